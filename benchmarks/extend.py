@@ -41,7 +41,7 @@ from stga_addon.training.evaluate.match_exposure import known_exposure
 from stga_addon.training.evaluate.metrics import evaluate
 from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.optimize.precompile import precompile_kernels
-from stga_addon.training.optimize.strategies import ExtendStrategy, GlobalStrategy, Strategy
+from stga_addon.training.optimize.strategies import Strategy
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.continuation import (
     DENSITY_INTERVAL,
@@ -205,11 +205,10 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
-    union, every = np.any(list(prepared.selection.values()), axis=0), GlobalStrategy()
+    first = Strategy(settings, prepared.selection)
+    every = Strategy(replace(settings, strategy="global"), {})
     arms = {
-        "extend": Arm(
-            settings, continued_order(continuation, capture, None, seed), ExtendStrategy(union)
-        ),
+        "extend": Arm(settings, continued_order(continuation, capture, None, seed), first),
         "all-in-turn": Arm(settings, alternating(old, new, seed), every),
         "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), every),
         "all-new-only": Arm(settings, view_order(new, 1, seed), every),
@@ -248,7 +247,7 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         "refine-grown": Arm(
             grown, continued_order(continuation, capture, region, seed), base.strategy
         ),
-        "all": Arm(settings, every, GlobalStrategy()),
+        "all": Arm(settings, every, Strategy(replace(settings, strategy="global"), {})),
     }
 
 

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter, process_time
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -54,10 +55,9 @@ from stga_addon.raster.cpu.tiles import (
     sum_tiles,
 )
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.losses import image_gradient, whole_image
-from stga_addon.training.optimize.state import new_state
+from stga_addon.training.optimize.state import Batch, new_state
 from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.settings import make_settings
 
@@ -247,7 +247,7 @@ def stages(
 
 def global_step(
     splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
-) -> tuple[Backend, Batch]:
+) -> tuple[Any, Batch]:
     """A whole iteration on the CPU, from the posed mesh's frames on, and its global batch."""
     poses = lambda timestep: mesh, lambda timestep, zero_pose: mesh
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, *poses)

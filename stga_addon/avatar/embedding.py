@@ -72,24 +72,21 @@ def face_frames(
         axes = first, _cross(normal, first), normal
         before = face_areas(neutral, faces) if neutral_areas is None else neutral_areas
         # A triangle without area in the neutral mesh has no meaningful ratio: its scale is 1.
-        scale = np.where(
-            before > 0, np.sqrt(triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)), 1.0
-        )
+        ratio = triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)
+        scale = np.where(before > 0, np.sqrt(ratio), 1.0)
     elif convention == "gaussian_avatars":
         edge, side = _length(to_p1), _length(to_p2)
         first, normal = _orthonormal(to_p1, triangles)
         axes = first, normal, _cross(first, normal)
         no_edge = edge <= MIN_AREA_RATIO * np.sqrt(triangles.longest_squared)
-        scale = (
-            edge + np.where(no_edge, side, triangles.twice_area / np.where(no_edge, 1.0, edge))
-        ) / 2
+        height = triangles.twice_area / np.where(no_edge, 1.0, edge)
+        scale = (edge + np.where(no_edge, side, height)) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     deformed = np.zeros((len(faces), 0), np.float32)
     if strain is not None:
-        deformed = gram_strain(
-            strain, triangles.squared[0], _dot(to_p1, to_p2), triangles.squared[1]
-        )
+        first_squared, second_squared, _ = triangles.squared
+        deformed = gram_strain(strain, first_squared, _dot(to_p1, to_p2), second_squared)
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):
@@ -101,10 +98,8 @@ def face_frames(
 def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
     """The frames with their origins moved by shift (F, 3), in each triangle's own axes and unit."""
     # In one type: einsum takes several times as long where it has to convert.
-    moved = frames.scale[:, None] * np.einsum(
-        "fij,fj->fi", frames.rotation, shift.astype(np.float64)
-    )
-    return replace(frames, origin=frames.origin + moved)
+    turned = np.einsum("fij,fj->fi", frames.rotation, shift.astype(np.float64))
+    return replace(frames, origin=frames.origin + frames.scale[:, None] * turned)
 
 
 def frame_backward(
@@ -126,23 +121,19 @@ def frame_backward(
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    flat = twice <= np.maximum(
-        2 * MIN_AREA_RATIO * _largest(_squared(_edges(corners.transpose(1, 2, 0)))), MIN_DIVISOR
-    )
+    longest_squared = _largest(_squared(_edges(corners.transpose(1, 2, 0))))
+    flat = twice <= np.maximum(2 * MIN_AREA_RATIO * longest_squared, MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left,
     # over twice the area.
-    slope_x, slope_y = (
-        (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area,
-        (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area,
-    )
+    slope_x = (y[:, [1, 2, 0]] - y[:, [2, 0, 1]]) * per_area
+    slope_y = (x[:, [2, 0, 1]] - x[:, [1, 2, 0]]) * per_area
     # The first axis points from the origin to p0.
     spin = np.where(flat, 0.0, torque[:, 2] / np.where(flat, 1.0, x[:, 0]))
     pull = np.repeat(force[:, None] / 3, 3, axis=1)
     pull[..., 0] += growth[:, None] / 2 * slope_x
-    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * np.array(
-        [2 / 3, -1 / 3, -1 / 3]
-    )
+    turn = np.array([2 / 3, -1 / 3, -1 / 3])
+    pull[..., 1] += growth[:, None] / 2 * slope_y + spin[:, None] * turn
     pull[..., 2] += torque[:, :1] * slope_y - torque[:, 1:2] * slope_x
     pull = (pull @ frames.rotation.transpose(0, 2, 1)).reshape(-1, 3)
     return np.stack([np.bincount(faces.ravel(), column, len(vertices)) for column in pull.T], -1)
@@ -152,10 +143,8 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see
     MIN_AREA_RATIO)."""
     triangles = _triangles(vertices, faces)
-    area = triangles.twice_area / 2
-    return np.where(
-        area > np.maximum(MIN_AREA_RATIO * triangles.longest_squared, MIN_DIVISOR), area, 0.0
-    )
+    area, least = triangles.twice_area / 2, MIN_AREA_RATIO * triangles.longest_squared
+    return np.where(area > np.maximum(least, MIN_DIVISOR), area, 0.0)
 
 
 def points_to_world(points: np.ndarray, frames: FaceFrames, face: np.ndarray) -> np.ndarray:
@@ -190,10 +179,8 @@ def strained_sh(splats: Splats, frames: FaceFrames) -> np.ndarray:
     """The splats' `sh` (N, K, 3) including the color change by strain."""
     if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
         return splats.sh
-    sh = splats.sh.copy()
-    sh[:, 0] += np.einsum(
-        "ns,nsc->nc", frames.strain[splats.face], splats.strain_color
-    ) / np.float32(SH_C0)
+    sh, strain = splats.sh.copy(), frames.strain[splats.face]
+    sh[:, 0] += np.einsum("ns,nsc->nc", strain, splats.strain_color) / np.float32(SH_C0)
     return sh
 
 
@@ -201,10 +188,8 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
     """Express world-space splats in the frames of the triangles `face` (N,): the inverse of
     `to_world`."""
     scale = np.maximum(frames.scale[face], MIN_DIVISOR)
-    xyz = (
-        np.einsum("nji,nj->ni", frames.rotation[face], world.xyz - frames.origin[face])
-        / scale[:, None]
-    )
+    offset = world.xyz - frames.origin[face]
+    xyz = np.einsum("nji,nj->ni", frames.rotation[face], offset) / scale[:, None]
     inverse = frames.quaternion[face] * np.array([1.0, -1.0, -1.0, -1.0])
     rotation = multiply(inverse, normalized(world.rotation))
     return replace(
@@ -276,20 +261,15 @@ def _orthonormal(first: np.ndarray, triangles: _Triangles) -> tuple[np.ndarray, 
     follows the same rules.
     """
     longest, length, normal = triangles.longest_squared, _length(first), triangles.normal
-    no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
+    no_first, x_axis = length <= MIN_AREA_RATIO * np.sqrt(longest), np.array([[1.0], [0.0], [0.0]])
     if no_first.any():
-        first = np.where(
-            no_first, np.array([[1.0], [0.0], [0.0]]), first / np.where(no_first, 1.0, length)
-        )
+        first = np.where(no_first, x_axis, first / np.where(no_first, 1.0, length))
     else:
         first = first / length
     no_normal = triangles.twice_area <= 2 * MIN_AREA_RATIO * longest
     if no_normal.any():
-        upright = np.abs(first[2]) > UPRIGHT_COSINE
-        substitute = _cross(
-            first,
-            np.where(upright, np.array([[1.0], [0.0], [0.0]]), np.array([[0.0], [0.0], [1.0]])),
-        )
+        upright, z_axis = np.abs(first[2]) > UPRIGHT_COSINE, np.array([[0.0], [0.0], [1.0]])
+        substitute = _cross(first, np.where(upright, x_axis, z_axis))
         normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first) * first
     return first, normal / _length(normal)

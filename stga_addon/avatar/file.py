@@ -3,7 +3,7 @@ avatar."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -78,8 +78,7 @@ class Avatar:
                  rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
     strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and
-                  positions follow
-                (`avatar.strain`); None: the same for all, ±MAX_STRAIN
+                  positions follow (`avatar.strain`); None: the same for all, ±MAX_STRAIN
     driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of
                     that name in
                 `offsets.OFFSETS`, for each of its S components a vector in the triangle's frame
@@ -107,13 +106,11 @@ class Avatar:
     def frames(self, mesh: np.ndarray) -> FaceFrames:
         """The triangles' local frames on a posed mesh (V, 3), with strain where splats follow it,
         and moved by the driven offsets."""
-        basis = self._strain
+        basis, offsets = self._strain, self.driven_offsets
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
         if basis is None:
             return frames
-        return moved_frames(
-            frames, self.driven_offsets, lambda name: OFFSETS[name].signal(basis, frames)
-        )
+        return moved_frames(frames, offsets, lambda name: OFFSETS[name].signal(basis, frames))
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -121,11 +118,9 @@ class Avatar:
 
     @cached_property
     def _strain(self) -> StrainBasis | None:
-        return (
-            strain_basis(self.neutral, self.faces, self.strain_range)
-            if self.follows_strain
-            else None
-        )
+        if not self.follows_strain:
+            return None
+        return strain_basis(self.neutral, self.faces, self.strain_range)
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
@@ -147,9 +142,8 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     }
     arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
-    arrays["region_faces"] = np.array(list(avatar.regions.values()), bool).reshape(
-        -1, len(avatar.faces)
-    )
+    masks = np.array(list(avatar.regions.values()), bool)
+    arrays["region_faces"] = masks.reshape(-1, len(avatar.faces))
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
     arrays.update(avatar.driven_offsets)
@@ -171,9 +165,10 @@ def read_avatar(path: Path) -> Avatar:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
     names, masks = header["regions"], arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
-        raise StgaError(
-            f"{path}: region_faces has shape {masks.shape}, expected ({len(names)}, faces)"
-        )
+        expected = f"expected ({len(names)}, faces)"
+        raise StgaError(f"{path}: region_faces has shape {masks.shape}, {expected}")
+    light, vertices = header.get("light"), len(arrays["neutral"])
+    light = light_from(path, arrays, light, vertices) if "light" in header else None
     avatar = Avatar(
         splats=Splats(**{name: arrays[name] for name in ARRAYS if name in arrays}),
         convention=header["convention"],
@@ -186,9 +181,7 @@ def read_avatar(path: Path) -> Avatar:
         principal_point=header["principal_point"],
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
-        light=light_from(path, arrays, header["light"], len(arrays["neutral"]))
-        if "light" in header
-        else None,
+        light=light,
     )
     _check(path, avatar)
     return avatar
@@ -207,13 +200,9 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
         version = shorten(header.get("version"))
         raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
     kinds = {
-        "convention": str,
-        "background": list,
-        "antialiased": bool,
-        "principal_point": str,
-        "regions": list,
-        "settings": dict,
-    }
+        "convention": str, "background": list, "antialiased": bool, "principal_point": str,
+        "regions": list, "settings": dict,
+    }  # fmt: skip
     for name, kind in kinds.items():
         if not isinstance(header.get(name), kind):
             raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
@@ -225,14 +214,11 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
     if avatar.convention not in CONVENTIONS:
-        raise StgaError(
-            f"{path}: convention is {shorten(avatar.convention)}, expected one of {', '.join(CONVENTIONS)}"
-        )
+        expected = f"expected one of {', '.join(CONVENTIONS)}"
+        raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, {expected}")
     if avatar.principal_point not in PRINCIPAL_POINTS:
-        raise StgaError(
-            f"{path}: principal_point is {shorten(avatar.principal_point)}, "
-            f"expected one of {', '.join(PRINCIPAL_POINTS)}"
-        )
+        expected = f"expected one of {', '.join(PRINCIPAL_POINTS)}"
+        raise StgaError(f"{path}: principal_point is {shorten(avatar.principal_point)}, {expected}")
     check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
     check_array(path, "faces", avatar.faces, "int32", (-1, 3))
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
@@ -241,31 +227,20 @@ def _check(path: Path, avatar: Avatar) -> None:
         array = getattr(avatar.splats, name)
         check_array(path, name, array, kind.dtype, (count, *kind.shape))
         if kind.sizes and array.shape[1] not in kind.sizes:
-            raise StgaError(
-                f"{path}: {name} has {array.shape[1]} coefficients, expected one of {kind.sizes}"
-            )
-    if avatar.strain_range is not None:
-        check_array(
-            path,
-            "strain_range",
-            avatar.strain_range,
-            "float32",
-            (len(avatar.faces), 2, STRAIN_COMPONENTS),
-        )
+            found = f"{array.shape[1]} coefficients"
+            raise StgaError(f"{path}: {name} has {found}, expected one of {kind.sizes}")
+    faces, limits, color = len(avatar.faces), avatar.strain_range, avatar.background
+    if limits is not None:
+        check_array(path, "strain_range", limits, "float32", (faces, 2, STRAIN_COMPONENTS))
     for name, coefficients in avatar.driven_offsets.items():
-        check_array(
-            path, name, coefficients, "float32", (len(avatar.faces), OFFSETS[name].signals, 3)
-        )
-    _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
+        shape = faces, OFFSETS[name].signals, 3
+        check_array(path, name, coefficients, "float32", shape)
+    _check_index(path, "face", avatar.splats.face, faces, "faces")
     for name, mask in avatar.regions.items():
-        check_array(path, f"region {name!r}", mask, "bool", (len(avatar.faces),))
-    numbers = [
-        value for value in avatar.background if isinstance(value, (int, float)) and 0 <= value <= 1
-    ]
-    if len(numbers) != 3 or len(avatar.background) != 3:
-        raise StgaError(
-            f"{path}: background is {shorten(avatar.background)}, expected three numbers between 0 and 1"
-        )
+        check_array(path, f"region {name!r}", mask, "bool", (faces,))
+    if len(color) != 3 or not all(isinstance(c, (int, float)) and 0 <= c <= 1 for c in color):
+        expected = "expected three numbers between 0 and 1"
+        raise StgaError(f"{path}: background is {shorten(color)}, {expected}")
 
 
 def check_array(
@@ -278,63 +253,45 @@ def check_array(
     )
     if not fits or array.dtype != dtype:
         expected = ", ".join("any" if size < 0 else str(size) for size in shape)
-        raise StgaError(
-            f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} ({expected})"
-        )
+        found = f"{array.dtype} {array.shape}"
+        raise StgaError(f"{path}: {name} is {found}, expected {dtype} ({expected})")
     if not np.isfinite(array).all():
         raise StgaError(f"{path}: {name} holds a value that is not finite")
 
 
 def _check_index(path: Path, name: str, index: np.ndarray, count: int, of: str) -> None:
     if index.size and (index.min() < 0 or index.max() >= count):
-        raise StgaError(
-            f"{path}: {name} refers to {index.min()}…{index.max()}, but there are {count} {of}"
-        )
+        refers = f"{name} refers to {index.min()}…{index.max()}"
+        raise StgaError(f"{path}: {refers}, but there are {count} {of}")
 
 
 def light_arrays(light: AvatarLight) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays for an avatar file, by vertex in half precision (30 bytes a vertex), and the rest for
     its header."""
-    arrays = {
-        f"{_PREFIX}{name}": np.asarray(getattr(light, name), np.float16) for name in _LIGHT_ARRAYS
-    }
-    rest = {
-        field.name: getattr(light, field.name)
-        for field in fields(light)
-        if field.name not in _LIGHT_ARRAYS
-    }
-    return arrays, rest
+    values, arrays = dict(vars(light)), {}
+    for name in _LIGHT_ARRAYS:
+        arrays[f"{_PREFIX}{name}"] = np.asarray(values.pop(name), np.float16)
+    return arrays, values
 
 
 def light_from(
     path: Path, arrays: Mapping[str, np.ndarray], rest: object, vertices: int
 ) -> AvatarLight:
     """The reverse of `light_arrays`. Raises StgaError naming the file and what is wrong."""
-    found = {}
+    values: dict[str, Any] = {}
     for name, shape in _LIGHT_ARRAYS.items():
         array, expected = arrays.get(_PREFIX + name), tuple(vertices if n < 0 else n for n in shape)
-        if (
-            array is None
-            or array.dtype != np.float16
-            or array.shape != expected
-            or not np.isfinite(array).all()
-        ):
-            raise StgaError(
-                f"{path}: {_PREFIX}{name} is missing or damaged, expected float16 {expected}, finite"
-            )
-        found[name] = array.astype(np.float32)
+        fits = array is not None and array.dtype == np.float16 and array.shape == expected
+        if array is None or not fits or not np.isfinite(array).all():
+            text = f"is missing or damaged, expected float16 {expected}, finite"
+            raise StgaError(f"{path}: {_PREFIX}{name} {text}")
+        values[name] = array.astype(np.float32)
     if not isinstance(rest, dict) or rest.get("source") not in SOURCES:
-        raise StgaError(
-            f"{path}: header field 'light' is {shorten(rest)}, expected residual, damping and source"
-        )
+        expected_fields = "expected residual, damping and source"
+        raise StgaError(f"{path}: header field 'light' is {shorten(rest)}, {expected_fields}")
     for name in ("residual", "damping"):
         value = rest.get(name)
         if not isinstance(value, (int, float)) or not 0 <= value <= 1e6:
-            raise StgaError(
-                f"{path}: header field 'light.{name}' is {shorten(value)}, expected a number from 0 on"
-            )
-    values: dict[str, Any] = {
-        **found,
-        **{name: rest[name] for name in ("residual", "damping", "source")},
-    }
-    return AvatarLight(**values)
+            found = f"header field 'light.{name}' is {shorten(value)}"
+            raise StgaError(f"{path}: {found}, expected a number from 0 on")
+    return AvatarLight(**values, **{name: rest[name] for name in ("residual", "damping", "source")})

@@ -35,23 +35,19 @@ def lattice_splats(
     weights = lattice_weights(order, INSET)
     frames = face_frames(neutral, faces, neutral, convention)
     corners = np.asarray(neutral, np.float64)[faces] - frames.origin[:, None]
-    local = (
-        np.einsum("fji,fcj->fci", frames.rotation, corners)
-        / np.maximum(frames.scale, MIN_SPACING_M)[:, None, None]
-    )
+    scale = np.maximum(frames.scale, MIN_SPACING_M)
+    local = np.einsum("fji,fcj->fci", frames.rotation, corners) / scale[:, None, None]
     xyz = np.einsum("pc,fci->fpi", weights, local).reshape(-1, 3)
 
     spacing = np.sqrt(2 * face_areas(neutral, faces)) / max(order, 1)
-    sigma = SCALE * np.maximum(spacing, MIN_SPACING_M) / np.maximum(frames.scale, MIN_SPACING_M)
+    sigma = SCALE * np.maximum(spacing, MIN_SPACING_M) / scale
     stretch = np.ones(3)
     stretch[NORMAL_AXIS[convention]] = FLATNESS
-    count = len(xyz)
+    count, log_scale = len(xyz), np.log(sigma[:, None] * stretch).astype(np.float32)
     return Splats(
         xyz=xyz.astype(np.float32),
         rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        log_scale=np.repeat(np.log(sigma[:, None] * stretch), len(weights), axis=0).astype(
-            np.float32
-        ),
+        log_scale=np.repeat(log_scale, len(weights), axis=0),
         opacity=np.full(count, opacity_logit, np.float32),
         sh=np.zeros((count, (sh_degree + 1) ** 2, 3), np.float32),
         face=np.repeat(np.arange(len(faces), dtype=np.int32), len(weights)),

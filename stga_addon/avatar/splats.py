@@ -35,8 +35,7 @@ class Splats:
     unbound    (N,) bool: splats of hair and shoulders; they follow their triangle without being
                limited to it
     strain_color  (N, S, 3) change of the degree-0 coefficient's color per unit of the triangle's
-                  strain (`strain`),
-               S = 3, or 0 (default) where colors do not depend on deformation
+                  strain (`strain`), S = 3, or 0 (default) where colors do not depend on deformation
     """
 
     xyz: np.ndarray
@@ -85,19 +84,13 @@ class SplatArray:
     shape: tuple[int, ...] = ()
     sizes: tuple[int, ...] = ()
 
-    def shape_at(self, size: int) -> tuple[int, ...]:
-        """The shape after N where −1 stands for `size`."""
-        return tuple(size if axis < 0 else axis for axis in self.shape)
-
 
 ARRAYS = {
     "xyz": SplatArray(shape=(3,)),
     "rotation": SplatArray(shape=(4,)),
     "log_scale": SplatArray(shape=(3,)),
     "opacity": SplatArray(),
-    "sh": SplatArray(
-        shape=(-1, 3), sizes=tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))
-    ),
+    "sh": SplatArray(shape=(-1, 3), sizes=tuple(n**2 for n in range(1, MAX_SH_DEGREE + 2))),
     "face": SplatArray("int32"),
     "unbound": SplatArray("bool"),
     "strain_color": SplatArray(shape=(-1, 3), sizes=(0, STRAIN_COMPONENTS)),
@@ -110,9 +103,8 @@ the same name switches them in `TrainingSettings`, and one in `Rates` trains the
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """All splats of sets with coefficients of the same kinds, in order."""
-    return Splats(
-        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Splats))
-    )
+    names = [field.name for field in fields(Splats)]
+    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def no_strain_color(count: int) -> np.ndarray:
@@ -150,11 +142,8 @@ def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 def harmonics_text() -> list[str]:
     """What `harmonics` returns as expressions of x, y, z, xx, yy and zz, in GLSL and JavaScript as
     well as Python."""
-    returned = next(
-        node
-        for node in ast.walk(ast.parse(inspect.getsource(harmonics)))
-        if isinstance(node, ast.Return)
-    )
+    nodes = ast.walk(ast.parse(inspect.getsource(harmonics)))
+    returned = next(node for node in nodes if isinstance(node, ast.Return))
     assert isinstance(returned.value, ast.Tuple)
     return [ast.unparse(term) for term in returned.value.elts]
 
@@ -162,7 +151,6 @@ def harmonics_text() -> list[str]:
 def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """(N, 3) sRGB, not clipped, of splats' coefficients (N, K, 3) seen in unit directions (N, 3)
     from the eye."""
-    terms = harmonics(*direction.T)[1 : sh.shape[1]]
-    return np.asarray(
-        0.5 + SH_C0 * sh[:, 0] + sum(term[:, None] * sh[:, k] for k, term in enumerate(terms, 1))
-    )
+    terms = enumerate(harmonics(*direction.T)[1 : sh.shape[1]], 1)
+    rest = sum(term[:, None] * sh[:, k] for k, term in terms)
+    return np.asarray(0.5 + SH_C0 * sh[:, 0] + rest)

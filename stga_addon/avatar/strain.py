@@ -107,6 +107,8 @@ def strain_basis(
     corners = np.ascontiguousarray(faces.T, np.intp)
     vertex_faces = _index_lists(corners.ravel(), np.tile(np.arange(len(faces)), 3), len(neutral))
     neighbors = edge_neighbors(faces)
+    to_tensor = _product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2
+    to_plane = _product(along, along), _product(across, across), _product(along, across)
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
     if strain_range is None:
         ends = np.array([[-MAX_STRAIN], [MAX_STRAIN]], np.float32)
@@ -114,16 +116,8 @@ def strain_basis(
     return StrainBasis(
         faces=faces,
         gram=_by_component(np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1)),
-        to_tensor=_by_component(
-            np.stack([_product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2], 1), np.float32
-        ),
-        to_plane=_by_component(
-            twice
-            * np.stack(
-                [_product(along, along), _product(across, across), _product(along, across)], 1
-            ),
-            np.float32,
-        ),
+        to_tensor=_by_component(np.stack(to_tensor, 1), np.float32),
+        to_plane=_by_component(twice * np.stack(to_plane, 1), np.float32),
         corners=corners,
         vertex_faces=vertex_faces,
         vertex_weight=(1 / (3 * np.maximum(vertex_faces.counts, 1))).astype(np.float32),
@@ -146,9 +140,8 @@ def _ranked(lists: IndexLists) -> RankedLists:
     order = np.argsort(-lists.counts, kind="stable")
     starts, counts = lists.indptr[:-1][order], lists.counts[order]
     lengths = (int((counts > rank).sum()) for rank in range(int(counts.max(initial=0))))
-    return RankedLists(
-        order, tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths))
-    )
+    ranks = tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths))
+    return RankedLists(order, ranks)
 
 
 def _add_listed(lists: RankedLists, rows: np.ndarray, total: np.ndarray) -> None:
@@ -215,9 +208,8 @@ def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
     It includes the neutral mesh, and stays within that of the basis. What is fitted to a few
     expressions is not extrapolated to stronger ones.
     """
-    seen = range_with_margin(
-        rest_strain(basis.range), (face_strain(basis, mesh) for mesh in meshes)
-    )
+    strains = (face_strain(basis, mesh) for mesh in meshes)
+    seen = range_with_margin(rest_strain(basis.range), strains)
     return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 

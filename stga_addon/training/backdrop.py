@@ -35,9 +35,8 @@ def without_backdrop(
     if backdrop == "plain" or (mask is None and backdrop == "masked"):
         return image, mask
     if mask is None:
-        mask = 255 * silhouette(
-            np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera
-        ).astype(np.uint8)
+        mesh = np.asarray(capture.mesh(view.timestep))
+        mask = 255 * silhouette(mesh, capture.faces, view.camera).astype(np.uint8)
     return over_color(image, mask, background), mask
 
 
@@ -48,39 +47,24 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
     mean of those pixels around it that show nothing else; only this second term is exchanged. A
     mask's soft edge thus keeps no rim of the backdrop's color.
     """
+    from scipy.ndimage import gaussian_filter
+
     cover = mask[..., None].astype(np.float32) / 255
     rest = (1 - cover) * 255 * np.asarray(color, np.float32)
     found = cover * image
     edge = (mask > 0) & (mask < 255)
     if edge.any() and not mask.all():
-        rows, columns = _around(edge, round(3 * BLUR_SHARES[1] * len(image)))
-        part, share = image[rows, columns].astype(np.float32), cover[rows, columns]
-        foreground = part - (1 - share) * _backdrop(part, mask[rows, columns] == 0, len(image))
-        soft = edge[rows, columns]
-        found[rows, columns][soft] = np.clip(foreground, 0, 255 * share)[soft]
+        margin = round(3 * BLUR_SHARES[1] * len(image))
+        spans = [np.flatnonzero(edge.any(axis=axis)) for axis in (1, 0)]
+        box = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in spans)
+        part, share, clear = image[box].astype(np.float32), cover[box], mask[box] == 0
+        total, weight = np.zeros_like(part), np.full_like(share, 1e-12)
+        shown = np.where(clear[..., None], part, 0)
+        for blur, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
+            sigma = max(1.0, blur * len(image))
+            total += importance * gaussian_filter(shown, (sigma, sigma, 0), truncate=3.0)
+            near = gaussian_filter(clear.astype(np.float32), sigma, truncate=3.0)
+            weight += importance * near[..., None]
+        foreground = np.clip(part - (1 - share) * (total / weight), 0, 255 * share)
+        found[box][edge[box]] = foreground[edge[box]]
     return np.asarray(np.clip(found + rest, 0, 255) + 0.5).astype(np.uint8)
-
-
-def _around(where: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the box around `where` (H, W) bool, with a margin in pixels."""
-    spans = [np.flatnonzero(where.any(axis=axis)) for axis in (1, 0)]
-    rows, columns = (
-        slice(max(0, int(span[0]) - margin), int(span[-1]) + margin + 1) for span in spans
-    )
-    return rows, columns
-
-
-def _backdrop(image: np.ndarray, clear: np.ndarray, height: int) -> np.ndarray:
-    """(H, W, 3) mean color of the pixels `clear` (H, W) bool around each pixel of an image (H, W,
-    3) float32; height: of the whole image."""
-    from scipy.ndimage import gaussian_filter
-
-    total, weight = np.zeros_like(image), np.full((*clear.shape, 1), 1e-12, np.float32)
-    shown = np.where(clear[..., None], image, 0)
-    for share, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
-        sigma = max(1.0, share * height)
-        total += importance * gaussian_filter(shown, (sigma, sigma, 0), truncate=3.0)
-        weight += (
-            importance * gaussian_filter(clear.astype(np.float32), sigma, truncate=3.0)[..., None]
-        )
-    return np.asarray(total / weight)

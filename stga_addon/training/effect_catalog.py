@@ -29,78 +29,70 @@ RELIGHT = "relight"
 place."""
 WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
+
+
+def _effect(name: str, cost: str, setting: str = "", **values: Any) -> Effect:
+    """An effect; setting: that is true where it is on, and false where it is off."""
+    switches = [{setting: on} if setting else {} for on in (True, False)]
+    return Effect(name, cost, **{"on": switches[0], "off": switches[1], **values})
+
+
+_SHAPES = "shape keys and drivers in Blender"
+_STRAIN = "and the strain of every frame"
+_LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03}
 _EFFECTS = (
-    Effect(
+    _effect(
         "view-color",
         "3, 8 or 15 coefficients more a splat and channel",
         off={"sh_degree": 0, "sh_steps": ()},
     ),
-    Effect("exposure", "a pass over each image when it is read"),
-    Effect("antialiasing", "a root a splat", on={"antialiased": True}, off={"antialiased": False}),
-    Effect(
+    _effect("exposure", "a pass over each image when it is read"),
+    _effect("antialiasing", "a root a splat", "antialiased"),
+    _effect(
         "background",
-        "a pass over the image in every iteration, and one when it is read where the backdrop is not of one color",
+        "a pass over the image in every iteration, and one when it is read where the backdrop is "
+        "not of one color",
         on={"random_background": True, "backdrop": "plain"},
         off={"random_background": False, "backdrop": "plain"},
     ),
-    Effect(
-        "hull-points",
-        "a splat for every 4 mm beside the mesh",
-        on={"hull_points": True},
-        off={"hull_points": False},
-    ),
-    Effect(
-        "depth-limits",
-        "none: splats are smaller and nearer to their triangles",
-        on={
-            "scale_limit": 1.5,
-            "stray_limit": 0.5,
-            "stray_reset_interval": 20,
-            "adam_epsilon": 0.03,
-        },
-    ),
-    Effect(
+    _effect("hull-points", "a splat for every 4 mm beside the mesh", "hull_points"),
+    _effect("depth-limits", "none: splats are smaller and nearer to their triangles", on=_LIMITS),
+    _effect(
         "density",
         "up to a quarter more splats, more in the preset final",
         off={"density_interval": 0},
     ),
-    Effect(
+    _effect(
         "selection",
         "none: local iterations are cheaper than global ones",
         on={"strategy": "selective"},
         off={"strategy": "global"},
     ),
-    Effect(
+    _effect(
         "strain-color",
-        "3 coefficients more a splat and channel, and the strain of every frame",
-        on={"strain_color": True},
-        off={"strain_color": False},
+        f"3 coefficients more a splat and channel, {_STRAIN}",
+        "strain_color",
         added_later=True,
     ),
-    Effect(
+    _effect(
         "strain-position",
-        "9 coefficients a triangle, and the strain of every frame",
+        f"9 coefficients a triangle, {_STRAIN}",
         offset="strain_position",
         added_later=True,
     ),
-    Effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
-    Effect(WORLD, "seconds to a minute after training, and a file of its own"),
-    Effect("teeth", "splats on 168 triangles", on={"teeth": True}, off={"teeth": False}),
-    Effect(
-        "torso",
-        "none: splats below the neck follow other triangles",
-        on={"torso": True},
-        off={"torso": False},
-    ),
-    Effect("neck", "9 shape keys and drivers in Blender"),
-    Effect("jaw", "9 shape keys and drivers in Blender"),
-    Effect("eyes", "18 shape keys and drivers in Blender"),
-    Effect("dynamic-offsets", "a mesh a frame beside the parameters"),
-    Effect(
+    _effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
+    _effect(WORLD, "seconds to a minute after training, and a file of its own"),
+    _effect("teeth", "splats on 168 triangles", "teeth"),
+    _effect("torso", "none: splats below the neck follow other triangles", "torso"),
+    _effect("neck", f"9 {_SHAPES}"),
+    _effect("jaw", f"9 {_SHAPES}"),
+    _effect("eyes", f"18 {_SHAPES}"),
+    _effect("dynamic-offsets", "a mesh a frame beside the parameters"),
+    _effect(
         "tracking",
-        "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the head's motion",
-        on={"tracking": True},
-        off={"tracking": False},
+        "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
+        "head's motion",
+        "tracking",
     ),
 )
 EFFECTS = {effect.name: effect for effect in _EFFECTS}

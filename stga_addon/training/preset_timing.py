@@ -78,9 +78,7 @@ def seconds_per_iteration(
     order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
     scales = {image_scale(settings, 0.0), settings.scale}
-    loaded = {
-        scale: cycle([_load(capture, view, scale, settings) for view in views]) for scale in scales
-    }
+    loaded = {s: cycle([_load(capture, view, s, settings) for view in views]) for s in scales}
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)

@@ -2,6 +2,7 @@
 rates, image scale."""
 
 from collections.abc import Iterator, Sequence
+from itertools import count
 
 import numpy as np
 
@@ -20,24 +21,18 @@ def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0)
     fully shuffled), and the groups in random order. Epoch e depends on (seed, e) alone, so a
     resumed run continues the same order.
     """
-    epoch = start // len(views)
-    skip = start % len(views)
-    while True:
-        yield from _epoch(views, per_visit, seed, epoch)[skip:]
-        epoch, skip = epoch + 1, 0
-
-
-def _epoch(views: Sequence[View], per_visit: int, seed: int, epoch: int) -> list[View]:
-    rng = np.random.default_rng([seed, epoch])
     frames: dict[int, list[View]] = {}
     for view in views:
         frames.setdefault(view.timestep, []).append(view)
-    visits = []
-    for frame in frames.values():
-        shuffled = [frame[n] for n in rng.permutation(len(frame))]
-        size = per_visit or len(shuffled)
-        visits += [shuffled[n : n + size] for n in range(0, len(shuffled), size)]
-    return [view for n in rng.permutation(len(visits)) for view in visits[n]]
+    skip = start % len(views)
+    for epoch in count(start // len(views)):
+        rng, visits = np.random.default_rng([seed, epoch]), []
+        for frame in frames.values():
+            shuffled = [frame[n] for n in rng.permutation(len(frame))]
+            size = per_visit or len(shuffled)
+            visits += [shuffled[n : n + size] for n in range(0, len(shuffled), size)]
+        yield from [view for n in rng.permutation(len(visits)) for view in visits[n]][skip:]
+        skip = 0
 
 
 def sh_degree(settings: TrainingSettings, progress: float) -> int:

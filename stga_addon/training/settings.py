@@ -113,19 +113,16 @@ class TrainingSettings:
     unbound_scale_limit  the scale limit of unbound splats, a multiple of the distance between hull
                          points
     unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points
-                           that few cameras
-                   see fade, unless nothing else explains what these cameras see
+                   that few cameras see fade, unless nothing else explains what these cameras see
     adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
                    that hardly show in an image, and whose gradients are below it, hardly move
     ema_share      share of the latest step in each splat's exponential moving average, which the
-                   avatar is made of;
-                   1: no averaging
+                   avatar is made of; 1: no averaging
     stray_reset_interval, stray_limit, stray_reset_share   every so many iterations (0: never), a
-    splat farther than the
-                   limit from its triangle's origin is put back to this share of the limit; 0: onto
-                   the origin, as in the paper All limits but `unbound_scale_limit` are multiples of
-                   sqrt(2·triangle area) for "stga", of the triangle's own unit of length for
-                   "gaussian_avatars"
+                   splat farther than the limit from its triangle's origin is put back to this share
+                   of the limit; 0: onto the origin, as in the paper. All limits but
+                   `unbound_scale_limit` are multiples of sqrt(2·triangle area) for "stga", of the
+                   triangle's own unit of length for "gaussian_avatars"
     sh_degree, sh_steps   highest SH degree, and the shares of the budget at which the degree rises
                           by one
     hull_points    add hull points for what the mesh does not cover
@@ -139,8 +136,7 @@ class TrainingSettings:
     backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for
                    "plain", training and evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
-                          first
-                   `coarse_share` of the budget half of that
+                          first `coarse_share` of the budget half of that
     target_psnr    stop when the held-out views reach this many dB
     stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
     preset         the preset that these settings began with, or none
@@ -223,8 +219,8 @@ class TrainingSettings:
     exposure: tuple[tuple[float, ...], ...] = ()
     tracking: bool = False
     effects: Mapping[str, str] | None = option(
-        "switch an effect on or off instead of deciding from the capture (docs/effects.md); may be repeated",
-        None, flag="--effect", metavar="NAME=on|off", parse=parse_choice,
+        "switch an effect on or off instead of deciding from the capture (docs/effects.md); may be "
+        "repeated", None, flag="--effect", metavar="NAME=on|off", parse=parse_choice,
     )  # fmt: skip
 
     @property
@@ -251,24 +247,21 @@ class TrainingSettings:
             raise StgaError("the budget must be given either in seconds or in iterations")
         for row in self.exposure:
             if len(row) not in EXPOSURE_SIZES or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
-                expected = "rows of a camera index, three gains above 0, three offsets, and a timestep where they drift"
+                expected = (
+                    "rows of a camera index, three gains above 0, three offsets, and a timestep "
+                    "where they drift"
+                )
                 raise StgaError(complaint("exposure", expected, row))
         if not set(self.driven_offsets) <= set(OFFSETS):
-            raise StgaError(
-                complaint(
-                    "driven_offsets", f"names among {', '.join(OFFSETS)}", self.driven_offsets
-                )
-            )
+            expected = f"names among {', '.join(OFFSETS)}"
+            raise StgaError(complaint("driven_offsets", expected, self.driven_offsets))
         effects = self.effects or {}
         if not (set(effects) <= set(EFFECTS) and set(effects.values()) <= set(CHOICES)):
-            raise StgaError(
-                complaint("effects", f"effects with {', '.join(CHOICES)}", dict(effects))
-            )
-        if effects and (self.schedule == "paper" or self.strategy == "gaussian-avatars"):
-            other = (
-                "--schedule paper" if self.schedule == "paper" else "--strategy gaussian-avatars"
-            )
-            raise StgaError(f"--effect cannot be combined with {other}")
+            expected = f"effects with {', '.join(CHOICES)}"
+            raise StgaError(complaint("effects", expected, dict(effects)))
+        for name, value in {"schedule": "paper", "strategy": "gaussian-avatars"}.items():
+            if effects and getattr(self, name) == value:
+                raise StgaError(f"--effect cannot be combined with --{name} {value}")
 
 
 INRIA_ADAM_EPSILON = 1e-9
@@ -294,16 +287,7 @@ PAPER_SETTINGS = {
 GAUSSIAN_AVATARS_SETTINGS = {
     "convention": "gaussian_avatars",
     "lattice": 0,
-    "rates": Rates(
-        xyz=5e-3,
-        log_scale=1.7e-2,
-        rotation=1e-3,
-        opacity=5e-2,
-        sh=2.5e-3,
-        sh_rest=1.25e-4,
-        position_end=0.01,
-        end=1.0,
-    ),
+    "rates": Rates(5e-3, 1e-3, 1.7e-2, 5e-2, 2.5e-3, 1.25e-4, position_end=0.01, end=1.0),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_reset_interval": 0,

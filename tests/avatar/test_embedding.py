@@ -209,8 +209,7 @@ def test_unknown_convention_is_refused():
 @pytest.mark.parametrize("part", ["force", "torque", "growth"])
 def test_backward_agrees_with_differences(part: str) -> None:
     """Catches a gradient that leaves out what turns or grows a triangle, takes an edge for another,
-    or has a wrong
-    sign: against central differences of the frames in random directions."""
+    or has a wrong sign: against central differences of the frames in random directions."""
     vertices, faces = random_mesh(4)
     rng = np.random.default_rng(5)
     neutral = vertices + rng.normal(0, 0.01, vertices.shape)

@@ -70,10 +70,8 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
         xyz[order], rotation[order], log_scale[order], scene.camera
     )
     shape = (scene.camera.height, scene.camera.width)
-    steady, transmittance = (
-        torch.ones(shape, dtype=torch.bool),
-        torch.ones(shape, dtype=torch.float64),
-    )
+    steady = torch.ones(shape, dtype=torch.bool)
+    transmittance = torch.ones(shape, dtype=torch.float64)
     running = torch.ones(shape, dtype=torch.bool)
     # The same with the cut-offs moved by the margin, by making each splat a little more or less
     # opaque.
@@ -167,6 +165,7 @@ def assert_close(errors: dict[str, float], image: float, gradient: float) -> Non
 
 
 __all__ = [
-    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients", "random_cotangents",
+    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients",
+    "random_cotangents",
     "reference_gradients", "rows", "steady_pixels",
 ]  # fmt: skip

@@ -22,10 +22,8 @@ splats = Parameters(
     rng.normal(0, 0.4, (n, 16, 3)),
 )
 splats = Parameters(*(a.astype(np.float32) for a in splats[:5]))
-camera_frames, face = (
-    frames_in_camera(WORLD, Camera(70, 50, 90.0, 90.0, 35.0, 25.0, pose)),
-    np.zeros(n, np.int32),
-)
+camera_frames = frames_in_camera(WORLD, Camera(70, 50, 90.0, 90.0, 35.0, 25.0, pose))
+face = np.zeros(n, np.int32)
 rendering = render_forward(splats, face, camera_frames, 3)
 target = rng.integers(0, 256, (50, 70, 3)).astype(np.uint8)
 v_image = np.empty_like(rendering.image)

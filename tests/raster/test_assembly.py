@@ -40,10 +40,8 @@ class Processor:
     conditional: str
 
 
-PACKED_X86, SCALAR_X86 = (
-    r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ps\s",
-    r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ss\s",
-)
+PACKED_X86 = r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ps\s"
+SCALAR_X86 = r"\sv(add|sub|mul|div|sqrt|min|max|fn?m\w+)ss\s"
 MASKED_X86 = r"\svp?maskmov|\sv\w*(gather|scatter)|\sv\w*mov\w*\s.*\(.*\{%k"
 AVX2 = Processor(X86, "%ymm", PACKED_X86, SCALAR_X86, MASKED_X86)
 AVX512 = Processor(X86, "%zmm", PACKED_X86, SCALAR_X86, MASKED_X86)

@@ -63,10 +63,8 @@ def test_every_thread_of_a_long_dispatch_runs_once(
 def test_recorded_work_runs_in_order_in_one_submit(device: Device) -> None:
     """Catches a dispatch that does not see what an earlier dispatch, copy or constant did."""
     words, submits, dispatches = 1000, device.submits, device.dispatches
-    source, target = (
-        device.upload("source", np.full(words, 5, np.uint32)),
-        device.buffer("target", words),
-    )
+    source = device.upload("source", np.full(words, 5, np.uint32))
+    target = device.buffer("target", words)
     with device.record() as work:
         work.copy(source, target, words)
         work.dispatch("numbers.main", words, {"numbers": target})
@@ -90,10 +88,8 @@ def test_an_upload_does_not_change_work_submitted_before(device: Device) -> None
 
 def test_groups_from_the_device(device: Device) -> None:
     """Catches an indirect dispatch at the wrong offset."""
-    groups, target = (
-        device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect"),
-        device.buffer("two", 1024),
-    )
+    groups = device.upload("groups", np.uint32([9, 9, 9, 2, 1, 1]), "indirect")
+    target = device.buffer("two", 1024)
     with device.record() as work:
         work.clear(target)
         work.dispatch("numbers.main", (groups, 12), {"numbers": target})

@@ -5,15 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from raster import gpu_device, reference, test_kernels
+from raster import gpu_device, reference
 from raster.test_kernels import (
-    GRADIENT_TOLERANCE,
     IMAGE_TOLERANCE,
     NAMES,
     SCENES,
     Scene,
     assert_gradients_agree,
-    cloud,
     random_cotangents,
 )
 from stga_addon.avatar.embedding import WORLD
@@ -26,7 +24,6 @@ from stga_addon.raster.gpu.rasterize import (
     Rasterizer,
     Tables,
     ViewOptions,
-    mark_focus,
     upload_frames,
     upload_splats,
 )
@@ -60,7 +57,8 @@ class Raw:
         self.table = upload_splats(self.device, self.splats, np.zeros(self.count, np.int32))
         frames = upload_frames(self.device, frames_in_camera(WORLD, self.scene.camera))
         options = ViewOptions(
-            self.scene.camera, self.scene.degree, background, antialiased=self.antialiased, focused=focus is not None,
+            self.scene.camera, self.scene.degree, background, antialiased=self.antialiased,
+            focused=focus is not None,
             reach=reach,
         )  # fmt: skip
         marked = None if focus is None else self.device.upload("focus", focus.astype(np.uint32))
@@ -105,55 +103,6 @@ def test_background_shows_through_and_pulls_on_the_splats() -> None:
     expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
     assert np.abs(raw.image(rendering) - image.detach().numpy()).max() < IMAGE_TOLERANCE
     assert_gradients_agree(gradients, dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
-
-
-def test_screen_gradient_is_the_other_back_ends() -> None:
-    """Catches density control fed with pixels, or with the gradient of something else."""
-    scene = cloud(25, count=40, size=(60, 35))
-    raw = Raw(scene)
-    _, written, screen = raw.gradients(raw.forward())
-    _, _, expected_rows, expected = test_kernels.raw_gradients(scene)
-    np.testing.assert_array_equal(written, np.sort(expected_rows))
-    np.testing.assert_allclose(
-        screen, expected[written], atol=GRADIENT_TOLERANCE["xyz"] * expected[written].max()
-    )
-
-
-@pytest.mark.parametrize("count", [80, 700])
-def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count: int) -> None:
-    """Catches a local iteration whose restricted tiles change a selected gradient, or touch another
-    row."""
-    scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
-    focus = np.zeros(count, bool)
-    focus[[3, 17, 40]] = True
-    raw = Raw(scene)
-    rendering = raw.forward()
-    image = raw.image(rendering)
-    full, all_written, full_screen = raw.gradients(rendering)
-    part = raw.forward(focus, reach=10)
-    rendered = raw.read(part["rendered"], 5, 7, dtype=np.uint32) > 0
-    assert 0 < rendered.sum() < rendered.size
-    pixels = np.kron(rendered, np.ones((16, 16), bool))[:70, :100]
-    np.testing.assert_array_equal(raw.image(part)[:, pixels], image[:, pixels])
-    gradients, written, screen = raw.gradients(part, fill=123.0)
-    assert len(written) > 0
-    assert set(written) <= {3, 17, 40}
-    scales = {name: np.abs(values).max() for name, values in full.items()}
-    for name, gradient in gradients.items():
-        # Batches begin elsewhere, so pixels are added up in another grouping.
-        np.testing.assert_allclose(
-            gradient[written], full[name][written], atol=1e-6 * scales[name], err_msg=name
-        )
-        assert (np.delete(gradient, written, axis=0) == 123).all(), name
-    np.testing.assert_allclose(screen, full_screen[np.isin(all_written, written)], rtol=1e-5)
-
-
-def test_coefficients_above_the_degree_are_overwritten() -> None:
-    """Catches stale gradients of harmonics that are not in use yet."""
-    raw = Raw(SCENES["lower degree than stored"])
-    gradients, written, _ = raw.gradients(raw.forward(), fill=5.0)
-    assert len(written) > 20
-    assert not gradients["sh"][written, 4:].any()
 
 
 def test_the_same_bits_twice_and_from_used_buffers() -> None:
@@ -235,16 +184,3 @@ def test_a_broken_splat_is_dropped(field: str, value: float) -> None:
     np.testing.assert_array_equal(columns[others & visible], expected[others & visible])
     assert np.isfinite(columns[visible]).all()
     assert visible[row] == (on_cpu[row, 2] > on_cpu[row, 0])
-
-
-def test_focus_is_the_selected_triangles_splats() -> None:
-    """Catches a triangle's byte read from the wrong place of its word."""
-    rng, raw = np.random.default_rng(2), Raw(SCENES["plain"], Rasterizer(gpu_device.device()))
-    selected, face = rng.random(9) < 0.5, rng.integers(0, 9, raw.count).astype(np.int32)
-    table = upload_splats(raw.device, raw.splats, face)
-    with raw.device.record() as work:
-        view = raw.rasterizer.upload_view(table, ViewOptions(raw.scene.camera, 3))
-        focus = mark_focus(
-            work, table, view, raw.device.upload("selected", selected.astype(np.uint8))
-        )
-    np.testing.assert_array_equal(raw.read(focus, raw.count, dtype=np.uint32), selected[face])

@@ -53,7 +53,8 @@ def test_reference_stages_are_gsplats() -> None:
     center, covariance, depth, compensation = reference.project(xyz, rotation, log_scale, CAMERA)
     color = reference.sh_color(sh, xyz - torch.from_numpy(CAMERA.position), 3)
     found = {
-        "means2d": center, "conics": conics(covariance.numpy()), "depths": depth, "compensations": compensation,
+        "means2d": center, "conics": conics(covariance.numpy()), "depths": depth,
+        "compensations": compensation,
         "colors": color,
     }  # fmt: skip
     for name, values in found.items():

@@ -202,10 +202,8 @@ def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     triangles."""
     scene = SCENES["plain"]
     rng = np.random.default_rng(30)
-    vertices, faces = (
-        rng.normal(size=(12, 3)) * 0.6,
-        rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3],
-    )
+    vertices = rng.normal(size=(12, 3)) * 0.6
+    faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
     frames = face_frames(vertices, faces, neutral, convention)
     face = rng.integers(0, len(faces), len(scene.splats["xyz"])).astype(np.int32)

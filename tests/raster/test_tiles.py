@@ -38,22 +38,6 @@ def test_depths_are_sorted_whatever_their_range(least, most):
     assert total == expected.sum()
 
 
-def test_splats_with_tiles_are_listed():
-    """Catches splats left out at the end, and broken ones (−1) that are listed, with depths that
-    are not numbers."""
-    rect = np.array(
-        [[0, 0, 0, 0], [1, 2, 3, 4], [-1, -1, -1, -1], [0, 0, 1, 1], [5, 0, 6, 2]], np.int32
-    )
-    visible, order, first_pair, _, total = by_depth(
-        np.array([0, 3, np.nan, 1, 2], np.float32), rect
-    )
-    assert (visible.tolist(), order.tolist(), total) == ([1, 3, 4], [3, 4, 1], 7)
-    assert first_pair[visible].tolist() == [0, 4, 5]
-    for n in (0, 1):
-        visible, order, *_, total = by_depth(np.ones(n, np.float32), rect[:n])
-        assert (len(visible), len(order), total) == (0, 0, 0)
-
-
 @pytest.mark.parametrize("count", [1, 7, 8, 1785])
 def test_runs_of_tiles_begin_with_the_fullest(count):
     """Catches tiles that are lost or doubled, neighbors that are torn apart, and a long run that is

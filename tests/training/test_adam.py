@@ -109,40 +109,6 @@ def test_frozen_rows_keep_every_bit() -> None:
     assert set(trained) | {"steps"} == set(moved)
 
 
-def test_first_step_after_the_others_many() -> None:
-    """Catches bias correction by a common count: Adam's first step is the rate exactly, however
-    late it comes."""
-    state = new_state(random_splats(2, 4))
-    rng = np.random.default_rng(0)
-    others = np.array([0], np.int32)
-    for _ in range(30):
-        adam.step(state, others, RATES)
-    state.steps[0] = 10_000
-    set_gradients(state, rng)
-    before = {name: array.copy() for name, array in state.parameters._asdict().items()}
-    adam.step(state, np.array([0, 1], np.int32), RATES)
-    assert state.steps.tolist() == [10_001, 1]
-    for name in ("xyz", "rotation", "log_scale", "opacity"):
-        moved = (getattr(state.parameters, name) - before[name])[1]
-        expected = -RATES[name] * np.sign(getattr(state.gradients, name)[1])
-        np.testing.assert_allclose(moved, expected, rtol=1e-3, atol=1e-7)
-    rate = np.array([RATES["sh"], *[RATES["sh_rest"]] * 3])[:, None]
-    np.testing.assert_allclose(
-        (state.parameters.sh - before["sh"])[1], -rate * np.sign(state.gradients.sh[1]), rtol=1e-3
-    )
-    # Row 0 has no history but zeros and a full count: (0.1·g) / (√0.001·|g|), corrected by 10,001
-    # steps.
-    expected = (
-        -RATES["opacity"]
-        * 0.1
-        / np.sqrt(0.001 / (1 - 0.999**10_001))
-        * np.sign(state.gradients.opacity[0])
-    )
-    assert float(state.parameters.opacity[0] - before["opacity"][0]) == pytest.approx(
-        expected, rel=1e-3
-    )
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
     """Catches one NaN from a degenerate view spreading into parameters or moments, where it would
@@ -164,15 +130,6 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
         for p in (state.parameters, state.first, state.second)
         for array in p
     )
-
-
-def test_no_rows() -> None:
-    """Catches a local iteration in which no selected splat is visible."""
-    state = random_state(4, 3)
-    before = bits(state)
-    adam.step(state, np.zeros(0, np.int32), RATES)
-    for name, value in bits(state).items():
-        np.testing.assert_array_equal(value, before[name])
 
 
 def test_many_rows() -> None:

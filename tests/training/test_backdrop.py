@@ -60,10 +60,8 @@ def test_masks_of_one_value(level: int) -> None:
 
 def same_but_for_the_edge(found: np.ndarray, expected: np.ndarray) -> bool:
     """Whether both are the same but for two pixels outside of the outline, or one inside."""
-    near, core = (
-        binary_dilation(expected, np.ones((5, 5))),
-        binary_erosion(expected, np.ones((3, 3))),
-    )
+    near = binary_dilation(expected, np.ones((5, 5)))
+    core = binary_erosion(expected, np.ones((3, 3)))
     return bool(core.any() and not near.all() and (found <= near).all() and (found >= core).all())
 
 

@@ -17,10 +17,8 @@ def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
     """Catches a wrong sign or scale in the compositing: compared with blending the foreground
     itself."""
     rng = np.random.default_rng(0)
-    foreground, coverage = (
-        rng.integers(0, 256, (9, 7, 3)),
-        rng.integers(0, 256, (9, 7)).astype(np.uint8),
-    )
+    foreground = rng.integers(0, 256, (9, 7, 3))
+    coverage = rng.integers(0, 256, (9, 7)).astype(np.uint8)
     alpha = coverage[..., None] / 255
     before, after = np.array([255, 255, 255], np.float32), np.array([20, 130, 240], np.float32)
     image = np.rint(foreground * alpha + before * (1 - alpha)).astype(np.uint8)

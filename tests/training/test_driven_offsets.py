@@ -7,19 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import STRAIN_POSITION
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.render.render import render_avatar
-from stga_addon.training.optimize import adam, driven_offsets
+from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import starting_state
-from stga_addon.training.run.folder import CHECKPOINT, Continuation, Run, read_run
-from stga_addon.training.run.identity import file_digest
+from stga_addon.training.run.folder import CHECKPOINT, Run, read_run
 from stga_addon.training.run.session import train
 from stga_addon.training.run.strain_range import trained_strain_range
 
@@ -98,14 +95,13 @@ def test_the_step_is_adam_in_float64() -> None:
     for number in range(8):
         face = rng.choice([0, 1, 3, 4] if number % 2 else [0, 2, 3], 40).astype(np.int32)
         rows = rng.permutation(40).astype(np.int32)[:25]
-        gradient, smoothed = (
-            rng.normal(0, 1, (40, 3)).astype(np.float32),
-            rng.normal(0, 1, (faces, 3)).astype(np.float32),
-        )
+        gradient = rng.normal(0, 1, (40, 3)).astype(np.float32)
+        smoothed = rng.normal(0, 1, (faces, 3)).astype(np.float32)
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
-        driven_offsets.step(
-            {"strain_position": state}, rows, face, gradient, {"strain_position": smoothed}.__getitem__, rate,
+        adam.step_offsets(
+            {"strain_position": state}, rows, face, gradient,
+            {"strain_position": smoothed}.__getitem__, rate,
             ema_share, epsilon,
         )  # fmt: skip
         for f in np.unique(face[rows]):
@@ -185,82 +181,6 @@ def trained(capture: Capture, out: Path, **changes: Any) -> Path:
     )
     train(capture, out, Run(capture.root, None, "vhap", settings))
     return out
-
-
-def test_a_run_keeps_them(toy: Capture, tmp_path: Path) -> None:
-    """Catches coefficients that density control loses, that the avatar or the checkpoint forgets,
-    or that a continuation begins without."""
-    capture = squeezed(toy)
-    # the avatar is then that of the last state
-    capture = replace(capture, views={"train": capture.views["train"]})
-    out = trained(capture, tmp_path / "run")
-    avatar, kept = read_avatar(out / "avatar.npz"), read_checkpoint(out)
-    position = kept.state.driven_offsets["strain_position"]
-    assert avatar.strain_range is not None
-    assert np.abs(avatar.driven_offsets["strain_position"]).max() > 0
-    np.testing.assert_array_equal(avatar.driven_offsets["strain_position"], position.average)
-    continuation = Continuation(out, file_digest(out / "avatar.npz"), 0, 9)
-    settings = quick_settings("global", driven_offsets=("strain_position",))
-    state = starting_state(continuation, settings, len(capture.faces))
-    np.testing.assert_array_equal(
-        state.driven_offsets["strain_position"].value, avatar.driven_offsets["strain_position"]
-    )
-    np.testing.assert_array_equal(state.driven_offsets["strain_position"].second, position.second)
-    (out / CHECKPOINT).unlink()
-    state = starting_state(continuation, settings, len(capture.faces))
-    np.testing.assert_array_equal(
-        state.driven_offsets["strain_position"].average, avatar.driven_offsets["strain_position"]
-    )
-    assert not state.driven_offsets["strain_position"].second.any()
-
-
-def test_a_resumed_run_ends_where_an_unbroken_one_does(toy: Capture, tmp_path: Path) -> None:
-    """Catches moments, averages or step counts that a checkpoint forgets."""
-    capture = squeezed(toy)
-    whole = read_avatar(trained(capture, tmp_path / "whole") / "avatar.npz")
-    settings = read_run(tmp_path / "whole").settings
-    run = Run(capture.root, None, "vhap", settings)
-    train(
-        capture,
-        tmp_path / "parts",
-        run,
-        report=lambda progress: progress.figures().get("iteration", 0) == 17,
-    )
-    assert read_checkpoint(tmp_path / "parts").iteration == 17
-    train(capture, tmp_path / "parts", run, resume=True)
-    parts = read_avatar(tmp_path / "parts" / "avatar.npz")
-    np.testing.assert_array_equal(
-        parts.driven_offsets["strain_position"], whole.driven_offsets["strain_position"]
-    )
-    np.testing.assert_array_equal(parts.splats.xyz, whole.splats.xyz)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        (
-            "first",
-            np.zeros((3, 3, 3), np.float32),
-            r"strain_position/first is float32 \(3, 3, 3\), expected float32",
-        ),
-        ("steps", None, "missing or malformed"),
-        ("value", np.nan, "strain_position/value holds a value that is not finite"),
-    ],
-)
-def test_a_damaged_checkpoint(
-    toy: Capture, tmp_path: Path, name: str, value: Any, says: str
-) -> None:
-    """Catches coefficients that are taken for what they are not."""
-    out = trained(squeezed(toy), tmp_path / "run", seed=1)
-    arrays = read_npz(out / CHECKPOINT)
-    field = f"strain_position/{name}"
-    if value is None:
-        del arrays[field]
-    else:
-        arrays[field] = value if np.ndim(value) else np.full_like(arrays[field], value)
-    write_npz(out / CHECKPOINT, arrays)
-    with pytest.raises(StgaError, match=says):
-        read_checkpoint(out)
 
 
 def test_a_checkpoint_of_another_choice(toy: Capture, tmp_path: Path) -> None:

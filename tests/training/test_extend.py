@@ -24,13 +24,14 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.jobs.train import Extend, Prepared, prepare
 from stga_addon.progress import Progress, ignore
-from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, ExtendStrategy
+from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, Strategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
 from stga_addon.training.run.folder import Run, open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
+from stga_addon.training.settings import TrainingSettings
 
 from .test_run import assert_same_state
 from .toys import quick_settings
@@ -243,11 +244,12 @@ def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], paren
 def test_what_new_takes_need_is_trained_first() -> None:
     """Catches an extension that trains all splats from the start, or never."""
     region = np.array([True, False])
-    strategy = ExtendStrategy(region)
-    assert strategy.triangles(0, 0, 0, 0.0) is region
-    assert strategy.triangles(1, 0, 0, EXTEND_LOCAL_SHARE - 0.01) is region
+    settings = TrainingSettings(strategy="extend")
+    strategy = Strategy(settings, {0: region, 1: region & ~region})
+    for progress in (0.0, EXTEND_LOCAL_SHARE - 0.01):
+        np.testing.assert_array_equal(strategy.triangles(0, 0, 0, progress), region)
     assert strategy.triangles(2, 0, 0, EXTEND_LOCAL_SHARE) is None
-    assert ExtendStrategy(~region & region).triangles(0, 0, 0, 0.0) is None
+    assert Strategy(settings, {0: ~region & region}).triangles(0, 0, 0, 0.0) is None
 
 
 @pytest.mark.parametrize("change", ["shape", "images", "folder"])
@@ -304,55 +306,6 @@ def test_the_benchmark_compares_equal_effects(
     assert (plain.strain_color, plain.driven_offsets) == (True, ())  # as the parent
 
 
-def test_the_benchmark_shows_what_the_old_take_pays(benchmark: Any) -> None:
-    """Catches a summary that praises what the new take gains and is silent about the old one."""
-    first = {
-        "psnr_take_1": 40.0,
-        "psnr_moving_take_1": 39.0,
-        "psnr_take_2": 35.0,
-        "psnr_moving_take_2": 30.0,
-    }
-    last = {
-        "psnr_take_1": 39.5,
-        "psnr_moving_take_1": 37.0,
-        "psnr_take_2": 39.0,
-        "psnr_moving_take_2": 36.0,
-    }
-    lines = [
-        {**values, "psnr": 37.0, "seconds": 10.0 * n} for n, values in enumerate((first, last))
-    ]
-    rows = [
-        [cell.strip() for cell in row.strip("|").split("|")]
-        for row in benchmark.differences({"extend": [lines], "anew": [[lines[1]]]})
-        if row.startswith("|")
-    ]
-    assert rows[0] == ["over before", "new take", "where it moves", "old take", "where it moves"]
-    assert rows[2] == ["extend", "+4.00", "+6.00", "-0.50", "-2.00"]
-    assert rows[3] == ["anew", "+4.00", "+6.00", "-0.50", "-2.00"]
-
-
-def test_the_benchmark_shows_what_there_is(benchmark: Any) -> None:
-    """Catches a measurement that is lost after its trainings, where nothing moves and where only
-    `anew` was asked."""
-    first = {
-        "psnr": 30.0,
-        "psnr_take_1": 30.0,
-        "psnr_take_2": 30.0,
-        "seconds": 0.0,
-        "iterations": 0,
-    }
-    ends = [
-        first,
-        {"psnr": 40.0, "psnr_take_1": 40.0, "psnr_take_2": 40.0, "seconds": 2.0, "iterations": 9},
-    ]
-    assert (
-        benchmark.table({"extend": [ends], "all-in-turn": [ends]})[2]
-        == "| before |  |  | 30.00 | 30.00 |  |"
-    )
-    assert "| extend | +10.00 | +10.00 |" in benchmark.differences({"extend": [ends]})
-    assert [row.split()[1] for row in benchmark.table({"anew": [ends]})] == ["arm", "---", "anew"]
-
-
 def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
     """The take with its cameras, and its tracked but not its neutral meshes, in millimeters."""
     for path in sorted(root.glob("transforms_*.json")) if cameras else ():
@@ -398,10 +351,8 @@ def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
     """Catches a FLAME take whose cameras and translation are in millimeters; its meshes' size is
     the model's."""
     root, model = factory.write_flame_capture(tmp_path / "old")
-    run, settings = (
-        tmp_path / "run",
-        quick_settings("global", iterations=1, lattice=0, density_interval=0),
-    )
+    run = tmp_path / "run"
+    settings = quick_settings("global", iterations=1, lattice=0, density_interval=0)
     train(open_capture(root, model), run, Run(root, model, "vhap", settings))
     moved = in_millimeters(Path(shutil.copytree(root, tmp_path / "new")), cameras=True)
     for path in (moved / "flame_param").glob("*.npz"):
@@ -446,6 +397,6 @@ def test_views_that_show_something_else_are_named(
     prepare(replace(request, captures=(take,)), ignore, said.append)
     (line,) = [line for line in said if "swapped" in line]
     assert (
-        line
-        == "warning: images/00001_01.png: does not look like the head from this camera; are images swapped?"
+        line == "warning: images/00001_01.png: does not look like the head from this camera; are "
+        "images swapped?"
     )

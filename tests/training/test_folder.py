@@ -189,7 +189,8 @@ def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
     them."""
     rows = np.zeros((FACES, 3, 3), np.float32)
     arrays = {
-        "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES, np.int32), **changes,
+        "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES,
+        np.int32), **changes,
     }  # fmt: skip
     return {f"strain_position/{name}": array for name, array in arrays.items()}
 
@@ -236,12 +237,18 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
         {"meta": meta(last_timestep=1 << 53)},
         "last_timestep is 9007199254740992",
     ),
-    "losses that are no list": ({"meta": meta(losses=5)}, "losses is no list of numbers"),
+    "losses that are no list": (
+        {"meta": meta(losses=5)},
+        "losses is .*, expected a list of numbers",
+    ),
     "a loss that is no number": (
         {"meta": meta(losses=[0.5, math.nan])},
-        "losses is no list of numbers",
+        "losses is .*, expected a list of numbers",
     ),
-    "identity that is no text": ({"meta": meta(identity=None)}, "identity is no text"),
+    "identity that is no text": (
+        {"meta": meta(identity=None)},
+        "identity is None, expected a text",
+    ),
     "wrong width": (
         {"parameters/rotation": np.zeros((12, 3), np.float32)},
         "parameters/rotation is .*, expected",

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from stga_addon.format import format_duration
 from stga_addon.training.evaluate.forecast import (
     MIN_EVALUATIONS,
     Forecast,
@@ -13,7 +12,6 @@ from stga_addon.training.evaluate.forecast import (
     explain_missed_target,
     flat_since,
     forecast,
-    forecast_horizon,
     forecast_text,
     plateau_start,
 )
@@ -86,14 +84,6 @@ def test_nothing_is_said_too_early_or_of_nonsense() -> None:
     same = forecast([(float(t), 30.0) for t in range(1, 9)], 4.0)
     assert same is not None
     assert (same.gain, same.psnr) == (0.0, 30.0)
-
-
-def test_horizon() -> None:
-    """Catches forecasts beyond the budget, or farther ahead than what was seen allows."""
-    assert forecast_horizon(240, 1000) == 120
-    assert forecast_horizon(1000, 65) == 60
-    assert forecast_horizon(9, 1000) is None
-    assert forecast_horizon(1000, 4) is None
 
 
 def test_plateau_start() -> None:
@@ -182,25 +172,9 @@ def test_why_a_target_was_missed() -> None:
         curve(TIMES[:6], -rising(TIMES[:6])), 40
     )
     assert explain_missed_target([(1.0, 20.0)], 40) == (
-        "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it would take"
+        "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it "
+        "would take"
     )
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (4.6, "5 s"),
-        (60, "1 min"),
-        (90, "90 s"),
-        (120, "2 min"),
-        (150, "2.5 min"),
-        (1290, "22 min"),
-        (8000, "2 h 13 min"),
-    ],
-)
-def test_clock(seconds: float, text: str) -> None:
-    """Catches "2.0 min" and "133 min"."""
-    assert format_duration(seconds) == text
 
 
 def test_forecasts_read_as_people_speak() -> None:

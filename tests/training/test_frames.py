@@ -42,25 +42,3 @@ def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
     store.mesh(1)
     store.of(1)
     assert read[-2:] == [1, 1]  # read again, once for mesh and frames
-
-
-def test_meshes_that_were_read_elsewhere_are_used(toy: Capture) -> None:
-    """Catches a second read of a mesh that the loader has prepared, and a cached mesh that is
-    replaced."""
-    read: list[int] = []
-
-    def mesh(timestep: int) -> np.ndarray:
-        read.append(timestep)
-        return toy.mesh(timestep)
-
-    store = FrameStore(replace(toy, mesh=mesh), "stga")
-    store.add(3, toy.mesh(3))
-    np.testing.assert_array_equal(store.of(3).origin, FrameStore(toy, "stga").of(3).origin)
-    frames = store.of(3)
-    store.add(3, toy.mesh(0))
-    assert store.of(3) is frames
-    assert read == []
-    for timestep in range(CACHED_TIMESTEPS):
-        store.add(100 + timestep, toy.mesh(0))
-    store.of(3)
-    assert read == [3]

@@ -15,12 +15,12 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import DeviceError, StgaError
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
-from stga_addon.training.optimize.backend import Backend, Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.state import (
+    Batch,
     OffsetState,
     TrainState,
     arrays_of,
@@ -99,13 +99,14 @@ def batch_of(
 ) -> Batch:
     view = view_of(capture, timestep)
     values = {
-        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3, np.float32), "sh_degree": 3,
+        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3,
+        np.float32), "sh_degree": 3,
         "selected": None, "rates": learning_rates(settings.rates, 0.0),
     }  # fmt: skip
     return Batch(**{**values, **changes})
 
 
-def moments(step: Backend) -> dict[str, np.ndarray]:
+def moments(step: Any) -> dict[str, np.ndarray]:
     """After the first step, a tenth of the gradient."""
     return step.state.first._asdict()
 
@@ -405,18 +406,6 @@ def test_iterations_are_the_cpus(toy: Capture, part: str | None, strain_color: b
     ).all()
 
 
-def test_the_first_gradient_of_offsets_is_the_cpus(toy: Capture) -> None:
-    """Catches an error of the gradient that Adam's division hides: the first moment is a tenth of
-    it."""
-    capture, settings = squeezed(toy), settings_of()
-    cpu, gpu = pair(capture, settings)
-    for backend in (cpu, gpu):
-        backend.step(batch_of(capture, settings))
-    got, want = (following(backend.state).first for backend in (gpu, cpu))
-    np.testing.assert_allclose(got, want, atol=2e-4 * np.abs(want).max())
-    assert np.abs(want).max() > 0
-
-
 def test_renders_with_the_average(toy: Capture) -> None:
     """Catches a view of the splats where the latest step, or the mesh alone, puts them."""
     capture, settings = squeezed(toy), settings_of()
@@ -448,8 +437,7 @@ def test_other_splats_on_the_triangles(toy: Capture) -> None:
 
 def test_stopped_and_resumed_is_the_unbroken_run(toy: Capture, tmp_path: Path) -> None:
     """Catches coefficients, moments, averages or ages that a checkpoint of a GPU forgets, and sums
-    in the order of
-    chance: every bit must agree, across density control."""
+    in the order of chance: every bit must agree, across density control."""
     effects = {"driven_offsets": ("strain_position",), "strain_color": True}
     run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")
     broken, whole = tmp_path / "broken", tmp_path / "whole"

@@ -12,11 +12,10 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.model import Capture
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
-from stga_addon.training.optimize.backend import Batch
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
-from stga_addon.training.optimize.state import arrays_of, new_state
+from stga_addon.training.optimize.state import Batch, arrays_of, new_state
 from stga_addon.training.schedule import learning_rates
 
 from .test_trainer import view_of

@@ -241,8 +241,10 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> No
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
     capture = Capture(
-        tmp_path, "flame", model.faces, sequence_mesh(head, TIMESTEP + 1), {"train": views}, tuple(frames), {},
-        lambda timestep: sequence_mesh(head, timestep), lambda timestep, pose: sequence_mesh(head, timestep), head,
+        tmp_path, "flame", model.faces, sequence_mesh(head, TIMESTEP + 1), {"train": views},
+        tuple(frames), {},
+        lambda timestep: sequence_mesh(head, timestep), lambda timestep, pose: sequence_mesh(head,
+        timestep), head,
     )  # fmt: skip
     hull, many = (hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views))
     at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))

@@ -50,7 +50,7 @@ def splats_after_a_turn(
     top = int(capture.neutral[capture.faces].mean(1)[:, 1].argmax())
     place(trainer, int(np.flatnonzero(trainer.state.face == top)[0]), needle)
     count = len(trainer)
-    trainer.restore(199, 0, None, count)
+    trainer.iteration = 199
     view = capture.views["train"][0]
     trainer.step(view, read_image(view), 0.5)
     return count, len(trainer)

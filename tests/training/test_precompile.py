@@ -29,7 +29,8 @@ from stga_addon.training.settings import make_settings
 from stga_addon.capture.open import open_capture
 
 out, *roots = map(Path, sys.argv[1:])
-modules = [importlib.import_module(f"{kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(kernels.__path__)]
+modules = [importlib.import_module(f"{kernels.__name__}.{m.name}")
+    for m in pkgutil.iter_modules(kernels.__path__)]
 functions = [getattr(f, "__wrapped__", f) for m in modules for f in vars(m).values()]
 found = {f.__module__ + "." + f.__name__: f for f in functions if isinstance(f, Dispatcher)}
 counts = lambda: {name: len(f.signatures) for name, f in found.items()}
@@ -42,10 +43,12 @@ run_module.precompile_kernels()
 before = counts()
 settings = make_settings(
     iterations=14, lattice=1, hull_points=False, warm_up_share=0.2, stray_reset_interval=3,
-    density_interval=3, density_span=(0, 1), distance_weight=0.1, scale_limit=0.5, sh_steps=(0.2, 0.4, 0.6),
+    density_interval=3, density_span=(0, 1), distance_weight=0.1, scale_limit=0.5, sh_steps=(0.2,
+    0.4, 0.6),
 )
 for root in roots:
-    run_module.train(open_capture(root), out / f"run of {root.name}", Run(root, None, "vhap", settings))
+    run_module.train(open_capture(root), out / f"run of {root.name}", Run(root, None, "vhap",
+    settings))
     assert len(read_metrics(out / f"run of {root.name}")) == 10
 after = counts()
 print(json.dumps([sum(before.values()), {name: [before[name], after[name]] for name in after}]))
@@ -80,7 +83,7 @@ COLD = """
 import json
 from stga_addon.raster.cpu import tiles
 from stga_addon.training.optimize import precompile
-precompile._optimize = precompile._limit = lambda: None  # which the first process compiles meanwhile
+precompile._step = lambda: None  # which the first process compiles meanwhile
 precompile.precompile_kernels()
 kernel = getattr(tiles.fill_pairs, "__wrapped__", tiles.fill_pairs)
 print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]))

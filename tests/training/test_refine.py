@@ -21,9 +21,10 @@ from stga_addon.training.optimize.state import TrainState, arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import (
+    START_SHARE,
     continued_order,
+    continued_settings,
     distinct_timesteps,
-    late_rates,
     replayed_views,
     starting_state,
     views_of_region,
@@ -32,7 +33,7 @@ from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
-from stga_addon.training.settings import Rates
+from stga_addon.training.settings import Rates, TrainingSettings
 
 from .test_run import assert_same_state
 from .toys import quick_settings
@@ -46,7 +47,8 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     iteration."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
-        "global", iterations=12, strain_color=True, lattice=1, density_interval=10, density_span=(0.0, 1.0),
+        "global", iterations=12, strain_color=True, lattice=1, density_interval=10,
+        density_span=(0.0, 1.0),
         stray_reset_interval=4, stray_limit=0.3, hull_points=True,
     )  # fmt: skip
     without_held_out = replace(toy, views={"train": toy.views["train"]})
@@ -237,10 +239,10 @@ def test_what_is_refused(parent: Path, changes: dict[str, Any], sentence: str) -
 def test_late_rates_are_the_rest_of_the_schedule() -> None:
     """Catches rates that jump where a continuation begins, or end elsewhere than a training's."""
     rates = Rates()
-    for share in (0.0, 0.6, 1.0):
-        for progress in (0.0, 0.3, 1.0):
-            expected = learning_rates(rates, share + (1 - share) * progress)
-            assert learning_rates(late_rates(rates, share), progress) == pytest.approx(expected)
+    late = continued_settings(TrainingSettings(iterations=9), "refine", 0.0, None, 5, 0).rates
+    for progress in (0.0, 0.3, 1.0):
+        expected = learning_rates(rates, START_SHARE + (1 - START_SHARE) * progress)
+        assert learning_rates(late, progress) == pytest.approx(expected)
 
 
 def test_order_of_views_continues_and_replays(toy: Capture) -> None:

@@ -1,29 +1,10 @@
 """Rows travel with everything that belongs to them."""
 
 import numpy as np
-import pytest
 
-from stga_addon.training.optimize.state import arrays_of, join, keep_rows, new_state, state_of
+from stga_addon.training.optimize.state import arrays_of, join, keep_rows, new_state
 
 from .toys import random_splats, random_state
-
-
-def test_flat_names_round_trip() -> None:
-    """Catches an array that a checkpoint would lose or put under another's name."""
-    state = random_state(9, 5)
-    flat = arrays_of(state)
-    assert len(flat) == 5 * 6 + 6
-    some = {
-        "parameters/xyz", "average/sh", "gradients/sh", "first/opacity", "second/rotation", "steps",
-        "screen_gradient",
-    }  # fmt: skip
-    assert some <= set(flat)
-    again = arrays_of(state_of(flat))
-    assert list(again) == list(flat)
-    assert all(again[name] is flat[name] for name in flat)
-    del flat["second/sh"]
-    with pytest.raises(KeyError, match="second/sh"):
-        state_of(flat)
 
 
 def test_keep_and_join() -> None:

@@ -16,13 +16,14 @@ from stga_addon.avatar.strain import (
 )
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
+from stga_addon.files import write_npz
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.identity import identity_of
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
-from stga_addon.training.run.strain_range import trained_strain_range, write_strain_range
+from stga_addon.training.run.strain_range import STRAIN_RANGE, trained_strain_range
 from stga_addon.training.settings import Rates
 
 from .toys import quick_settings, random_splats
@@ -169,13 +170,11 @@ def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     train(toy, out, run, report=lambda progress: progress.figures().get("iteration", 0) == 2)
     limits, digest = color_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
-    for arrays, says in (
+    for (stored, identity), says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),
-        (
-            (limits[1:], digest),
-            r"expected 'strain_range', float32 \(320, 2, 3\)",
-        ),
+        ((limits[1:], digest), r"expected 'strain_range', float32 \(320, 2, 3\)"),
     ):
-        write_strain_range(out, *arrays)
+        arrays = {"strain_range": stored, "identity": np.frombuffer(identity.encode(), np.uint8)}
+        write_npz(out / STRAIN_RANGE, arrays)
         with pytest.raises(StgaError, match=rf"strain_range\.npz: {says}"):
             train(toy, out, run, resume=True)

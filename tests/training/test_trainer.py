@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from capture import factory
 from PIL import Image
 
@@ -125,20 +124,6 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
         assert difference <= 1e-6 * np.abs(full[name][rows]).max(initial=0), name
         np.testing.assert_array_equal(array[others], 7.0)
     np.testing.assert_allclose(screen[rows], screen_gradient[rows], rtol=1e-5)
-
-
-def test_a_local_iteration_works_on_fewer_pixels(toy: Capture) -> None:
-    """Catches a restriction that restricts nothing, with which the test above would hold of
-    itself."""
-    trainer = make_trainer(toy)
-    view, _ = large(view_of(toy, 1))
-    focus = toy.regions["mouth"][trainer.state.face]
-    splats, frames = trainer.state.parameters, trainer.frames.of(view.timestep)
-
-    def tiles(focus: np.ndarray | None) -> int:
-        return len(cpu_backend(trainer)._forward(splats, frames, view, WHITE, 0, focus).tiles)
-
-    assert 0 < tiles(focus) < 0.8 * tiles(None)
 
 
 @pytest.mark.parametrize("timestep", [0, 4])
@@ -295,13 +280,6 @@ def test_unseen_share(toy: Capture) -> None:
     assert 0.05 < found[::2].mean() < 0.95
 
 
-def test_nothing_beside_the_mesh_gives_no_hull_points(toy: Capture) -> None:
-    """Catches the hull's phantom volumes behind the head, which few cameras on one side cannot
-    contradict."""
-    full = initial_splats(toy, quick_settings(lattice=2, hull_points=True))
-    assert not full.unbound.any()
-
-
 def test_render_shows_the_average(toy: Capture) -> None:
     """Catches evaluations of other splats than those that the avatar is made of."""
     trainer = make_trainer(toy)
@@ -322,14 +300,6 @@ def test_render_returns_a_copy(toy: Capture) -> None:
     disturb(trainer)
     assert not np.array_equal(trainer.render(view), kept)
     np.testing.assert_array_equal(picture, kept)
-
-
-def test_limits_are_in_the_unit_of_the_convention(toy: Capture) -> None:
-    """Catches limits in meters applied to GaussianAvatars' triangle units, and an area without its
-    factor two."""
-    areas = trimesh.Trimesh(toy.neutral, toy.faces, process=False).area_faces
-    np.testing.assert_allclose(FrameStore(toy, "stga").units, np.sqrt(2 * areas), rtol=1e-5)
-    np.testing.assert_array_equal(FrameStore(toy, "gaussian_avatars").units, 1)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])

@@ -22,8 +22,7 @@ def render_differentiable(
     """Differentiable rendering of float32 torch tensors.
 
     Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on
-    black,
-    alpha (H, W), and depth (H, W) = Σ weight · camera z.
+    black, alpha (H, W), and depth (H, W) = Σ weight · camera z.
     """
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
     camera_frames = frames_in_camera(frames, camera)
@@ -46,13 +45,9 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         rendering = render_forward(
-            splats,
-            face,
-            camera_frames,
-            degree,
-            depth_as_color=depth_as_color,
+            splats, face, camera_frames, degree, depth_as_color=depth_as_color,
             antialiased=antialiased,
-        )
+        )  # fmt: skip
         ctx.saved = camera_frames, face, splats, rendering
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
 
@@ -62,11 +57,4 @@ class _Blend(torch.autograd.Function):
         gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
         v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
         render_backward(rendering, splats, face, camera_frames, v_rgb, gradients, v_t)
-        return (
-            None,
-            None,
-            None,
-            None,
-            None,
-            *(torch.from_numpy(g) for g in gradients if g is not None),
-        )
+        return *[None] * 5, *(torch.from_numpy(g) for g in gradients if g is not None)

@@ -31,7 +31,7 @@ from .layout import (
     RED,
     SHEAR,
     TILE,
-)
+)  # fmt: skip
 from .outline import outline, rows_within
 from .threads import next_piece, parallel
 
@@ -69,8 +69,9 @@ BACKWARD_SIZE = 8 * PIXELS + 7 * LISTED * BLOCK_PIXELS
 # all over it. The blocks that a batch reaches are computed in vectors. Column c of splat q lies at
 # c·BATCH_PAIRS + q of a flat array.
 BATCH_PAIRS = 32
-(AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN, AT_BLUE, AT_EXTENT_Y,
- AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
+(AT_MEAN_X, AT_MEAN_Y, AT_PRECISION_X, AT_SHEAR, AT_PRECISION_Y, AT_OPACITY, AT_RED, AT_GREEN,
+ AT_BLUE, AT_EXTENT_Y, AT_RATE_X, AT_RATE_Y, AT_BLOCKS) = (
+    np.uint64(n * BATCH_PAIRS) for n in range(13))  # fmt: skip
 BATCH_SIZE = 13 * BATCH_PAIRS
 
 RUN_TILES = 4
@@ -109,18 +110,12 @@ def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
     corner (x0, y0)."""
     for q in range(np.uint64(count)):
         i = np.uint64(pair_splat[np.uint64(first) + q])
-        batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q] = (
-            projected[i, MEAN_X] - x0,
-            projected[i, MEAN_Y] - y0,
-        )
-        batch[AT_PRECISION_X + q], batch[AT_SHEAR + q] = (
-            projected[i, PRECISION_X],
-            projected[i, SHEAR],
-        )
-        batch[AT_PRECISION_Y + q], batch[AT_OPACITY + q] = (
-            projected[i, PRECISION_Y],
-            projected[i, OPACITY],
-        )
+        batch[AT_MEAN_X + q] = projected[i, MEAN_X] - x0
+        batch[AT_MEAN_Y + q] = projected[i, MEAN_Y] - y0
+        batch[AT_PRECISION_X + q] = projected[i, PRECISION_X]
+        batch[AT_SHEAR + q] = projected[i, SHEAR]
+        batch[AT_PRECISION_Y + q] = projected[i, PRECISION_Y]
+        batch[AT_OPACITY + q] = projected[i, OPACITY]
         batch[AT_RED + q], batch[AT_GREEN + q] = projected[i, RED], projected[i, GREEN]
         batch[AT_BLUE + q] = projected[i, BLUE]
         batch[AT_RATE_X + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
@@ -133,8 +128,8 @@ def _find_blocks(count, batch):
     rows, side, one = np.float32(TILE), np.float32(SIDE), np.int32(1)
     for q in range(np.uint64(count)):
         ellipse = outline(
-            batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q], batch[AT_SHEAR + q],
-            batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
+            batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q],
+            batch[AT_SHEAR + q], batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
         )  # fmt: skip
         bits = np.int32(0)
         for column in range(BLOCKS_ALONG):
@@ -183,10 +178,8 @@ def _set_coordinates(s):
     for row in range(TILE):
         for column in range(TILE):
             p = _pixel(column, row)
-            s[X + p], s[Y + p] = (
-                np.float32(column) + np.float32(0.5),
-                np.float32(row) + np.float32(0.5),
-            )
+            s[X + p] = np.float32(column) + np.float32(0.5)
+            s[Y + p] = np.float32(row) + np.float32(0.5)
 
 
 @inline_jit
@@ -303,12 +296,8 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
     are needed, see `find_needed_rows`; pixels of the others are undefined. background (3,):
     composited behind the splats.
     """
-    start, pair_splat, projected, extent_y = (
-        lists.start,
-        lists.pair_splat,
-        projection.columns,
-        projection.extent_y,
-    )
+    start, pair_splat, projected = lists.start, lists.pair_splat, projection.columns
+    extent_y = projection.extent_y
     pair_blocks = blended.pair_blocks
     s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
@@ -332,27 +321,18 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
                 _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
                 for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
                     prefetch(extent_y, np.uint64(pair_splat[j]))
-                _copy_batch(
-                    pair_splat,
-                    batch_begin,
-                    count,
-                    projected,
-                    np.float32(left),
-                    np.float32(top),
-                    batch,
-                )
+                x0, y0 = np.float32(left), np.float32(top)
+                _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
                 for q in range(np.uint64(count)):
-                    batch[AT_EXTENT_Y + q] = extent_y[
-                        np.uint64(pair_splat[np.uint64(batch_begin) + q])
-                    ]
+                    i = np.uint64(pair_splat[np.uint64(batch_begin) + q])
+                    batch[AT_EXTENT_Y + q] = extent_y[i]
                 _find_blocks(count, batch)
                 for group in range(0, count, PAIRS_PER_GROUP):
                     if group > 0:
                         alive = _blocks_alive(s)
                     blocks = np.uint64(0)
-                    for q in range(
-                        np.uint64(group), np.uint64(min(count, group + PAIRS_PER_GROUP))
-                    ):
+                    past = min(count, group + PAIRS_PER_GROUP)
+                    for q in range(np.uint64(group), np.uint64(past)):
                         reached = np.uint16(np.uint16(batch[AT_BLOCKS + q]) & alive)
                         pair_blocks[np.uint64(batch_begin) + q] = reached
                         blocks = _list_blocks(listed, blocks, q, reached)
@@ -424,11 +404,8 @@ def _sum_gradient(first, past, s, sums):
 @part_jit
 def _store_pair(grads, j, q, batch, sums):
     """Write the gradient of pair j, splat q of a batch, from the sums of `_sum_gradient`."""
-    precision_x, precision_y, shear = (
-        batch[AT_PRECISION_X + q],
-        batch[AT_PRECISION_Y + q],
-        batch[AT_SHEAR + q],
-    )
+    precision_x, precision_y = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q]
+    shear = batch[AT_SHEAR + q]
     grads[j, MEAN_X] = precision_x * sums[1]
     grads[j, MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
     grads[j, PRECISION_X] = np.float32(-0.5) * sums[3]
@@ -507,18 +484,10 @@ def blend_backward(
             for batch_end in range(deepest, nearest, -BATCH_PAIRS):
                 batch_begin = max(nearest, batch_end - BATCH_PAIRS)
                 count = batch_end - batch_begin
-                _prefetch_batch(
-                    pair_splat, max(nearest, batch_begin - BATCH_PAIRS), batch_begin, projected
-                )
-                _copy_batch(
-                    pair_splat,
-                    batch_begin,
-                    count,
-                    projected,
-                    np.float32(left),
-                    np.float32(top),
-                    batch,
-                )
+                before = max(nearest, batch_begin - BATCH_PAIRS)
+                _prefetch_batch(pair_splat, before, batch_begin, projected)
+                x0, y0 = np.float32(left), np.float32(top)
+                _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)
                     blocks = np.uint64(0)

@@ -20,7 +20,7 @@ from .rasterize import (
     sort_into_tiles,
     tile_grid,
     with_strain_color,
-)
+)  # fmt: skip
 from .tiles import sum_tiles, whole_tiles
 
 
@@ -38,8 +38,9 @@ def compose(
             *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
         )
         project_forward(
-            np.arange(len(splats)), everywhere, with_strain_color(parameters), splats.face, layer_frames(layer,
-            camera), splats.sh_degree, False, layer.antialiased, Projection(*(array[rows] for array in projection)),
+            np.arange(len(splats)), everywhere, with_strain_color(parameters), splats.face,
+            layer_frames(layer, camera), splats.sh_degree, False, layer.antialiased,
+            Projection(*(array[rows] for array in projection)),
         )  # fmt: skip
         begin = rows.stop
     whole = whole_tiles(tiles_x * tiles_y)
@@ -53,9 +54,8 @@ def compose(
     projection.columns[:, GREEN] = projection.columns[:, BLUE] = 0
     blended = new_image(camera.width, camera.height, lists, BufferPool())
     blend_forward(tiles, tiles_x, whole, lists, projection, BLACK_BACKGROUND, blended)
-    return ComposedImage(
-        rgb, alpha, blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny)
-    )
+    depth = blended.image[0] / np.maximum(alpha, np.finfo(np.float32).tiny)
+    return ComposedImage(rgb, alpha, depth)
 
 
 def layer_frames(layer: PosedSplats, camera: Camera) -> CameraFrames:

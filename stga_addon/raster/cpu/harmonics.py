@@ -6,11 +6,10 @@ from . import inline_jit
 
 TWO, THREE, FOUR, SIX, EIGHT = (np.float32(n) for n in (2, 3, 4, 6, 8))
 # The normalization constants, in order of first use.
-C0, C1, C2, C3, C4 = (np.float32(c) for c in (
-    0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396,
-))  # fmt: skip
-C5, C6, C7, C8, C9 = (np.float32(c) for c in (
-    0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277,
+C0, C1, C2, C3, C4, C5, C6, C7, C8, C9 = (np.float32(c) for c in (
+    0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005,
+    0.5462742152960396, 0.5900435899266435, 2.890611442640554, 0.4570457994644658,
+    0.3731763325901154, 1.445305721320277,
 ))  # fmt: skip
 
 
@@ -22,8 +21,8 @@ def basis(x, y, z):
         C0, -C1 * y, C1 * z, -C1 * x,
         C2 * x * y, -C2 * y * z, C3 * (TWO * zz - xx - yy), -C2 * x * z, C4 * (xx - yy),
         -C5 * y * (THREE * xx - yy), C6 * x * y * z, -C7 * y * (FOUR * zz - xx - yy),
-        C8 * z * (TWO * zz - THREE * xx - THREE * yy), -C7 * x * (FOUR * zz - xx - yy), C9 * z * (xx - yy),
-        -C5 * x * (xx - THREE * yy),
+        C8 * z * (TWO * zz - THREE * xx - THREE * yy), -C7 * x * (FOUR * zz - xx - yy),
+        C9 * z * (xx - yy), -C5 * x * (xx - THREE * yy),
     )  # fmt: skip
 
 

@@ -71,19 +71,9 @@ def _blur_column(ring, plane, stride, row, out, at, count):
     r10 = np.uint64((base + (row + 5) % RING_ROWS) * stride)
     for x in range(np.uint64(count)):
         out[np.uint64(at) + x] = _blur(
-            ring,
-            r0 + x,
-            r1 + x,
-            r2 + x,
-            r3 + x,
-            r4 + x,
-            r5 + x,
-            r6 + x,
-            r7 + x,
-            r8 + x,
-            r9 + x,
+            ring, r0 + x, r1 + x, r2 + x, r3 + x, r4 + x, r5 + x, r6 + x, r7 + x, r8 + x, r9 + x,
             r10 + x,
-        )
+        )  # fmt: skip
 
 
 @inline_jit
@@ -133,19 +123,9 @@ def _sum_row(values, first, past):
 
 @inline_jit
 def _gradient_row(
-    image,
-    target_row,
-    keep,
-    blurred,
-    stride,
-    left,
-    first,
-    past,
-    ssim_weight,
-    scale,
-    gradient,
+    image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient,
     differences,
-):
+):  # fmt: skip
     """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and
     |image − target|.
 
@@ -252,8 +232,8 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                     _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
                 keep = (out % RING_ROWS) * stride
                 _gradient_row(
-                    image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left, ssim_weight, scale,
-                    gradient[c, out], differences,
+                    image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left,
+                    ssim_weight, scale, gradient[c, out], differences,
                 )  # fmt: skip
                 sums[0, c, first_sum + out] = _sum_row(differences, x0 - left, x1 - left)
         first_job, past_job = next_piece(work)

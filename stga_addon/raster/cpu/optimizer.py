@@ -130,14 +130,9 @@ def sum_by_triangle(rows, face, gradient, total, trained):
 
 
 def scale_limit(
-    rows: np.ndarray,
-    log_scale: np.ndarray,
-    face: np.ndarray,
-    unbound: np.ndarray,
-    limits: np.ndarray,
-    weight: float,
-    gradient: np.ndarray,
-) -> float:
+    rows: np.ndarray, log_scale: np.ndarray, face: np.ndarray, unbound: np.ndarray,
+    limits: np.ndarray, weight: float, gradient: np.ndarray,
+) -> float:  # fmt: skip
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N,
     3).
 
@@ -148,9 +143,8 @@ def scale_limit(
     sum_excess_scale(sums, rows, log_scale, face, unbound, limits)
     norm = math.sqrt(math.fsum(sums.tolist()))
     if norm > 0.0:
-        add_excess_scale(
-            rows, log_scale, face, unbound, limits, np.float32(weight / norm), gradient
-        )
+        factor = np.float32(weight / norm)
+        add_excess_scale(rows, log_scale, face, unbound, limits, factor, gradient)
     return norm
 
 

@@ -22,16 +22,8 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
     # Slack, so that rounding (of differences of squares above all) does not lose a pixel.
     slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * extent_y
     lean, rate = shear * extent_y, precision_x * shear * shrink
-    return (
-        mean_x - HALF,
-        mean_y - HALF,
-        extent_y,
-        lean,
-        rate,
-        chord,
-        precision_x * precision_y * shrink * shrink,
-        slack,
-    )
+    cut = precision_x * precision_y * shrink * shrink
+    return mean_x - HALF, mean_y - HALF, extent_y, lean, rate, chord, cut, slack
 
 
 @part_jit

@@ -8,6 +8,7 @@ at once.
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
 
 import numpy as np
@@ -31,7 +32,7 @@ from .rasterize import (
     sort_into_tiles,
     tile_grid,
     with_strain_color,
-)
+)  # fmt: skip
 from .tiles import find_needed_rows, split_splats, sum_tiles, whole_tiles
 
 SIZE = 16
@@ -51,36 +52,27 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
     """The process that runs `compile_rendering`, started by the first call; None if the kernels are
     cached already or a second process would not help.
     """
-    if (
-        has_kernels(KERNEL_CACHE_FOLDER)
-        or (os.cpu_count() or 1) < 2
-        or not __name__.startswith(f"{PACKAGE}.")
-    ):
+    is_whole = __name__.startswith(f"{PACKAGE}.")
+    if has_kernels(KERNEL_CACHE_FOLDER) or (os.cpu_count() or 1) < 2 or not is_whole:
         return None
-    try:
+    code = f"from {__name__} import compile_rendering; compile_rendering()"
+    with suppress(OSError):
         return subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                f"from {__name__} import compile_rendering; compile_rendering()",
-            ],
+            [sys.executable, "-c", code],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env=same_interpreter_environment(os.environ),
             preexec_fn=end_with_this_process(),
         )
-    except OSError:
-        return None
+    return None
 
 
 def compile_rendering() -> None:
     """Compile `render_forward` with the types of real training."""
     buffers, (tiles_x, tiles_y) = BufferPool(), tile_grid(SIZE, SIZE)
-    tiles, everywhere = (
-        np.arange(tiles_x * tiles_y, dtype=np.int32),
-        sum_tiles(np.ones((tiles_y, tiles_x), bool)),
-    )
+    tiles = np.arange(tiles_x * tiles_y, dtype=np.int32)
+    everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
     splats, face, frames = _two_splats()
     projection = new_projection(2, buffers)
     project_forward(np.arange(2), everywhere, splats, face, frames, 3, False, False, projection)
@@ -106,20 +98,18 @@ def compile_gradients() -> None:
     tiles, projection = np.arange(tiles_x * tiles_y, dtype=np.int32), new_projection(2, buffers)
     none, by_splat = np.zeros(0, np.int32), np.zeros(2, np.int32)
     lists = TileLists(none, by_splat, by_splat, none, np.zeros(len(tiles) + 1, np.int64), none)
-    v_image, v_transmittance = (
-        np.zeros((3, SIZE, SIZE), np.float32),
-        np.zeros((SIZE, SIZE), np.float32),
-    )
+    v_image = np.zeros((3, SIZE, SIZE), np.float32)
+    v_transmittance = np.zeros((SIZE, SIZE), np.float32)
     pair_gradients = buffers.get("pair_gradients", (0, PROJECTED))
     blend_backward(
-        tiles, tiles_x, lists, new_image(SIZE, SIZE, lists, buffers), np.ones(2, bool), projection.columns,
-        BLACK_BACKGROUND, v_image, v_transmittance, pair_gradients,
+        tiles, tiles_x, lists, new_image(SIZE, SIZE, lists, buffers), np.ones(2, bool),
+        projection.columns, BLACK_BACKGROUND, v_image, v_transmittance, pair_gradients,
     )  # fmt: skip
     projection.columns[:] = 1
     # Without rows, no kernel is called: two, each of no pair.
     project_backward(
-        np.arange(2, dtype=np.int32), splats, face, frames, 3, False, False, projection.columns, lists,
-        pair_gradients, splats, buffers.get("screen_gradient", (2,)),
+        np.arange(2, dtype=np.int32), splats, face, frames, 3, False, False, projection.columns,
+        lists, pair_gradients, splats, buffers.get("screen_gradient", (2,)),
     )  # fmt: skip
 
 

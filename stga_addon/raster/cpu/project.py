@@ -46,38 +46,19 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
 @part_jit
 def _load(rows, splats, face, frames, b):
     """Copy the listed splats (at most BLOCK_SPLATS) and their frames to the block `b`."""
-    xyz, rotation, log_scale, opacity = (
-        splats.xyz,
-        splats.rotation,
-        splats.log_scale,
-        splats.opacity,
-    )
-    origin, matrix = frames.origin, frames.matrix
+    xyz, rotation, log_scale = splats.xyz, splats.rotation, splats.log_scale
+    opacity = splats.opacity
+    origin, m = frames.origin, frames.matrix
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         f = np.uint64(face[i])
-        b[block.M00 + q], b[block.M01 + q], b[block.M02 + q] = (
-            matrix[f, 0, 0],
-            matrix[f, 0, 1],
-            matrix[f, 0, 2],
-        )
-        b[block.M10 + q], b[block.M11 + q], b[block.M12 + q] = (
-            matrix[f, 1, 0],
-            matrix[f, 1, 1],
-            matrix[f, 1, 2],
-        )
-        b[block.M20 + q], b[block.M21 + q], b[block.M22 + q] = (
-            matrix[f, 2, 0],
-            matrix[f, 2, 1],
-            matrix[f, 2, 2],
-        )
+        b[block.M00 + q], b[block.M01 + q], b[block.M02 + q] = m[f, 0, 0], m[f, 0, 1], m[f, 0, 2]
+        b[block.M10 + q], b[block.M11 + q], b[block.M12 + q] = m[f, 1, 0], m[f, 1, 1], m[f, 1, 2]
+        b[block.M20 + q], b[block.M21 + q], b[block.M22 + q] = m[f, 2, 0], m[f, 2, 1], m[f, 2, 2]
         b[block.ORIGIN_X + q], b[block.ORIGIN_Y + q] = origin[f, 0], origin[f, 1]
         b[block.ORIGIN_Z + q] = origin[f, 2]
-        b[block.LOCAL_X + q], b[block.LOCAL_Y + q], b[block.LOCAL_Z + q] = (
-            xyz[i, 0],
-            xyz[i, 1],
-            xyz[i, 2],
-        )
+        b[block.LOCAL_X + q], b[block.LOCAL_Y + q] = xyz[i, 0], xyz[i, 1]
+        b[block.LOCAL_Z + q] = xyz[i, 2]
         b[block.RAW_0 + q], b[block.RAW_1 + q] = rotation[i, 0], rotation[i, 1]
         b[block.RAW_2 + q], b[block.RAW_3 + q] = rotation[i, 2], rotation[i, 3]
         b[block.LOG_0 + q], b[block.LOG_1 + q] = log_scale[i, 0], log_scale[i, 1]
@@ -176,18 +157,12 @@ def project_forward(
     mode).
     """
     sh, strain_color, strain = splats.sh, splats.strain_color, frames.strain
-    projected, depth, extent_y, rect = (
-        projection.columns,
-        projection.depth,
-        projection.extent_y,
-        projection.rect,
-    )
+    projected, depth, extent_y = projection.columns, projection.depth, projection.extent_y
+    rect = projection.rect
     strains = np.uint64(min(strain.shape[1], strain_color.shape[1]))
     tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
-    limits, coefficients = (
-        _tan_limits(frames.intrinsics, frames.size),
-        np.uint64((degree + 1) * (degree + 1)),
-    )
+    limits = _tan_limits(frames.intrinsics, frames.size)
+    coefficients = np.uint64((degree + 1) * (degree + 1))
     b, seen = np.zeros(block.FORWARD_SIZE, np.float32), np.empty(BLOCK_SPLATS, np.uint64)
     begin, end = next_piece(work)
     while begin < end:
@@ -222,18 +197,12 @@ def project_forward(
                 rect[i, 0], rect[i, 1] = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
                 rect[i, 2], rect[i, 3] = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
                 depth[i], extent_y[i] = z, b[block.EXTENT_Y + q]
-                projected[i, MEAN_X], projected[i, MEAN_Y] = (
-                    b[block.MEAN_X + q],
-                    b[block.MEAN_Y + q],
-                )
-                projected[i, PRECISION_X], projected[i, SHEAR] = (
-                    b[block.PRECISION_X + q],
-                    b[block.SHEAR + q],
-                )
-                projected[i, PRECISION_Y], projected[i, OPACITY] = (
-                    b[block.PRECISION_Y + q],
-                    b[block.OPACITY + q],
-                )
+                projected[i, MEAN_X] = b[block.MEAN_X + q]
+                projected[i, MEAN_Y] = b[block.MEAN_Y + q]
+                projected[i, PRECISION_X] = b[block.PRECISION_X + q]
+                projected[i, SHEAR] = b[block.SHEAR + q]
+                projected[i, PRECISION_Y] = b[block.PRECISION_Y + q]
+                projected[i, OPACITY] = b[block.OPACITY + q]
                 projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
         begin, end = next_piece(work)
 
@@ -242,12 +211,8 @@ def project_forward(
 def _sum_pairs(rows, lists, pair_gradients, b):
     """Sum the gradients of each listed splat's pairs to the block: a short loop asks memory for
     many of them at once."""
-    first_pair, pairs, splat_pairs, grads = (
-        lists.first_pair,
-        lists.pairs,
-        lists.splat_pairs,
-        pair_gradients,
-    )
+    first_pair, pairs, splat_pairs = lists.first_pair, lists.pairs, lists.splat_pairs
+    grads = pair_gradients
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
@@ -267,14 +232,10 @@ def _load_projected(rows, projected, b):
     at zero."""
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
-        b[block.PRECISION_X + q], b[block.SHEAR + q] = (
-            projected[i, PRECISION_X],
-            projected[i, SHEAR],
-        )
-        b[block.PRECISION_Y + q], b[block.OPACITY + q] = (
-            projected[i, PRECISION_Y],
-            projected[i, OPACITY],
-        )
+        b[block.PRECISION_X + q] = projected[i, PRECISION_X]
+        b[block.SHEAR + q] = projected[i, SHEAR]
+        b[block.PRECISION_Y + q] = projected[i, PRECISION_Y]
+        b[block.OPACITY + q] = projected[i, OPACITY]
         b[block.G_RED + q] = b[block.G_RED + q] if projected[i, RED] > ZERO else ZERO
         b[block.G_GREEN + q] = b[block.G_GREEN + q] if projected[i, GREEN] > ZERO else ZERO
         b[block.G_BLUE + q] = b[block.G_BLUE + q] if projected[i, BLUE] > ZERO else ZERO
@@ -287,11 +248,8 @@ def _color_gradient(b, q, i, coefficients, sh, v_sh):
     red, green, blue = b[block.G_RED + q], b[block.G_GREEN + q], b[block.G_BLUE + q]
     for k in range(coefficients):
         harmonic = b[block.B0 + k * COLUMN + q]
-        v_sh[i, k, 0], v_sh[i, k, 1], v_sh[i, k, 2] = (
-            harmonic * red,
-            harmonic * green,
-            harmonic * blue,
-        )
+        v_sh[i, k, 0], v_sh[i, k, 1] = harmonic * red, harmonic * green
+        v_sh[i, k, 2] = harmonic * blue
         b[block.W0 + k * COLUMN + q] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
     for k in range(coefficients, np.uint64(v_sh.shape[1])):
         v_sh[i, k, 0] = v_sh[i, k, 1] = v_sh[i, k, 2] = ZERO
@@ -302,12 +260,8 @@ def _color_gradient(b, q, i, coefficients, sh, v_sh):
 @part_jit
 def _store_gradient(rows, b, gradients, screen_gradient):
     """Copy the gradients of the listed splats' geometry from the block."""
-    xyz, rotation, log_scale, opacity = (
-        gradients.xyz,
-        gradients.rotation,
-        gradients.log_scale,
-        gradients.opacity,
-    )
+    xyz, rotation, log_scale = gradients.xyz, gradients.rotation, gradients.log_scale
+    opacity = gradients.opacity
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         xyz[i, 0], xyz[i, 1] = b[block.V_LOCAL_X + q], b[block.V_LOCAL_Y + q]
@@ -340,10 +294,8 @@ def project_backward(
     )
     strains = np.uint64(min(strain.shape[1], splats.strain_color.shape[1]))
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
-    limits, coefficients = (
-        _tan_limits(frames.intrinsics, frames.size),
-        np.uint64((degree + 1) * (degree + 1)),
-    )
+    limits = _tan_limits(frames.intrinsics, frames.size)
+    coefficients = np.uint64((degree + 1) * (degree + 1))
     compensated = ONE if antialiased else ZERO
     b = np.zeros(block.BACKWARD_SIZE, np.float32)
     begin, end = next_piece(work)

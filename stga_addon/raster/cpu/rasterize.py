@@ -35,7 +35,7 @@ from .tiles import (
     sum_parts,
     sum_tiles,
     whole_tiles,
-)
+)  # fmt: skip
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 
@@ -101,10 +101,8 @@ class BufferPool:
 def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
     """Compose face frames with a camera in float64, so that distance from the origin costs no
     precision."""
-    rotation, translation = (
-        np.float64(camera.world_to_camera[:3, :3]),
-        np.float64(camera.world_to_camera[:3, 3]),
-    )
+    rotation = np.float64(camera.world_to_camera[:3, :3])
+    translation = np.float64(camera.world_to_camera[:3, 3])
     parts = (frames.origin, frames.rotation, frames.scale, rotation, translation)
     origin = np.empty((len(frames.origin), 3), np.float32)
     matrix = np.empty((len(frames.origin), 3, 3), np.float32)
@@ -148,9 +146,8 @@ def render_forward(
     projection = new_projection(len(splats.xyz), buffers)
 
     def project(rows: np.ndarray, covered: np.ndarray) -> None:
-        project_forward(
-            rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
-        )
+        options = degree, depth_as_color, antialiased
+        project_forward(rows, covered, splats, face, frames, *options, projection)
 
     touched = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
     everywhere = buffers.kept(
@@ -171,18 +168,9 @@ def render_forward(
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
     return RenderOutput(
-        blended,
-        projection,
-        lists,
-        tiles,
-        tile_rows,
-        focus,
-        touched,
-        background,
-        degree,
-        depth_as_color,
-        antialiased,
-    )
+        blended, projection, lists, tiles, tile_rows, focus, touched, background, degree,
+        depth_as_color, antialiased,
+    )  # fmt: skip
 
 
 def render_backward(
@@ -226,8 +214,9 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        rows, with_strain_color(splats), face, frames, output.degree, output.depth_as_color, output.antialiased,
-        columns, lists, pair_gradients, with_strain_color(gradients), screen_gradient,
+        rows, with_strain_color(splats), face, frames, output.degree, output.depth_as_color,
+        output.antialiased, columns, lists, pair_gradients, with_strain_color(gradients),
+        screen_gradient,
     )  # fmt: skip
     return rows, screen_gradient
 
@@ -292,16 +281,8 @@ def sort_by_depth(
     keys, moved_keys = (buffers.get(name, (n,), np.uint32) for name in ("keys", "moved_keys"))
     parts = buffers.get("parts", (parts_of(n) + 1, 4), np.int64)
     counts = buffers.get("digits", (parts_of(n), DIGITS), np.int32)
-    list_visible(
-        projection.rect,
-        projection.depth.view(np.uint32),
-        found,
-        keys,
-        pairs,
-        first_pair,
-        parts,
-        counts,
-    )
+    depth_bits = projection.depth.view(np.uint32)
+    list_visible(projection.rect, depth_bits, found, keys, pairs, first_pair, parts, counts)
     least, greatest = sum_parts(parts, counts)
     splats, total = int(parts[-1, SPLATS]), int(parts[-1, PAIRS])
     visible = visible[:splats]

@@ -68,13 +68,8 @@ def add_lights(
                     dx, dy, dz = light[1] - px, light[2] - py, light[3] - pz
                     square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
                     away = ONE / math.sqrt(square)
-                    dx, dy, dz, strength, width = (
-                        dx * away,
-                        dy * away,
-                        dz * away,
-                        ONE / square,
-                        width * away,
-                    )
+                    dx, dy, dz, strength = dx * away, dy * away, dz * away, ONE / square
+                    width = width * away
                     along = -(dx * light[4] + dy * light[5] + dz * light[6])
                     if kind == AREA:
                         strength *= max(along, ZERO)

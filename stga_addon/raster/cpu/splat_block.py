@@ -24,8 +24,9 @@ ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.flo
 BLOCK_SPLATS = 64
 BASIS_SIZE = 16
 # The splat's frame in camera space and its parameters.
-(M00, M01, M02, M10, M11, M12, M20, M21, M22, ORIGIN_X, ORIGIN_Y, ORIGIN_Z, LOCAL_X, LOCAL_Y, LOCAL_Z,
- RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (np.uint64(n * BLOCK_SPLATS) for n in range(23))  # fmt: skip
+(M00, M01, M02, M10, M11, M12, M20, M21, M22, ORIGIN_X, ORIGIN_Y, ORIGIN_Z, LOCAL_X, LOCAL_Y,
+ LOCAL_Z, RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(23))  # fmt: skip
 # On the screen: the geometry of `layout.Projection`; the covariance, its determinant, and that of
 # the splat without LOW_PASS_PX2; bounds in tiles; SEEN: 1 where the splat may be visible, −1 where
 # it is not finite, else 0.
@@ -49,8 +50,9 @@ G_MEAN_X, G_MEAN_Y, G_PRECISION_X, G_SHEAR, G_PRECISION_Y, G_OPACITY, G_RED, G_G
 W0, W1, W2, W3, W4, W5, W6, W7, W8, W9, W10, W11, W12, W13, W14, W15 = (
     np.uint64(n * BLOCK_SPLATS) for n in range(72, 88)
 )
-(V_LOCAL_X, V_LOCAL_Y, V_LOCAL_Z, V_RAW_0, V_RAW_1, V_RAW_2, V_RAW_3, V_LOG_0, V_LOG_1, V_LOG_2, V_LOGIT,
- V_CAMERA_X, V_CAMERA_Y, V_CAMERA_Z, V_SCREEN) = (np.uint64(n * BLOCK_SPLATS) for n in range(88, 103))  # fmt: skip
+(V_LOCAL_X, V_LOCAL_Y, V_LOCAL_Z, V_RAW_0, V_RAW_1, V_RAW_2, V_RAW_3, V_LOG_0, V_LOG_1, V_LOG_2,
+ V_LOGIT, V_CAMERA_X, V_CAMERA_Y, V_CAMERA_Z, V_SCREEN) = (
+    np.uint64(n * BLOCK_SPLATS) for n in range(88, 103))  # fmt: skip
 BACKWARD_SIZE = 103 * BLOCK_SPLATS
 
 
@@ -169,12 +171,8 @@ def project_bounds(b, tiles_x, tiles_y):
     float32."""
     size = np.float32(TILE)
     for q in range(np.uint64(BLOCK_SPLATS)):
-        mean_x, mean_y, det, opacity = (
-            b[MEAN_X + q],
-            b[MEAN_Y + q],
-            b[DETERMINANT + q],
-            b[OPACITY + q],
-        )
+        mean_x, mean_y, det = b[MEAN_X + q], b[MEAN_Y + q], b[DETERMINANT + q]
+        opacity = b[OPACITY + q]
         reach = TWO * logarithm(np.float32(255.0) * opacity)
         yy, infinite = b[YY + q], np.float32(np.inf)
         ex, ey = math.sqrt(reach * b[XX + q]), math.sqrt(reach * yy)
@@ -184,12 +182,8 @@ def project_bounds(b, tiles_x, tiles_y):
         b[X1 + q] = min(tiles_x, max(ZERO, np.ceil((mean_x + ex) / size)))
         b[Y0 + q] = min(tiles_y, max(ZERO, np.floor((mean_y - ey) / size)))
         b[Y1 + q] = min(tiles_y, max(ZERO, np.ceil((mean_y + ey) / size)))
-        finite = (
-            (opacity >= ZERO)
-            & (det < infinite)
-            & (abs(mean_x) < infinite)
-            & (abs(mean_y) < infinite)
-        )
+        finite = (opacity >= ZERO) & (det < infinite)
+        finite = finite & (abs(mean_x) < infinite) & (abs(mean_y) < infinite)
         seen = (ONE if reach > ZERO else ZERO) if finite else -ONE
         b[SEEN + q] = ZERO if b[CAMERA_Z + q] < NEAR_M else seen
 
@@ -208,8 +202,9 @@ def compute_harmonics(b, to_world):
         dz = (t20 * x + t21 * y + t22 * z) * rd
         b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q] = dx, dy, dz, rd
         (
-            b[B0 + q], b[B1 + q], b[B2 + q], b[B3 + q], b[B4 + q], b[B5 + q], b[B6 + q], b[B7 + q],
-            b[B8 + q], b[B9 + q], b[B10 + q], b[B11 + q], b[B12 + q], b[B13 + q], b[B14 + q], b[B15 + q],
+            b[B0 + q], b[B1 + q], b[B2 + q], b[B3 + q], b[B4 + q], b[B5 + q], b[B6 + q],
+            b[B7 + q], b[B8 + q], b[B9 + q], b[B10 + q], b[B11 + q], b[B12 + q], b[B13 + q],
+            b[B14 + q], b[B15 + q],
         ) = basis(dx, dy, dz)  # fmt: skip
 
 
@@ -334,8 +329,9 @@ def differentiate_position(b, to_world):
     for q in range(np.uint64(BLOCK_SPLATS)):
         dx, dy, dz, rd = b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q]
         ex, ey, ez = basis_gradient(
-            dx, dy, dz, b[W1 + q], b[W2 + q], b[W3 + q], b[W4 + q], b[W5 + q], b[W6 + q], b[W7 + q], b[W8 + q],
-            b[W9 + q], b[W10 + q], b[W11 + q], b[W12 + q], b[W13 + q], b[W14 + q], b[W15 + q],
+            dx, dy, dz, b[W1 + q], b[W2 + q], b[W3 + q], b[W4 + q], b[W5 + q], b[W6 + q],
+            b[W7 + q], b[W8 + q], b[W9 + q], b[W10 + q], b[W11 + q], b[W12 + q], b[W13 + q],
+            b[W14 + q], b[W15 + q],
         )  # fmt: skip
         along = ex * dx + ey * dy + ez * dz
         ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd

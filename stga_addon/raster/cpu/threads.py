@@ -34,7 +34,7 @@ from .entry import (
     raise_failure,
     run_entry,
     store_entry,
-)
+)  # fmt: skip
 
 UNITS, PIECE = 1, 2
 """Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the
@@ -91,7 +91,18 @@ def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Calla
 
         @wraps(kernel)
         def call(*arguments: Any) -> None:
-            _run(team_kernel, units(*arguments), piece, arguments)
+            count = units(*arguments)
+            if not count:
+                return
+            work, team = np.array([0, count, piece], np.int64), _team
+            if team.is_led.acquire(blocking=False):
+                try:
+                    helpers = team.start(min(_threads, -(-count // piece)) - 1)
+                    team_kernel.call(team.words, helpers, (work, *arguments))
+                finally:
+                    team.is_led.release()
+            else:  # another thread leads them
+                team_kernel.call(np.zeros(FIRST_HELPER, np.int64), 0, (work, *arguments))
 
         return call
 
@@ -132,26 +143,8 @@ class TeamKernel:
         self.kernel.compile(tuple(kind))
         compiled = self.kernel.overloads[tuple(kind)]
         address = compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name)
-        self.addresses = np.concatenate(
-            [self.addresses, np.array([[number_of(kind), address]], np.int64)]
-        )
-
-
-def _run(kernel: TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
-    """Do all units of a kernel, on this thread and others."""
-    if not units:
-        return
-    work = np.array([0, units, piece], np.int64)
-    team = _team
-    if team.is_led.acquire(blocking=False):
-        try:
-            kernel.call(
-                team.words, team.start(min(_threads, -(-units // piece)) - 1), (work, *arguments)
-            )
-        finally:
-            team.is_led.release()
-    else:  # another thread leads them
-        kernel.call(np.zeros(FIRST_HELPER, np.int64), 0, (work, *arguments))
+        new = np.array([[number_of(kind), address]], np.int64)
+        self.addresses = np.concatenate([self.addresses, new])
 
 
 class Team:
@@ -174,9 +167,8 @@ class Team:
                 self.words[SPINS] = spins_of(SPIN_S)
             place = FIRST_HELPER + HELPER_WORDS * len(self._helpers)
             self.words[place] = _new_lock()
-            helper = Thread(
-                target=_help, args=(self.words, place), name="stga kernels", daemon=True
-            )
+            arguments = self.words, place
+            helper = Thread(target=_help, args=arguments, name="stga kernels", daemon=True)
             self._helpers.append(helper)
             helper.start()
         return count
@@ -187,9 +179,8 @@ class Team:
         with self.is_led:
             self.words[STOPPED] = 1
             for n, helper in enumerate(self._helpers):
-                pythonapi.PyThread_release_lock(
-                    c_void_p(int(self.words[FIRST_HELPER + HELPER_WORDS * n]))
-                )
+                lock = int(self.words[FIRST_HELPER + HELPER_WORDS * n])
+                pythonapi.PyThread_release_lock(c_void_p(lock))
                 helper.join()
             self._helpers.clear()
             self.words[:] = 0

@@ -34,10 +34,9 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
     """List the splats with tiles in their bounds, rect (N, 4), by parts of SPLATS_PER_SORT splats.
 
     Writes from each part's first place on its visible splats to found (N,) int32, and their keys,
-    the bits of their
-    depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs each splat has,
-    and how many in its part come before. parts (parts + 1, 4) int64: see SPLATS. counts (parts,
-    DIGITS) int32: of the keys' lowest digits.
+    the bits of their depths (N,), to keys (N,) uint32. pairs, first_pair (N,) int32: how many pairs
+    each splat has, and how many in its part come before. parts (parts + 1, 4) int64: see SPLATS.
+    counts (parts, DIGITS) int32: of the keys' lowest digits.
     """
     part, past_part = next_piece(work)
     while part < past_part:
@@ -54,16 +53,10 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
                 pairs[i], first_pair[i] = width * (rect[i, 3] - rect[i, 1]), before
                 count, before = count + np.uint64(seen), np.int32(before + pairs[i])
                 row[_digit(key, np.uint32(0), np.uint32(0))] += seen
-                least, greatest = (
-                    min(least, key if seen else least),
-                    max(greatest, key if seen else greatest),
-                )
-            parts[k, SPLATS], parts[k, PAIRS], parts[k, LEAST], parts[k, GREATEST] = (
-                count,
-                before,
-                least,
-                greatest,
-            )
+                least = min(least, key if seen else least)
+                greatest = max(greatest, key if seen else greatest)
+            parts[k, SPLATS], parts[k, PAIRS] = count, before
+            parts[k, LEAST], parts[k, GREATEST] = least, greatest
         part, past_part = next_piece(work)
 
 
@@ -126,8 +119,7 @@ def sum_digits(counts):
 @kernel_jit
 def move_visible(work, parts, found, keys, place, first_pair, visible, moved_keys, moved):
     """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by
-    the lowest digit to
-    moved (M,) and moved_keys (M,).
+    the lowest digit to moved (M,) and moved_keys (M,).
 
     parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair
     (N,): from now on counts the pairs of the parts before as well.
@@ -135,11 +127,8 @@ def move_visible(work, parts, found, keys, place, first_pair, visible, moved_key
     part, past_part = next_piece(work)
     while part < past_part:
         for k in range(part, past_part):
-            row, begin, first = (
-                place[k],
-                np.uint64(k * SPLATS_PER_SORT),
-                np.uint64(parts[k, SPLATS]),
-            )
+            row, begin = place[k], np.uint64(k * SPLATS_PER_SORT)
+            first = np.uint64(parts[k, SPLATS])
             before = np.int32(parts[k, PAIRS])
             for n in range(np.uint64(parts[k + 1, SPLATS] - parts[k, SPLATS])):
                 i, key = found[begin + n], keys[begin + n]
@@ -166,9 +155,8 @@ def count_digits(work, counts, keys, least, shift):
         for k in range(part, past_part):
             row = counts[k]
             row[:] = 0
-            for n in range(
-                np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))
-            ):
+            past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
+            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
                 row[_digit(keys[n], least, shift)] += 1
         part, past_part = next_piece(work)
 
@@ -182,9 +170,8 @@ def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
     while part < past_part:
         for k in range(part, past_part):
             row = place[k]
-            for n in range(
-                np.uint64(k * SPLATS_PER_SORT), np.uint64(min(len(keys), (k + 1) * SPLATS_PER_SORT))
-            ):
+            past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
+            for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
                 digit = _digit(keys[n], least, shift)
                 at = np.uint64(row[digit])
                 moved_keys[at], moved[at] = keys[n], values[n]
@@ -200,9 +187,8 @@ SPLATS_AHEAD = 16
 def _prefetch_rect(rect, order, n, past):
     """Ask memory for the bounds of the splat SPLATS_AHEAD after the n-th in order: they lie
     anywhere."""
-    prefetch(
-        rect, np.uint64(order[min(n + np.uint64(SPLATS_AHEAD), past - np.uint64(1))]) * np.uint64(4)
-    )
+    ahead = order[min(n + np.uint64(SPLATS_AHEAD), past - np.uint64(1))]
+    prefetch(rect, np.uint64(ahead) * np.uint64(4))
 
 
 @inline_jit
@@ -258,9 +244,8 @@ def arrange_tiles(counts, tile_rows):
     tiles, count = np.empty(len(tile_rows), np.int32), 0
     for tile in range(len(tile_rows)):
         tiles[count] = tile
-        count += (tile_rows[tile, 0] < tile_rows[tile, 1]) | (
-            tile_rows[tile, 2] < tile_rows[tile, 3]
-        )
+        row = tile_rows[tile]
+        count += (row[0] < row[1]) | (row[2] < row[3])
     return start, heaviest_first(tiles[:count], start)
 
 
@@ -389,36 +374,24 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
     projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
     two, half, slack = np.float32(2.0), np.float32(TILE // 2), np.float32(1e-4)
     strips, pairs = 2 * tiles_x, TILE // 2 * tiles_y  # cells: two rows of half a tile
-    near, reached = (
-        np.zeros((pairs + 1, strips + 1), np.int32),
-        np.zeros((tiles_y + 1, tiles_x + 1), np.int32),
-    )
+    near = np.zeros((pairs + 1, strips + 1), np.int32)
+    reached = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for n in range(len(splats)):
         i = np.uint64(splats[n])
         if rect[i, 2] <= rect[i, 0]:
             continue
         _add_box(reached, rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3])
-        x, y, ey, shear = (
-            projected[i, MEAN_X],
-            projected[i, MEAN_Y],
-            extent_y[i],
-            projected[i, SHEAR],
-        )
+        x, y, ey = projected[i, MEAN_X], projected[i, MEAN_Y], extent_y[i]
+        shear = projected[i, SHEAR]
         ex = ey * math.sqrt(projected[i, PRECISION_Y] / projected[i, PRECISION_X] + shear * shear)
-        ex, ey = (
-            ex + slack * ex + reach + np.float32(0.5),
-            ey + slack * ey + reach + np.float32(0.5),
-        )
-        _add_box(
-            near, _cell(x - ex, half, strips), _cell(y - ey, two, pairs), _cell(x + ex + half, half, strips),
-            _cell(y + ey + two, two, pairs),
-        )  # fmt: skip
+        ex = ex + slack * ex + reach + np.float32(0.5)
+        ey = ey + slack * ey + reach + np.float32(0.5)
+        x0, x1 = _cell(x - ex, half, strips), _cell(x + ex + half, half, strips)
+        _add_box(near, x0, _cell(y - ey, two, pairs), x1, _cell(y + ey + two, two, pairs))
     _sum_boxes(reached)
     _sum_boxes(near)
-    touched, tile_rows = (
-        np.empty((tiles_y, tiles_x), np.bool_),
-        np.empty((tiles_y * tiles_x, 4), np.uint8),
-    )
+    touched = np.empty((tiles_y, tiles_x), np.bool_)
+    tile_rows = np.empty((tiles_y * tiles_x, 4), np.uint8)
     covered = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for tile in range(tiles_y * tiles_x):
         ty, tx = tile // tiles_x, tile % tiles_x
@@ -462,19 +435,15 @@ def box_groups(tiles, most_rows):
     columns, numbers = tiles.shape[1], np.zeros(tiles.shape, np.int64)
     boxes, count, number = np.empty((tiles.size, 4), np.int64), 0, 0
     for tile in range(tiles.size):
-        if (
-            not tiles[tile // columns, tile % columns]
-            or numbers[tile // columns, tile % columns] > 0
-        ):
+        y, x = tile // columns, tile % columns
+        if not tiles[y, x] or numbers[y, x] > 0:
             continue
         number += 1
         first, past = _number_group(tiles, numbers, tile, number)
         bands = (past - first + most_rows - 1) // most_rows
         for band in range(bands):
-            y0, y1 = (
-                first + (past - first) * band // bands,
-                first + (past - first) * (band + 1) // bands,
-            )
+            y0 = first + (past - first) * band // bands
+            y1 = first + (past - first) * (band + 1) // bands
             x0, x1 = columns, 0
             for y in range(y0, y1):
                 for x in range(columns):

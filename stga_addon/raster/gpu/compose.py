@@ -52,11 +52,8 @@ def _compose(
         frames = layer_frames(layer, camera)
         parameters = Parameters(*(getattr(layer.splats, name) for name in Parameters._fields))
         table = upload_splats(device, parameters, layer.splats.face, f" {n}")
-        tables = {
-            "splats": table.rows,
-            "face": table.face,
-            "frames": upload_frames(device, frames, f" {n}"),
-        }
+        tables = {"splats": table.rows, "face": table.face}
+        tables["frames"] = upload_frames(device, frames, f" {n}")
         given.append((layer, table, frames, tables))
     count = sum(table.count for _, table, _, _ in given)
 
@@ -64,8 +61,8 @@ def _compose(
         first, seen = 0, projected_tables(device, count)
         for n, (layer, table, frames, tables) in enumerate(given):
             options = ViewOptions(
-                camera, layer.splats.sh_degree, strains=frames.strain.shape[1], depth_as_color=depth_as_color,
-                antialiased=layer.antialiased,
+                camera, layer.splats.sh_degree, strains=frames.strain.shape[1],
+                depth_as_color=depth_as_color, antialiased=layer.antialiased,
             )  # fmt: skip
             view = rasterizer.upload_view(table, options, frames.to_world, first, f"view {n}")
             work.dispatch("project.forward", table.count, {**tables, **seen, "view": view})

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from time import sleep
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -33,10 +32,8 @@ _BINDING = re.compile(
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
 _WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
 _LAYOUT_TYPE = {
-    "uniform": "uniform",
-    "storage, read": "read-only-storage",
-    "storage, read_write": "storage",
-}
+    "uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage",
+}  # fmt: skip
 
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
@@ -65,20 +62,17 @@ class Device:
         """Open the adapter called `name` in `adapters()`, the first one by default."""
         known = adapters()
         if not known:
-            raise StgaError(
-                "--device gpu: no graphics driver with Vulkan, Metal or Direct3D 12 was found"
-            )
+            text = "no graphics driver with Vulkan, Metal or Direct3D 12 was found"
+            raise StgaError(f"--device gpu: {text}")
         self.name = name or next(iter(known))
         if self.name not in known:
-            raise StgaError(
-                f"--device gpu:{self.name}: no such adapter; there are: {', '.join(known)}"
-            )
+            text = f"no such adapter; there are: {', '.join(known)}"
+            raise StgaError(f"--device gpu:{self.name}: {text}")
         self.is_software = is_software(known[self.name])
         with self.errors():
             self.gpu, self._kernels, self.failures = _open(self.name)
-        self.max_bytes = min(
-            self.gpu.limits["max-storage-buffer-binding-size"], self.gpu.limits["max-buffer-size"]
-        )
+        names = ("max-storage-buffer-binding-size", "max-buffer-size")
+        self.max_bytes = min(self.gpu.limits[name] for name in names)
         self.dispatches = self.submits = self.waits = 0
         self._buffers: dict[str, Any] = {}
         self._groups: dict[tuple[int, ...], tuple[Any, list[Any]]] = {}
@@ -99,11 +93,8 @@ class Device:
         needed = 4 * max(words, 4)
         if buffer is None or buffer.size < needed:
             # An eighth to spare, so that a slowly growing count does not allocate every time.
-            size = (
-                needed
-                if buffer is None
-                else min(needed + needed // 32 * 4, max(needed, self.max_bytes // 4 * 4))
-            )
+            most = max(needed, self.max_bytes // 4 * 4)
+            size = needed if buffer is None else min(needed + needed // 32 * 4, most)
             self._groups.clear()  # which would keep the old buffer's memory
             buffer = self._buffers[name] = self.new_buffer(name, size, _USAGE[usage])
         return buffer
@@ -111,9 +102,9 @@ class Device:
     def new_buffer(self, name: str, size: int, usage: int) -> Any:
         """A buffer of so many bytes; usage: flags of WebGPU."""
         if size > self.max_bytes:
+            allowed = f"{self.name} allows buffers of {self.max_bytes >> 20} MiB"
             raise DeviceError(
-                f"{self.name} allows buffers of {self.max_bytes >> 20} MiB and one of {size >> 20} MiB is needed "
-                f"for {name}",
+                f"{allowed} and one of {size >> 20} MiB is needed for {name}",
                 "use smaller images or fewer splats, or continue on the CPU (--device cpu)",
             )
         with self.errors():
@@ -133,9 +124,8 @@ class Device:
             if whole:
                 self.gpu.queue.write_buffer(buffer, 0, data, 0, whole)
             if whole < data.size:
-                self.gpu.queue.write_buffer(
-                    buffer, whole, np.pad(data[whole:], (0, 4 - data.size % 4))
-                )
+                rest = np.pad(data[whole:], (0, 4 - data.size % 4))
+                self.gpu.queue.write_buffer(buffer, whole, rest)
         return buffer
 
     def read(self, buffer: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
@@ -162,29 +152,19 @@ class Device:
     def _compile(self, name: str, constants: dict[str, float]) -> Kernel:
         file, entry = name.split(".")
         code, tables = _linked(file, entry)
+        entries = [
+            {"binding": n, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
+            for n, kind in tables.values()
+        ]
         with self.errors():
-            layout = self.gpu.create_bind_group_layout(
-                entries=[
-                    {
-                        "binding": index,
-                        "visibility": wgpu.ShaderStage.COMPUTE,
-                        "buffer": {"type": kind},
-                    }
-                    for index, kind in tables.values()
-                ]
-            )
+            layout = self.gpu.create_bind_group_layout(entries=entries)
+            module = self.gpu.create_shader_module(label=file, code=code)
             pipeline = self.gpu.create_compute_pipeline(
                 label=name,
                 layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
-                compute={
-                    "module": self.gpu.create_shader_module(label=file, code=code),
-                    "entry_point": entry,
-                    "constants": constants,
-                },
+                compute={"module": module, "entry_point": entry, "constants": constants},
             )
-        return Kernel(
-            name, pipeline, layout, {table: index for table, (index, _) in tables.items()}
-        )
+        return Kernel(name, pipeline, layout, {table: n for table, (n, _) in tables.items()})
 
     def bind(self, kernel: Kernel, tables: Mapping[str, Any]) -> Any:
         """The bind group of a kernel with those of the tables that it uses; made once for the same
@@ -214,21 +194,24 @@ class Device:
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """Turn what driver and library raise into a DeviceError; mistakes in kernels and calls pass
-        as they are."""
+        """Turn what driver and library raise into a DeviceError; mistakes in kernels pass."""
         try:
             yield
-        except wgpu.GPUOutOfMemoryError as error:
-            raise _full_memory(self.name) from error
         except (wgpu.GPUError, RuntimeError) as error:
             text = str(error).lower()
-            if "memory" in text and "out of" in text:
-                raise _full_memory(self.name) from error
+            is_full = "memory" in text and "out of" in text
+            if is_full or isinstance(error, wgpu.GPUOutOfMemoryError):
+                raise DeviceError(
+                    f"the memory of {self.name} is full",
+                    "close other programs that use it, use smaller images or fewer splats, or "
+                    "continue on the CPU (--device cpu)",
+                ) from error
             if "lost" in text or "could not map" in text:
                 _open.cache_clear()
                 raise DeviceError(
                     f"{self.name} was lost (the driver was reset, or took too long)",
-                    "try again, on the CPU (--device cpu) if it happens again; a run's checkpoint is kept for --resume",
+                    "try again, on the CPU (--device cpu) if it happens again; a run's checkpoint "
+                    "is kept for --resume",
                 ) from error
             raise
 
@@ -254,7 +237,9 @@ class Recording:
         indirect = not isinstance(groups[0], int)
         if not indirect and 0 in groups:
             return
-        compute = self._compute_pass()
+        if self._pass is None:
+            self._pass = self._encoder.begin_compute_pass()
+        compute = self._pass
         compute.set_pipeline(kernel.pipeline)
         compute.set_bind_group(0, self.device.bind(kernel, tables))
         if indirect:
@@ -283,19 +268,9 @@ class Recording:
     def __enter__(self) -> "Recording":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         if error is None:
             self.submit()
-
-    def _compute_pass(self) -> Any:
-        if self._pass is None:
-            self._pass = self._encoder.begin_compute_pass()
-        return self._pass
 
     def _end_pass(self) -> None:
         if self._pass is not None:
@@ -363,17 +338,6 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
         required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
     )
     failures: list[Exception] = []
-    _poll_without_blocking(device, failures)
-    return device, {}, failures
-
-
-def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
-    """Let wgpu's thread, which runs while a result is awaited, look now and then whether it is
-    there.
-
-    By itself it waits inside the driver for all submitted work, and holds a lock that the next
-    submit waits for.
-    """
     reference = weakref.ref(device)
 
     def poll(_: bool) -> None:
@@ -386,9 +350,12 @@ def _poll_without_blocking(device: Any, failures: list[Exception]) -> None:
             sleep(LOST_CHECK_S)
         sleep(POLL_INTERVAL_S)
 
-    # private: a version without it is slower, not wrong
+    # wgpu's thread, which runs while a result is awaited, looks now and then whether it is there.
+    # By itself it waits inside the driver for all submitted work, and holds a lock that the next
+    # submit waits for. Private: a version without it is slower, not wrong.
     if hasattr(getattr(device, "_poller", None), "_poll_func"):
         device._poller._poll_func = poll
+    return device, {}, failures
 
 
 def _source(name: str) -> str:
@@ -403,9 +370,8 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
     A table is bound for reading where none of them assigns to it: what only reads needs no barrier
     between dispatches.
     """
-    text = "\n".join(
-        [constants_wgsl(), struct_wgsl("View", VIEW), _source("common"), _source(file)]
-    )
+    sources = _source("common"), _source(file)
+    text = "\n".join([constants_wgsl(), struct_wgsl("View", VIEW), *sources])
     code = re.sub("//.*", "", text)
     bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}
     while left:
@@ -413,10 +379,8 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
         called = {name for each in left for name in re.findall(r"\w+(?=\()", bodies[each])}
         left = called & bodies.keys() - reached
     body = "".join(bodies[name] for name in sorted(reached))
-    used, assigned = (
-        set(re.findall(r"(?<![.\w])\w+", body)),
-        {name for pair in _WRITTEN.findall(body) for name in pair},
-    )
+    used = set(re.findall(r"(?<![.\w])\w+", body))
+    assigned = {name for pair in _WRITTEN.findall(body) for name in pair}
     tables: dict[str, tuple[int, str]] = {}
 
     def declare(found: re.Match[str]) -> str:
@@ -430,10 +394,3 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
 
     code = _BINDING.sub(declare, code)
     return _FUNCTION.sub(lambda found: found[0] if found[1] in reached else "", code), tables
-
-
-def _full_memory(name: str) -> DeviceError:
-    return DeviceError(
-        f"the memory of {name} is full",
-        "close other programs that use it, use smaller images or fewer splats, or continue on the CPU (--device cpu)",
-    )

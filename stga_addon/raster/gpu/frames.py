@@ -2,7 +2,7 @@
 driven offsets."""
 
 from collections.abc import Collection, Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,20 +20,9 @@ POSE = np.dtype(
 """The uniform of frames.wgsl."""
 
 
-class Signal(Protocol):
-    """Computes the signal of a driven offset of one mesh; kernels: what it dispatches."""
-
-    kernels: ClassVar[tuple[str, ...]]
-
-    def __init__(self, device: Device, basis: StrainBasis) -> None: ...
-
-    def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
-        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns
-        its table (F, S)."""
-
-
 class SmoothedStrain:
-    """The signal of one mesh, whose neighborhood is uploaded once."""
+    """Computes the signal of a driven offset of one mesh, whose neighborhood is uploaded once;
+    kernels: what it dispatches."""
 
     kernels: ClassVar[tuple[str, ...]] = ("frames.smooth_strain",)
 
@@ -45,21 +34,17 @@ class SmoothedStrain:
         ]
 
     def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
-        """As of `Signal`; S is 3."""
-        averaged = strain_from_rest
+        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns
+        its table (F, 3)."""
+        tables, averaged = {"pose": pose, "neighbors": self._neighbors}, strain_from_rest
         for n in range(AVERAGING_ROUNDS):
             smoothed, averaged = averaged, self._rounds[n % 2]
-            tables = {
-                "pose": pose,
-                "neighbors": self._neighbors,
-                "smoothed": smoothed,
-                "averaged": averaged,
-            }
-            work.dispatch(self.kernels[0], self._count, tables)
+            own = {**tables, "smoothed": smoothed, "averaged": averaged}
+            work.dispatch(self.kernels[0], self._count, own)
         return averaged
 
 
-SIGNALS: dict[str, type[Signal]] = {"strain_position": SmoothedStrain}
+SIGNALS = {"strain_position": SmoothedStrain}
 """Driven offset -> what computes its signal; those without are trained on the CPU only."""
 
 
@@ -78,9 +63,8 @@ class Embedding:
         """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow
         strain; offsets: the driven offsets that they follow, which need the basis."""
         if convention not in embedding.CONVENTIONS:
-            raise ValueError(
-                f"embedding convention {convention!r} is not one of {embedding.CONVENTIONS}"
-            )
+            known = embedding.CONVENTIONS
+            raise ValueError(f"embedding convention {convention!r} is not one of {known}")
         self.strains = 0 if basis is None else STRAIN_COMPONENTS
         self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
         area = embedding.face_areas(neutral, faces)
@@ -89,9 +73,8 @@ class Embedding:
         rows, touching = np.zeros(0, np.float32), np.zeros(0, np.uint32)
         if basis is not None:
             parts = basis.gram, basis.to_tensor, basis.to_plane, basis.range
-            rows = np.concatenate(
-                [part.reshape(len(faces), -1) for part in parts], axis=1, dtype=np.float32
-            )
+            flat = [part.reshape(len(faces), -1) for part in parts]
+            rows = np.concatenate(flat, axis=1, dtype=np.float32)
             touching = list_words(basis.vertex_faces)
         self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
@@ -122,11 +105,8 @@ class Embedding:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         pose = np.zeros(1, POSE)
         pose["rows"] = np.c_[turn, turn @ center + shift]
-        pose["triangles"], pose["strains"], pose["area_scales"] = (
-            self._count,
-            self.strains,
-            self._area_scales,
-        )
+        pose["triangles"], pose["strains"] = self._count, self.strains
+        pose["area_scales"] = self._area_scales
         self._device.upload("pose", pose, "uniform")
 
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:

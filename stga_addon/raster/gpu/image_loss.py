@@ -24,8 +24,7 @@ def upload_target(
     """Send the target (H, W, 3) uint8 of the next image, and how it is compared.
 
     mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's
-    color is changed by
-    `change` (3,) in 0…255.
+    color is changed by `change` (3,) in 0…255.
     """
     loss = np.zeros(1, LOSS)
     loss["ssim_weight"], loss["masked"] = ssim_weight, mask is not None

@@ -5,37 +5,22 @@ A table is a flat array of 32-bit words, row by row, without padding: word c of 
 stride + c]. N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image
 H × W.
 
-| table          | words per row    | content
-                 |
-|----------------|------------------|----------------------------------------------------------------------------------|
-| splats         | 11 + 3K + 3S f32 | the fields of `cpu.layout.Parameters` in that order; also
-                 gradients and moments  |
-| frames         | 12 + columns f32 | a triangle's origin (3), matrix (3, 3) by rows, strain, in
-                 camera space          |
-| projected      | PROJECTED f32    | a splat on the screen: the columns of `cpu.layout`
-                 |
-| rect           | 4 i32            | tile bounds x0, y0, x1, y1 of a splat, as in
-                 `cpu.layout.Projection`             |
-| depth_key      | 1 u32            | bits of a splat's depth; HIDDEN where it is not visible
-                 |
-| slots          | 2 u32            | a splat's first slot, and how many it has: one for each of its
-                 pairs             |
-| slot_splat     | 1 u32            | the splat of a slot, with WANTED
-                 |
-| pair_gradients | PROJECTED f32    | by slot: gradient of the pair with respect to the splat's
-                                    projected columns      |
-| wanted         | 1 u32            | 1 for splats that are visible and in focus: only their
-                 gradients are written     |
-| touched        | 1 u32            | 1 for the tiles that a splat in focus reaches
-                 |
-| rendered       | 1 u32            | 1 for those and the tiles around them, as far as their
-                 gradient depends on       |
-| tile_range     | 2 u32            | a tile's first pair and one past its last
-                 |
-| pair_slot      | 1 u32            | a pair's slot; by tile, near to far
-                 |
-| pixels         | 2 words          | transmittance f32, and one past the last contributing pair of
-                 the tile           |
+splats          11 + 3K + 3S f32  the fields of `cpu.layout.Parameters` in order; also gradients
+                and moments
+frames          12 + columns f32  a triangle's origin (3), matrix (3, 3) by rows, strain, in camera
+                space
+projected       PROJECTED f32     a splat on the screen: the columns of `cpu.layout`
+rect            4 i32             tile bounds x0, y0, x1, y1 of a splat, as in `Projection`
+depth_key       1 u32             bits of a splat's depth; HIDDEN where it is not visible
+slots           2 u32             a splat's first slot and how many it has: one a pair
+slot_splat      1 u32             the splat of a slot, with WANTED
+pair_gradients  PROJECTED f32     by slot: the pair's gradient of the projected columns
+wanted          1 u32             1 for visible splats in focus: only their gradients are written
+touched         1 u32             1 for the tiles that a splat in focus reaches
+rendered        1 u32             1 for those and the tiles that their gradient depends on
+tile_range      2 u32             a tile's first pair and one past its last
+pair_slot       1 u32             a pair's slot; by tile, near to far
+pixels          2 words           transmittance f32, and one past the last contributing pair
 """
 
 import math
@@ -89,11 +74,12 @@ VIEW = np.dtype(
 """The uniform `view` of an iteration: camera, sizes and rendering options."""
 
 _OWN = (
-    "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED XYZ ROTATION"
-    " LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX FRAME_STRAIN"
+    "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED"
+    " XYZ ROTATION LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX FRAME_STRAIN"
 )
+_COLUMNS = "MEAN_X MEAN_Y PRECISION_X SHEAR PRECISION_Y OPACITY RED GREEN BLUE"
 _CPU = {
-    layout: "TILE PIXELS PROJECTED MEAN_X MEAN_Y PRECISION_X SHEAR PRECISION_Y OPACITY RED GREEN BLUE",
+    layout: f"TILE PIXELS PROJECTED {_COLUMNS}",
     blend: "MAX_ALPHA MIN_ALPHA MIN_TRANSMITTANCE",
     splat_block: "LOW_PASS_PX2 NEAR_M QUATERNION_LIFT",
     embedding: "MIN_AREA_RATIO UPRIGHT_COSINE",
@@ -113,10 +99,8 @@ CONSTANTS: dict[str, int | float] = {
 
 def splat_rows(splats: Parameters) -> np.ndarray:
     """Numpy arrays of splats as one table (N, stride) float32."""
-    parts = [part for part in splats if part is not None]
-    flat = [
-        np.asarray(part, np.float32).reshape(len(part), math.prod(part.shape[1:])) for part in parts
-    ]
+    parts = [np.asarray(part, np.float32) for part in splats if part is not None]
+    flat = [part.reshape(len(part), math.prod(part.shape[1:])) for part in parts]
     return np.concatenate(flat, axis=1)
 
 

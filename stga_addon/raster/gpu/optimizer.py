@@ -33,13 +33,10 @@ KERNELS = {
 RATES = (*Parameters._fields, "sh_rest")
 """Learning rates in the order of the kernels; the last is that of the harmonics above the constant
 one."""
+_NUMBERS = "beta1 beta2 log_beta1 log_beta2 epsilon ema_share scale_weight distance_weight"
 STEP = np.dtype(
     [("rates", np.float32, 8)]
-    + [
-        (name, np.float32)
-        for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon", "ema_share")
-    ]
-    + [(name, np.float32) for name in ("scale_weight", "distance_weight", "opacity_weight")]
+    + [(name, np.float32) for name in (*_NUMBERS.split(), "opacity_weight")]
     + [(name, np.uint32) for name in ("statistics", "triangles", "padding")]
 )
 """The uniform `step` of optimizer.wgsl."""

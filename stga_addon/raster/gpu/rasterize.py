@@ -28,7 +28,7 @@ from .layout import (
     VIEW,
     WORKGROUP,
     splat_rows,
-)
+)  # fmt: skip
 
 INITIAL_PAIR_CAPACITY = 1 << 18
 """Pairs that a rasterizer has room for at first: 14 MB."""
@@ -85,14 +85,9 @@ class Rasterizer:
         self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self,
-        work: Recording,
-        splats: SplatTable,
-        frames: Any,
-        options: ViewOptions,
-        view: Any,
+        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any,
         focus: Any = None,
-    ) -> Tables:
+    ) -> Tables:  # fmt: skip
         """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if
         `options.focused`.
 
@@ -107,25 +102,48 @@ class Rasterizer:
     def draw(
         self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None
     ) -> Tables:
-        """Record the rendering of `count` projected splats, with the view in `tables`."""
+        """Record the rendering of `count` projected splats, with the view in `tables`.
+
+        Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
+        sort by tile keeps. A splat has a pair with each rendered tile that its outline reaches; its
+        bounding box would count more. How many pairs there are is known on the device only, so
+        everything that follows is dispatched indirectly.
+        """
         columns, rows = tile_grid(camera.width, camera.height)
+        tiles, room, buffer = columns * rows, self.capacity, self.device.buffer
+        words = {"touched": tiles, "rendered": tiles, "wanted": count, "slots": 2 * count}
+        words |= dict.fromkeys(("slot_tile", "slot_splat"), room)
+        words["pairs_until"] = count + -(-count // WORKGROUP)
+        tables |= {name: buffer(name, each) for name, each in words.items()}
+        tables["tile_range"] = buffer("ranges", 2 * tiles)
+        tables["counts"] = counts_buffer(self.device)
         tables["focus"] = tables["rect"] if focus is None else focus
-        choose_tiles(work, count, columns * rows, tables, focus is not None)
-        list_pairs(work, count, columns * rows, self.capacity, tables)
+        if focus is not None:
+            work.clear(tables["touched"], tiles)
+            work.dispatch("tiles.mark_touched", count, tables)
+        work.dispatch("tiles.choose_rendered", tiles, tables)
+        view = tables["view"]
+        _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, view)
+        work.dispatch("tiles.count_pairs", count, tables)
+        work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
+        work.dispatch("tiles.fill_pairs", count, tables)
+        keys, bits = tables["slot_tile"], tiles.bit_length()
+        by_tile = sort_keys(work, keys, room, bits, view, of_pairs=True)
+        tables["pair_tile"], tables["pair_slot"] = by_tile
+        work.dispatch("tiles.find_ranges", (tables["counts"], 4 * PAIR_GROUPS), tables)
         blend(work, camera, tables)
         return tables
 
     def backward(
-        self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any, gradients: Any,
-        v_transmittance: Any = None,
+        self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any,
+        gradients: Any, v_transmittance: Any = None,
     ) -> Any:  # fmt: skip
         """Record the gradient of a scalar with respect to the splats, from that with respect to the
         image.
 
         v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites the wanted rows of
-        `gradients`. Returns
-        `screen` (N,): for these rows, the length of the gradient with respect to the projected
-        center in units of half the image.
+        `gradients`. Returns `screen` (N,): for these rows, the length of the gradient with respect
+        to the projected center in units of half the image.
         """
         columns, rows = tile_grid(camera.width, camera.height)
         tables = {
@@ -155,8 +173,8 @@ class Rasterizer:
         self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
     def upload_view(
-        self, splats: SplatTable, options: ViewOptions, to_world: np.ndarray | None = None, first: int = 0,
-        name: str = "view",
+        self, splats: SplatTable, options: ViewOptions, to_world: np.ndarray | None = None,
+        first: int = 0, name: str = "view",
     ) -> Any:  # fmt: skip
         """Send the uniform of that name for the next rendering.
 
@@ -166,30 +184,13 @@ class Rasterizer:
         camera, view = options.camera, np.zeros((), VIEW)
         to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
-        values = (
-            *(
-                camera.fl_x,
-                camera.fl_y,
-                camera.cx,
-                camera.cy,
-                camera.width,
-                camera.height,
-                columns,
-                rows,
-            ),
-            *to_world.ravel(),
-            *options.background,
-            *(splats.count, splats.coefficients, splats.strain_colors, options.degree),
-            *(min(options.strains, splats.strain_colors), options.strains, options.depth_as_color),
-            *(
-                options.antialiased,
-                options.focused,
-                -(-options.reach // TILE),
-                self.capacity,
-                first,
-            ),
-        )
-        view[...] = values
+        view[...] = (
+            camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns,
+            rows, *to_world.ravel(), *options.background, splats.count, splats.coefficients,
+            splats.strain_colors, options.degree, min(options.strains, splats.strain_colors),
+            options.strains, options.depth_as_color, options.antialiased, options.focused,
+            -(-options.reach // TILE), self.capacity, first,
+        )  # fmt: skip
         return self.device.upload(name, view, "uniform")
 
 
@@ -200,11 +201,9 @@ def upload_splats(
     several."""
     rows = splat_rows(splats)
     strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
-    on_device = (
-        device.upload(f"splats{layer}", rows),
-        device.upload(f"face{layer}", face.astype(np.uint32)),
-    )
-    return SplatTable(*on_device, len(rows), splats.sh.shape[1], strain_colors)
+    table = device.upload(f"splats{layer}", rows)
+    faces = device.upload(f"face{layer}", face.astype(np.uint32))
+    return SplatTable(table, faces, len(rows), splats.sh.shape[1], strain_colors)
 
 
 def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
@@ -235,41 +234,6 @@ def projected_tables(device: Device, count: int) -> Tables:
     return {name: device.buffer(name, count * each) for name, each in words.items()}
 
 
-def choose_tiles(work: Recording, count: int, tiles: int, tables: Tables, focused: bool) -> None:
-    """Record which of `tiles` tiles are rendered of `count` splats, by view, rect and, if there is
-    one, the focus."""
-    buffer = work.device.buffer
-    tables |= {"touched": buffer("touched", tiles), "rendered": buffer("rendered", tiles)}
-    tables["tile_range"] = buffer("ranges", 2 * tiles)
-    if focused:
-        work.clear(tables["touched"], tiles)
-        work.dispatch("tiles.mark_touched", count, tables)
-    work.dispatch("tiles.choose_rendered", tiles, tables)
-
-
-def list_pairs(work: Recording, count: int, tiles: int, capacity: int, tables: Tables) -> None:
-    """Record every rendered tile's list of pairs, near to far, with room for `capacity` pairs.
-
-    Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
-    sort by tile keeps. A splat has a pair with each tile that its outline reaches; its bounding box
-    would count more. How many pairs there are is known on the device only, so everything that
-    follows is dispatched indirectly.
-    """
-    buffer, counts = work.device.buffer, counts_buffer(work.device)
-    _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, tables["view"])
-    words = {"pairs_until": count + -(-count // WORKGROUP), "wanted": count, "slots": 2 * count}
-    words |= {"slot_tile": capacity, "slot_splat": capacity}
-    tables |= {name: buffer(name, each) for name, each in words.items()} | {"counts": counts}
-    work.dispatch("tiles.count_pairs", count, tables)
-    work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
-    work.dispatch("tiles.fill_pairs", count, tables)
-    keys, bits = tables["slot_tile"], tiles.bit_length()
-    tables["pair_tile"], tables["pair_slot"] = sort_keys(
-        work, keys, capacity, bits, tables["view"], of_pairs=True
-    )
-    work.dispatch("tiles.find_ranges", (counts, 4 * PAIR_GROUPS), tables)
-
-
 def sort_keys(
     work: Recording, keys: Any, room: int, bits: int, view: Any, *, of_pairs: bool = False
 ) -> tuple[Any, Any]:
@@ -288,8 +252,9 @@ def sort_keys(
         targets.append((keys, buffer(f"{name}_numbers 2", room)))
     for n, constants in enumerate(sort_passes(bits, of_pairs)):
         tables = {
-            "view": view, "counts": counts, "keys": keys, "values": values, "sorted_keys": targets[n % 2][0],
-            "sorted_values": targets[n % 2][1], "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
+            "view": view, "counts": counts, "keys": keys, "values": values,
+            "sorted_keys": targets[n % 2][0], "sorted_values": targets[n % 2][1],
+            "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
             "digit_totals": buffer("digit_totals", 1 << DIGIT_BITS),
         }  # fmt: skip
         work.dispatch("sort.count", groups, tables, **constants)
@@ -301,10 +266,8 @@ def sort_keys(
 
 def sort_passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
     """The constants of sort.wgsl in each pass."""
-    return [
-        {"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs}
-        for shift in range(0, bits, DIGIT_BITS)
-    ]
+    shifts = range(0, bits, DIGIT_BITS)
+    return [{"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs} for shift in shifts]
 
 
 def blend(work: Recording, camera: Camera, tables: Tables) -> None:

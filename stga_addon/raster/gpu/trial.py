@@ -1,6 +1,7 @@
 """Trial: whether a device's gradients are the CPU's, and which of the two is faster, before
 training on it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
-from ..cpu.layout import CameraFrames, Parameters
+from ..cpu.layout import Parameters
 from ..cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from .device import Device
 from .layout import splat_rows
@@ -44,79 +45,52 @@ def try_device(device: Device) -> Trial:
     """Render a cloud of splats and differentiate a random sum of its colors, on the device and on
     the CPU."""
     count, size = SOFTWARE_SIZE if device.is_software else SIZE
-    splats, camera = (
-        _cloud(count),
-        Camera(size, size, 1.25 * size, 1.25 * size, size / 2, size / 2, np.eye(4)),
-    )
-    face, frames = np.zeros(count, np.int32), frames_in_camera(WORLD, camera)
-    v_image = np.random.default_rng(1).normal(size=(3, size, size)).astype(np.float32)
-    expected, cpu_s = _on_cpu(splats, face, frames, v_image)
-    got, device_s = _on_device(device, splats, face, frames, camera, v_image)
-    lengths = np.linalg.norm(expected, axis=0)
-    errors = np.linalg.norm(got - expected, axis=0)[lengths > 0] / lengths[lengths > 0]
-    return Trial(float(errors.max()), device_s, cpu_s)
-
-
-def _cloud(count: int) -> Parameters:
-    random = np.random.default_rng(0)
+    random, middle = np.random.default_rng(0), size / 2
     values = (
         random.normal(size=(count, 3)) * 0.4 + (0, 0, 2),
         random.normal(size=(count, 4)),
         random.normal(size=(count, 3)) * 0.4 - 4.5,
         random.normal(size=count),
         random.normal(size=(count, (DEGREE + 1) ** 2, 3)) * 0.4,
+        np.zeros((count, 0, 3)),
     )
-    xyz, rotation, log_scale, opacity, sh = (value.astype(np.float32) for value in values)
-    return Parameters(xyz, rotation, log_scale, opacity, sh, np.zeros((count, 0, 3), np.float32))
-
-
-def _on_cpu(
-    splats: Parameters, face: np.ndarray, frames: CameraFrames, v_image: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Gradients (N, stride) and the time of one image."""
+    splats = Parameters(*(value.astype(np.float32) for value in values))
+    camera = Camera(size, size, 1.25 * size, 1.25 * size, middle, middle, np.eye(4))
+    face, frames = np.zeros(count, np.int32), frames_in_camera(WORLD, camera)
+    v_image = np.random.default_rng(1).normal(size=(3, size, size)).astype(np.float32)
     gradients, buffers = Parameters(*map(np.zeros_like, splats)), BufferPool()
 
-    def once() -> None:
+    def on_cpu() -> None:
         output = render_forward(splats, face, frames, DEGREE, buffers=buffers)
         render_backward(output, splats, face, frames, v_image, gradients, buffers=buffers)
 
-    once()
-    count, began = 0, perf_counter()
-    while not count or perf_counter() - began < SECONDS:
-        once()
-        count += 1
-    return splat_rows(gradients), (perf_counter() - began) / count
-
-
-def _on_device(
-    device: Device,
-    splats: Parameters,
-    face: np.ndarray,
-    frames: CameraFrames,
-    camera: Camera,
-    v_image: np.ndarray,
-) -> tuple[np.ndarray, float]:
-    """Gradients (N, stride) and the time of one image."""
     rasterizer, table = Rasterizer(device), upload_splats(device, splats, face)
     on_device, cotangents = upload_frames(device, frames), device.upload("v_image", v_image)
-    gradients, options = (
-        device.buffer("gradients", table.count * table.stride),
-        ViewOptions(camera, DEGREE),
-    )
+    found, options = device.buffer("gradients", count * table.stride), ViewOptions(camera, DEGREE)
 
-    def once() -> None:
+    def on_gpu() -> None:
         view = rasterizer.upload_view(table, options)
         with device.record() as work:
             rendering = rasterizer.forward(work, table, on_device, options, view)
-            rasterizer.backward(work, rendering, table, camera, cotangents, gradients)
+            rasterizer.backward(work, rendering, table, camera, cotangents, found)
 
-    once()
+    on_cpu()
+    cpu_s, expected = _seconds_of(on_cpu, lambda: True, 1), splat_rows(gradients)
+    on_gpu()
     while not rasterizer.pairs_fit():
-        once()
+        on_gpu()
+    device_s = _seconds_of(on_gpu, rasterizer.pairs_fit, 4)
+    lengths, got = np.linalg.norm(expected, axis=0), device.read(found, (count, table.stride))
+    errors = np.linalg.norm(got - expected, axis=0)[lengths > 0] / lengths[lengths > 0]
+    return Trial(float(errors.max()), device_s, cpu_s)
+
+
+def _seconds_of(once: Callable[[], None], wait: Callable[[], bool], ahead: int) -> float:
+    """Of one image; ahead: how many the host may be ahead of the device, as in training."""
     count, began = 0, perf_counter()
     while not count or perf_counter() - began < SECONDS:
-        for _ in range(4):  # with the host ahead of the device, as in training
+        for _ in range(ahead):
             once()
-        rasterizer.pairs_fit()
-        count += 4
-    return device.read(gradients, (table.count, table.stride)), (perf_counter() - began) / count
+        wait()
+        count += ahead
+    return (perf_counter() - began) / count

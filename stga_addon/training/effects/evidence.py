@@ -102,19 +102,15 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     x, y = x.reshape(-1, 3), y.reshape(-1, 3)
     known = ~np.isnan(y[:, 0]) & ~np.isnan(x[:, 0])
     x, difference = x[known], (y - x)[known]
-    xx, xo, oo = (
-        (x**2).sum(0) + CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2,
-        x.sum(0),
-        len(x) * (1 + OFFSET_PENALTY) + CAMERA_PRIOR_SAMPLES,
-    )
+    xx, xo = (x**2).sum(0) + CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2, x.sum(0)
+    oo = len(x) * (1 + OFFSET_PENALTY) + CAMERA_PRIOR_SAMPLES
     dx, do = (x * difference).sum(0), difference.sum(0)
     determinant = xx * oo - xo**2
     return 1 + (oo * dx - xo * do) / determinant, (xx * do - xo * dx) / determinant
 
 
 def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
-    """Whether cameras fitted to one half of the triangles make the images of the other half
-    agree."""
+    """Whether cameras fitted to half of the triangles make images of the others agree."""
     half = np.arange(len(samples.faces)) % 2 == 0
     fitted = fit_cameras(samples, np.where(half[:, None], color, np.nan))
     other = color[:, ~half]
@@ -161,9 +157,8 @@ def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
         others = np.flatnonzero((samples.camera == camera) & (samples.timestep != timestep))
         others = others[np.argsort(samples.timestep[others])]
         if len(others):
-            predicted[row] = [
-                np.interp(timestep, samples.timestep[others], column) for column in gain[others].T
-            ]
+            known, columns = samples.timestep[others], gain[others].T
+            predicted[row] = [np.interp(timestep, known, column) for column in columns]
     other = color[:, ~half]
     return compare(_scatter(other), _scatter(other / predicted[:, None]))
 
@@ -221,7 +216,18 @@ def linear_evidence(
     """
     before, after = [], []
     for held, fitted in folds:
-        mean, center, slope = _ridge(color[fitted], features[fitted])
+        # ridge regression by triangle: mean color (K, 3), NaN without a sample, mean features (K,
+        # D) and slopes (K, D, 3)
+        seen = ~np.isnan(color[fitted][..., :1])
+        count = seen.sum(0)
+        mean = np.where(seen, color[fitted], 0).sum(0) / np.where(count, count, np.nan)
+        center = np.where(seen, features[fitted], 0).sum(0) / np.maximum(count, 1)
+        x = np.where(seen, features[fitted] - center, 0)
+        y = np.where(seen, color[fitted] - mean, 0)
+        inner, size = np.einsum("skd,ske->kde", x, x), x.shape[2]
+        weight = RIDGE_WEIGHT * np.einsum("kdd->", inner) / max(float(count.sum()) * size, 1.0)
+        inner += max(weight, 1e-12) * np.eye(size)
+        slope = np.linalg.solve(inner, np.einsum("skd,skc->kdc", x, y))
         error, given = color[held] - mean, features[held]
         if rest is not None:
             lowest, highest = range_with_margin(rest, features[fitted]).swapaxes(0, 1)
@@ -231,27 +237,9 @@ def linear_evidence(
         before.append(error[known])
         after.append((error - predicted)[known])
     errors = np.abs(np.concatenate([[], *before])), np.abs(np.concatenate([[], *after]))
-    limit = (
-        max_error * float(np.median(errors[0]))
-        if np.isfinite(max_error) and errors[0].size
-        else np.inf
-    )
+    is_clipped = np.isfinite(max_error) and errors[0].size
+    limit = max_error * float(np.median(errors[0])) if is_clipped else np.inf
     return compare(np.minimum(errors[0], limit), np.minimum(errors[1], limit))
-
-
-def _ridge(color: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per triangle mean color (K, 3), mean features (K, D) and slopes (K, D, 3); NaN mean where
-    there is no sample."""
-    seen = ~np.isnan(color[..., :1])
-    count = seen.sum(0)
-    with np.errstate(invalid="ignore"):
-        mean = np.where(seen, color, 0).sum(0) / np.where(count, count, np.nan)
-        center = np.where(seen, features, 0).sum(0) / np.maximum(count, 1)
-    x, y = np.where(seen, features - center, 0), np.where(seen, color - mean, 0)
-    inner = np.einsum("skd,ske->kde", x, x)
-    weight = RIDGE_WEIGHT * np.einsum("kdd->", inner) / max(float(count.sum()) * x.shape[2], 1.0)
-    inner += max(weight, 1e-12) * np.eye(x.shape[2])
-    return mean, center, np.linalg.solve(inner, np.einsum("skd,skc->kdc", x, y))
 
 
 def _mean(color: np.ndarray) -> np.ndarray:

@@ -78,15 +78,13 @@ class CaptureFacts:
     @cached_property
     def drift(self) -> np.ndarray:
         """(S, 3) gains of the sampled views against their camera's mean."""
-        return fit_drift(
-            self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera)
-        )
+        colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
+        return fit_drift(self.samples, colors)
 
     @cached_property
     def drifts(self) -> Evidence:
-        return drift_evidence(
-            self.samples, self.camera_colors.undo(self.stable_colors, self.samples.camera)
-        )
+        colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
+        return drift_evidence(self.samples, colors)
 
     @cached_property
     def camera_difference(self) -> Evidence:
@@ -95,23 +93,19 @@ class CaptureFacts:
     @cached_property
     def view_dependence(self) -> Evidence:
         """Errors are clipped, so that motion that the mesh does not follow counts little."""
-        folds = scattered_folds(np.arange(len(self.samples.camera)))
-        return linear_evidence(
-            self.matched_colors, self.samples.direction, folds, MAX_VIEW_ERROR_RATIO
-        )
+        direction = self.samples.direction
+        folds = scattered_folds(np.arange(len(direction)))
+        return linear_evidence(self.matched_colors, direction, folds, MAX_VIEW_ERROR_RATIO)
 
     @cached_property
     def strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on their triangle's strain, within the range that a training on the other views
-        would write."""
-        return self._strain_evidence(
-            self.samples.strain, rest_strain(color_range(len(self.samples.faces)))
-        )
+        """Of colors on their triangle's strain, in the range that the other views would train."""
+        rest = rest_strain(color_range(len(self.samples.faces)))
+        return self._strain_evidence(self.samples.strain, rest)
 
     @cached_property
     def smoothed_strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on the strain around their triangle: what moves over it changes its color as
-        well."""
+        """Of colors on the strain around their triangle, as what moves over it changes them."""
         smoothed = self.samples.smoothed_strain
         return self._strain_evidence(smoothed, np.zeros_like(smoothed[0]))
 
@@ -121,10 +115,8 @@ class CaptureFacts:
         folds = {"frames": consecutive_folds(self.samples.timestep)}
         if self.cameras > 1:
             folds["cameras"] = scattered_folds(self.samples.camera)
-        return {
-            kind: linear_evidence(self.matched_colors, strain, each, rest=rest)
-            for kind, each in folds.items()
-        }
+        colors = self.matched_colors
+        return {n: linear_evidence(colors, strain, each, rest=rest) for n, each in folds.items()}
 
     @cached_property
     def pixel_range(self) -> float:
@@ -134,15 +126,11 @@ class CaptureFacts:
         return float(widths.max() / widths.min()) if len(widths) else 1.0
 
     def pixels_per_splat(self, percentile: float) -> float:
-        """Percentile over the visible triangles, at the trained image size; 0 where none is
-        visible."""
+        """Percentile over the visible triangles, in trained images; 0 where none is visible."""
         lattice = self.settings.lattice_order(len(self.capture.faces))
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
-        return (
-            float(np.percentile(pixels, percentile)) / ((lattice + 1) * (lattice + 2) / 2)
-            if len(pixels)
-            else 0.0
-        )
+        splats = (lattice + 1) * (lattice + 2) / 2
+        return float(np.percentile(pixels, percentile)) / splats if len(pixels) else 0.0
 
     @cached_property
     def uncovered(self) -> float:
@@ -171,20 +159,19 @@ class CaptureFacts:
         known = ~np.isnan(self.samples.background_spread)
         if self.unmasked or not known.any():
             return None
-        backgrounds = self.samples.background[known]
-        return max(
-            float(self.samples.background_spread[known].max()),
-            float(abs(backgrounds - backgrounds.mean(0)).max()),
-        )
+        within, backgrounds = self.samples.background_spread[known], self.samples.background[known]
+        return float(max(within.max(), abs(backgrounds - backgrounds.mean(0)).max()))
 
     @cached_property
     def moving_cameras(self) -> int:
         """How many cameras have another pose or lens in some training view than in their first."""
+        names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
         first: dict[int, Camera] = {}
         moved = set()
-        for view in self.capture.views["train"]:
-            known = first.setdefault(view.camera_index, view.camera)
-            if known is not view.camera and not _is_same(known, view.camera):
+        for view in self.views:
+            known, own = first.setdefault(view.camera_index, view.camera), view.camera
+            pairs = [(getattr(known, name), getattr(own, name)) for name in names]
+            if known is not own and not all(np.allclose(*pair, atol=1e-6) for pair in pairs):
                 moved.add(view.camera_index)
         return len(moved)
 
@@ -198,11 +185,8 @@ class CaptureFacts:
         """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its
         lips."""
         pose = self.capture.expression_mesh
-        return replace(
-            self.capture,
-            timesteps=self.sampled_timesteps,
-            expression_mesh=cache(pose) if self.has_teeth else pose,
-        )
+        pose = cache(pose) if self.has_teeth else pose
+        return replace(self.capture, timesteps=self.sampled_timesteps, expression_mesh=pose)
 
     @cached_property
     def selected_share(self) -> float:
@@ -220,11 +204,7 @@ class CaptureFacts:
     def frames(self) -> list[FlameFrame]:
         """FLAME's parameters in the sampled timesteps; none for other captures."""
         sequence = self.capture.flame
-        return (
-            []
-            if sequence is None
-            else [sequence.frame(timestep) for timestep in self.sampled_timesteps]
-        )
+        return [] if sequence is None else [sequence.frame(t) for t in self.sampled_timesteps]
 
     def joint_angle(self, *joints: int) -> float:
         """Largest angle in degrees by which one of these FLAME joints turns."""
@@ -235,10 +215,8 @@ class CaptureFacts:
         """How far the lips part at most, beyond their distance in the neutral mesh."""
         assert self.capture.flame is not None
         upper, lower = lip_pairs(self.capture.flame.model)
-        zero_pose = self.settings.selection.zero_pose
-        posed = (
-            self.sampled.expression_mesh(timestep, zero_pose) for timestep in self.sampled_timesteps
-        )
+        pose, zero_pose = self.sampled.expression_mesh, self.settings.selection.zero_pose
+        posed = (pose(timestep, zero_pose) for timestep in self.sampled_timesteps)
         meshes = [self.capture.neutral, *posed]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])
@@ -247,8 +225,3 @@ class CaptureFacts:
     def has_teeth(self) -> bool:
         """Whether the mesh has teeth."""
         return self.capture.flame is not None and "teeth" in self.capture.flame.model.masks
-
-
-def _is_same(one: Camera, other: Camera) -> bool:
-    names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
-    return all(np.allclose(getattr(one, name), getattr(other, name), atol=1e-6) for name in names)

@@ -12,7 +12,7 @@ from ..effect_catalog import EFFECTS, Effect
 from ..effect_decisions import EffectDecision
 from ..settings import TrainingSettings
 from .facts import CaptureFacts
-from .rules import RULES, Verdict
+from .rules import RULES
 
 Plan = tuple[EffectDecision, ...]
 
@@ -33,13 +33,17 @@ def plan_effects(
     decided, plan = settings, []
     for effect in EFFECTS.values():
         choice, verdict = choices.get(effect.name, "auto"), RULES[effect.name](facts)
+        flag = f"--effect {effect.name}={choice}"
         if verdict is None:
             if choice == "on":
-                raise StgaError(
-                    f"--effect {effect.name}=on: {capture.root} has none: {_needs(effect)}"
-                )
+                lacks = "it has no parameters of FLAME"
+                if effect.name == "teeth":
+                    lacks = "its mesh has no rows of teeth"
+                raise StgaError(f"{flag}: {capture.root} has none: {lacks}")
             continue
-        on = _decided(effect, choice, verdict)
+        on = verdict.on if choice == "auto" else choice == "on"
+        if verdict.fixed and on != verdict.on:
+            raise StgaError(f"{flag}: is not possible, because {verdict.reason}")
         decided = switched(decided, effect, on, verdict.changes)
         plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
     return decided, tuple(plan)
@@ -50,20 +54,14 @@ def add_effects(
 ) -> tuple[TrainingSettings, Plan]:
     """Settings and plan with the effects that may be `added_later` where the capture, of all takes,
     calls for them and the run that is continued went without. A user's choice stays."""
-    facts, plan = (
-        CaptureFacts(capture, settings),
-        {decision.effect: decision for decision in before},
-    )
+    facts, plan = CaptureFacts(capture, settings), {each.effect: each for each in before}
     for effect in EFFECTS.values():
         decision = plan.get(effect.name)
-        if (
-            effect.added_later
-            and decision is not None
-            and not decision.on
-            and decision.choice == "auto"
-        ):
+        is_open = decision is not None and not decision.on and decision.choice == "auto"
+        if effect.added_later and is_open:
             verdict = RULES[effect.name](facts)
             assert verdict is not None
+            assert decision is not None
             plan[effect.name] = replace(decision, on=verdict.on, reason=verdict.reason)
             settings = switched(settings, effect, verdict.on)
     return settings, tuple(plan.values())
@@ -78,31 +76,9 @@ def switched(
     """The settings with an effect on or off; changes: further ones for when it is on."""
     changed = {**effect.on, **changes} if on else dict(effect.off)
     if effect.offset is not None:
-        offsets = (
-            {*settings.driven_offsets, effect.offset}
-            if on
-            else {*settings.driven_offsets} - {effect.offset}
-        )
+        offsets = {*settings.driven_offsets} - {effect.offset} | ({effect.offset} if on else set())
         changed["driven_offsets"] = tuple(name for name in OFFSETS if name in offsets)
     return replace(settings, **changed)
-
-
-def _decided(effect: Effect, choice: str, verdict: Verdict) -> bool:
-    if choice == "auto":
-        return verdict.on
-    if verdict.fixed and (choice == "on") != verdict.on:
-        raise StgaError(
-            f"--effect {effect.name}={choice}: is not possible, because {verdict.reason}"
-        )
-    return choice == "on"
-
-
-def _needs(effect: Effect) -> str:
-    return (
-        "its mesh has no rows of teeth"
-        if effect.name == "teeth"
-        else "it has no parameters of FLAME"
-    )
 
 
 def describe_effects(plan: Sequence[EffectDecision]) -> list[tuple[str, str]]:

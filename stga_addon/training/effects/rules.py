@@ -32,7 +32,10 @@ MAX_BACKGROUND_SPREAD_LEVELS = 6.0
 """Root mean square deviation of a uniform background, in levels of 255."""
 BACKGROUND_TOLERANCE_LEVELS = 3.0
 """Largest difference, in levels of 255, between the background and the color in the settings."""
-MESH_AS_MASK = "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` makes masks)"
+MESH_AS_MASK = (
+    "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` "
+    "makes masks)"
+)
 """What becomes of images without a mask."""
 MIN_UNCOVERED_SHARE = 0.003
 """Share of the foreground that the mesh does not cover, from which splats are added for it."""
@@ -68,11 +71,11 @@ def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1:
         return Verdict(False, "a single camera sees everything from one direction", fixed=True)
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
-        return Verdict(
-            False, f"{facts.cameras} cameras are too few to tell how color depends on the view"
-        )
+        reason = f"{facts.cameras} cameras are too few to tell how color depends on the view"
+        return Verdict(False, reason)
     found = facts.view_dependence
-    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels ({found.share:.1%} of the variance)"
+    variance = f"({found.share:.1%} of the variance)"
+    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels {variance}"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
 
 
@@ -80,23 +83,16 @@ def exposure(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1 and facts.timesteps == 1:
         return Verdict(False, "a single image has no other to differ from", fixed=True)
     colors, samples = facts.camera_colors, facts.samples
-    exposures = zip(colors.camera.tolist(), colors.gain, colors.offset, strict=True)
-    rows = tuple(
-        (float(camera), *gain.tolist(), *offset.tolist()) for camera, gain, offset in exposures
-    )
-    found = facts.camera_difference.gain
+    table = np.column_stack([colors.camera, colors.gain, colors.offset])
+    found, drift = facts.camera_difference.gain, facts.drifts.gain
     reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
-    if facts.drifts.gain >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
-        own = {row[0]: np.array(row[1:7]) for row in rows}
-        drifting = zip(samples.camera.tolist(), facts.drift, samples.timestep.tolist(), strict=True)
-        rows = tuple(
-            (float(camera), *(own[camera] * [*gain, 1, 1, 1]).tolist(), float(timestep))
-            for camera, gain, timestep in drifting
-        )
-        found = max(found, facts.drifts.gain)
-        reason = (
-            f"a camera shows the same colors {facts.drifts.gain:.1f} of 255 levels apart over time"
-        )
+    if drift >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
+        own = table[np.searchsorted(colors.camera, samples.camera)]
+        own[:, 1:4] *= facts.drift
+        table = np.column_stack([own, samples.timestep])
+        found = max(found, drift)
+        reason = f"a camera shows the same colors {drift:.1f} of 255 levels apart over time"
+    rows = tuple(map(tuple, table.tolist()))
     return Verdict(found >= MIN_EXPOSURE_LEVELS, reason, changes={"exposure": rows})
 
 
@@ -107,51 +103,41 @@ def antialiasing(facts: CaptureFacts) -> Verdict:
     if widest > MAX_PIXEL_WIDTH_RATIO:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
     pixels = facts.pixels_per_splat(50)
-    reason = f"pixels have the same width at the head, and half of the splats cover less than {pixels:.1f}"
+    width = "pixels have the same width at the head"
+    reason = f"{width}, and half of the splats cover less than {pixels:.1f}"
     return Verdict(pixels < FINE_SPLAT_PIXELS, reason)
 
 
 def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
     if facts.shows_backdrop:
-        count, total = facts.unmasked, len(samples.white)
-        reason = f"{count} of {total} sampled images have no mask, and show more than white behind the head: {MESH_AS_MASK}"
+        count = f"{facts.unmasked} of {len(samples.white)} sampled images have no mask"
+        reason = f"{count}, and show more than white behind the head: {MESH_AS_MASK}"
         return Verdict(True, reason, changes={"backdrop": "mesh"})
-    spread = facts.backdrop_spread
+    spread, every = facts.backdrop_spread, "every image has a mask"
     if spread is None:
-        return Verdict(
-            False,
-            "not every image has a mask or transparency that shows where the head ends",
-            fixed=True,
-        )
-    color = samples.background[~np.isnan(samples.background_spread)].mean(0)
+        reason = "not every image has a mask or transparency that shows where the head ends"
+        return Verdict(False, reason, fixed=True)
     if spread > MAX_BACKGROUND_SPREAD_LEVELS:
-        reason = f"every image has a mask; what lies outside, which varies by {spread:.0f} of 255 levels, is replaced"
+        varies = f"varies by {spread:.0f} of 255 levels"
+        reason = f"{every}; what lies outside, which {varies}, is replaced"
         return Verdict(True, reason, changes={"backdrop": "masked"})
-    named = bool(
-        abs(color - 255 * np.array(facts.settings.background)).max() < BACKGROUND_TOLERANCE_LEVELS
-    )
-    changes = {} if named else {"background": tuple((color / 255).round(4).tolist())}
+    color = samples.background[~np.isnan(samples.background_spread)].mean(0)
+    differs = abs(color - 255 * np.array(facts.settings.background)).max()
+    is_named = differs < BACKGROUND_TOLERANCE_LEVELS
+    changes = {} if is_named else {"background": tuple((color / 255).round(4).tolist())}
     red, green, blue = color.round().astype(int).tolist()
-    return Verdict(
-        True,
-        f"every image has a mask, and one color behind the head ({red}, {green}, {blue})",
-        changes=changes,
-    )
+    reason = f"{every}, and one color behind the head ({red}, {green}, {blue})"
+    return Verdict(True, reason, changes=changes)
 
 
 def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.shows_backdrop:
-        return Verdict(
-            False,
-            "without masks, it is not known what beside the mesh belongs to the head",
-            fixed=True,
-        )
+        reason = "without masks, it is not known what beside the mesh belongs to the head"
+        return Verdict(False, reason, fixed=True)
     if np.isnan(facts.uncovered):
-        return Verdict(
-            facts.settings.hull_points,
-            "without masks, it is not known how much lies beside the mesh",
-        )
+        reason = "without masks, it is not known how much lies beside the mesh"
+        return Verdict(facts.settings.hull_points, reason)
     reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
     if facts.cameras == 1:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
@@ -161,16 +147,14 @@ def hull_points(facts: CaptureFacts) -> Verdict:
 def depth_limits(facts: CaptureFacts) -> Verdict:
     if facts.cameras > 1:
         return Verdict(False, f"{facts.cameras} cameras show how far away a splat is")
-    return Verdict(
-        True, "a single camera does not show how far in front of or behind the mesh a splat is"
-    )
+    reason = "a single camera does not show how far in front of or behind the mesh a splat is"
+    return Verdict(True, reason)
 
 
 def density(facts: CaptureFacts) -> Verdict:
     pixels = facts.pixels_per_splat(90)
-    return Verdict(
-        pixels > MIN_PIXELS_PER_SPLAT, f"triangles show up to {pixels:.1f} pixels a splat"
-    )
+    reason = f"triangles show up to {pixels:.1f} pixels a splat"
+    return Verdict(pixels > MIN_PIXELS_PER_SPLAT, reason)
 
 
 def selection(facts: CaptureFacts) -> Verdict:
@@ -179,22 +163,19 @@ def selection(facts: CaptureFacts) -> Verdict:
         count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
         return Verdict(False, reason, fixed=count == total)
-    reason = (
-        f"a frame moves {facts.selected_share:.0%} of the triangles by more than {threshold:g} mm"
-    )
-    asked = facts.settings.strategy == "selective"
+    share, asked = f"{facts.selected_share:.0%}", facts.settings.strategy == "selective"
+    reason = f"a frame moves {share} of the triangles by more than {threshold:g} mm"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
 def strain_color(facts: CaptureFacts) -> Verdict:
-    return _undeformed(facts, "color follows") or _dependent("deformation", facts.strain_dependence)
+    found = _undeformed(facts, "color follows")
+    return found or _dependent("deformation", facts.strain_dependence)
 
 
 def strain_position(facts: CaptureFacts) -> Verdict:
-    around = "deformation around a triangle"
-    return _undeformed(facts, "positions follow") or _dependent(
-        around, facts.smoothed_strain_dependence
-    )
+    found, what = _undeformed(facts, "positions follow"), "deformation around a triangle"
+    return found or _dependent(what, facts.smoothed_strain_dependence)
 
 
 def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
@@ -202,37 +183,30 @@ def _undeformed(facts: CaptureFacts, follows: str) -> Verdict | None:
     if facts.strain < MIN_STRETCH:
         return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
-        return Verdict(
-            False, f"{facts.timesteps} frames are too few to tell how {follows} deformation"
-        )
+        reason = f"{facts.timesteps} frames are too few to tell how {follows} deformation"
+        return Verdict(False, reason)
     return None
 
 
 def _dependent(what: str, left_out: Mapping[str, Evidence]) -> Verdict:
     """On where what follows brings enough in the mean of frames and cameras that were left out: of
     what a head shows, unseen expressions and unseen views count alike."""
-    gains = [found.decibels for found in left_out.values()]
-    figures = " and ".join(
-        f"{found.decibels:+.2f} dB in left-out {kind}" for kind, found in left_out.items()
-    )
-    return Verdict(
-        sum(gains) / len(gains) >= MIN_STRAIN_GAIN_DB, f"colors that follow {what} bring {figures}"
-    )
+    gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
+    figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
+    is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
+    return Verdict(is_on, f"colors that follow {what} bring {figures}")
 
 
 def relight(facts: CaptureFacts) -> Verdict:
-    return Verdict(
-        True,
-        "the lights of a scene that has any light the avatar; elsewhere colors stay as recorded",
-    )
+    lit = "the lights of a scene that has any light the avatar"
+    return Verdict(True, f"{lit}; elsewhere colors stay as recorded")
 
 
 def world(facts: CaptureFacts) -> Verdict:
     spread = facts.backdrop_spread
     if spread is None:
-        return Verdict(
-            False, "not every image has a mask that shows where the person ends", fixed=True
-        )
+        reason = "not every image has a mask that shows where the person ends"
+        return Verdict(False, reason, fixed=True)
     if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
         return Verdict(False, "what lies behind the person is of one color", fixed=True)
     if facts.moving_cameras:
@@ -253,75 +227,54 @@ def torso(facts: CaptureFacts) -> Verdict | None:
         return None
     found = read_torso_motion(facts.capture.root)
     if found is None:
-        return Verdict(
-            False,
-            "the torso was not followed in the images, as `stga track` does where they have masks",
-        )
+        where = "in the images, as `stga track` does where they have masks"
+        return Verdict(False, f"the torso was not followed {where}")
     return Verdict(found.motion != "head", found.description)
 
 
-def neck(facts: CaptureFacts) -> Verdict | None:
-    return _turning(facts, 1)
-
-
-def jaw(facts: CaptureFacts) -> Verdict | None:
-    return _turning(facts, 2)
-
-
-def eyes(facts: CaptureFacts) -> Verdict | None:
-    return _turning(facts, 3, 4)
-
-
-def _turning(facts: CaptureFacts, *joints: int) -> Verdict | None:
+def _turning(name: str, *joints: int) -> Rule:
     """On where one of these FLAME joints turns."""
-    if not facts.frames:
-        return None
-    turn = facts.joint_angle(*joints)
-    return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
+
+    def rule(facts: CaptureFacts) -> Verdict | None:
+        if not facts.frames:
+            return None
+        turn = facts.joint_angle(*joints)
+        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
+
+    rule.__name__ = name
+    return rule
 
 
 def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     count = sum(frame.dynamic_offset is not None for frame in facts.frames)
-    if not count:
-        return Verdict(False, "no frame has any", fixed=True)
-    return Verdict(
-        True,
-        f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them",
-        fixed=True,
-    )
+    have = f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them"
+    return Verdict(bool(count), have if count else "no frame has any", fixed=True)
 
 
 def tracking(facts: CaptureFacts) -> Verdict | None:
     if not facts.frames:
         return None
     if facts.device != "cpu":
-        return Verdict(
-            False,
-            f"FLAME's parameters are refined on the CPU only, not on {facts.device}",
-            fixed=True,
-        )
+        reason = f"FLAME's parameters are refined on the CPU only, not on {facts.device}"
+        return Verdict(False, reason, fixed=True)
     if facts.timesteps == 1:
-        return Verdict(
-            False, "the splats of a single frame follow its images without it", fixed=True
-        )
+        reason = "the splats of a single frame follow its images without it"
+        return Verdict(False, reason, fixed=True)
     if is_tracked(facts.capture.root):
-        return Verdict(
-            True,
-            "the capture is from `stga track`: splats see motion more sharply than landmarks do",
-        )
+        source = "the capture is from `stga track`"
+        return Verdict(True, f"{source}: splats see motion more sharply than landmarks do")
     if np.isnan(facts.outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
-    return Verdict(
-        facts.outside > MAX_OUTSIDE_SHARE,
-        f"{facts.outside:.2%} of the mesh sticks out of the masks",
-    )
+    reason = f"{facts.outside:.2%} of the mesh sticks out of the masks"
+    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, reason)
 
 
 _RULES: tuple[Rule, ...] = (
-    view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection, strain_color,
-    strain_position, relight, world, teeth, torso, neck, jaw, eyes, dynamic_offsets, tracking,
+    view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection,
+    strain_color, strain_position, relight, world, teeth, torso, _turning("neck", 1),
+    _turning("jaw", 2), _turning("eyes", 3, 4), dynamic_offsets, tracking,
 )  # fmt: skip
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
 """Effect -> its rule, a function of that name."""

@@ -8,7 +8,6 @@ from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, uniform_filter
 
 from ...avatar.strain import color_range, face_strain, smoothed_strain, strain_basis
-from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_view
 from ...capture.model import Capture, View, evenly_spread
 
@@ -82,17 +81,11 @@ class Samples:
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
     """MAX_VIEWS of them, or one of each camera where that is more: timesteps evenly spread, cameras
     equally often."""
-    cameras = len({view.camera_index for view in views})
-    timesteps = evenly_spread(
-        sorted({view.timestep for view in views}), max(MAX_TIMESTEPS, MAX_VIEWS // cameras)
-    )
-    rng = np.random.default_rng(seed)
-    left: dict[int, list[View]] = {
-        t: [view for view in views if view.timestep == t] for t in timesteps
-    }
     used = dict.fromkeys((view.camera_index for view in views), 0)
-    chosen: list[View] = []
-    count = max(MAX_VIEWS, len(used))
+    every = sorted({view.timestep for view in views})
+    timesteps = evenly_spread(every, max(MAX_TIMESTEPS, MAX_VIEWS // len(used)))
+    rng, chosen, count = np.random.default_rng(seed), list[View](), max(MAX_VIEWS, len(used))
+    left = {t: [view for view in views if view.timestep == t] for t in timesteps}
     while len(chosen) < count and any(left.values()):
         for timestep in rng.permutation(timesteps).tolist():
             if left[timestep] and len(chosen) < count:
@@ -101,10 +94,8 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
                 left[timestep].remove(view)
                 used[view.camera_index] += 1
                 chosen.append(view)
-    return [
-        *chosen,
-        *{view.camera_index: view for view in views if not used[view.camera_index]}.values(),
-    ]
+    rest = {view.camera_index: view for view in views if not used[view.camera_index]}
+    return [*chosen, *rest.values()]
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
@@ -134,110 +125,60 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)
     camera, mesh = small.camera, np.asarray(capture.mesh(view.timestep))
     corners, depth = camera.project(mesh)
-    depths = depth[capture.faces].mean(1)
-    towards = _facing(mesh, capture.faces, camera)
-    nearest = _nearest(
-        corners[capture.faces],
-        depths,
-        (towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1),
-        camera,
-    )
-    center = corners[capture.faces[faces]].mean(1)
+    depths, (p0, p1, p2) = depth[capture.faces].mean(1), mesh[capture.faces].swapaxes(0, 1)
+    # cosine between each triangle's normal and its direction to the camera
+    normal, to_camera = np.cross(p1 - p0, p2 - p0), camera.position - (p0 + p1 + p2) / 3
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
+    towards = np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30)
+    # (H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
+    # are drawn whole, from far to near
+    picture = Image.new("I", (camera.width, camera.height), -1)
+    drawn = np.flatnonzero((towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1))
+    drawn = drawn[np.argsort(-depths[drawn], kind="stable")]
+    polygons = (corners[capture.faces[drawn]].reshape(-1, 6) - 0.5).tolist()
+    draw = ImageDraw.Draw(picture)
+    for face, polygon in zip(drawn.tolist(), polygons, strict=True):
+        draw.polygon(polygon, fill=face)
+    nearest, triangles = np.asarray(picture), corners[capture.faces[faces]]
+    center = triangles.mean(1)
     x, y = np.round(center - 0.5).astype(int).T
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
     in_front = np.where(nearest[y, x] >= 0, depths[nearest[y, x]], np.inf)
-    clean = (
-        np.ones(image.shape[:2], bool)
-        if mask is None
-        else binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
-    )
-    seen = (
-        inside
-        & (towards[faces] > MIN_FACING_COSINE)
-        & (depths[faces] < in_front * (1 + DEPTH_TOLERANCE_SHARE))
-        & clean[y, x]
-    )
+    seen = inside & (towards[faces] > MIN_FACING_COSINE)
+    seen &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_SHARE)
+    if mask is not None:
+        seen &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)[y, x]
+    smooth, at = uniform_filter(image.astype(np.float32), (3, 3, 0)), center.T[::-1] - 0.5
+    colors = [map_coordinates(smooth[..., c], at, order=1, mode="nearest") for c in range(3)]
     direction = mesh[capture.faces[faces]].mean(1) - camera.position
+    distance = np.linalg.norm(direction, axis=1, keepdims=True)
     area = view.camera.width * view.camera.height / (camera.width * camera.height)
-    distance = float(np.median(depth))
-    return {
-        "color": np.where(seen[:, None], _colors(image, center), np.nan).astype(np.float32),
-        "direction": direction
-        / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12),
-        "pixels": np.where(seen, area * _areas(corners[capture.faces[faces]]), np.nan),
-        "pixel_width": np.array(distance / view.camera.fl_x if distance > 0 else np.nan),
-        **_coverage(image, mask, nearest >= 0, area),
+    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    head = float(np.median(depth))
+    pixels = area * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    covered = nearest >= 0
+    near = binary_dilation(covered, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
+    white = (image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0
+    row = {
+        "color": np.where(seen[:, None], np.stack(colors, -1), np.nan).astype(np.float32),
+        "direction": direction / np.maximum(distance, 1e-12),
+        "pixels": np.where(seen, pixels, np.nan),
+        "pixel_width": np.array(head / view.camera.fl_x if head > 0 else np.nan),
+        "white": np.array(white),
+        "background": np.full(3, np.nan),
     }
-
-
-def _facing(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """(F,) cosine between each triangle's normal and its direction to the camera."""
-    corners = mesh[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    to_camera = camera.position - corners.mean(1)
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
-    return np.asarray(np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30))
-
-
-def _nearest(
-    corners: np.ndarray, depth: np.ndarray, shown: np.ndarray, camera: Camera
-) -> np.ndarray:
-    """(H, W) index of the nearest triangle in each pixel, -1 for none; corners (F, 3, 2), depth
-    (F,), shown (F,) bool.
-
-    Painter's algorithm: triangles are drawn whole, from far to near.
-    """
-    picture = Image.new("I", (camera.width, camera.height), -1)
-    draw = ImageDraw.Draw(picture)
-    drawn = np.flatnonzero(shown)
-    drawn = drawn[np.argsort(-depth[drawn], kind="stable")]
-    for face, polygon in zip(
-        drawn.tolist(), (corners[drawn].reshape(-1, 6) - 0.5).tolist(), strict=True
-    ):
-        draw.polygon(polygon, fill=face)
-    return np.asarray(picture)
-
-
-def _colors(image: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(K, 3) mean color of 3 x 3 pixels around positions (K, 2)."""
-    smooth = uniform_filter(image.astype(np.float32), (3, 3, 0))
-    rows = np.stack([at[:, 1], at[:, 0]]) - 0.5
-    return np.stack(
-        [map_coordinates(smooth[..., c], rows, order=1, mode="nearest") for c in range(3)], -1
-    )
-
-
-def _areas(corners: np.ndarray) -> np.ndarray:
-    """(K,) areas of triangles (K, 3, 2)."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2)
-
-
-def _coverage(
-    image: np.ndarray, mask: np.ndarray | None, mesh: np.ndarray, area: float
-) -> dict[str, np.ndarray]:
-    """How mesh (H, W) bool and mask cover each other, and the background; area: of a pixel, in
-    original pixels."""
-    unknown = np.array(np.nan)
-    near = binary_dilation(mesh, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
-    white = np.array((image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0)
     if mask is None:
         names = ("foreground", "uncovered", "mesh", "outside", "background_spread")
-        return {"background": np.full(3, np.nan), "white": white, **dict.fromkeys(names, unknown)}
+        return {**row, **dict.fromkeys(names, np.array(np.nan))}
     foreground = mask > 127
-    clear = image[binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)].astype(
-        np.float64
-    )
-    background = clear.mean(0) if len(clear) else np.full(3, np.nan)
-    return {
-        "foreground": np.array(area * foreground.sum()),
-        "uncovered": np.array(area * (foreground & ~near).sum()),
-        "mesh": np.array(area * mesh.sum()),
-        "outside": np.array(area * (mesh & ~binary_dilation(foreground, np.ones((3, 3)))).sum()),
-        "background": background,
-        "background_spread": np.array(np.sqrt(((clear - background) ** 2).mean()))
-        if len(clear)
-        else unknown,
-        "white": white,
-    }
+    outside = covered & ~binary_dilation(foreground, np.ones((3, 3)))
+    uncovered = foreground & ~near
+    parts = {"foreground": foreground, "uncovered": uncovered, "mesh": covered, "outside": outside}
+    row |= {name: np.array(area * part.sum()) for name, part in parts.items()}
+    beside = binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)
+    clear, spread = image[beside].astype(np.float64), np.nan
+    if len(clear):
+        row["background"] = clear.mean(0)
+        spread = np.sqrt(((clear - row["background"]) ** 2).mean())
+    return {**row, "background_spread": np.array(spread)}

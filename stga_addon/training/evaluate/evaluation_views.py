@@ -32,8 +32,7 @@ class EvaluationView:
              pixels of the triangles that the default selection picks at the timestep, if there are
              any
     interior (H, W) bool: the head mask without the matte's border; None without a mask
-    group    of views whose quality is reported apart as well, such as those of one take; empty for
-             none
+    group    of views whose quality is reported apart as well, as those of one take; empty: none
     """
 
     view: View
@@ -44,8 +43,7 @@ class EvaluationView:
 
 
 def choose_evaluation_views(capture: Capture) -> Sequence[View]:
-    """The held-out views that are evaluated during training: at most MAX_EVALUATION_VIEWS, evenly
-    spread."""
+    """At most MAX_EVALUATION_VIEWS of the held-out views, evenly spread: those of a training."""
     return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
 
 
@@ -72,9 +70,8 @@ def read_evaluation_view(
     interior = None
     if mask is not None:
         regions = {"mask": mask > 127, **regions}
-        inside = binary_erosion(
-            mask > 127, iterations=max(1, round(MATTE_BORDER_SHARE * len(mask)))
-        )
+        border = max(1, round(MATTE_BORDER_SHARE * len(mask)))
+        inside = binary_erosion(mask > 127, iterations=border)
         interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
     regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
     return EvaluationView(view, target, regions, interior)

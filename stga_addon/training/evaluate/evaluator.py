@@ -11,12 +11,18 @@ import numpy as np
 from ...capture.model import View, ViewExposure
 from ..settings import TrainingSettings
 from .evaluation_views import EvaluationView
-from .forecast import DETAIL, UNMATCHED, curve_of, describe_forecast, flat_since, next_forecast
+from .forecast import (
+    DETAIL,
+    curve_of,
+    describe_forecast,
+    flat_since,
+    forecast,
+    forecast_horizon,
+)
 from .metrics import evaluate
 
 EVALUATIONS = 10
-"""Evaluations over a budget in iterations, at fixed shares of it so that the run is
-reproducible."""
+"""Evaluations over a budget in iterations, at fixed shares of it, so that runs are reproducible."""
 EVALUATION_SHARE = 0.04
 """Largest share of the training time that evaluations add to a budget in seconds, without the last
 one."""
@@ -74,45 +80,41 @@ class Evaluator:
     best_difference: float = math.inf
     forecast_text: str = ""
 
-    @property
-    def psnr(self) -> float | None:
-        """Of the last evaluation, in dB."""
-        return self.lines[-1].get("psnr") if self.lines else None
-
-    @property
-    def psnr_unmatched(self) -> float | None:
-        """The same without fitted exposure; None where none was fitted."""
-        return self.lines[-1].get(UNMATCHED) if self.lines else None
-
     def is_due(self, spent: Spent) -> bool:
         """Whether to evaluate now; at the end of the budget there is an evaluation anyway."""
-        if spent.share >= 1 or self.settings.seconds is None:
+        budget_s = self.settings.seconds
+        if spent.share >= 1 or budget_s is None:
             return 1 > spent.share >= (self.count + 1) / EVALUATIONS
         cost, last = RENDERING_COST * len(self.views) * spent.seconds / spent.iterations, 0.0
         if self.lines:
             cost, last = float(self.lines[-1]["evaluation_s"]), float(self.lines[-1]["seconds"])
-        return spent.seconds - last >= max(
-            self.settings.seconds / MAX_EVALUATIONS, cost / EVALUATION_SHARE
-        )
+        return spent.seconds - last >= max(budget_s / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
 
     def is_finished(self, spent: Spent) -> bool:
         """Whether the budget is spent, the target PSNR is reached, or a stop at a flat curve is
         due."""
         target = self.settings.target_psnr
-        if spent.share >= 1 or (
-            target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))
-        ):
+        reached = target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))
+        if spent.share >= 1 or reached:
             return True
         return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
     def evaluate(
         self, render: Callable[[View], np.ndarray], perceptual: bool = False
     ) -> Evaluation:
-        """Measure `render(view)` on the evaluation views; perceptual: with LPIPS."""
+        """Measure `render(view)` on the evaluation views; perceptual: with LPIPS.
+
+        An avatar is kept that is the sharpest so far, or reaches the target, which ends the run
+        (`saved_line`). Otherwise not by PSNR, which prefers an early, blurred state to detail that
+        is a pixel off.
+        """
         if not self.views:
             return Evaluation({}, True)
         quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
-        return Evaluation(quality, self._is_kept(quality))
+        difference, target = quality.get(DETAIL), self.settings.target_psnr
+        reached = target is not None and quality["psnr"] >= target
+        is_sharp = difference is None or difference <= self.best_difference
+        return Evaluation(quality, self.keeps_latest or reached or is_sharp)
 
     def record(
         self, evaluation: Evaluation, line: Mapping[str, Any], spent: Spent
@@ -123,25 +125,10 @@ class Evaluator:
         if evaluation.is_kept:
             self.best_difference = evaluation.quality.get(DETAIL, self.best_difference)
         self.lines.append(dict(line))
-        predicted = next_forecast(self.lines, spent.seconds, spent.left_s)
+        lines, elapsed, left = self.lines, spent.seconds, spent.left_s
+        ahead = forecast_horizon(elapsed, left)
+        predicted = None if ahead is None else forecast(curve_of(lines), ahead)
         if predicted is not None and "psnr" in line:
-            self.lines[-1]["forecast"] = predicted.as_json()
-        self.forecast_text = describe_forecast(
-            self.lines, spent.seconds, spent.left_s, self.settings.target_psnr
-        )
-        return self.lines[-1]
-
-    def _is_kept(self, quality: Mapping[str, float]) -> bool:
-        """Whether this avatar is the sharpest so far, or reaches the target, which ends the run
-        (`saved_line`).
-
-        Otherwise not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
-        """
-        difference, target = quality.get(DETAIL), self.settings.target_psnr
-        if (
-            self.keeps_latest
-            or difference is None
-            or (target is not None and quality["psnr"] >= target)
-        ):
-            return True
-        return difference <= self.best_difference
+            lines[-1]["forecast"] = predicted.as_json()
+        self.forecast_text = describe_forecast(lines, elapsed, left, self.settings.target_psnr)
+        return lines[-1]

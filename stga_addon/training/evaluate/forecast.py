@@ -53,9 +53,8 @@ class Forecast:
         return {name: round(value, 4) for name, value in asdict(self).items()}
 
     def __str__(self) -> str:
-        return (
-            f"another {format_duration(self.ahead)}: about {self.gain:+.1f} dB (±{self.error:.1f})"
-        )
+        ahead = format_duration(self.ahead)
+        return f"another {ahead}: about {self.gain:+.1f} dB (±{self.error:.1f})"
 
 
 def forecast(curve: Curve, ahead: float) -> Forecast | None:
@@ -143,9 +142,7 @@ def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tupl
 def detail_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
     """(seconds, −20·log10 of the detail difference) of the evaluations: dB like PSNR, higher is
     sharper."""
-    return [
-        (seconds, -20 * np.log10(value)) for seconds, value in curve_of(lines, DETAIL) if value > 0
-    ]
+    return [(t, -20 * np.log10(value)) for t, value in curve_of(lines, DETAIL) if value > 0]
 
 
 def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
@@ -171,14 +168,6 @@ def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
     return f"{text}, detail difference {change:+.0f} % (±{error:.0f})"
 
 
-def next_forecast(
-    lines: Sequence[Mapping[str, Any]], elapsed: float, left: float
-) -> Forecast | None:
-    """Forecast of PSNR over `forecast_horizon`; None where there is none."""
-    ahead = forecast_horizon(elapsed, left)
-    return None if ahead is None else forecast(curve_of(lines), ahead)
-
-
 def describe_forecast(
     lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None
 ) -> str:
@@ -195,7 +184,8 @@ def describe_forecast(
     end = forecast(curve_of(lines), left) if left else None
     if target is not None and end is not None and end.psnr + end.error < target:
         fitted = ", exposure fitted" if is_exposure_fitted(lines) else ""
-        far = f"{target:g} dB is out of reach ({end.psnr:.1f} ± {end.error:.1f} dB at the end{fitted})"
+        expected = f"{end.psnr:.1f} ± {end.error:.1f} dB at the end{fitted}"
+        far = f"{target:g} dB is out of reach ({expected})"
         text = "; ".join(filter(None, (text, far)))
     return text
 
@@ -206,8 +196,8 @@ def explain_missed_target(curve: Curve, target: float) -> str:
     missed = f"{target:g} dB was not reached (best {best:.2f} dB)"
     plateau = plateau_start(curve)
     if plateau is not None:
-        since = format_duration(plateau)
-        return f"{missed}: nothing was gained after {since}, so more time would not help; more splats may"
+        since = f"nothing was gained after {format_duration(plateau)}"
+        return f"{missed}: {since}, so more time would not help; more splats may"
     if not _can_fit(curve):
         return f"{missed}: there are too few evaluations to say how long it would take"
     t, psnr = np.array(curve, np.float64).T
@@ -216,15 +206,13 @@ def explain_missed_target(curve: Curve, target: float) -> str:
         return f"{missed}: the curve does not rise steadily"
     remaining = 1 - (target - now) / gain  # share of the total gain that lies beyond the target
     if remaining < MIN_REMAINING_SHARE:
-        unreachable = target > now + (1 + PRIOR_RELATIVE_ERROR) * gain
-        advice = (
-            "more time alone would not reach it"
-            if unreachable
-            else "only a much longer budget might reach it"
-        )
+        advice = "only a much longer budget might reach it"
+        if target > now + (1 + PRIOR_RELATIVE_ERROR) * gain:
+            advice = "more time alone would not reach it"
         return f"{missed}: the curve levels off at about {now + gain:.1f} dB; {advice}"
     factor = max(remaining**-2, MIN_TIME_FACTOR)
-    return f"{missed}: extrapolating the curve, it would take about {format_duration((factor - 1) * t[-1])} more"
+    more = format_duration((factor - 1) * t[-1])
+    return f"{missed}: extrapolating the curve, it would take about {more} more"
 
 
 def _can_fit(curve: Curve) -> bool:
@@ -240,9 +228,8 @@ def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, 
 
     The slope is the Theil–Sen estimator.
     """
-    late = np.arange(len(t)) >= min(
-        np.searchsorted(t, FITTED_SINCE_SHARE * t[-1]), len(t) - MIN_EVALUATIONS
-    )
+    first_late = np.searchsorted(t, FITTED_SINCE_SHARE * t[-1])
+    late = slice(min(int(first_late), len(t) - MIN_EVALUATIONS), None)
     x, y = -np.sqrt(t[-1] / t[late]), psnr[late]
     first, second = np.triu_indices(len(x), 1)
     slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))

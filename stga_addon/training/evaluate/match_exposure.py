@@ -80,9 +80,8 @@ def match_exposure(
     prior = PRIOR_SHARE * x.shape[1]
     matched = image.copy()
     for channel, (drawn, seen) in enumerate(zip(x, y, strict=True)):
-        inner = np.array(
-            [[drawn @ drawn, drawn.sum()], [drawn.sum(), len(drawn)]]
-        ) + prior * np.eye(2)
+        total = drawn.sum()
+        inner = np.array([[drawn @ drawn, total], [total, len(drawn)]]) + prior * np.eye(2)
         difference = seen - drawn
         gain, offset = np.linalg.solve(inner, [drawn @ difference, difference.sum()])
         matched[channel, head] += np.float32(gain) * image[channel, head] + np.float32(offset)

@@ -39,8 +39,7 @@ class Quality:
     detail_difference  within the head mask, without the matte's border: what the avatar that a run
                        keeps is chosen by; None for a region
     psnr_unmatched     PSNR without fitting the exposure of views; None where none was fitted
-    psnr_recorded      of the avatar in front of its world, against whole images as recorded; None
-                       where it has no world
+    psnr_recorded      of the avatar in front of its world, against images as recorded; or None
     """
 
     psnr: float
@@ -53,11 +52,8 @@ class Quality:
 
     def as_json(self) -> dict[str, float]:
         """Flat: "psnr", "ssim", "psnr_mask" and so on, without what was not measured."""
-        flat = {
-            name: value
-            for name, value in vars(self).items()
-            if name != "regions" and value is not None
-        }
+        own = {name: value for name, value in vars(self).items() if name != "regions"}
+        flat = {name: value for name, value in own.items() if value is not None}
         for region, quality in self.regions.items():
             flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
         return flat
@@ -89,12 +85,9 @@ def evaluate(
         differences.append(detail_difference(image, target, evaluation_view.interior))
         parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
         for region, where in parts.items():
-            found = _scores(image, target, perceptual, where)
-            scores.setdefault(region, []).append(found)
-            if evaluation_view.group:
-                scores.setdefault(
-                    "_".join(filter(None, (region, evaluation_view.group))), []
-                ).append(found)
+            found, group = _scores(image, target, perceptual, where), evaluation_view.group
+            for name in dict.fromkeys((region, "_".join(filter(None, (region, group))))):
+                scores.setdefault(name, []).append(found)
     means = {region: _mean(of_views) for region, of_views in scores.items()}
     whole = means.pop("")
     return replace(
@@ -121,17 +114,13 @@ def evaluate_avatar(
     backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
         exposure = known_exposure(rows, capture.views.get("train", ()))
-    return evaluate(
-        lambda view: render_avatar(
-            avatar, capture.mesh(view.timestep), view.camera, avatar.background
-        ),
-        (
-            read_evaluation_view(capture, view, avatar.background, backdrop)
-            for view in capture.views[split]
-        ),
-        perceptual,
-        exposure,
-    )
+    background, views = avatar.background, capture.views[split]
+    read = (read_evaluation_view(capture, view, background, backdrop) for view in views)
+
+    def render(view: View) -> np.ndarray:
+        return render_avatar(avatar, capture.mesh(view.timestep), view.camera, background)
+
+    return evaluate(render, read, perceptual, exposure)
 
 
 def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
@@ -182,26 +171,20 @@ def _scores(
     For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is
     scaled to a mean over the region.
     """
-    psnr_db = psnr(image, target, where)
-    share = 1.0
+    psnr_db, shown = psnr(image, target, where), target.transpose(2, 0, 1).astype(np.float32) / 255
+    share = 1.0 if where is None else float(where.mean())
     if where is not None:
-        image = np.where(where, image, target.transpose(2, 0, 1).astype(np.float32) / 255)
-        share = float(where.mean())
+        image = np.where(where, image, shown)
     ssim = 1 - (1 - mean_ssim(image, target)) / share
-    distance = _lpips(image, target) if perceptual else None
-    return psnr_db, ssim, np.nan if distance is None else distance
+    network = lpips.load_network() if perceptual else None
+    if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
+        return psnr_db, ssim, np.nan
+    return psnr_db, ssim, network.distance(image, shown)
 
 
 def _mean(scores: list[tuple[float, float, float]]) -> Quality:
     mean = np.mean(scores, axis=0) if scores else [np.nan] * 3
     return Quality(float(mean[0]), float(mean[1]), None if np.isnan(mean[2]) else float(mean[2]))
-
-
-def _lpips(image: np.ndarray, target: np.ndarray) -> float | None:
-    network = lpips.load_network()
-    if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
-        return None
-    return network.distance(image, target.transpose(2, 0, 1).astype(np.float32) / 255)
 
 
 def detail_difference(
@@ -211,17 +194,12 @@ def detail_difference(
     images, below 1.
 
     image (3, H, W) float32 in 0…1, target (H, W, 3) uint8; a and b are their mean gradients of luma
-    around a pixel. It falls with LPIPS during training, also where PSNR falls, and needs no
-    weights.
+    (by Prewitt) around a pixel. It falls with LPIPS during training, also where PSNR falls, and
+    needs no weights.
     """
-    first = _local_gradient(np.tensordot(LUMA, image, 1))
-    second = _local_gradient(target @ LUMA / np.float32(255))
-    difference = abs(first - second) / (first + second + NOISE_LEVEL)
-    return float(difference.mean() if where is None else difference[where].mean())
-
-
-def _local_gradient(luma: np.ndarray) -> np.ndarray:
-    """Length of Prewitt's gradient of an image (H, W), averaged over a window."""
-    return np.asarray(
+    a, b = (
         uniform_filter(np.hypot(prewitt(luma, 0), prewitt(luma, 1)) / PREWITT_SUM, WINDOW_PX)
+        for luma in (np.tensordot(LUMA, image, 1), target @ LUMA / np.float32(255))
     )
+    difference = abs(a - b) / (a + b + NOISE_LEVEL)
+    return float(difference.mean() if where is None else difference[where].mean())

@@ -111,7 +111,8 @@ class RefinedTracking:
             )
         if capture.flame is None:
             raise StgaError(
-                f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot refine its parameters"
+                f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot "
+                f"refine its parameters"
             )
         self.sequence = capture.flame
         self.tracked = np.stack(

@@ -22,11 +22,10 @@ from ...raster.cpu.rasterize import (
 )
 from ...raster.cpu.threads import threads
 from ..settings import TrainingSettings
-from . import adam, driven_offsets
-from .backend import Batch
+from . import adam
 from .frames import FrameStore
 from .losses import image_gradient, tile_rectangles, whole_image
-from .state import TrainState
+from .state import Batch, TrainState
 
 
 class CpuBackend:
@@ -45,16 +44,37 @@ class CpuBackend:
     def step(self, batch: Batch) -> float | None:
         """Forward, backward and optimizer step; returns the image loss of a global iteration, None
         for a local one."""
-        state = self.state
-        focus = None if batch.selected is None else batch.selected.take(state.face)
-        target = self._target(batch)
+        state, settings, target = self.state, self._settings, batch.target
+        face, gradients, unbound = state.face, state.gradients, state.unbound
+        focus = None if batch.selected is None else batch.selected.take(face)
+        if batch.mask is not None:
+            over = self._buffers.get("target", target.shape, np.uint8)
+            captured = 255 * np.array(settings.background, np.float32)
+            change_background(target, batch.mask, captured, 255 * batch.background, over)
+            target = over.view()
+            target.setflags(write=False)  # like the loader's: Numba compiles for one type only
         rows, screen, loss = self._backward(
             batch.view, target, batch.background, batch.sh_degree, focus
         )
-        epsilon = adam.image_epsilon(self._settings.adam_epsilon, batch.view.camera)
-        self._step_offsets(batch, rows, epsilon)
-        self._add_limit_gradients(rows)
-        adam.step(state, rows, batch.rates, self._settings.ema_share, epsilon)
+        epsilon = adam.image_epsilon(settings.adam_epsilon, batch.view.camera)
+        adam.step_offsets(  # before the limits' gradients are added
+            state.driven_offsets, rows, face, gradients.xyz,
+            self._frames.signals(batch.view.timestep), batch.rates["xyz"], settings.ema_share,
+            epsilon,
+        )  # fmt: skip
+        # what keeps splats near what they cover, and unbound ones out of the air
+        if settings.scale_weight:
+            log_scale, weight = state.parameters.log_scale, settings.scale_weight
+            limits = self._scale_limits
+            scale_limit(rows, log_scale, face, unbound, limits, weight, gradients.log_scale)
+        if settings.unseen_opacity_weight and state.has_unseen:
+            weight, share = settings.unseen_opacity_weight / len(state), state.unseen_share
+            opacity_weight(rows, state.parameters.opacity, share, weight, gradients.opacity)
+        if settings.distance_weight:
+            limit = np.float32(settings.distance_limit) * self._frames.units
+            xyz, weight = state.parameters.xyz, settings.distance_weight
+            distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
+        adam.step(state, rows, batch.rates, settings.ema_share, epsilon)
         if batch.accumulate:
             add_screen_gradients(rows, screen, state.screen_gradient, state.gradient_count)
         return loss
@@ -63,18 +83,6 @@ class CpuBackend:
         """The view with the splats' exponential moving average: a new (3, H, W) float32 image."""
         frames = self._moved_frames(view.timestep, averaged=True)
         return self._forward(self.state.average, frames, view, background, sh_degree).image.copy()
-
-    def _target(self, batch: Batch) -> np.ndarray:
-        """The target over the batch's background."""
-        if batch.mask is None:
-            return batch.target
-        target = self._buffers.get("target", batch.target.shape, np.uint8)
-        captured = np.array(self._settings.background, np.float32)
-        change_background(batch.target, batch.mask, 255 * captured, 255 * batch.background, target)
-        read_only = target.view()
-        # like the loader's arrays: Numba compiles for one type only
-        read_only.setflags(write=False)
-        return read_only
 
     def _backward(
         self,
@@ -97,8 +105,8 @@ class CpuBackend:
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = render_backward(
-            rendering, state.parameters, state.face, self._frames_in_camera, v_image, state.gradients,
-            buffers=self._buffers,
+            rendering, state.parameters, state.face, self._frames_in_camera, v_image,
+            state.gradients, buffers=self._buffers,
         )  # fmt: skip
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
@@ -111,13 +119,13 @@ class CpuBackend:
         return self._frames.moved(timestep, coefficients)
 
     def _forward(
-        self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray, sh_degree: int,
-        focus: np.ndarray | None = None,
+        self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray,
+        sh_degree: int, focus: np.ndarray | None = None,
     ) -> RenderOutput:  # fmt: skip
         self._frames_in_camera = frames_in_camera(frames, view.camera)
         return render_forward(
-            splats, self.state.face, self._frames_in_camera, sh_degree, background, focus, LOSS_REACH_PX,
-            antialiased=self._settings.antialiased, buffers=self._buffers,
+            splats, self.state.face, self._frames_in_camera, sh_degree, background, focus,
+            LOSS_REACH_PX, antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
 
     def mesh_gradient(
@@ -136,34 +144,6 @@ class CpuBackend:
         return loss, frame_backward(
             store.mesh(view.timestep), store.capture.faces, frames, *by_frame
         )
-
-    def _step_offsets(self, batch: Batch, rows: np.ndarray, epsilon: np.float32) -> None:
-        """Step the driven offsets, before the limits' gradients are added."""
-        state = self.state
-        driven_offsets.step(
-            state.driven_offsets, rows, state.face, state.gradients.xyz,
-            self._frames.signals(batch.view.timestep), batch.rates["xyz"], self._settings.ema_share, epsilon,
-        )  # fmt: skip
-
-    def _add_limit_gradients(self, rows: np.ndarray) -> None:
-        """Add the gradients that keep splats near what they cover, and unbound ones out of the
-        air."""
-        settings, state = self._settings, self.state
-        face, unbound = state.face, state.unbound
-        if settings.scale_weight:
-            gradient, log_scale = state.gradients.log_scale, state.parameters.log_scale
-            scale_limit(
-                rows, log_scale, face, unbound, self._scale_limits, settings.scale_weight, gradient
-            )
-        if settings.unseen_opacity_weight and self.state.has_unseen:
-            weight = settings.unseen_opacity_weight / len(state)
-            opacity_weight(
-                rows, state.parameters.opacity, state.unseen_share, weight, state.gradients.opacity
-            )
-        if settings.distance_weight:
-            limit = np.float32(settings.distance_limit) * self._frames.units
-            weight, gradient = settings.distance_weight, state.gradients.xyz
-            distance_limit(rows, state.parameters.xyz, face, unbound, limit, weight, gradient)
 
 
 def frame_gradient(

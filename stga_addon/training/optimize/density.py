@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...avatar.splats import Splats
+from ...avatar.splats import joined
 from ...flame.quaternions import to_matrices
 from .state import TrainState, join, keep_rows, new_state
 
@@ -28,9 +28,10 @@ def control_density(
 
     budget: how many splats may be added; max_share: largest share of the splats that is split;
     region (F,) bool: the triangles whose splats may change, None for all. Every triangle with bound
-    splats keeps one. Children inherit triangle, binding and unseen share, lie within the parent's
-    Gaussian in local units, and keep Adam's second moment and step count, without which their first
-    steps would all be as long as the rate.
+    splats keeps one. Children, on either side of the parent's center along its longest axis,
+    inherit triangle, binding and unseen share, lie within the parent's Gaussian in local units, and
+    keep Adam's second moment and step count, without which their first steps would all be as long
+    as the rate.
     """
     gradient = state.screen_gradient / np.maximum(state.gradient_count, 1)
     within = np.ones(len(state), bool) if region is None else region[state.face]
@@ -38,14 +39,21 @@ def control_density(
     count = max(0, min(budget, int(max_share * within.sum())))
     split = np.argsort(-gradient, kind="stable")[:count]
     split = split[gradient[split] > 0]
-    parents = keep_rows(state, split)
-    pairs = join(parents, parents)
-    children = replace(
-        new_state(_halves(parents.splats(), rng)),
-        second=pairs.second,
-        steps=pairs.steps,
-        unseen_share=pairs.unseen_share,
-    )
+    kept = keep_rows(state, split)
+    parents, pairs, n = kept.splats(), join(kept, kept), np.arange(len(split))
+    longest = np.argmax(parents.log_scale, axis=1)
+    length = np.exp(parents.log_scale[n, longest])[:, None]
+    offset = to_matrices(parents.rotation)[n, :, longest] * length * 0.5
+    jitter = 1 + 0.1 * rng.standard_normal((len(parents), 1))
+    parents.log_scale[n, longest] -= SPLIT_LOG_SCALE
+    # Two splats of opacity a cover as one of opacity o where 1 − (1 − a)² = o.
+    opacity = 1 - np.sqrt(1 - np.clip(_sigmoid(parents.opacity), 0, 0.999))
+    opacity = np.maximum(opacity, 2 * MIN_OPACITY)
+    parents.opacity[:] = np.log(opacity / (1 - opacity))
+    sides = [(parents.xyz + side * offset * jitter).astype(np.float32) for side in (-1, 1)]
+    halves = joined([replace(parents, xyz=xyz) for xyz in sides])
+    children = new_state(halves, pairs.unseen_share)
+    children.second, children.steps = pairs.second, pairs.steps
     faint = _sigmoid(state.parameters.opacity) < MIN_OPACITY
     keep = ~prunable(state, faint & within)
     keep[split] = False
@@ -59,11 +67,10 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
     returns how many.
 
     limit (F,) in local units, infinite where none is moved. Works in place. (STGA, training, which
-    moves them onto the
-    origin: share = 0.) Adam's first moment of the position is reset. The second moment is kept:
-    with it at zero and the step count of the row, which all its parameters share, in the thousands,
-    the bias correction would make the next step 3.2 times as long as the learning rate (0.1 /
-    √0.001).
+    moves them onto the origin: share = 0.) Adam's first moment of the position is reset. The second
+    moment is kept: with it at zero and the step count of the row, which all its parameters share,
+    in the thousands, the bias correction would make the next step 3.2 times as long as the learning
+    rate (0.1 / √0.001).
     """
     distance = np.linalg.norm(state.parameters.xyz, axis=1)
     allowed = limit[state.face]
@@ -74,30 +81,6 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
     state.first.xyz[strays] = 0
     state.average.xyz[strays] = state.parameters.xyz[strays]
     return len(strays)
-
-
-def _halves(parents: Splats, rng: np.random.Generator) -> Splats:
-    """Two smaller splats per parent, on either side of its center along its longest axis."""
-    axes = to_matrices(parents.rotation)
-    longest = np.argmax(parents.log_scale, axis=1)
-    n = np.arange(len(parents))
-    offset = axes[n, :, longest] * np.exp(parents.log_scale[n, longest])[:, None] * 0.5
-    jitter = 1 + 0.1 * rng.standard_normal((len(parents), 1))
-    log_scale = parents.log_scale.copy()
-    log_scale[n, longest] -= SPLIT_LOG_SCALE
-    # Two splats of opacity a cover as one of opacity o where 1 − (1 − a)² = o.
-    opacity = 1 - np.sqrt(1 - np.clip(_sigmoid(parents.opacity), 0, 0.999))
-    opacity = np.maximum(opacity, 2 * MIN_OPACITY)
-    halves = []
-    for side in (-1, 1):
-        half = replace(
-            parents,
-            xyz=(parents.xyz + side * offset * jitter).astype(np.float32),
-            log_scale=log_scale,
-            opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
-        )
-        halves.append(vars(half).values())
-    return Splats(*(np.concatenate(pair) for pair in zip(*halves, strict=True)))
 
 
 def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:

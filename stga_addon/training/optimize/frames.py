@@ -38,12 +38,9 @@ class _Timestep:
 class FrameStore:
     """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
 
-    strain    `strain_basis` of the neutral mesh, None if neither colors nor positions depend on
-              strain
-    tracking  meshes of its timesteps come from here instead of the capture, None if no tracking is
-              refined
-    units     (F,) float32: per triangle the length that limits are multiples of, in the
-              convention's local units
+    strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
+    tracking  what its timesteps' meshes are from instead of the capture, None if none is refined
+    units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     """
 
     def __init__(
@@ -60,21 +57,16 @@ class FrameStore:
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self.units = np.ones(len(capture.faces), np.float32)
         if convention != "gaussian_avatars":
-            self.units = np.asarray(
-                np.sqrt(2 * face_areas(capture.neutral, capture.faces)), np.float32
-            )
+            areas = face_areas(capture.neutral, capture.faces)
+            self.units = np.asarray(np.sqrt(2 * areas), np.float32)
         self._cached: dict[int, _Timestep] = {}
 
     def scale_limits(self, settings: TrainingSettings) -> np.ndarray:
-        """Largest scale (2, F) float32 of bound and of unbound splats by triangle, in the
-        convention's local units."""
+        """Largest scale (2, F) float32 of bound and of unbound splats, in local units."""
         neutral = self.capture.neutral
         frames = face_frames(neutral, self.capture.faces, neutral, self.convention)
-        unbound = (
-            settings.unbound_scale_limit
-            * voxel_size(neutral)
-            / np.maximum(frames.scale, MIN_DIVISOR)
-        )
+        limit = settings.unbound_scale_limit * voxel_size(neutral)
+        unbound = limit / np.maximum(frames.scale, MIN_DIVISOR)
         return np.asarray(np.stack([settings.scale_limit * self.units, unbound]), np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
@@ -108,7 +100,7 @@ class FrameStore:
     def add(self, timestep: int, mesh: np.ndarray) -> None:
         """Use `mesh`, already read from the capture, if the timestep is not cached; refined
         timesteps ignore it."""
-        if not self._refines(timestep):
+        if self.tracking is None or not self.tracking.refines(timestep):
             self._latest(timestep, mesh)
 
     def clear(self) -> None:
@@ -131,18 +123,12 @@ class FrameStore:
             self.clear()
 
     def _latest(self, timestep: int, mesh: np.ndarray | None = None) -> _Timestep:
-        entry = self._cached.pop(timestep, None)
+        entry, tracking = self._cached.pop(timestep, None), self.tracking
         if entry is None:
-            entry = _Timestep(self._read(timestep) if mesh is None else mesh)
+            if mesh is None and tracking is not None and tracking.refines(timestep):
+                mesh = tracking.mesh(timestep)
+            entry = _Timestep(np.asarray(self.capture.mesh(timestep)) if mesh is None else mesh)
         self._cached[timestep] = entry  # dictionaries keep insertion order, so the oldest is first
         if len(self._cached) > CACHED_TIMESTEPS:
             del self._cached[next(iter(self._cached))]
         return entry
-
-    def _read(self, timestep: int) -> np.ndarray:
-        if self.tracking is not None and self._refines(timestep):
-            return self.tracking.mesh(timestep)
-        return np.asarray(self.capture.mesh(timestep))
-
-    def _refines(self, timestep: int) -> bool:
-        return self.tracking is not None and self.tracking.refines(timestep)

@@ -10,7 +10,6 @@ import numpy as np
 from ...avatar.offsets import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
-from ...raster.cpu.layout import Parameters
 from ...raster.gpu import optimizer
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
@@ -28,9 +27,8 @@ from ...raster.gpu.rasterize import (
 )
 from ..settings import TrainingSettings
 from .adam import BETA1, BETA2, image_epsilon
-from .backend import Batch
 from .frames import FrameStore
-from .state import OffsetState, TrainState
+from .state import Batch, OffsetState, TrainState
 
 QUEUED_ITERATIONS = 2
 """Iterations that the device may be behind; losses are returned as many iterations late."""
@@ -65,17 +63,12 @@ class GpuBackend:
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = Rasterizer(device)
         self._embedding = Embedding(
-            device,
-            capture.neutral,
-            capture.faces,
-            frames.convention,
-            frames.strain,
+            device, capture.neutral, capture.faces, frames.convention, frames.strain,
             state.driven_offsets,
-        )
+        )  # fmt: skip
         self._triangles = len(capture.faces)
-        self._limits = np.column_stack(
-            [*frames.scale_limits(settings), settings.distance_limit * frames.units]
-        )
+        distance_limits = settings.distance_limit * frames.units
+        self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
@@ -91,29 +84,25 @@ class GpuBackend:
         self._finish_all()
         count, stride, coefficients = len(self), self._splats.stride, self._splats.coefficients
         read, buffer = self.device.read, self.device.buffer
-        tables = {
-            name: Parameters(*split_rows(read(buffer(name, 0), (count, stride)), coefficients))
+        tables = [
+            split_rows(read(buffer(name, 0), (count, stride)), coefficients)
             for name in ("splats", *TABLES)
-        }
-        history, traits = (
-            read(self._tables.history, (count, 3), np.uint32),
-            read(self._tables.traits, (count, 2)),
-        )
-        sums = history.view(np.float32)
+        ]
+        history = read(self._tables.history, (count, 3), np.uint32)
+        traits, sums = read(self._tables.traits, (count, 2)), history.view(np.float32)
+        offsets = {}
+        for name, each in self._offsets.items():
+            shape = self._triangles, OFFSETS[name].signals, 3
+            parts = (each.coefficients, each.first, each.second, each.average)
+            value, first, second, average = (read(part, shape) for part in parts)
+            steps = read(each.steps, (self._triangles,), np.int32)
+            offsets[name] = OffsetState(value, first, second, average, steps)
+        parameters, gradients, *moments, mean = tables
         return TrainState(
-            parameters=tables["splats"],
-            gradients=tables["gradients"],
-            first=tables["first"],
-            second=tables["second"],
-            average=tables["average"],
-            steps=history[:, 0].astype(np.int32),
-            face=read(self._splats.face, (count,), np.int32),
-            unbound=traits[:, 0] > 0,
-            unseen_share=traits[:, 1].copy(),
-            screen_gradient=sums[:, 1].copy(),
-            gradient_count=sums[:, 2].copy(),
-            driven_offsets={name: self._read_offset(name) for name in self._offsets},
-        )
+            parameters, gradients, moments[0], moments[1], mean, history[:, 0].astype(np.int32),
+            read(self._splats.face, (count,), np.int32), traits[:, 0] > 0, traits[:, 1].copy(),
+            sums[:, 1].copy(), sums[:, 2].copy(), offsets,
+        )  # fmt: skip
 
     @state.setter
     def state(self, state: TrainState) -> None:
@@ -121,32 +110,19 @@ class GpuBackend:
         upload = self.device.upload
         rows = {name: upload(name, splat_rows(getattr(state, name))) for name in TABLES}
         self._gradients = rows.pop("gradients")
-        history = np.stack(
-            [
-                state.steps.astype(np.uint32),
-                state.screen_gradient.view(np.uint32),
-                state.gradient_count.view(np.uint32),
-            ],
-            axis=1,
-        )
+        sums = (state.screen_gradient.view(np.uint32), state.gradient_count.view(np.uint32))
+        history = np.stack([state.steps.astype(np.uint32), *sums], axis=1)
         traits = np.stack([state.unbound, state.unseen_share], axis=1, dtype=np.float32)
         self._tables = OptimizerTables(
             **rows, history=upload("history", history), traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
         self._splats = upload_splats(self.device, state.parameters, state.face)
-        splats_of = upload(
-            "splats by triangle", optimizer.splats_by_triangle(state.face, self._triangles)
-        )
-        self._offsets = {
-            name: OffsetTables._make(
-                [
-                    *(upload(f"{name} {part}", each) for part, each in vars(offset).items()),
-                    splats_of,
-                ]
-            )
-            for name, offset in state.driven_offsets.items()
-        }
+        by_triangle = optimizer.splats_by_triangle(state.face, self._triangles)
+        splats_of, self._offsets = upload("splats by triangle", by_triangle), {}
+        for name, offset in state.driven_offsets.items():
+            parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
+            self._offsets[name] = OffsetTables._make([*parts, splats_of])
 
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last if it was a global
@@ -171,9 +147,8 @@ class GpuBackend:
             with self.device.record() as work:
                 rendering = self._render(work, average, moved, view, background, sh_degree)
             if self._rasterizer.pairs_fit():
-                return self.device.read(
-                    rendering["image"], (3, view.camera.height, view.camera.width)
-                )
+                shape = 3, view.camera.height, view.camera.width
+                return self.device.read(rendering["image"], shape)
 
     def _finish_all(self) -> None:
         """Wait until all queued iterations are done."""
@@ -200,9 +175,16 @@ class GpuBackend:
 
     def _enqueue(self, queued: _Queued) -> None:
         """Submit one iteration."""
-        batch, whole = queued.batch, queued.batch.selected is None
-        self._upload_target(batch)
-        self._upload_step(batch)
+        batch, settings, whole = queued.batch, self._settings, queued.batch.selected is None
+        change = 255 * batch.background - 255 * np.array(settings.background, np.float32)
+        upload_target(self.device, batch.target, settings.ssim_weight, batch.mask, change)
+        opacity_weight = settings.unseen_opacity_weight / max(len(self), 1)
+        optimizer.upload_step(
+            self.device, batch.rates, (float(BETA1), float(BETA2)),
+            float(image_epsilon(settings.adam_epsilon, batch.view.camera)), settings.ema_share,
+            (settings.scale_weight, settings.distance_weight, opacity_weight),
+            statistics=batch.accumulate, triangles=self._triangles,
+        )  # fmt: skip
         with self.device.record() as work:
             splats, camera = self._splats, batch.view.camera
             moved = {name: tables.coefficients for name, tables in self._offsets.items()}
@@ -210,29 +192,24 @@ class GpuBackend:
                 work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected
             )
             v_image, loss = image_loss(
-                work, camera.width, camera.height, view=rendering["view"], image=rendering["image"],
-                touched=rendering["touched"], whole=whole,
+                work, camera.width, camera.height, whole=whole,
+                **{name: rendering[name] for name in ("view", "image", "touched")},
             )  # fmt: skip
             screen = self._rasterizer.backward(
                 work, rendering, splats, camera, v_image, self._gradients
             )
-            given = {
-                "view": rendering["view"],
-                "wanted": rendering["wanted"],
-                "gradients": self._gradients,
-            }
-            optimizer.step_offsets(
-                work, self._triangles, self._offsets, self._embedding.signals, **given
-            )
-            limited = bool(self._settings.scale_weight or self._settings.distance_weight)
+            given = {name: rendering[name] for name in ("view", "wanted")}
+            given["gradients"], signals = self._gradients, self._embedding.signals
+            optimizer.step_offsets(work, self._triangles, self._offsets, signals, **given)
+            limited = bool(settings.scale_weight or settings.distance_weight)
             given |= {"splats": splats.rows, "face": splats.face, "screen": screen}
             optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
             queued.readback.copy_from(work, (counts_buffer(self.device), COUNTS), (loss, 1))
         queued.readback.start()
 
     def _render(
-        self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View, background: np.ndarray,
-        sh_degree: int, selected: np.ndarray | None = None,
+        self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View,
+        background: np.ndarray, sh_degree: int, selected: np.ndarray | None = None,
     ) -> Tables:  # fmt: skip
         """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on
         the device.
@@ -241,44 +218,12 @@ class GpuBackend:
         """
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
         options = ViewOptions(
-            view.camera, sh_degree, background, self._embedding.strains, antialiased=self._settings.antialiased,
-            focused=selected is not None, reach=LOSS_REACH_PX,
+            view.camera, sh_degree, background, self._embedding.strains,
+            antialiased=self._settings.antialiased, focused=selected is not None,
+            reach=LOSS_REACH_PX,
         )  # fmt: skip
         uniform = self._rasterizer.upload_view(splats, options)
-        focus = None
-        if selected is not None:
-            marked = self.device.upload("selected", selected)
-            focus = mark_focus(work, splats, uniform, marked)
+        marked = None if selected is None else self.device.upload("selected", selected)
+        focus = None if marked is None else mark_focus(work, splats, uniform, marked)
         frames = self._embedding.compose(work, offsets)
         return self._rasterizer.forward(work, splats, frames, options, uniform, focus)
-
-    def _upload_target(self, batch: Batch) -> None:
-        change = 255 * batch.background - 255 * np.array(self._settings.background, np.float32)
-        upload_target(self.device, batch.target, self._settings.ssim_weight, batch.mask, change)
-
-    def _upload_step(self, batch: Batch) -> None:
-        settings = self._settings
-        epsilon = float(image_epsilon(settings.adam_epsilon, batch.view.camera))
-        weights = (
-            settings.scale_weight,
-            settings.distance_weight,
-            settings.unseen_opacity_weight / max(len(self), 1),
-        )
-        optimizer.upload_step(
-            self.device, batch.rates, (float(BETA1), float(BETA2)), epsilon, settings.ema_share, weights,
-            statistics=batch.accumulate, triangles=self._triangles,
-        )  # fmt: skip
-
-    def _read_offset(self, name: str) -> OffsetState:
-        read, tables, shape = (
-            self.device.read,
-            self._offsets[name],
-            (self._triangles, OFFSETS[name].signals, 3),
-        )
-        return OffsetState(
-            value=read(tables.coefficients, shape),
-            first=read(tables.first, shape),
-            second=read(tables.second, shape),
-            average=read(tables.average, shape),
-            steps=read(tables.steps, (self._triangles,), np.int32),
-        )

@@ -16,7 +16,7 @@ from ...capture.mesh_geometry import MIN_DEPTH_M, silhouette
 from ...capture.model import Capture, View
 from ...flame.model import torso_faces
 from ...flame.sequence import below_neck
-from ...tracking.folder import TorsoPoints, read_torso_points
+from ...tracking.folder import read_torso_points
 
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
@@ -75,23 +75,14 @@ def hull_points(
     if not len(triangles):
         return hull
     rest = hull.rows(~below_neck(capture.flame, views[0].timestep, points[outside]))
-    return _joined(rest, _torso_surface(capture, seen, triangles, convention, sh_degree))
-
-
-def _torso_surface(
-    capture: Capture, seen: TorsoPoints, triangles: np.ndarray, convention: str, sh_degree: int
-) -> Splats:
-    """Splats around the points at which the torso is seen, in its triangles (their numbers)."""
+    # around the points at which the torso is seen, in its triangles
     mesh, voxel = capture.mesh(seen.timestep), voxel_size(capture.mesh(seen.timestep))
     spread = np.random.default_rng(0).normal(0, SEEN_SPREAD * voxel, (SEEN_COPIES, *seen.at.shape))
     points = (seen.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
-    return to_local(_new_splats(points, voxel, sh_degree), frames, triangles[among])
-
-
-def _joined(*parts: Splats) -> Splats:
-    return joined(parts)
+    shown = to_local(_new_splats(points, voxel, sh_degree), frames, triangles[among])
+    return joined([rest, shown])
 
 
 def flat_points(
@@ -165,19 +156,17 @@ def _carried(
         return nearest
     torso = np.flatnonzero(torso_faces(capture.flame.model))
     below = below_neck(capture.flame, timestep, points)
-    if not len(torso) or not below.any():
-        return nearest
-    _, among = _nearest_triangle(points[below], capture.mesh(timestep), capture.faces[torso])
     found = nearest.copy()
-    found[below] = torso[among]
+    if len(torso) and below.any():
+        _, among = _nearest_triangle(points[below], capture.mesh(timestep), capture.faces[torso])
+        found[below] = torso[among]
     return found
 
 
 def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Points (F · S, 3) of a lattice on every triangle, triangle by triangle."""
-    return np.asarray(
-        np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces]).reshape(-1, 3)
-    )
+    samples = np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces])
+    return np.asarray(samples.reshape(-1, 3))
 
 
 def _hull_surface(
@@ -188,12 +177,37 @@ def _hull_surface(
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     foreground = [_foreground(view) for view in views]
-    within = _carved_by_blocks(axes, voxel, [view.camera for view in views], foreground)
-    points = np.stack(
-        [axis[rows] for axis, rows in zip(axes, np.nonzero(within), strict=True)], axis=1
-    )
+    min_visible = max(2, MIN_VISIBLE_SHARE * len(views))
+    # first blocks are carved, whose bounding sphere lies in the background of an image, or outside
+    # of too many images
+    centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
+    points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
+    kept, outside = np.ones(len(points), bool), np.zeros(len(points), int)
+    for view, mask in zip(views, foreground, strict=True):
+        camera = view.camera
+        pixels, depth = camera.project(points)
+        before, nearest = depth - radius > MIN_DEPTH_M, np.maximum(depth - radius, MIN_DEPTH_M)
+        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
+        # radius)).
+        focal = [camera.fl_x, camera.fl_y]
+        slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
+        reach = np.ceil((slope * focal).max(1) * radius / nearest) + 1
+        beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
+        outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
+        # Beyond an image, what is background is not known.
+        clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
+        x, y, seen = pixels_of(points, camera)
+        kept &= ~(before & seen & (clear[y, x] > reach))
+    kept &= len(views) - outside >= min_visible
+    within = kept.reshape([len(along) for along in centers])
+    for number, axis in enumerate(axes):
+        within = within.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
+    # then voxels
+    rows = np.nonzero(within)
+    points = np.stack([axis[row] for axis, row in zip(axes, rows, strict=True)], axis=1)
     inside = np.ones(len(points), bool)
-    visible, exposed = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    visible, exposed = np.zeros((2, len(points)), np.int32)
     for view, mask in zip(views, foreground, strict=True):
         beside = ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
@@ -203,49 +217,9 @@ def _hull_surface(
         exposed[remaining] += beside[y, x]
         inside[remaining] = mask[y, x]
     solid = within.copy()
-    solid[within] = inside & (visible >= _min_visible_views(len(views)))
+    solid[within] = inside & (visible >= min_visible)
     surface = (solid & ~binary_erosion(solid))[within]
     return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
-
-
-def _carved_by_blocks(
-    axes: Sequence[np.ndarray],
-    voxel: float,
-    cameras: Sequence[Camera],
-    foreground: Sequence[np.ndarray],
-) -> np.ndarray:
-    """(X, Y, Z) bool: the grid without the blocks whose bounding sphere lies in the background of
-    an image, or outside of too many images."""
-    centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
-    points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
-    radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
-    kept, outside = np.ones(len(points), bool), np.zeros(len(points), int)
-    for camera, mask in zip(cameras, foreground, strict=True):
-        pixels, depth = camera.project(points)
-        before = depth - radius > MIN_DEPTH_M
-        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
-        # radius)).
-        focal = [camera.fl_x, camera.fl_y]
-        slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
-        reach = (
-            np.ceil((slope * focal).max(1) * radius / np.maximum(depth - radius, MIN_DEPTH_M)) + 1
-        )
-        beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
-        outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
-        # Beyond an image, what is background is not known.
-        clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
-        x, y, seen = pixels_of(points, camera)
-        kept &= ~(before & seen & (clear[y, x] > reach))
-    kept &= len(cameras) - outside >= _min_visible_views(len(cameras))
-    blocks = kept.reshape([len(along) for along in centers])
-    for number, axis in enumerate(axes):
-        blocks = blocks.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
-    return blocks
-
-
-def _min_visible_views(views: int) -> float:
-    """Number of views in whose image a voxel must lie."""
-    return max(2, MIN_VISIBLE_SHARE * views)
 
 
 def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
@@ -279,12 +253,9 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
 def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
     """Gray unbound spheres of one voxel's size at world points (N, 3)."""
     n = len(points)
+    rotation, log_scale = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)), np.log(voxel / 2)
     return Splats(
-        xyz=points.astype(np.float32),
-        rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        log_scale=np.full((n, 3), np.log(voxel / 2), np.float32),
-        opacity=np.zeros(n, np.float32),
-        sh=np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
-        face=np.zeros(n, np.int32),
-        unbound=np.ones(n, bool),
-    )
+        points.astype(np.float32), rotation, np.full((n, 3), log_scale, np.float32),
+        np.zeros(n, np.float32), np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
+        np.zeros(n, np.int32), np.ones(n, bool),
+    )  # fmt: skip

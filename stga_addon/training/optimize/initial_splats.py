@@ -34,29 +34,18 @@ not symmetric."""
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
+    convention, degree, views = settings.convention, settings.sh_degree, capture.views["train"]
     order = settings.lattice_order(len(capture.faces))
-    lattice = lattice_splats(
-        capture.neutral, capture.faces, order, settings.sh_degree, convention=settings.convention
-    )
-    if not settings.teeth:
-        lattice = lattice.rows(~teeth_triangles(capture)[lattice.face])
-    first = capture.views["train"][0].timestep
-    views = [view for view in capture.views["train"] if view.timestep == first]
-    lattice.sh[:, 0] = (
-        triangle_colors(capture, capture.views["train"])[lattice.face] - 0.5
-    ) / SH_C0
-    parts = [lattice]
-    if settings.hull_points:
-        if len(views) == 1:
-            parts.append(
-                flat_points(
-                    capture, views[0], settings.convention, settings.sh_degree, settings.torso
-                )
-            )
-        else:
-            parts.append(
-                hull_points(capture, views, settings.convention, settings.sh_degree, settings.torso)
-            )
+    lattice = lattice_splats(capture.neutral, capture.faces, order, degree, convention=convention)
+    if not settings.teeth and capture.flame is not None:
+        teeth = capture.flame.model.masks.get("teeth", ())
+        lattice = lattice.rows(~np.isin(capture.faces, teeth).all(axis=1)[lattice.face])
+    lattice.sh[:, 0] = (triangle_colors(capture, views)[lattice.face] - 0.5) / SH_C0
+    parts, first = [lattice], [view for view in views if view.timestep == views[0].timestep]
+    if settings.hull_points and len(first) == 1:
+        parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
+    elif settings.hull_points:
+        parts.append(hull_points(capture, first, convention, degree, settings.torso))
     splats = joined(parts)
     added = {name: np.zeros((len(splats), ADDED[name], 3), np.float32) for name in settings.added}
     return replace(splats, **added)
@@ -80,13 +69,6 @@ def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarra
     return share
 
 
-def teeth_triangles(capture: Capture) -> np.ndarray:
-    """(F,) bool: the triangles of the rows of teeth added to FLAME's mesh; none in any other
-    mesh."""
-    masks = {} if capture.flame is None else capture.flame.model.masks
-    return np.asarray(np.isin(capture.faces, masks.get("teeth", ())).all(axis=1))
-
-
 def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     """Mean color (F, 3) from 0 to 1 of each triangle in the first view's timestep or, if hidden
     there, in later ones.
@@ -98,30 +80,32 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     Where all connected ones are hidden too, as a back tooth, it is the nearest of those that only
     later timesteps show or, without any, of all. Gray if no view shows any.
     """
-    first = views[0].timestep
-    color, seen = mean_colors(capture, [view for view in views if view.timestep == first])
-    late_color, late = mean_colors(
-        capture, _later_views([view for view in views if view.timestep != first])
-    )
-    late &= ~seen
+    by_timestep: dict[int, list[View]] = {}
+    for view in views:
+        by_timestep.setdefault(view.timestep, []).append(view)
+    color, shown = mean_colors(capture, by_timestep.pop(views[0].timestep))
+    later: list[View] = []  # a few, of timesteps that are evenly spread, by other cameras in each
+    for n, timestep in enumerate(evenly_spread(sorted(by_timestep), MAX_LATER_TIMESTEPS)):
+        step = -(-len(by_timestep[timestep]) // MAX_LATER_VIEWS)
+        later += by_timestep[timestep][n % step :: step]
+    late_color, late = mean_colors(capture, later)
+    late &= ~shown
     color[late] = late_color[late]
-    shown = seen | late
+    shown |= late
     if not shown.any():
         return np.full(color.shape, MIDDLE_GRAY)
-    hidden, mirrored = _other_side(capture, shown)
-    color[hidden], shown[hidden] = color[mirrored], True
-    return np.asarray(color[_nearest_shown(capture, shown, late if late.any() else shown)])
-
-
-def _later_views(views: Sequence[View]) -> list[View]:
-    """A few views of timesteps that are evenly spread, by other cameras in each."""
-    timesteps = sorted({view.timestep for view in views})
-    chosen: list[View] = []
-    for n, timestep in enumerate(evenly_spread(timesteps, MAX_LATER_TIMESTEPS)):
-        at_once = [view for view in views if view.timestep == timestep]
-        step = -(-len(at_once) // MAX_LATER_VIEWS)
-        chosen += at_once[n % step :: step]
-    return chosen
+    hidden, mirrored = mirror_images(capture, ~shown, shown)
+    a, b, c = capture.neutral[capture.faces].swapaxes(0, 1)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if area[hidden].sum() >= MIN_ONE_SIDED_SHARE * area.sum():
+        color[hidden], shown[hidden] = color[mirrored], True
+    centers, others = capture.neutral[capture.faces].mean(1), late if late.any() else shown
+    nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
+    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
+    for number in np.unique(part[shown]):
+        members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
+        nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
+    return np.asarray(color[nearest])
 
 
 def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
@@ -141,17 +125,6 @@ def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np
     return total / np.maximum(count, 1)[:, None] / 255, count > 0
 
 
-def _other_side(capture: Capture, shown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`mirror_images` of the triangles that are not `shown` (F,) bool; none where they are few."""
-    hidden, partner = mirror_images(capture, ~shown, shown)
-    corners = capture.neutral[capture.faces]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    few = area[hidden].sum() < MIN_ONE_SIDED_SHARE * area.sum()
-    return (hidden[:0], partner[:0]) if few else (hidden, partner)
-
-
 def mirror_images(
     capture: Capture, hidden: np.ndarray, shown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -164,18 +137,3 @@ def mirror_images(
     if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
         rows = rows[:0]
     return rows, partner[rows]
-
-
-def _nearest_shown(capture: Capture, shown: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(F,) the nearest triangle that is `shown` of those connected with each or, if none is, the
-    nearest of `others`.
-
-    shown, others (F,) bool.
-    """
-    centers = capture.neutral[capture.faces].mean(1)
-    nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
-    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
-    for number in np.unique(part[shown]):
-        members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
-        nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
-    return np.asarray(nearest)

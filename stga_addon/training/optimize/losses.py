@@ -14,6 +14,16 @@ BAND_TILES = 4
 """Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
 
 
+@cache
+def _bands(height: int, count: int) -> int:
+    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces
+    than threads."""
+    fewest, most, beyond = -(-count // 2), 2 * count, 2 * LOSS_REACH_PX
+    return min(
+        range(fewest, most + 1), key=lambda n: -(-3 * n // count) * (-(-height // n) + beyond)
+    )
+
+
 def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
     thread's work.
@@ -22,23 +32,9 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
     would cost more than what lies above and below. By default, so many that the threads are done
     soonest.
     """
-    tops = _edges(height, bands or _bands(height, threads()))
+    count = min(bands or _bands(height, threads()), height)
+    tops = [height * n // count for n in range(count + 1)]
     return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
-
-
-@cache
-def _bands(height: int, count: int) -> int:
-    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces
-    than threads."""
-
-    def rows_of_a_thread(bands: int) -> int:
-        return -(-3 * bands // count) * (-(-height // bands) + 2 * LOSS_REACH_PX)
-
-    return min(range(-(-count // 2), 2 * count + 1), key=rows_of_a_thread)
-
-
-def _edges(side: int, count: int) -> list[int]:
-    return [side * n // min(count, side) for n in range(min(count, side) + 1)]
 
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -23,7 +23,7 @@ from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_fo
 from ...raster.cpu.threads import start_threads
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
-from . import adam, driven_offsets
+from . import adam
 from .losses import image_gradient, whole_image
 from .state import TrainState, new_state, with_offsets
 
@@ -38,12 +38,12 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the
     cache is empty, a second process compiles rendering at the same time (`raster.cpu.precompile`).
-    While a process compiles
-    ahead (`jobs.preparation`), this one waits for it, unless it has kernels that are bundled
-    (`raster.cpu.bundled`).
+    While a process compiles ahead (`jobs.preparation`), this one waits for it, unless it has
+    kernels that are bundled (`raster.cpu.bundled`).
     """
-    if not USES_BUNDLED_KERNELS:
-        _await_preparation()
+    end = time.monotonic() + HELPER_TIMEOUT_S
+    while not USES_BUNDLED_KERNELS and is_preparing() and time.monotonic() < end:
+        time.sleep(POLL_INTERVAL_S)
     compile_for_cpu()
     if device != "cpu":
         from ...raster.gpu.device import Device
@@ -52,19 +52,12 @@ def precompile_kernels(device: str = "cpu") -> None:
         compile_kernels(Device(adapter_name(device)))
 
 
-def _await_preparation() -> None:
-    end = time.monotonic() + HELPER_TIMEOUT_S
-    while is_preparing() and time.monotonic() < end:
-        time.sleep(POLL_INTERVAL_S)
-
-
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
     start_threads()
     compile_gradients()
-    _limit()
-    _optimize()
+    _step()
     if helper is not None:
         try:
             helper.wait(HELPER_TIMEOUT_S)
@@ -73,64 +66,43 @@ def compile_for_cpu() -> None:
     _render()  # loads from the cache what the second process has compiled
 
 
-def _pair() -> TrainState:
-    # Two splats, because a column of a one-row array is contiguous, which is another type to Numba.
-    return new_state(
-        Splats(
-            xyz=np.array([[0, 0, 1], [0, 0, 2]], np.float32),
-            rotation=np.array([[1, 0, 0, 0]] * 2, np.float32),
-            log_scale=np.full((2, 3), -3, np.float32),
-            opacity=np.zeros(2, np.float32),
-            sh=np.zeros((2, 16, 3), np.float32),
-            face=np.zeros(2, np.int32),
-            unbound=np.zeros(2, bool),
-        )
-    )
-
-
 def _render() -> None:
     """Forward and backward pass."""
-    state = _pair()
-    seen, face = frames_in_camera(WORLD, CAMERA), state.face
-    rendering = render_forward(state.parameters, face, seen, 3, focus=np.ones(2, bool))
-    gradients = state.gradients
-    render_backward(
-        rendering, state.parameters, face, seen, np.zeros_like(rendering.image), gradients
-    )
+    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
+    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
+    v_image = np.zeros_like(rendering.image)
+    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
 
 
-def _optimize() -> None:
-    """Loss and Adam."""
+def _step() -> None:
+    """Limits, replacement of the background, loss and Adam."""
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
-    # like the loader's arrays: read-only arrays are a type of their own
-    target.setflags(write=False)
+    mask, rows = np.zeros((16, 16), np.uint8), np.arange(2, dtype=np.int32)
+    for loaded in (target, mask):  # read-only arrays are a type of their own
+        loaded.setflags(write=False)
+    black, white = np.zeros(3, np.float32), np.ones(3, np.float32)
+    change_background(target, mask, black, white, np.empty_like(target))
+    state = _two_splats()
+    face, unbound, gradients = state.face, state.unbound, state.gradients
+    xyz, _, log_scale, opacity, *_ = state.parameters
+    # Smaller than the splats: without an excess, its gradient is not computed.
+    limits = np.full((2, 1), 0.01, np.float32)
+    scale_limit(rows, log_scale, face, unbound, limits, 1.0, gradients.log_scale)
+    opacity_weight(rows, opacity, state.unseen_share, 1.0, gradients.opacity)
+    distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradients.xyz)
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
-    rates = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
-    state, rows = _pair(), np.arange(2, dtype=np.int32)
-    adam.step(state, rows, rates)
+    adam.step(state, rows, dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3))
     add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient, state.gradient_count)
-    offsets = with_offsets(state, OFFSETS, 2).driven_offsets
-    driven_offsets.step(
-        offsets, rows, state.face, state.gradients.xyz,
+    adam.step_offsets(
+        with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
         lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 1.0, adam.EPSILON,
     )  # fmt: skip
 
 
-def _limit() -> None:
-    """Limits, and replacement of the background."""
-    state = _pair()
-    target, mask = np.zeros((16, 16, 3), np.uint8), np.zeros((16, 16), np.uint8)
-    target.setflags(write=False)
-    mask.setflags(write=False)
-    change_background(
-        target, mask, np.zeros(3, np.float32), np.ones(3, np.float32), np.empty_like(target)
-    )
-    rows = np.arange(2, dtype=np.int32)
-    face, unbound = state.face, state.unbound
-    # Smaller than the splats: without an excess, its gradient is not computed.
-    limits, log_scale = np.full((2, 1), 0.01, np.float32), state.parameters.log_scale
-    scale_limit(rows, log_scale, face, unbound, limits, 1.0, state.gradients.log_scale)
-    opacity, share = state.parameters.opacity, state.unseen_share
-    opacity_weight(rows, opacity, share, 1.0, state.gradients.opacity)
-    xyz, gradient = state.parameters.xyz, state.gradients.xyz
-    distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradient)
+def _two_splats() -> TrainState:
+    # Two, because a column of a one-row array is contiguous, which is another type to Numba.
+    shapes = [(2, 3), (2, 4), (2, 3), (2,), (2, 16, 3)]
+    xyz, rotation, log_scale, opacity, sh = (np.zeros(shape, np.float32) for shape in shapes)
+    xyz[:, 2], rotation[:, 0], log_scale[:] = (1, 2), 1, -3
+    face, unbound = np.zeros(2, np.int32), np.zeros(2, bool)
+    return new_state(Splats(xyz, rotation, log_scale, opacity, sh, face, unbound))

@@ -2,17 +2,43 @@
 control."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import Field, dataclass, field, fields, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import ADDED, Splats
+from ...capture.model import View
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamTables
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Input of one iteration: one view.
+
+    target      (H, W, 3) uint8 over the settings' background
+    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`,
+                else None
+    background  (3,) float32 behind the splats
+    sh_degree   degree of spherical harmonics in use
+    selected    (F,) bool triangles whose splats are trained; None trains all
+    rates       learning rate by parameter name, and "sh_rest"
+    accumulate  whether screen gradients are summed for density control
+    """
+
+    view: View
+    target: np.ndarray
+    mask: np.ndarray | None
+    background: np.ndarray
+    sh_degree: int
+    selected: np.ndarray | None
+    rates: Mapping[str, float]
+    accumulate: bool = True
 
 
 @dataclass
@@ -89,68 +115,55 @@ class TrainState:
         """Whether a splat has a share of cameras that did not see it."""
         return bool(self.unseen_share.any())
 
-    def splats(self) -> Splats:
-        """A copy of the current splats."""
-        return self._copy(self.parameters)
+    def splats(self, averaged: bool = False) -> Splats:
+        """A copy of the current splats, or of their exponential moving average."""
+        kept = self.average if averaged else self.parameters
+        arrays = {name: array.copy() for name, array in kept._asdict().items()}
+        return Splats(**arrays, face=self.face.copy(), unbound=self.unbound.copy())
 
     def averaged(self) -> Splats:
         """A copy of the splats' exponential moving average."""
-        return self._copy(self.average)
+        return self.splats(averaged=True)
 
-    def _copy(self, parameters: Parameters) -> Splats:
-        arrays = {name: array.copy() for name, array in parameters._asdict().items()}
-        return Splats(**arrays, face=self.face.copy(), unbound=self.unbound.copy())
+
+_SPLAT_FIELDS = [field.name for field in fields(TrainState) if field.name != "driven_offsets"]
 
 
 def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainState:
     """A copy of the splats with zero moments; unseen_share (N,), zeros if None."""
     values = [getattr(splats, name).astype(np.float32, order="C") for name in Parameters._fields]
-    n = len(splats)
-
-    def zeros() -> Parameters:
-        return Parameters(*map(np.zeros_like, values))
-
+    gradients, first, second = (Parameters(*map(np.zeros_like, values)) for _ in range(3))
+    share, screen, count = np.zeros((3, len(splats)), np.float32)
+    if unseen_share is not None:
+        share = unseen_share.astype(np.float32)
+    average, steps = Parameters(*(v.copy() for v in values)), np.zeros(len(splats), np.int32)
     return TrainState(
-        parameters=Parameters(*values),
-        gradients=zeros(),
-        first=zeros(),
-        second=zeros(),
-        average=Parameters(*(v.copy() for v in values)),
-        steps=np.zeros(n, np.int32),
-        face=splats.face.astype(np.int32),
-        unbound=splats.unbound.astype(bool),
-        unseen_share=np.zeros(n, np.float32)
-        if unseen_share is None
-        else unseen_share.astype(np.float32),
-        screen_gradient=np.zeros(n, np.float32),
-        gradient_count=np.zeros(n, np.float32),
-    )
+        Parameters(*values), gradients, first, second, average, steps, splats.face.astype(np.int32),
+        splats.unbound.astype(bool), share, screen, count,
+    )  # fmt: skip
 
 
 def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:
     """The rows at `keep`, a mask (N,) or indices, of every array."""
-    return _map(lambda arrays: arrays[0][keep], state)
+    kept = state_of({name: array[keep] for name, array in arrays_of(state).items()})
+    return replace(kept, driven_offsets=state.driven_offsets)
+
+
+def join(state: TrainState, other: TrainState) -> TrainState:
+    """All rows of both states, in order."""
+    more = arrays_of(other)
+    rows = {name: np.concatenate([own, more[name]]) for name, own in arrays_of(state).items()}
+    return replace(state_of(rows), driven_offsets=state.driven_offsets)
 
 
 def with_added(state: TrainState, names: Collection[str]) -> TrainState:
     """The state with these arrays of ADDED; they and their moments are zero where there were
     none."""
-    zeros = {name: np.zeros((len(state), ADDED[name], 3), np.float32) for name in names}
-    zeros = {
-        name: array for name, array in zeros.items() if not getattr(state.parameters, name).shape[1]
-    }
-
-    def added(arrays: Parameters) -> Parameters:
-        return arrays._replace(**{name: array.copy() for name, array in zeros.items()})
-
-    return replace(
-        state,
-        parameters=added(state.parameters),
-        gradients=added(state.gradients),
-        first=added(state.first),
-        second=added(state.second),
-        average=added(state.average),
-    )
+    flat = arrays_of(state)
+    for table, name in product(("parameters", "gradients", "first", "second", "average"), names):
+        if not flat[f"{table}/{name}"].shape[1]:
+            flat[f"{table}/{name}"] = np.zeros((len(state), ADDED[name], 3), np.float32)
+    return replace(state_of(flat), driven_offsets=state.driven_offsets)
 
 
 def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> TrainState:
@@ -163,43 +176,24 @@ def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> T
     return replace(state, driven_offsets={**zeros, **state.driven_offsets})
 
 
-def join(state: TrainState, other: TrainState) -> TrainState:
-    """All rows of both states, in order."""
-    return _map(np.concatenate, state, other)
-
-
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
     """Every array of the splats under a flat name such as "first/xyz"; the inverse of
     `state_of`."""
     flat = {}
-    for f in _splat_fields():
-        value = getattr(state, f.name)
+    for name in _SPLAT_FIELDS:
+        value = getattr(state, name)
         if isinstance(value, np.ndarray):
-            flat[f.name] = value
+            flat[name] = value
         else:
-            flat.update({f"{f.name}/{name}": array for name, array in value._asdict().items()})
+            flat.update({f"{name}/{part}": array for part, array in value._asdict().items()})
     return flat
 
 
 def state_of(arrays: Mapping[str, np.ndarray]) -> TrainState:
     """Rebuild a state from `arrays_of`. Raises KeyError with the name of a missing array."""
     values: dict[str, Any] = {}
-    for f in _splat_fields():
-        if f.name in arrays:
-            values[f.name] = arrays[f.name]
-        else:
-            values[f.name] = Parameters(
-                *(arrays[f"{f.name}/{name}"] for name in Parameters._fields)
-            )
+    for name in _SPLAT_FIELDS:
+        values[name] = arrays[name] if name in arrays else Parameters(
+            *(arrays[f"{name}/{part}"] for part in Parameters._fields)
+        )  # fmt: skip
     return TrainState(**values)
-
-
-def _splat_fields() -> list[Field[Any]]:
-    return [f for f in fields(TrainState) if f.name != "driven_offsets"]
-
-
-def _map(function: Callable[[list[np.ndarray]], np.ndarray], *states: TrainState) -> TrainState:
-    """The first state with other splats."""
-    flat = [arrays_of(s) for s in states]
-    mapped = state_of({name: function([f[name] for f in flat]) for name in flat[0]})
-    return replace(mapped, driven_offsets=states[0].driven_offsets)

@@ -1,7 +1,8 @@
 """One training step: a view in, updated splats out."""
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,21 +12,23 @@ from ...render.device import adapter_name
 from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
-from .backend import Backend, Batch
 from .cpu_backend import CpuBackend
+from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .outlines import Outline, read_outlines
-from .state import TrainState, new_state, with_offsets
-from .strategies import (
-    DensityControl,
-    OutlineControl,
-    PostStep,
-    SideReset,
-    StrayReset,
-    make_strategy,
-)
+from .outlines import Outline, prune_outside, read_outlines
+from .state import Batch, TrainState, new_state, with_offsets
+from .strategies import Strategy
 from .unseen_sides import UnseenSides, unseen_sides
+
+if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
+    from .gpu_backend import GpuBackend
+
+MAX_REGION_SPLIT_SHARE = 0.1
+"""Largest share of a region's splats that one round of density control splits: a refinement has few
+rounds."""
+OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
+"""Iterations between turns of pruning outside of the masks, and of coloring unseen sides."""
 
 
 class Trainer:
@@ -52,7 +55,7 @@ class Trainer:
         strain_range (F, 2, 3): within which colors and positions follow strain; None: COLOR_RANGE.
         """
         self.capture, self.settings = capture, settings
-        self.strategy = make_strategy(settings, selection)
+        self.strategy = Strategy(settings, selection)
         self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
         self.frames = FrameStore(
             capture, settings.convention, settings.follows_strain, self.tracking, strain_range
@@ -65,6 +68,10 @@ class Trainer:
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
             state = with_offsets(state, settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self.frames, state)
+        self._outlines: list[Outline] | None = None
+        self._sides: UnseenSides | None = None
+        cameras = {view.camera_index for view in capture.views["train"]}
+        self._has_one_camera = len(cameras) == 1
         self.initial_count = len(self)
 
     def __len__(self) -> int:
@@ -80,18 +87,6 @@ class Trainer:
     @state.setter
     def state(self, state: TrainState) -> None:
         self._backend.state = state
-
-    def restore(
-        self,
-        iteration: int,
-        visit: int,
-        last_timestep: int | None,
-        initial_count: int,
-    ) -> None:
-        """Restore, beside the state given at construction, everything that the next step depends
-        on."""
-        self.iteration, self.visit = iteration, visit
-        self.last_timestep, self.initial_count = last_timestep, initial_count
 
     def step(
         self,
@@ -116,26 +111,15 @@ class Trainer:
         self.last_timestep = view.timestep
         if mesh is not None:
             self.frames.add(view.timestep, mesh)
-        background = self._background
-        if not settings.random_background:
-            mask = None
+        background, mask = self._background, mask if settings.random_background else None
         if mask is not None:
-            background = np.random.default_rng([settings.seed, self.iteration]).random(
-                3, np.float32
-            )
+            rng = np.random.default_rng([settings.seed, self.iteration])
+            background = rng.random(3, np.float32)
+        degree, rates = sh_degree(settings, progress), learning_rates(settings.rates, progress)
         selected = self.strategy.triangles(self.iteration, self.visit, view.timestep, progress)
-        loss = self._backend.step(
-            Batch(
-                view=view,
-                target=target,
-                mask=mask,
-                background=background,
-                sh_degree=sh_degree(settings, progress),
-                selected=selected,
-                rates=learning_rates(settings.rates, progress),
-                accumulate=selected is None or self.strategy.region is not None,
-            )
-        )
+        accumulate = selected is None or self.strategy.region is not None
+        batch = Batch(view, target, mask, background, degree, selected, rates, accumulate)
+        loss = self._backend.step(batch)
         self.iteration += 1
         self._post_step(progress)
         return loss
@@ -145,47 +129,56 @@ class Trainer:
         the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
-    @cached_property
-    def _outlines(self) -> list[Outline]:
-        return read_outlines(self.capture, self.settings.seed)
-
-    @cached_property
-    def _sides(self) -> UnseenSides:
-        return unseen_sides(self.capture)
-
-    @cached_property
-    def _has_one_camera(self) -> bool:
-        return len({view.camera_index for view in self.capture.views["train"]}) == 1
-
     def _post_step(self, progress: float) -> None:
-        steps: tuple[PostStep, ...] = (
-            StrayReset(self.settings, self.frames.units, self.strategy.region),
-            DensityControl(self.settings, self.initial_count, self.strategy.region),
-            OutlineControl(
-                self.settings, self.frames, lambda: self._outlines, self.strategy.region
-            ),
-            SideReset(lambda: self._sides, self._has_one_camera and self.strategy.region is None),
-        )
-        due = [step for step in steps if step.is_due(self.iteration, progress)]
-        if due:
-            state = self.state
-            for step in due:
-                state = step.apply(state, self.iteration)
-            self.state = state
+        """Change the splats after an optimizer step, where it is the turn of one of the changes."""
+        settings, region, count = self.settings, self.strategy.region, self.iteration
+
+        def is_turn(interval: int) -> bool:
+            return interval > 0 and count % interval == 0
+
+        moves_strays = is_turn(settings.stray_reset_interval)
+        start, end = settings.density_span
+        splits = start <= progress < end and is_turn(settings.density_interval)
+        # where alpha is learned from masks
+        prunes = settings.random_background and is_turn(OUTLINE_INTERVAL)
+        colors = self._has_one_camera and region is None and is_turn(SIDE_INTERVAL)
+        if not (moves_strays or splits or prunes or colors):
+            return
+        state = self.state
+        if moves_strays:
+            limit = settings.stray_limit * self.frames.units
+            if region is not None:
+                limit = np.where(region, limit, np.inf).astype(limit.dtype)
+            reset_strays(state, limit, settings.stray_reset_share)
+        if splits:
+            budget = round(self.initial_count * (1 + settings.growth)) - len(state)
+            share = MAX_SPLIT_SHARE if region is None else MAX_REGION_SPLIT_SHARE
+            rng = np.random.default_rng([settings.seed, count])
+            state = control_density(state, budget, rng, share, region)
+        if prunes:
+            coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
+            frames = partial(self.frames.moved, coefficients=coefficients)
+            if self._outlines is None:
+                self._outlines = read_outlines(self.capture, settings.seed)
+            state = prune_outside(state, frames, self._outlines, region)
+        if colors:
+            if self._sides is None:
+                self._sides = unseen_sides(self.capture)
+            state = self._sides.restore(state)
+        self.state = state
 
 
 def make_backend(
     device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState
-) -> Backend:
+) -> "CpuBackend | GpuBackend":
     """The backend of a device of `choose_device`. Raises StgaError if the device does not support
     the settings."""
     if device == "cpu":
         return CpuBackend(settings, frames, state)
     if settings.tracking:
-        raise StgaError(
-            f"--effect tracking=on: FLAME parameters are refined on the CPU only, not on {device}"
-        )
-    from ...raster.gpu.device import Device  # needs wgpu, which training on the CPU does without
+        text = f"FLAME parameters are refined on the CPU only, not on {device}"
+        raise StgaError(f"--effect tracking=on: {text}")
+    from ...raster.gpu.device import Device
     from ...raster.gpu.frames import SIGNALS
     from .gpu_backend import GpuBackend
 

@@ -22,9 +22,7 @@ VERSION = 3
 TRACKING, IDENTITY = "tracking/parameters", "identity"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
-OTHER_RUN = (
-    "belongs to another run than run.json beside it; remove it, or train into another folder"
-)
+OTHER_RUN = "belongs to another run than run.json; remove it, or train into another folder"
 
 
 @dataclass
@@ -67,28 +65,19 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
     stored = arrays.pop(IDENTITY, None)
     if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
         raise StgaError(f"{path}: {OTHER_RUN}")
-    selection = {}
     for name, mask in arrays.items():
-        if (
-            not re.fullmatch(r"\d{1,18}", name, re.ASCII)
-            or mask.dtype != bool
-            or mask.shape != (faces,)
-        ):
-            raise StgaError(
-                f"{path}: '{name}' is {mask.dtype} {mask.shape}, expected bool ({faces},) by timestep"
-            )
-        selection[int(name)] = mask
-    return selection
+        named = re.fullmatch(r"\d{1,18}", name, re.ASCII)
+        if not named or mask.dtype != bool or mask.shape != (faces,):
+            expected = f"expected bool ({faces},) by timestep"
+            raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, {expected}")
+    return {int(name): mask for name, mask in arrays.items()}
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they
     are read."""
-    arrays = {
-        k: array
-        for k, array in arrays_of(checkpoint.state).items()
-        if not k.startswith("gradients/")
-    }
+    every = arrays_of(checkpoint.state).items()
+    arrays = {name: array for name, array in every if not name.startswith("gradients/")}
     for effect, offset in checkpoint.state.driven_offsets.items():
         arrays.update({f"{effect}/{name}": array for name, array in vars(offset).items()})
     if checkpoint.tracking is not None:
@@ -110,13 +99,19 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         if tracking is not None:
             timesteps, parameters = tracking.shape
             check_array(path, TRACKING, tracking, "float64", (timesteps, parameters))
-        elif _taken(arrays, "tracking/"):
-            raise StgaError(
-                f"{path}: refines the tracking as version 0.2.0 did; train into another folder"
-            )
-        offsets = {
-            name: offset for name in OFFSETS if (offset := _offset(path, arrays, name)) is not None
-        }
+        elif any(name.startswith("tracking/") for name in arrays):
+            text = "refines the tracking as version 0.2.0 did; train into another folder"
+            raise StgaError(f"{path}: {text}")
+        offsets = {}
+        for effect, offset in OFFSETS.items():
+            names = [name for name in arrays if name.startswith(f"{effect}/")]
+            if names:
+                taken = {name.removeprefix(f"{effect}/"): arrays.pop(name) for name in names}
+                offsets[effect] = found = OffsetState(**taken)
+                whole, tail = found.steps.shape[:1], (offset.signals, 3)
+                for part, array in taken.items():
+                    kind = ("int32", whole) if part == "steps" else ("float32", (*whole, *tail))
+                    check_array(path, f"{effect}/{part}", array, *kind)
         if any(array.ndim == 0 for array in arrays.values()):
             raise StgaError(f"{path}: an array has no rows")
         for name in [n for n in arrays if n.startswith("first/")]:
@@ -134,40 +129,32 @@ def _packed(text: str) -> np.ndarray:
 
 
 def _meta(packed: np.ndarray) -> dict[str, Any]:
-    """Everything of a checkpoint that is no array. Raises ValueError for what training cannot
-    continue with."""
-    meta = json.loads(packed.tobytes())
-    if not isinstance(meta, dict):
+    """Everything of a checkpoint that is no array. Raises ValueError for what is none of that."""
+    stored = json.loads(packed.tobytes())
+    if not isinstance(stored, dict):
         raise ValueError("meta is no object")
-    meta.setdefault("rounds", 0)
+    meta = {"rounds": 0, **stored}
     lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
-    for name, low in lowest.items():
-        if type(meta.get(name)) is not int or not low <= meta[name] < MAX_COUNT:
-            raise ValueError(
-                f"{name} is {shorten(meta.get(name))}, expected a whole number from {low} up"
-            )
-    last, losses = meta.get("last_timestep"), meta.get("losses")
-    if last is not None and (type(last) is not int or not 0 <= last < MAX_COUNT):
-        raise ValueError(f"last_timestep is {shorten(last)}, expected a timestep")
-    if not _is_number(meta.get("elapsed_s")) or not 0 <= meta["elapsed_s"] < math.inf:
-        raise ValueError(
-            f"elapsed_s is {shorten(meta.get('elapsed_s'))}, expected seconds from 0 up"
-        )
-    if not _is_number(meta.get("best_difference")) or math.isnan(meta["best_difference"]):
-        raise ValueError(
-            f"best_difference is {shorten(meta.get('best_difference'))}, expected a number"
-        )
-    if not isinstance(losses, list) or not all(
-        _is_number(loss) and not math.isnan(loss) for loss in losses
-    ):
-        raise ValueError("losses is no list of numbers")
-    if not isinstance(meta.get("identity"), str):
-        raise ValueError("identity is no text")
+    last, seconds, losses = (meta[name] for name in ("last_timestep", "elapsed_s", "losses"))
+
+    def is_count(value: Any, low: int = 0) -> bool:
+        return type(value) is int and low <= value < MAX_COUNT
+
+    def is_number(value: Any) -> bool:
+        return is_count(value, -MAX_COUNT) or (isinstance(value, float) and not math.isnan(value))
+
+    checks = {
+        **{n: (is_count(meta[n], m), f"a whole number from {m} up") for n, m in lowest.items()},
+        "last_timestep": (last is None or is_count(last), "a timestep"),
+        "elapsed_s": (is_number(seconds) and 0 <= seconds < math.inf, "seconds from 0 up"),
+        "best_difference": (is_number(meta["best_difference"]), "a number"),
+        "losses": (isinstance(losses, list) and all(map(is_number, losses)), "a list of numbers"),
+        "identity": (isinstance(meta["identity"], str), "a text"),
+    }
+    for name, (fits, expected) in checks.items():
+        if not fits:
+            raise ValueError(f"{name} is {shorten(meta[name])}, expected {expected}")
     return meta
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float) or (type(value) is int and abs(value) < MAX_COUNT)
 
 
 def _check_state(path: Path, state: TrainState) -> None:
@@ -177,42 +164,10 @@ def _check_state(path: Path, state: TrainState) -> None:
     for field, kind in ARRAYS.items():
         size = getattr(state.parameters, field).shape[1] if kind.sizes else 0
         if kind.sizes and size not in kind.sizes:
-            raise StgaError(
-                f"{path}: parameters/{field} has {size} coefficients, expected one of {kind.sizes}"
-            )
-        tails[field] = kind.shape_at(size)
+            text = f"parameters/{field} has {size} coefficients, expected one of {kind.sizes}"
+            raise StgaError(f"{path}: {text}")
+        tails[field] = tuple(size if axis < 0 else axis for axis in kind.shape)
     whole = {"steps": "int32", "face": "int32", "unbound": "bool"}
     for name, array in arrays_of(state).items():
-        check_array(
-            path,
-            name,
-            array,
-            whole.get(name, "float32"),
-            (n, *tails.get(name.rpartition("/")[2], ())),
-        )
-
-
-def _offset(path: Path, arrays: dict[str, np.ndarray], name: str) -> OffsetState | None:
-    """A driven offset, taken out of a checkpoint's arrays; None where there is none. Raises
-    StgaError naming an array that is wrong."""
-    taken = _taken(arrays, f"{name}/")
-    if not taken:
-        return None
-    found = OffsetState(**taken)
-    triangles = found.steps.shape[:1]
-    for part, array in taken.items():
-        tail = () if part == "steps" else (OFFSETS[name].signals, 3)
-        check_array(
-            path, f"{name}/{part}", array, "float32" if tail else "int32", (*triangles, *tail)
-        )
-    return found
-
-
-def _taken(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with the prefix, under the rest of their names; removed from
-    `arrays`."""
-    return {
-        name.removeprefix(prefix): arrays.pop(name)
-        for name in list(arrays)
-        if name.startswith(prefix)
-    }
+        shape = n, *tails.get(name.rpartition("/")[2], ())
+        check_array(path, name, array, whole.get(name, "float32"), shape)

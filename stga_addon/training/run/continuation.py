@@ -10,7 +10,7 @@ from operator import add
 
 import numpy as np
 
-from ...avatar.file import Avatar, read_avatar
+from ...avatar.file import read_avatar
 from ...avatar.splats import ADDED
 from ...capture.model import Capture, View, evenly_spread
 from ...errors import StgaError
@@ -26,15 +26,9 @@ from ..evaluate.evaluation_views import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
 from ..optimize.image_preparation import image_preparation
-from ..optimize.state import (
-    TrainState,
-    new_offset,
-    new_state,
-    with_added,
-    with_offsets,
-)
-from ..schedule import view_order
-from ..settings import Rates, TrainingSettings
+from ..optimize.state import TrainState, new_offset, new_state, with_added, with_offsets
+from ..schedule import learning_rates, view_order
+from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
@@ -67,38 +61,29 @@ def select_for_takes(
     A triangle looks different where the avatar's residual in a few views of the new takes is larger
     than in a few of the old ones by MIN_RESIDUAL_RATIO and MIN_RESIDUAL_GAIN.
     """
-    views = capture.views["train"]
-    avatar, prepare = (
-        read_avatar(continuation.parent / AVATAR),
-        image_preparation(capture, settings),
-    )
-    parts = [
-        [view for view in views if continuation.includes(view.timestep) is new]
-        for new in (False, True)
-    ]
+    avatar = read_avatar(continuation.parent / AVATAR)
+    prepare = image_preparation(capture, settings)
+    parts: tuple[list[View], list[View]] = [], []
+    for view in capture.views["train"]:
+        parts[continuation.includes(view.timestep)].append(view)
     old_views, new_views = (replayed_views(capture, part, COMPARED_VIEWS) for part in parts)
-    old = triangle_residuals(avatar, capture, old_views, prepare, RESIDUAL_SCALE)
-    by_view = [
-        triangle_residuals(avatar, capture, [view], prepare, RESIDUAL_SCALE) for view in new_views
-    ]
+
+    def residuals(*views: View) -> Residuals:
+        return triangle_residuals(avatar, capture, views, prepare, RESIDUAL_SCALE)
+
+    old, by_view = residuals(*old_views), [residuals(view) for view in new_views]
     new = reduce(add, by_view)
     known, now = np.nan_to_num(old.mean()), np.nan_to_num(new.mean())
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
     timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
     moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
     selection = {timestep: faces | differs for timestep, faces in moving.items()}
-    return selection, _unlike_views(new_views, by_view, starts)
-
-
-def _unlike_views(
-    views: Sequence[View], residuals: Sequence[Residuals], starts: Sequence[int]
-) -> list[View]:
-    """The views whose residual stands out in their take."""
-    errors = np.array([each.error.sum() / max(each.weight.sum(), 1.0) for each in residuals])
-    takes = np.array([bisect_right(starts, view.timestep) for view in views])
+    # views whose residual stands out in their take
+    errors = np.array([each.error.sum() / max(each.weight.sum(), 1.0) for each in by_view])
+    takes = np.array([bisect_right(starts, view.timestep) for view in new_views])
     usual = np.array([np.median(errors[takes == take]) for take in takes])
-    unlike = errors > np.maximum(MIN_UNLIKE_RATIO * usual, MIN_UNLIKE_RESIDUAL)
-    return [view for view, stands_out in zip(views, unlike, strict=True) if stands_out]
+    unlike = np.flatnonzero(errors > np.maximum(MIN_UNLIKE_RATIO * usual, MIN_UNLIKE_RESIDUAL))
+    return selection, [new_views[number] for number in unlike]
 
 
 def starting_state(
@@ -124,7 +109,13 @@ def starting_state(
     }
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
-        if _is_of(kept, avatar):
+        offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
+        pairs = [(vars(avatar.splats), vars(kept.averaged())), (avatar.driven_offsets, offsets)]
+        if all(
+            ours.keys() == theirs.keys()
+            and all(np.array_equal(ours[name], theirs[name]) for name in ours)
+            for ours, theirs in pairs
+        ):
             parameters = Parameters(*(array.copy() for array in kept.average))
             zero = np.zeros(len(kept), np.float32)
             state = replace(
@@ -134,26 +125,6 @@ def starting_state(
                 offset.value = offset.average.copy()
     state = with_added(state, settings.added)
     return with_offsets(state, settings.driven_offsets, triangles)
-
-
-def _is_of(state: TrainState, avatar: Avatar) -> bool:
-    """Whether the avatar was made of this state."""
-    offsets = {name: offset.average for name, offset in state.driven_offsets.items()}
-    pairs = [(vars(avatar.splats), vars(state.averaged())), (avatar.driven_offsets, offsets)]
-    return all(
-        ours.keys() == theirs.keys()
-        and all(np.array_equal(ours[name], theirs[name]) for name in ours)
-        for ours, theirs in pairs
-    )
-
-
-def late_rates(rates: Rates, share: float) -> Rates:
-    """The rates of a schedule of which this share has passed; they end where the schedule ends."""
-    names = [name for name in vars(rates) if name not in ("position_end", "end")]
-    ends = {name: rates.position_end if name == "xyz" else rates.end for name in names}
-    now = {name: getattr(rates, name) * ends[name] ** share for name in names}
-    rest = {"position_end": rates.position_end ** (1 - share), "end": rates.end ** (1 - share)}
-    return replace(rates, **now, **rest)
 
 
 def continued_settings(
@@ -170,9 +141,11 @@ def continued_settings(
     What effects add to splats begins with the first rate of the run in an extension: other
     expressions strain triangles in directions that the old takes never showed.
     """
-    rates = late_rates(settings.rates, START_SHARE)
+    first = settings.rates
+    ends = {"position_end": first.position_end**START_SHARE, "end": first.end**START_SHARE}
+    rates = replace(first, **learning_rates(first, START_SHARE), **ends)  # from there on
     if strategy == "extend":
-        rates = replace(rates, **{name: getattr(settings.rates, name) for name in ADDED})
+        rates = replace(rates, **{name: getattr(first, name) for name in ADDED})
     continued = replace(
         settings,
         strategy=strategy,
@@ -204,32 +177,25 @@ def continued_evaluation_views(
 
     region (F,) bool: its visible pixels become the views' region "region"; None for an extension.
     """
+    assert run.continuation is not None
     groups: dict[str, list[View]] = {}
     for view in capture.views.get("val", ()):
-        groups.setdefault(_group(run, view.timestep), []).append(view)
+        group = "frames" if run.continuation.includes(view.timestep) else "other_frames"
+        if run.settings.strategy == "extend":
+            group = f"take_{1 + sum(take.start <= view.timestep for take in run.takes)}"
+        groups.setdefault(group, []).append(view)
     limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
+    background, backdrop = run.settings.background, run.settings.backdrop
     for name, members in groups.items():
-        group = name if len(groups) > 1 else ""
         for view in evenly_spread(members, limit):
-            found = read_evaluation_view(
-                capture, view, run.settings.background, run.settings.backdrop
-            )
-            found = replace(found, group=group)
+            found = read_evaluation_view(capture, view, background, backdrop)
+            found = replace(found, group=name if len(groups) > 1 else "")
             pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
             if pixels.sum() >= MIN_REGION_PIXELS:
                 found = replace(found, regions={**found.regions, "region": pixels})
             chosen.append(found)
     return chosen
 
-
-def _group(run: Run, timestep: int) -> str:
-    assert run.continuation is not None
-    if run.settings.strategy == "extend":
-        return f"take_{1 + sum(take.start <= timestep for take in run.takes)}"
-    return "frames" if run.continuation.includes(timestep) else "other_frames"
-
-
-# Order of views
 
 REPLAY_SHARE = 1 / 3
 """Share of a refinement's iterations that train views outside the continuation's frames, where
@@ -263,9 +229,8 @@ def continued_order(
     """
     views = capture.views["train"]
     asked = [view for view in views if continuation.includes(view.timestep)]
-    others = replayed_views(
-        capture, [view for view in views if not continuation.includes(view.timestep)]
-    )
+    rest = [view for view in views if not continuation.includes(view.timestep)]
+    others = replayed_views(capture, rest)
     if region is not None:
         asked, others = (views_of_region(capture, members, region) for members in (asked, others))
     share = (EXTEND_REPLAY_SHARE if region is None else REPLAY_SHARE) if others else 0.0
@@ -323,11 +288,8 @@ def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray)
     """The views in which the region (F,) bool is seen large: turned to the camera, whatever may
     cover it."""
     seen = np.array([_facing_area(capture, view, region) for view in views])
-    return [
-        view
-        for view, area in zip(views, seen, strict=True)
-        if area >= MIN_REGION_SHARE * seen.max() > 0
-    ]
+    large = [area >= MIN_REGION_SHARE * seen.max() > 0 for area in seen]
+    return [view for view, is_large in zip(views, large, strict=True) if is_large]
 
 
 def is_faced(capture: Capture, views: Sequence[View], region: np.ndarray) -> bool:

@@ -17,7 +17,7 @@ world.ply       what stands still behind the person, in world space; only where 
 
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -71,9 +71,8 @@ class Continuation:
     def check(self) -> None:
         """Raise StgaError where there is no timestep from first to last."""
         if self.first > self.last:
-            raise StgaError(
-                f"continuation: its last timestep {self.last} is before its first, {self.first}"
-            )
+            text = f"its last timestep {self.last} is before its first, {self.first}"
+            raise StgaError(f"continuation: {text}")
 
     def includes(self, timestep: int) -> bool:
         return self.first <= timestep <= self.last
@@ -123,13 +122,11 @@ def read_run(folder: Path) -> Run:
     version = values.pop("version", None)
     if version not in (OLDEST_VERSION, VERSION):
         reads = f"{OLDEST_VERSION} and {VERSION}"
-        raise StgaError(
-            f"{path}: has run format version {shorten(version)}, this add-on reads {reads}"
-        )
+        found = f"has run format version {shorten(version)}"
+        raise StgaError(f"{path}: {found}, this add-on reads {reads}")
     if version == OLDEST_VERSION and isinstance(values.get("settings"), dict):
-        values["settings"].update(
-            {name: getattr(TrainingSettings, name) for name in LATER_SETTINGS}
-        )
+        later = {name: getattr(TrainingSettings, name) for name in LATER_SETTINGS}
+        values["settings"].update(later)
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:
@@ -161,16 +158,12 @@ def locked(folder: Path) -> Iterator[None]:
             folder.mkdir(parents=True, exist_ok=True)
             lock.enter_context(hold_lock(path))
         except BlockingIOError as error:
-            raise StgaError(
-                f"{folder}: another run is working in this folder (process {lock_owner(path)})"
-            ) from error
+            text = f"another run is working in this folder (process {lock_owner(path)})"
+            raise StgaError(f"{folder}: {text}") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         remove_leftovers(folder)
         yield
-
-
-# A run with its capture
 
 
 @dataclass(frozen=True)
@@ -199,18 +192,23 @@ def open_run(
     """
     run = read_run(folder)
     if principal_point not in (None, run.principal_point):
-        raise StgaError(
-            f"{folder}: was trained with principal point '{run.principal_point}', not '{principal_point}'"
-        )
+        trained = f"was trained with principal point '{run.principal_point}'"
+        raise StgaError(f"{folder}: {trained}, not '{principal_point}'")
     flame = run.flame if flame is None else flame.resolve()
     first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
-    run = replace(run, capture=first.root, flame=flame)
-    takes = (first, *(_open_take(folder, run, take) for take in run.takes))
+    run, takes = replace(run, capture=first.root, flame=flame), [first]
+    for take in run.takes:
+        takes.append(open_capture(take.capture, run.flame, run.principal_point))
+        given = identity_of(takes[-1], run.principal_point, run.settings)
+        changed = difference(take.identity, given)
+        if changed is not None:
+            text = f"{take.capture} ({take.identity.summary}), but it now {changed}"
+            raise StgaError(f"{folder}: was extended with {text}")
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
         opened = with_refined_tracking(opened, folder)
-    return OpenedRun(run, opened, takes)
+    return OpenedRun(run, opened, tuple(takes))
 
 
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
@@ -219,17 +217,6 @@ def open_refined(folder: Path, capture: Path | None = None, flame: Path | None =
     if not folder.is_dir():
         raise StgaError(f"{folder}: is not a folder; expected that of a run")
     return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
-
-
-def _open_take(folder: Path, run: Run, take: Take) -> Capture:
-    """A capture that joined the run. Raises StgaError where it is missing or has changed."""
-    capture = open_capture(take.capture, run.flame, run.principal_point)
-    changed = difference(take.identity, identity_of(capture, run.principal_point, run.settings))
-    if changed is not None:
-        raise StgaError(
-            f"{folder}: was extended with {take.capture} ({take.identity.summary}), but it now {changed}"
-        )
-    return capture
 
 
 def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
@@ -247,20 +234,19 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
         return given
     if trained == version_4_identity(given, run.settings):
         return trained
-    if trained.principal_point != given.principal_point:
-        wanted = f"principal point '{trained.principal_point}', not '{given.principal_point}'"
-        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
-    if "" not in (trained.flame, given.flame) and trained.flame != given.flame:
-        wanted = f"FLAME model {stored.flame}, but {run.flame} has other content"
-        raise StgaError(f"{folder}: was trained with {wanted}; train into another folder")
     changed = difference(trained, given)
-    if changed is not None:
+    if trained.principal_point != given.principal_point:
+        point = given.principal_point
+        was = f"trained with principal point '{trained.principal_point}', not '{point}'"
+    elif "" not in (trained.flame, given.flame) and trained.flame != given.flame:
+        was = f"trained with FLAME model {stored.flame}, but {run.flame} has other content"
+    elif changed is not None:
         where = "it now" if capture.root == stored.capture else f"{capture.root} ({given.summary})"
-        wanted = f"{stored.capture} ({trained.summary}), but {where} {changed}"
-        raise StgaError(f"{folder}: was trained on {wanted}; train into another folder")
-    raise StgaError(
-        f"{folder}: was begun with other settings; restore them in run.json, or train into another folder"
-    )
+        was = f"trained on {stored.capture} ({trained.summary}), but {where} {changed}"
+    else:
+        was = "begun with other settings; restore them in run.json, or"
+        raise StgaError(f"{folder}: was {was} train into another folder")
+    raise StgaError(f"{folder}: was {was}; train into another folder")
 
 
 def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
@@ -270,31 +256,23 @@ def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
     A run of a GPU that this machine lacks continues on the first one.
     Raises StgaError where that device does not work or cannot train this run.
     """
-    trained_on = run.device if _has(run.device) else run.device.partition(":")[0]
+    trained_on, has_adapter = run.device, False
+    with suppress(StgaError):  # where there is no GPU at all
+        named = trained_on.removeprefix(GPU)
+        has_adapter = trained_on.startswith(GPU) and named in adapter_names()
+    if not has_adapter:
+        trained_on = trained_on.partition(":")[0]
     try:
         device, reason = choose_device(trained_on if requested == "auto" else requested)
     except StgaError as error:
         if requested != "auto":
             raise
-        raise StgaError(
-            f"this run was trained on {trained_on}: {error}; give --device cpu to continue on the CPU"
-        ) from error
+        advice = "give --device cpu to continue on the CPU"
+        raise StgaError(f"this run was trained on {trained_on}: {error}; {advice}") from error
     if run.settings.tracking and device != "cpu":
-        raise StgaError(
-            f"--device {requested}: this run refines the tracking, which works on the CPU only"
-        )
+        text = "this run refines the tracking, which works on the CPU only"
+        raise StgaError(f"--device {requested}: {text}")
     return device, reason
-
-
-def _has(device: str) -> bool:
-    """Whether a device is a GPU by the name of an adapter of this machine."""
-    try:
-        return device.startswith(GPU) and device.removeprefix(GPU) in adapter_names()
-    except StgaError:  # no GPU at all
-        return False
-
-
-# Smaller files
 
 
 def write_tracking(

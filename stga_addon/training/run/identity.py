@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...capture.camera import Camera
-from ...capture.model import Capture, View
+from ...capture.model import Capture
 from ...errors import StgaError
 from ...schema import to_json
 from ..settings import TrainingSettings
@@ -55,11 +54,21 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises
     StgaError."""
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
+    cameras = {view.camera_index for _, view in views}
+    timesteps = {view.timestep for _, view in views}
+    images = [
+        (split, view.timestep, view.camera_index, view.name, view.camera.width, view.camera.height,
+         view.mask is not None)
+        for split, view in views
+    ]  # fmt: skip
+    lenses = [view.camera for _, view in views]
+    poses = np.array([lens.world_to_camera for lens in lenses], np.float64).reshape(-1, 16)
+    intrinsics = [(lens.fl_x, lens.fl_y, lens.cx, lens.cy) for lens in lenses]
     return RunIdentity(
         principal_point,
-        _summary([view for _, view in views]),
-        _digest(json.dumps([_image(split, view) for split, view in views]).encode()),
-        _digest(_quantized(_camera_table([view.camera for _, view in views]))),
+        f"{len(cameras)} cameras, {len(timesteps)} timesteps",
+        _digest(json.dumps(images).encode()),
+        _digest(_quantized(np.hstack([poses, np.reshape(intrinsics, (-1, 4))]))),
         _digest(np.ascontiguousarray(capture.faces, np.int32).tobytes()),
         _digest(_quantized(capture.neutral)),
         "" if capture.flame_file is None else file_digest(capture.flame_file),
@@ -85,14 +94,8 @@ def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
         "cameras": "has other camera poses or intrinsics",
         "neutral": "has another neutral mesh",
     }
-    return next(
-        (
-            phrase
-            for name, phrase in phrases.items()
-            if getattr(trained, name) != getattr(given, name)
-        ),
-        None,
-    )
+    other = [name for name in phrases if getattr(trained, name) != getattr(given, name)]
+    return phrases[other[0]] if other else None
 
 
 def _settings_digest(settings: dict[str, Any]) -> str:
@@ -110,33 +113,6 @@ def file_digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-
-
-def _summary(views: list[View]) -> str:
-    cameras, timesteps = {view.camera_index for view in views}, {view.timestep for view in views}
-    return f"{len(cameras)} cameras, {len(timesteps)} timesteps"
-
-
-def _image(split: str, view: View) -> tuple[object, ...]:
-    camera = view.camera
-    return (
-        split,
-        view.timestep,
-        view.camera_index,
-        view.name,
-        camera.width,
-        camera.height,
-        view.mask is not None,
-    )
-
-
-def _camera_table(cameras: list[Camera]) -> np.ndarray:
-    """(N, 20) float64: pose and intrinsics."""
-    poses = np.array([camera.world_to_camera for camera in cameras], np.float64).reshape(-1, 16)
-    intrinsics = np.array([(c.fl_x, c.fl_y, c.cx, c.cy) for c in cameras], np.float64).reshape(
-        -1, 4
-    )
-    return np.hstack([poses, intrinsics])
 
 
 def _quantized(values: np.ndarray) -> bytes:

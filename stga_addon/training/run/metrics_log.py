@@ -71,21 +71,18 @@ def _fault(line: Any) -> str | None:
         return f"iteration is {shorten(line['iteration'])}, expected a whole number"
     if "psnr" in line and "ssim" not in line:
         return "psnr has no ssim beside it"
-    return _forecast_fault(line) if "forecast" in line else None
-
-
-def _forecast_fault(line: dict[str, Any]) -> str | None:
-    forecast = line["forecast"]
-    if not isinstance(forecast, dict) or not all(
-        _is_finite(forecast.get(name)) for name in FORECAST
-    ):
-        return f"forecast is {shorten(forecast)}, expected numbers named {', '.join(FORECAST)}"
-    return None if _is_finite(line.get("psnr")) else "forecast has no psnr beside it"
+    if "forecast" not in line:
+        return None
+    found = line["forecast"]
+    numbers: list[Any] = [None]
+    if isinstance(found, dict):
+        numbers = [found.get(name) for name in FORECAST]
+    if not all(_is_number(each) and math.isfinite(each) for each in numbers):
+        return f"forecast is {shorten(found)}, expected numbers named {', '.join(FORECAST)}"
+    if "psnr" not in line or not math.isfinite(line["psnr"]):
+        return "forecast has no psnr beside it"
+    return None
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 63)
-
-
-def _is_finite(value: Any) -> bool:
-    return _is_number(value) and math.isfinite(value)

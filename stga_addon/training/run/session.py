@@ -7,20 +7,20 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from shutil import copyfile
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...avatar.splats import ADDED
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture, ViewExposure, evenly_spread
+from ...capture.model import Capture, evenly_spread
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...flame.sequence import SHIFT_SIZE
@@ -28,16 +28,13 @@ from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import (
-    EvaluationView,
-    choose_evaluation_views,
-    read_evaluation_view,
-)
-from ..evaluate.evaluator import Evaluation, Evaluator, Spent
+from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
+from ..evaluate.evaluator import Evaluator, Spent
+from ..evaluate.forecast import UNMATCHED
 from ..evaluate.match_exposure import known_exposure
 from ..evaluate.metrics import peak_memory_mb
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
-from ..optimize.avatar_tracking import track_by_avatar
+from ..optimize.avatar_tracking import RefinedTracking, track_by_avatar
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
@@ -56,7 +53,6 @@ from .continuation import continued_evaluation_views, continued_order, starting_
 from .folder import (
     AVATAR,
     CHECKPOINT,
-    RUN,
     SELECTION,
     TRACKING,
     WORLD_FILE,
@@ -85,355 +81,6 @@ RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
-
-
-@dataclass
-class Session:
-    """A run between two of its steps.
-
-    strain_range  (F, 2, 3) `Avatar.strain_range`; with refined tracking that of the last evaluation
-    elapsed_s     seconds of training so far, evaluation not counted
-    losses        of the last global iterations
-    """
-
-    capture: Capture
-    folder: Path
-    run: Run
-    trainer: Trainer
-    strain_range: np.ndarray | None
-    elapsed_s: float = 0.0
-    losses: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT_LOSSES))
-
-    @property
-    def settings(self) -> TrainingSettings:
-        return self.run.settings
-
-    @property
-    def loss(self) -> float | None:
-        """Mean of the recent losses; None before there is one."""
-        return float(np.mean(self.losses)) if self.losses else None
-
-    def spent(self) -> Spent:
-        iterations = self.trainer.iteration
-        if self.settings.seconds is not None:
-            return Spent(self.elapsed_s / self.settings.seconds, self.elapsed_s, iterations)
-        return Spent(iterations / (self.settings.iterations or 1), self.elapsed_s, iterations)
-
-    def loader(self) -> ViewLoader:
-        """The views to train from here on."""
-        settings, first = self.settings, self.trainer.iteration
-        red, green, blue = (round(255 * c) for c in settings.background)
-        if self.run.continuation is None:
-            order = view_order(
-                self.capture.views["train"], settings.views_per_visit, settings.seed, first
-            )
-        else:
-            region = _refined_region(self.run, self.trainer)
-            order = continued_order(
-                self.run.continuation, self.capture, region, settings.seed, first
-            )
-        prepare = image_preparation(self.capture, settings)
-        # refined meshes change with every step
-        mesh = self.capture.mesh if self.trainer.tracking is None else None
-        return ViewLoader(
-            order,
-            lambda position: self._scale(first + position),
-            (red, green, blue),
-            prepare=prepare,
-            mesh=mesh,
-        )
-
-    def step(self, loader: ViewLoader, clock: Callable[[], float]) -> None:
-        """Train the loader's next view."""
-        begin = clock()
-        view, image, mask, mesh = next(loader)
-        loss = self.trainer.step(view, image, self.spent().share, mask, mesh)
-        self.elapsed_s += clock() - begin
-        if loss is not None:
-            self.losses.append(loss)
-
-    @property
-    def tracking_is_due(self) -> bool:
-        """Whether the avatar is to track the training's timesteps now."""
-        tracking = self.trainer.tracking
-        return (
-            tracking is not None
-            and not tracking.rounds
-            and self.spent().share >= TRACKING_START_SHARE
-        )
-
-    def track(self, clock: Callable[[], float], report: Callable[[int, int], bool]) -> bool:
-        """Track the training's timesteps by the avatar; returns False where the report said to
-        stop."""
-        tracking, begin, seconds = self.trainer.tracking, clock(), self.settings.seconds
-        assert tracking is not None
-        done = self._tracked(
-            sorted({view.timestep for view in self.capture.views["train"]}),
-            None if seconds is None else TRACKING_TIME_SHARE * seconds,
-            report,
-        )
-        tracking.rounds += done
-        self.elapsed_s += clock() - begin
-        return done
-
-    def track_unseen(self, report: Callable[[int, int], bool]) -> None:
-        """Track the timesteps of other splits by the avatar, whose splats they do not change."""
-        tracking, seconds = self.trainer.tracking, self.settings.seconds
-        views = self.capture.views
-        seen = {view.timestep for view in views["train"]}
-        unseen = sorted({view.timestep for own in views.values() for view in own} - seen)
-        if tracking is not None and tracking.rounds == 1 and unseen:
-            limit = None if seconds is None else TRACKING_TIME_SHARE * seconds
-            tracking.rounds += self._tracked(unseen, limit, report)
-
-    def _tracked(
-        self, timesteps: list[int], seconds: float | None, report: Callable[[int, int], bool]
-    ) -> bool:
-        tracking = self.trainer.tracking
-        assert tracking is not None
-        try:
-            found = track_by_avatar(
-                self.avatar(),
-                self.settings,
-                tracking.refined(self.capture),
-                timesteps,
-                seconds,
-                report,
-            )
-        except Cancelled:
-            return False
-        tracking.take(found, timesteps)
-        self.trainer.frames.clear()
-        return True
-
-    def evaluate(self, evaluator: Evaluator, perceptual: bool) -> Evaluation:
-        """Evaluate the avatar as it would be written now."""
-        share, refines = min(1.0, self.spent().share), self.trainer.tracking is not None
-        if refines:
-            self._measure_refined_strain()
-        with self.trainer.frames.strain_within(self.strain_range if refines else None):
-            return evaluator.evaluate(lambda view: self.trainer.render(view, share), perceptual)
-
-    def avatar(self) -> Avatar:
-        if self.strain_range is None:
-            self._measure_refined_strain()
-        state = self.trainer.state
-        return Avatar(
-            state.averaged(),
-            self.settings.convention,
-            self.capture.neutral.astype(np.float32),
-            self.capture.faces,
-            to_json(self.settings),
-            dict(self.capture.regions),
-            self.settings.background,
-            self.settings.antialiased,
-            self.run.principal_point,
-            self.strain_range,
-            {name: offset.average.copy() for name, offset in state.driven_offsets.items()},
-        )
-
-    def figures(self) -> dict[str, Any]:
-        """Fields of a metrics line that are known without an evaluation."""
-        figures = {
-            "iteration": self.trainer.iteration,
-            "seconds": round(self.elapsed_s, 3),
-            "splats": len(self.trainer),
-        }
-        return figures if self.loss is None else {**figures, "loss": self.loss}
-
-    def require_folder(self) -> None:
-        """Raise StgaError where the run is no longer in its folder, which writing would make
-        anew."""
-        if (self.folder / RUN).exists() and read_run(self.folder).identity == self.run.identity:
-            return
-        raise StgaError(
-            f"{self.folder}: was moved or deleted while its run trained; resume the run from its checkpoint, "
-            "in the folder where it is now"
-        )
-
-    def write_avatar(self) -> None:
-        write_avatar(self.folder / AVATAR, self.avatar())
-        refined = self.trainer.tracking
-        if refined is not None:
-            write_tracking(self.folder, refined.sequence, refined.parameters, refined.tracked)
-
-    def write_checkpoint(self, evaluator: Evaluator) -> None:
-        trainer = self.trainer
-        assert self.run.identity is not None
-        self.require_folder()
-        checkpoint = Checkpoint(
-            trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep, trainer.initial_count,
-            self.elapsed_s, evaluator.best_difference, evaluator.count, list(self.losses),
-            None if trainer.tracking is None else trainer.tracking.parameters,
-            0 if trainer.tracking is None else trainer.tracking.rounds, self.run.identity.digest,
-        )  # fmt: skip
-        write_checkpoint(self.folder, checkpoint)
-
-    def write_residuals(self) -> None:
-        """Measure the error of the written avatar on each triangle, over a few views of all frames
-        and cameras."""
-        views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
-        refined = self.trainer.tracking is not None
-        capture = with_refined_tracking(self.capture, self.folder) if refined else self.capture
-        residuals = triangle_residuals(
-            read_avatar(self.folder / AVATAR), capture, evenly_spread(views, RESIDUAL_VIEWS),
-            image_preparation(capture, self.settings), RESIDUAL_SCALE,
-        )  # fmt: skip
-        write_residuals(self.folder, residuals.mean())
-
-    def _scale(self, iteration: int) -> float:
-        """Size of an iteration's image, as a share of the captured one; by the clock, a few images
-        ahead of it."""
-        total = self.settings.iterations
-        return image_scale(
-            self.settings, self.spent().share if total is None else iteration / total
-        )
-
-    def _measure_refined_strain(self) -> None:
-        """Measure the strain of all training timesteps where refined tracking has moved their
-        meshes."""
-        if self.settings.follows_strain:
-            self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
-
-
-def begin_session(
-    capture: Capture,
-    folder: Path,
-    run: Run,
-    selection: Mapping[int, np.ndarray] | None,
-    report: Report,
-) -> tuple[Session, Evaluator]:
-    """Start a new run: select triangles, place splats, and write the run's files.
-
-    selection: timestep -> (F,) bool to train; None: by the rule.
-    """
-    report(Progress(stage="Placing splats"))
-    settings, continuation, state = run.settings, run.continuation, None
-    if selection is None:
-        selection = (
-            select_capture(capture, settings.selection) if settings.strategy == "selective" else {}
-        )
-    if continuation is not None:
-        state = starting_state(continuation, settings, len(capture.faces))
-        _check_state(folder, capture, settings, state)
-    # of a run whose run.json was removed
-    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):
-        (folder / stale).unlink(missing_ok=True)
-    strain_range = _strain_range(folder, capture, run, report)
-    trainer = Trainer(capture, settings, selection, state, run.device, strain_range)
-    if continuation is not None and (continuation.parent / TRACKING).exists():
-        with replacing(folder / TRACKING) as partial:
-            copyfile(continuation.parent / TRACKING, partial)
-    session = Session(capture, folder, run, trainer, strain_range)
-    views, exposure = _evaluation_views(capture, run, trainer), _exposure(capture, run)
-    evaluator = Evaluator(settings, views, continuation is not None, exposure)
-    assert run.identity is not None
-    write_selection(folder, selection, run.identity.digest)
-    write_run(folder, run)
-    return session, evaluator
-
-
-def resume_session(
-    capture: Capture, folder: Path, run: Run, report: Report
-) -> tuple[Session, Evaluator]:
-    """Continue from the folder's checkpoint. Raises StgaError where it does not fit the capture or
-    the settings."""
-    report(Progress(stage="Reading the checkpoint"))
-    assert run.identity is not None
-    checkpoint = read_checkpoint(folder)
-    if checkpoint.identity != run.identity.digest:
-        raise StgaError(f"{folder / CHECKPOINT}: {OTHER_RUN}")
-    selection = read_selection(folder, len(capture.faces), run.identity.digest)
-    _check_state(folder, capture, run.settings, checkpoint.state)
-    strain_range = _strain_range(folder, capture, run, report)
-    trainer = Trainer(capture, run.settings, selection, checkpoint.state, run.device, strain_range)
-    _restore(folder, trainer, checkpoint)
-    session = Session(capture, folder, run, trainer, strain_range, checkpoint.elapsed_s)
-    session.losses.extend(checkpoint.losses)
-    cut_metrics(folder, checkpoint.iteration)
-    evaluator = Evaluator(
-        run.settings, _evaluation_views(capture, run, trainer), run.continuation is not None, _exposure(capture, run),
-        read_metrics(folder), checkpoint.evaluations, checkpoint.best_difference,
-    )  # fmt: skip
-    if not (folder / AVATAR).exists():
-        evaluator.best_difference = math.inf  # so that the next evaluation writes one
-    elif not evaluator.is_finished(session.spent()):
-        require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
-    write_run(folder, run)  # capture, model and device may be others now
-    return session, evaluator
-
-
-def _restore(folder: Path, trainer: Trainer, checkpoint: Checkpoint) -> None:
-    here, there = trainer.tracking, checkpoint.tracking
-    if here is not None and there is not None and there.shape == here.tracked.shape:
-        there = np.pad(there, ((0, 0), (0, SHIFT_SIZE)))  # of a version that shifted no torso
-    wanted = None if here is None else here.parameters.shape
-    if wanted != (None if there is None else there.shape):
-        raise StgaError(
-            f"{folder}: its checkpoint's refined tracking does not fit the capture or the settings"
-        )
-    trainer.restore(
-        checkpoint.iteration, checkpoint.visit, checkpoint.last_timestep, checkpoint.initial_count
-    )
-    if here is not None and there is not None:
-        here.parameters, here.rounds = there, checkpoint.rounds
-
-
-def _strain_range(folder: Path, capture: Capture, run: Run, report: Report) -> np.ndarray | None:
-    if run.settings.follows_strain:
-        report(Progress(stage="Measuring strain"))
-    return strain_range_of(folder, capture, run)
-
-
-def _evaluation_views(capture: Capture, run: Run, trainer: Trainer) -> list[EvaluationView]:
-    if run.continuation is not None:
-        return continued_evaluation_views(run, capture, _refined_region(run, trainer))
-    background, backdrop = run.settings.background, run.settings.backdrop
-    return [
-        read_evaluation_view(capture, view, background, backdrop)
-        for view in choose_evaluation_views(capture)
-    ]
-
-
-def _exposure(capture: Capture, run: Run) -> ViewExposure | None:
-    """`known_exposure` where images are corrected for it."""
-    rows = run.settings.exposure
-    return known_exposure(rows, capture.views["train"]) if rows else None
-
-
-def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
-    return trainer.strategy.region if run.settings.strategy == "refine" else None
-
-
-def _check_state(
-    folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
-) -> None:
-    """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
-    face, splats, faces = state.face, state.splats(), len(capture.faces)
-    if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
-        raise StgaError(
-            f"{folder}: its splats refer to triangles that {capture.root} does not have"
-        )
-    if splats.sh_degree != settings.sh_degree:
-        found = splats.sh_degree
-        raise StgaError(
-            f"{folder}: its splats have SH degree {found}, run.json says {settings.sh_degree}"
-        )
-    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
-        raise StgaError(f"{folder}: its splats and run.json disagree on {name}")
-    for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
-        raise StgaError(
-            f"{folder}: its checkpoint and run.json disagree on the driven offset {name}"
-        )
-    for name, offset in state.driven_offsets.items():
-        found = len(offset.steps)
-        if found != faces:
-            raise StgaError(
-                f"{folder}: its {name} is of {found} triangles, {capture.root} has {faces}"
-            )
-
-
-# Training
 
 
 def train(
@@ -480,9 +127,8 @@ def _train(
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
     if run.settings.target_psnr is not None and not capture.views.get("val"):
-        raise StgaError(
-            f"--target-psnr: {capture.root} has no held-out views (split 'val') to measure it on"
-        )
+        text = f"{capture.root} has no held-out views (split 'val') to measure it on"
+        raise StgaError(f"--target-psnr: {text}")
     if out.resolve() == capture.root:
         raise StgaError(f"{out}: is the folder of the capture; train into another one")
     with locked(out):
@@ -493,143 +139,188 @@ def _train(
         identity = check_identity(out, run, capture)
         run = replace(run, identity=identity)
         if has_begun and (out / CHECKPOINT).exists():
-            session, evaluator = resume_session(capture, out, run, report)
+            session = _resume(capture, out, run, report)
         else:
             if has_begun and selection is None and (out / SELECTION).exists():
                 selection = read_selection(out, len(capture.faces), identity.digest)
-            session, evaluator = begin_session(capture, out, run, selection, report)
-        _Loop(session, evaluator, report).work()
+            session = _begin(capture, out, run, selection, report)
+        session.work()
     return out / AVATAR
 
 
-def _asked_interval_s() -> float | None:
-    """Seconds between checkpoints by the environment variable; None without it. Raises StgaError
-    for no such number."""
-    text = os.environ.get(CHECKPOINT_VARIABLE, "")
-    if not text:
-        return None
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = -1.0
-    if not 0 <= seconds < math.inf:
-        raise StgaError(
-            f"{CHECKPOINT_VARIABLE}: expected seconds between checkpoints, got {shorten(text)}"
-        )
-    return seconds
-
-
 @dataclass
-class _Loop:
-    """Steps, evaluations and checkpoints of a session in turn.
+class _Session:
+    """A run that trains.
 
-    began  the clock at which the run would have begun, had it never been interrupted
-    speed  iterations per second since this process began to train
+    strain_range  (F, 2, 3) `Avatar.strain_range`; with refined tracking that of the last evaluation
+    elapsed_s     seconds of training so far, evaluation not counted
+    losses        of the last global iterations
+    began         the clock at which the run would have begun, had it never been interrupted
+    speed         iterations per second since this process began to train
+    interrupts    the first Ctrl-C
     """
 
-    session: Session
-    evaluator: Evaluator
+    capture: Capture
+    folder: Path
+    run: Run
     report: Report
+    trainer: Trainer
+    evaluator: Evaluator
+    strain_range: np.ndarray | None
+    elapsed_s: float = 0.0
+    losses: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT_LOSSES))
     began: float = 0.0
     speed: float = 0.0
+    interrupts: list[int] = field(default_factory=list)
 
     def work(self) -> None:
-        """Train until the budget is spent, a goal of the settings is reached or the report asks to
-        stop."""
+        """Train until the budget is spent, a goal is reached or the report asks to stop."""
         # meanwhile, the splats are shown as they begin
-        self.report(self._progress("Compiling kernels"))
-        precompile_kernels(self.session.run.device)
-        self.began = perf_counter() - (
-            self.evaluator.lines[-1]["wall_s"] if self.evaluator.lines else 0.0
-        )
+        self._tell("Compiling kernels")
+        precompile_kernels(self.run.device)
+        lines, path = self.evaluator.lines, self.folder / AVATAR
+        self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
         if self._is_finished():  # a finished run was resumed
-            self._restore_avatar()
+            if not path.exists():
+                text = "it is written anew from the checkpoint, the last state of training"
+                _log.warning("%s was missing; %s", path, text)
+                self._tell("Writing the missing avatar from the checkpoint")
+                self._write_avatar()
+                self._write_residuals()
             return
-        with interrupt_requests() as interrupts:
-            if self.session.run.continuation is not None and not self.evaluator.lines:
+        with interrupt_requests() as self.interrupts:
+            if self.run.continuation is not None and not lines:
                 self._evaluate()  # the avatar before, which the others are compared with
-            self._train(interrupts)
+            self._train()
             if self._is_finished():
-                self.session.track_unseen(self._tracks(interrupts))
+                # the timesteps of other splits, whose splats they do not change
+                tracking, views = self.trainer.tracking, self.capture.views
+                every = {view.timestep for own in views.values() for view in own}
+                unseen = every - {view.timestep for view in views["train"]}
+                if tracking is not None and tracking.rounds == 1 and unseen:
+                    self._track(tracking, sorted(unseen))
             # LPIPS takes long, so a run that is stopped goes without
             self._evaluate(perceptual=self._is_finished())
-            self.session.write_checkpoint(self.evaluator)
+            self._write_checkpoint()
             if self._is_finished():
-                self.report(self._progress("Measuring residuals"))
-                self.session.write_residuals()
-        self.report(self._progress("Interrupted" if interrupts else "Finished"))
-        if interrupts:
+                self._tell("Measuring residuals")
+                self._write_residuals()
+        self._tell("Interrupted" if self.interrupts else "Finished")
+        if self.interrupts:
             raise KeyboardInterrupt
 
-    def _restore_avatar(self) -> None:
-        """Write a finished run's avatar where it is missing."""
-        path = self.session.folder / AVATAR
-        if path.exists():
-            return
-        _log.warning(
-            "%s was missing; it is written anew from the checkpoint, the last state of training",
-            path,
-        )
-        self.report(self._progress("Writing the missing avatar from the checkpoint"))
-        self.session.write_avatar()
-        self.session.write_residuals()
-
-    def _train(self, interrupts: list[int]) -> None:
-        session = self.session
-        saved, started, first = session.elapsed_s, session.elapsed_s, session.trainer.iteration
+    def _train(self) -> None:
+        trainer, tracking = self.trainer, self.trainer.tracking
+        saved, started, first = self.elapsed_s, self.elapsed_s, trainer.iteration
         asked_s = _asked_interval_s()
-        with session.loader() as loader:
-            while not session.spent().share >= 1:
-                session.step(loader, perf_counter)
-                if session.tracking_is_due and not session.track(
-                    perf_counter, self._tracks(interrupts)
-                ):
-                    break
-                if self.evaluator.is_due(session.spent()):
+        with self._loader() as loader:
+            while not self._spent().share >= 1:
+                begin = perf_counter()
+                view, image, mask, mesh = next(loader)
+                loss = trainer.step(view, image, self._spent().share, mask, mesh)
+                self.elapsed_s += perf_counter() - begin
+                if loss is not None:
+                    self.losses.append(loss)
+                is_due = tracking is not None and self._spent().share >= TRACKING_START_SHARE
+                if tracking is not None and is_due and not tracking.rounds:
+                    begin = perf_counter()
+                    timesteps = {view.timestep for view in self.capture.views["train"]}
+                    self._track(tracking, sorted(timesteps))
+                    self.elapsed_s += perf_counter() - begin
+                    if not tracking.rounds:
+                        break
+                if self.evaluator.is_due(self._spent()):
                     self._evaluate()
                     if self._is_finished():
                         break
-                if session.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
-                    session.write_checkpoint(self.evaluator)
-                    saved = session.elapsed_s
-                self.speed = (session.trainer.iteration - first) / max(
-                    session.elapsed_s - started, 1e-9
-                )
-                if self.report(self._progress("Training")) or interrupts:
+                if self.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
+                    self._write_checkpoint()
+                    saved = self.elapsed_s
+                elapsed_s = max(self.elapsed_s - started, 1e-9)
+                self.speed = (trainer.iteration - first) / elapsed_s
+                if self._tell("Training") or self.interrupts:
                     break
 
-    def _tracks(self, interrupts: list[int]) -> Callable[[int, int], bool]:
-        """What tracking by the avatar reports to."""
-        return lambda done, total: (
-            self.report(self._progress(f"Tracking by the avatar: {done} of {total}"))
-            or bool(interrupts)
-        )
+    def _loader(self) -> ViewLoader:
+        """The views to train from here on."""
+        settings, capture, first = self.run.settings, self.capture, self.trainer.iteration
+        red, green, blue = (round(255 * c) for c in settings.background)
+        if self.run.continuation is None:
+            views = capture.views["train"]
+            order = view_order(views, settings.views_per_visit, settings.seed, first)
+        else:
+            region = _refined_region(self.run, self.trainer)
+            order = continued_order(self.run.continuation, capture, region, settings.seed, first)
+
+        def scale(position: int) -> float:
+            """Of the captured size; by the clock, a few images ahead of it."""
+            total = settings.iterations
+            share = self._spent().share if total is None else (first + position) / total
+            return image_scale(settings, share)
+
+        prepare = image_preparation(capture, settings)
+        # refined meshes change with every step
+        mesh = capture.mesh if self.trainer.tracking is None else None
+        return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
+
+    def _track(self, tracking: RefinedTracking, timesteps: list[int]) -> None:
+        """Track timesteps by the avatar, one round more; none where the report says to stop."""
+
+        def stops(done: int, total: int) -> bool:
+            told = self._tell(f"Tracking by the avatar: {done} of {total}")
+            return told or bool(self.interrupts)
+
+        settings, capture = self.run.settings, tracking.refined(self.capture)
+        seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
+        try:
+            found = track_by_avatar(self._avatar(), settings, capture, timesteps, seconds, stops)
+        except Cancelled:
+            return
+        tracking.take(found, timesteps)
+        self.trainer.frames.clear()
+        tracking.rounds += 1
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Evaluate, keep the avatar where that says so, and append a line of metrics."""
-        begin, session = perf_counter(), self.session
-        evaluation = session.evaluate(self.evaluator, perceptual)
-        session.require_folder()
+        begin, share, limits = perf_counter(), min(1.0, self._spent().share), None
+        if self.trainer.tracking is not None:
+            self._measure_refined_strain()
+            limits = self.strain_range
+        with self.trainer.frames.strain_within(limits):
+            render = partial(self.trainer.render, progress=share)
+            evaluation = self.evaluator.evaluate(render, perceptual)
+        self._require_folder()
         if evaluation.is_kept:
-            session.write_avatar()
+            self._write_avatar()
         now = perf_counter()
         line = {
-            **session.figures(),
+            "iteration": self.trainer.iteration,
+            "seconds": round(self.elapsed_s, 3),
+            "splats": len(self.trainer),
+            **({"loss": float(np.mean(self.losses))} if self.losses else {}),
             **evaluation.quality,
             "evaluation_s": round(now - begin, 3),
             "wall_s": round(now - self.began, 3),
             "peak_memory_mb": peak_memory_mb(),
         }
-        append_metrics(session.folder, self.evaluator.record(evaluation, line, session.spent()))
+        append_metrics(self.folder, self.evaluator.record(evaluation, line, self._spent()))
+
+    def _spent(self) -> Spent:
+        settings, iterations = self.run.settings, self.trainer.iteration
+        if settings.seconds is not None:
+            return Spent(self.elapsed_s / settings.seconds, self.elapsed_s, iterations)
+        return Spent(iterations / (settings.iterations or 1), self.elapsed_s, iterations)
 
     def _is_finished(self) -> bool:
-        return self.evaluator.is_finished(self.session.spent())
+        return self.evaluator.is_finished(self._spent())
 
-    def _progress(self, stage: str) -> Progress:
-        session, spent, evaluator = self.session, self.session.spent(), self.evaluator
+    def _tell(self, stage: str) -> bool:
+        """Report how far the run is; returns whether to stop."""
+        spent, evaluator, last = self._spent(), self.evaluator, [{}, *self.evaluator.lines][-1]
         figures = {
-            "iteration": spent.iterations, "per_second": self.speed, "left_s": spent.left_s, "loss": session.loss,
-            "psnr": evaluator.psnr, "psnr_unmatched": evaluator.psnr_unmatched, "splats": len(session.trainer),
+            "iteration": spent.iterations, "per_second": self.speed, "left_s": spent.left_s,
+            "loss": np.mean(self.losses) if self.losses else None, "psnr": last.get("psnr"),
+            "psnr_unmatched": last.get(UNMATCHED), "splats": len(self.trainer),
         }  # fmt: skip
 
         def known() -> dict[str, float]:
@@ -639,9 +330,197 @@ class _Loop:
         def preview(path: Path) -> None:
             # training continues without one, and reports a full disk itself
             with suppress(StgaError):
-                write_avatar(path, session.avatar())
+                write_avatar(path, self._avatar())
 
-        return Progress(min(1.0, spent.share), stage, evaluator.forecast_text, known, preview)
+        share = min(1.0, spent.share)
+        return self.report(Progress(share, stage, evaluator.forecast_text, known, preview))
+
+    def _avatar(self) -> Avatar:
+        if self.strain_range is None:
+            self._measure_refined_strain()
+        state, settings = self.trainer.state, self.run.settings
+        return Avatar(
+            splats=state.averaged(),
+            convention=settings.convention,
+            neutral=self.capture.neutral.astype(np.float32),
+            faces=self.capture.faces,
+            settings=to_json(settings),
+            regions=dict(self.capture.regions),
+            background=settings.background,
+            antialiased=settings.antialiased,
+            principal_point=self.run.principal_point,
+            strain_range=self.strain_range,
+            driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
+        )
+
+    def _measure_refined_strain(self) -> None:
+        """Measure the strain of the training timesteps, whose meshes refined tracking has moved."""
+        if self.run.settings.follows_strain:
+            self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
+
+    def _require_folder(self) -> None:
+        """Raise StgaError where the folder was moved: writing would make it anew."""
+        if not has_run(self.folder) or read_run(self.folder).identity != self.run.identity:
+            raise StgaError(
+                f"{self.folder}: was moved or deleted while its run trained; resume the run from "
+                "its checkpoint, in the folder where it is now"
+            )
+
+    def _write_avatar(self) -> None:
+        write_avatar(self.folder / AVATAR, self._avatar())
+        refined = self.trainer.tracking
+        if refined is not None:
+            write_tracking(self.folder, refined.sequence, refined.parameters, refined.tracked)
+
+    def _write_checkpoint(self) -> None:
+        trainer, tracking, evaluator = self.trainer, self.trainer.tracking, self.evaluator
+        assert self.run.identity is not None
+        self._require_folder()
+        checkpoint = Checkpoint(
+            trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep,
+            trainer.initial_count, self.elapsed_s, evaluator.best_difference, evaluator.count,
+            list(self.losses), None if tracking is None else tracking.parameters,
+            0 if tracking is None else tracking.rounds, self.run.identity.digest,
+        )  # fmt: skip
+        write_checkpoint(self.folder, checkpoint)
+
+    def _write_residuals(self) -> None:
+        """Measure the written avatar's error by triangle, over a few views of all frames."""
+        capture, settings = self.capture, self.run.settings
+        if self.trainer.tracking is not None:
+            capture = with_refined_tracking(capture, self.folder)
+        views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
+        shown, prepare = evenly_spread(views, RESIDUAL_VIEWS), image_preparation(capture, settings)
+        avatar = read_avatar(self.folder / AVATAR)
+        residuals = triangle_residuals(avatar, capture, shown, prepare, RESIDUAL_SCALE)
+        write_residuals(self.folder, residuals.mean())
+
+
+def _begin(
+    capture: Capture,
+    folder: Path,
+    run: Run,
+    selection: Mapping[int, np.ndarray] | None,
+    report: Report,
+) -> _Session:
+    """Start a new run: select triangles, by the rule or as given, place splats, write its files."""
+    report(Progress(stage="Placing splats"))
+    settings, continuation, state = run.settings, run.continuation, None
+    if selection is None:
+        selective = settings.strategy == "selective"
+        selection = select_capture(capture, settings.selection) if selective else {}
+    if continuation is not None:
+        state = starting_state(continuation, settings, len(capture.faces))
+        _check_state(folder, capture, settings, state)
+    # of a run whose run.json was removed
+    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):
+        (folder / stale).unlink(missing_ok=True)
+    session = _session(capture, folder, run, selection, state, report)
+    if continuation is not None and (continuation.parent / TRACKING).exists():
+        with replacing(folder / TRACKING) as partial_file:
+            copyfile(continuation.parent / TRACKING, partial_file)
+    assert run.identity is not None
+    write_selection(folder, selection, run.identity.digest)
+    write_run(folder, run)
+    return session
+
+
+def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Session:
+    """Continue from the folder's checkpoint. Raises StgaError where it does not fit."""
+    report(Progress(stage="Reading the checkpoint"))
+    assert run.identity is not None
+    found = read_checkpoint(folder)
+    if found.identity != run.identity.digest:
+        raise StgaError(f"{folder / CHECKPOINT}: {OTHER_RUN}")
+    selection = read_selection(folder, len(capture.faces), run.identity.digest)
+    _check_state(folder, capture, run.settings, found.state)
+    session = _session(capture, folder, run, selection, found.state, report)
+    trainer, tracking, evaluator = session.trainer, session.trainer.tracking, session.evaluator
+    refined = found.tracking
+    if tracking is not None and refined is not None and refined.shape == tracking.tracked.shape:
+        # of a version that shifted no torso
+        refined = np.pad(refined, ((0, 0), (0, SHIFT_SIZE)))
+    wanted = None if tracking is None else tracking.parameters.shape
+    if wanted != (None if refined is None else refined.shape):
+        text = "its checkpoint's refined tracking does not fit the capture or the settings"
+        raise StgaError(f"{folder}: {text}")
+    trainer.iteration, trainer.visit = found.iteration, found.visit
+    trainer.last_timestep, trainer.initial_count = found.last_timestep, found.initial_count
+    if tracking is not None and refined is not None:
+        tracking.parameters, tracking.rounds = refined, found.rounds
+    session.elapsed_s = found.elapsed_s
+    session.losses.extend(found.losses)
+    cut_metrics(folder, found.iteration)
+    evaluator.lines, evaluator.count = read_metrics(folder), found.evaluations
+    evaluator.best_difference = found.best_difference
+    if not (folder / AVATAR).exists():
+        evaluator.best_difference = math.inf  # so that the next evaluation writes one
+    elif not session._is_finished():
+        require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
+    write_run(folder, run)  # capture, model and device may be others now
+    return session
+
+
+def _session(
+    capture: Capture,
+    folder: Path,
+    run: Run,
+    selection: Mapping[int, np.ndarray],
+    state: TrainState | None,
+    report: Report,
+) -> _Session:
+    settings = run.settings
+    if settings.follows_strain:
+        report(Progress(stage="Measuring strain"))
+    strain_range = strain_range_of(folder, capture, run)
+    trainer = Trainer(capture, settings, selection, state, run.device, strain_range)
+    if run.continuation is not None:
+        views = continued_evaluation_views(run, capture, _refined_region(run, trainer))
+    else:
+        views = [
+            read_evaluation_view(capture, view, settings.background, settings.backdrop)
+            for view in choose_evaluation_views(capture)
+        ]
+    rows = settings.exposure  # where images are corrected for it
+    exposure = known_exposure(rows, capture.views["train"]) if rows else None
+    evaluator = Evaluator(settings, views, run.continuation is not None, exposure)
+    return _Session(capture, folder, run, report, trainer, evaluator, strain_range)
+
+
+def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
+    return trainer.strategy.region if run.settings.strategy == "refine" else None
+
+
+def _check_state(
+    folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
+) -> None:
+    """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
+    face, splats, faces = state.face, state.splats(), len(capture.faces)
+    if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
+        text = f"its splats refer to triangles that {capture.root} does not have"
+        raise StgaError(f"{folder}: {text}")
+    if splats.sh_degree != settings.sh_degree:
+        text = f"SH degree {splats.sh_degree}, run.json says {settings.sh_degree}"
+        raise StgaError(f"{folder}: its splats have {text}")
+    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
+        raise StgaError(f"{folder}: its splats and run.json disagree on {name}")
+    for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
+        text = f"its checkpoint and run.json disagree on the driven offset {name}"
+        raise StgaError(f"{folder}: {text}")
+    for name, offset in state.driven_offsets.items():
+        if len(offset.steps) != faces:
+            text = f"its {name} is of {len(offset.steps)} triangles, {capture.root} has {faces}"
+            raise StgaError(f"{folder}: {text}")
+
+
+def _asked_interval_s() -> float | None:
+    """Seconds between checkpoints by the environment variable; None without it."""
+    text = os.environ.get(CHECKPOINT_VARIABLE, "")
+    with suppress(ValueError):
+        if not text or 0 <= float(text) < math.inf:
+            return float(text) if text else None
+    expected = "expected seconds between checkpoints"
+    raise StgaError(f"{CHECKPOINT_VARIABLE}: {expected}, got {shorten(text)}")
 
 
 @contextmanager

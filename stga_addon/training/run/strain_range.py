@@ -33,16 +33,14 @@ def trained_strain_range(
     basis = strain_basis(capture.neutral, capture.faces, limits)
     timesteps = sorted({view.timestep for view in capture.views["train"]})
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
-    if continuation is None:
-        return seen
-    parent = read_avatar(continuation.parent / AVATAR)
-    earlier = parent.strain_range
-    if not parent.follows_strain:
+    parent = None if continuation is None else read_avatar(continuation.parent / AVATAR)
+    if parent is None or not parent.follows_strain:
         return seen  # it follows strain only from here on
-    if earlier is None:
+    if parent.strain_range is None:
         return limits
-    lowest, highest = np.minimum(seen[:, 0], earlier[:, 0]), np.maximum(seen[:, 1], earlier[:, 1])
-    return np.stack([np.maximum(lowest, limits[:, 0]), np.minimum(highest, limits[:, 1])], axis=1)
+    low, high = (np.stack([seen[:, k], parent.strain_range[:, k]]) for k in range(2))
+    lowest, highest = np.maximum(low.min(0), limits[:, 0]), np.minimum(high.max(0), limits[:, 1])
+    return np.stack([lowest, highest], axis=1)
 
 
 def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | None:
@@ -50,40 +48,29 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     folder has no file yet.
 
     None where nothing follows strain, and with refined tracking, which moves the meshes while it
-    trains.
+    trains. Raises StgaError where the file is damaged, or of another run or mesh.
     """
     if not run.settings.follows_strain or run.settings.tracking:
         return None
     assert run.identity is not None
-    if (folder / STRAIN_RANGE).exists():
-        return read_strain_range(folder, len(capture.faces), run.identity.digest)
-    limits = trained_strain_range(capture, capture.mesh, run.continuation)
-    write_strain_range(folder, limits, run.identity.digest)
-    return limits
-
-
-def write_strain_range(folder: Path, limits: np.ndarray, identity: str) -> None:
-    """Write the range (F, 2, 3) of the run with this digest of its identity."""
-    arrays = {"strain_range": limits, "identity": np.frombuffer(identity.encode(), np.uint8)}
-    write_npz(folder / STRAIN_RANGE, arrays, compressed=True)
-
-
-def read_strain_range(folder: Path, faces: int, identity: str) -> np.ndarray:
-    """(F, 2, 3) float32 as written. Raises StgaError where the file is damaged, or of another run
-    or mesh."""
-    path = folder / STRAIN_RANGE
+    path, identity = folder / STRAIN_RANGE, run.identity.digest.encode()
+    shape = len(capture.faces), *COLOR_RANGE.shape
+    if not path.exists():
+        limits = trained_strain_range(capture, capture.mesh, run.continuation)
+        arrays = {"strain_range": limits, "identity": np.frombuffer(identity, np.uint8)}
+        write_npz(path, arrays, compressed=True)
+        return limits
     arrays = read_npz(path)
-    limits, stored = arrays.get("strain_range"), arrays.get("identity")
-    if stored is None or stored.tobytes() != identity.encode():
+    found, stored = arrays.get("strain_range"), arrays.get("identity")
+    if stored is None or stored.tobytes() != identity:
         raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
-    if limits is None or limits.dtype != np.float32 or limits.shape != (faces, *COLOR_RANGE.shape):
-        found = "no such array" if limits is None else f"{limits.dtype} {limits.shape}"
-        raise StgaError(f"{path}: expected 'strain_range', float32 ({faces}, 2, 3), found {found}")
-    if not _is_color_range(limits):
-        raise StgaError(
-            f"{path}: 'strain_range' is not within the range that colors are trained to follow; remove it"
-        )
-    return limits
+    if found is None or found.dtype != np.float32 or found.shape != shape:
+        other = "no such array" if found is None else f"{found.dtype} {found.shape}"
+        raise StgaError(f"{path}: expected 'strain_range', float32 {shape}, found {other}")
+    if not _is_color_range(found):
+        text = "is not within the range that colors are trained to follow; remove it"
+        raise StgaError(f"{path}: 'strain_range' {text}")
+    return found
 
 
 def require_color_range(path: Path, avatar: Avatar) -> None:
@@ -91,9 +78,8 @@ def require_color_range(path: Path, avatar: Avatar) -> None:
 
     An earlier version trained it: more training would change it at once.
     """
-    if avatar.follows_strain and (
-        avatar.strain_range is None or not _is_color_range(avatar.strain_range)
-    ):
+    limits = avatar.strain_range
+    if avatar.follows_strain and (limits is None or not _is_color_range(limits)):
         raise StgaError(f"{path}: {OLDER_COLORS}")
 
 

@@ -1,6 +1,5 @@
 """Clean plates: what each camera would show without the person, from all timesteps together."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,42 +38,31 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
 
     correct: the exposure of images. Raises StgaError where a file cannot be read.
     """
+    from scipy.ndimage import binary_dilation
+
     by_camera: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         if view.mask is not None:
             by_camera.setdefault(view.camera_index, []).append(view)
-    return [
-        _plate(evenly_spread(views, MAX_PLATE_VIEWS), correct)
-        for _, views in sorted(by_camera.items())
-    ]
-
-
-def _plate(views: Sequence[View], correct: Correction | None) -> CleanPlate:
-    camera = views[0].camera
-    scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)
-    stack = []
-    for full_size in views:
-        view, image, mask = read_view(full_size, scale)
-        if correct is not None:
-            image = correct(view, image, None)
-        assert mask is not None
-        stack.append(np.where(_grown(mask > 0)[..., None], PERSON, image).astype(np.uint16))
-    levels = np.sort(np.stack(stack, axis=-1), axis=-1)
-    count = (levels[:, :, 0] < PERSON).sum(axis=-1)
-    middle = np.maximum(count - 1, 0)[..., None, None] // 2
-    image = np.take_along_axis(levels, np.broadcast_to(middle, (*count.shape, 3, 1)), axis=-1)[
-        ..., 0
-    ]
-    seen = count > 0
-    return CleanPlate(view.camera, filled(image.astype(np.float32) / 255, seen), seen)
-
-
-def _grown(person: np.ndarray) -> np.ndarray:
-    from scipy.ndimage import binary_dilation
-
-    return np.asarray(
-        binary_dilation(person, iterations=max(1, round(MATTE_MARGIN_SHARE * len(person))))
-    )
+    plates = []
+    for _, views in sorted(by_camera.items()):
+        camera, stack = views[0].camera, []
+        scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)
+        for full_size in evenly_spread(views, MAX_PLATE_VIEWS):
+            view, image, mask = read_view(full_size, scale)
+            if correct is not None:
+                image = correct(view, image, None)
+            assert mask is not None
+            margin = max(1, round(MATTE_MARGIN_SHARE * len(mask)))
+            person = binary_dilation(mask > 0, iterations=margin)
+            stack.append(np.where(person[..., None], PERSON, image).astype(np.uint16))
+        levels = np.sort(np.stack(stack, axis=-1), axis=-1)
+        count = (levels[:, :, 0] < PERSON).sum(axis=-1)
+        middle = np.maximum(count - 1, 0)[..., None, None] // 2
+        middle = np.broadcast_to(middle, (*count.shape, 3, 1))
+        image = np.take_along_axis(levels, middle, axis=-1)[..., 0].astype(np.float32) / 255
+        plates.append(CleanPlate(view.camera, filled(image, count > 0), count > 0))
+    return plates
 
 
 def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -83,6 +71,8 @@ def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
     Push and pull: pixels without a color get that of the image at half the size, whose pixels are
     the means of those that have one.
     """
+    from scipy.ndimage import zoom
+
     if seen.all() or not seen.any():
         return image
     height, width = seen.shape
@@ -91,12 +81,5 @@ def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
     half = weighted.reshape(len(weighted) // 2, 2, -1, 2, 4).mean(axis=(1, 3))
     known = half[..., 3] > 0
     smaller = filled(half[..., :3] / np.maximum(half[..., 3:], 1e-6), known)
-    larger = _twice(smaller)[:height, :width]
-    return np.where(seen[..., None], image, larger)
-
-
-def _twice(image: np.ndarray) -> np.ndarray:
-    """The image at twice the size, interpolated linearly."""
-    from scipy.ndimage import zoom
-
-    return np.asarray(zoom(image, (2, 2, 1), order=1, mode="nearest", grid_mode=True))
+    larger = zoom(smaller, (2, 2, 1), order=1, mode="nearest", grid_mode=True)
+    return np.where(seen[..., None], image, larger[:height, :width])

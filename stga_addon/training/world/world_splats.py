@@ -51,6 +51,8 @@ RATES = Rates(
     xyz=1e-6, rotation=1e-3, log_scale=0.01, opacity=0.02, sh=0.02, sh_rest=0.004, end=0.1
 )
 """Blocks begin where they belong."""
+TRIANGLE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+"""Meters: what the splats are bound to, around the person."""
 SH_DEGREE = 1
 """Walls shine a little, and cameras differ."""
 
@@ -70,12 +72,22 @@ def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Sp
 def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report = ignore) -> Splats:
     """Splats in world space, meters, that show the plates from their cameras; center: (3,) of the
     person."""
-    start = first_splats(plates, center)
-    capture = _still_capture(plates, center)
-    frames = face_frames(capture.neutral, capture.faces, capture.neutral)
-    local = to_local(start, frames, np.zeros(len(start), np.int32))
-    steps = max(MIN_STEPS, STEPS_PER_CAMERA * len(plates))
-    trainer = Trainer(capture, _settings(plates, steps), {}, new_state(local))
+    start, steps = first_splats(plates, center), max(MIN_STEPS, STEPS_PER_CAMERA * len(plates))
+    # a capture of one timestep, whose views are the plates' and whose mesh is one triangle
+    mesh, faces = center + TRIANGLE, np.arange(3, dtype=np.int32)[None]
+    cameras = enumerate(plate.camera for plate in plates)
+    views = tuple(View(0, n, camera, f"plate {n}", Path()) for n, camera in cameras)
+    capture = Capture(
+        Path(), "world", faces, mesh, {"train": views}, (0,), {}, lambda _: mesh, lambda *_: mesh
+    )
+    mean = np.mean([plate.image.mean((0, 1)) for plate in plates], axis=0)
+    settings = TrainingSettings(
+        iterations=steps, rates=RATES, ema_share=0.1, sh_degree=SH_DEGREE, sh_steps=(0.3,),
+        hull_points=False, density_interval=0, stray_reset_interval=0, unseen_opacity_weight=0.0,
+        unbound_scale_limit=1e3, background=tuple(mean.tolist()), random_background=False,
+    )  # fmt: skip
+    frames, face = face_frames(mesh, faces, mesh), np.zeros(len(start), np.int32)
+    trainer = Trainer(capture, settings, {}, new_state(to_local(start, frames, face)))
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
         # as in training: Numba would compile again for writable arrays
@@ -83,52 +95,25 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     turns, rng = -(-steps // len(plates)), np.random.default_rng(0)
     order = np.concatenate([rng.permutation(len(plates)) for _ in range(turns)])[:steps]
     for number in counted(order, steps, report, "World", "Step"):
-        trainer.step(capture.views["train"][number], targets[number], trainer.iteration / steps)
-    return replace(to_world(trainer.state.averaged(), frames), face=np.zeros(len(start), np.int32))
-
-
-def _still_capture(plates: Sequence[CleanPlate], center: np.ndarray) -> Capture:
-    """A capture of one timestep, whose views are the plates' and whose mesh is one triangle."""
-    mesh = center + np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
-    views = tuple(
-        View(0, number, plate.camera, f"plate {number}", Path())
-        for number, plate in enumerate(plates)
-    )
-    faces = np.arange(3, dtype=np.int32)[None]
-    return Capture(
-        Path(), "world", faces, mesh, {"train": views}, (0,), {}, lambda _: mesh, lambda *_: mesh
-    )
-
-
-def _settings(plates: Sequence[CleanPlate], steps: int) -> TrainingSettings:
-    mean = np.mean([plate.image.mean((0, 1)) for plate in plates], axis=0)
-    return TrainingSettings(
-        iterations=steps, rates=RATES, ema_share=0.1, sh_degree=SH_DEGREE, sh_steps=(0.3,), hull_points=False,
-        density_interval=0, stray_reset_interval=0, unseen_opacity_weight=0.0, unbound_scale_limit=1e3,
-        background=tuple(mean.tolist()), random_background=False,
-    )  # fmt: skip
+        trainer.step(views[number], targets[number], trainer.iteration / steps)
+    return replace(to_world(trainer.state.averaged(), frames), face=face)
 
 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
     """Meters from the person's center (3,) to the shell on which plates of different cameras look
     most alike."""
-    distance = float(
-        np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
-    )
-    details = [_detail(plate) for plate in plates]
+    from scipy.ndimage import gaussian_filter
+
+    details = []  # without coarse colors, which light and exposure change, and without noise
+    for plate in plates:
+        sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]
+        fine, coarse = (gaussian_filter(plate.image, size) for size in sizes)
+        details.append(fine - coarse)
+    distance = np.median([np.linalg.norm(plate.camera.position - center) for plate in plates])
     radii = distance * np.geomspace(NEAREST_RADIUS, FARTHEST_RADIUS, RADII)
     likeness = [_likeness(plates, details, center, radius) for radius in radii]
     best = int(np.argmax(likeness))
-    return float(radii[best]) if likeness[best] > MIN_LIKENESS else DEFAULT_RADIUS * distance
-
-
-def _detail(plate: CleanPlate) -> np.ndarray:
-    """(H, W, 3): the plate without its coarse colors, which light and exposure change, and without
-    noise."""
-    from scipy.ndimage import gaussian_filter
-
-    fine, coarse = (np.asarray([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES)
-    return np.asarray(gaussian_filter(plate.image, fine) - gaussian_filter(plate.image, coarse))
+    return float(radii[best] if likeness[best] > MIN_LIKENESS else DEFAULT_RADIUS * distance)
 
 
 def _likeness(
@@ -171,27 +156,34 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
     """A splat in world space for each block of the plates; of many plates more than
     MAX_FIRST_SPLATS, where blocks are as large as they may be."""
     radius, levels = shell_radius(plates, center), FLAT_LEVELS
-    splats = _splats_of_blocks(plates, center, radius, levels)
-    while len(splats) > MAX_FIRST_SPLATS and levels < 255:
+    while True:
+        parts = []
+        for number, plate in enumerate(plates):
+            camera = plate.camera
+            middles, sides, colors = blocks(plate.image, levels)
+            points = on_shell(camera, middles, center, radius)
+            new = np.ones(len(points), bool)
+            for other in plates[:number]:
+                x, y, inside = pixels_of(points, other.camera)
+                alike = abs(other.image[y, x] - colors).max(axis=1) < SAME_LEVELS / 255
+                new &= ~(inside & alike)
+            # flat, facing the camera
+            points, count = points[new], int(new.sum())
+            width = BLOCK_WIDTH * sides[new] * camera.project(points)[1] / camera.fl_x
+            log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
+            turn = from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1))
+            sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
+            sh[:, 0] = (colors[new] - 0.5) / SH_C0
+            splats = Splats(
+                points.astype(np.float32), np.repeat(turn, count, axis=0).astype(np.float32),
+                log_scale.astype(np.float32), np.full(count, START_OPACITY, np.float32), sh,
+                np.zeros(count, np.int32), np.ones(count, bool),
+            )  # fmt: skip
+            parts.append(splats)
+        found = joined(parts)
+        if len(found) <= MAX_FIRST_SPLATS or levels >= 255:
+            return found
         levels *= 2
-        splats = _splats_of_blocks(plates, center, radius, levels)
-    return splats
-
-
-def _splats_of_blocks(
-    plates: Sequence[CleanPlate], center: np.ndarray, radius: float, levels: float
-) -> Splats:
-    parts = []
-    for number, plate in enumerate(plates):
-        middles, sides, colors = blocks(plate.image, levels)
-        points = on_shell(plate.camera, middles, center, radius)
-        new = np.ones(len(points), bool)
-        for other in plates[:number]:
-            x, y, inside = pixels_of(points, other.camera)
-            alike = abs(other.image[y, x] - colors).max(axis=1) < SAME_LEVELS / 255
-            new &= ~(inside & alike)
-        parts.append(_block_splats(plate.camera, points[new], sides[new], colors[new]))
-    return joined(parts)
 
 
 def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,10 +191,8 @@ def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np
     levels, also a little beyond its edge: their middles (N, 2) in pixels, sides (N,) and mean
     colors (N, 3)."""
     height, width = image.shape[:2]
-    pad = [(LARGEST_BLOCK, LARGEST_BLOCK + -side % LARGEST_BLOCK) for side in (height, width)] + [
-        (0, 0)
-    ]
-    padded = np.pad(image, pad, mode="edge")
+    ends = [(LARGEST_BLOCK, LARGEST_BLOCK + -side % LARGEST_BLOCK) for side in (height, width)]
+    padded = np.pad(image, [*ends, (0, 0)], mode="edge")
     found, side = [], LARGEST_BLOCK
     open_ = np.ones((padded.shape[0] // side, padded.shape[1] // side), bool)
     while side >= SMALLEST_BLOCK:
@@ -210,28 +200,8 @@ def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np
         mean, deviation = squares.mean(axis=(1, 3)), squares.std(axis=(1, 3)).max(axis=-1)
         taken = open_ & ((deviation < levels / 255) | (side == SMALLEST_BLOCK))
         y, x = np.nonzero(taken)
-        found.append(
-            (side * (np.stack([x, y], 1) + 0.5) - LARGEST_BLOCK, np.full(len(x), side), mean[taken])
-        )
+        middles = side * (np.stack([x, y], 1) + 0.5) - LARGEST_BLOCK
+        found.append((middles, np.full(len(x), side), mean[taken]))
         open_, side = np.repeat(np.repeat(open_ & ~taken, 2, 0), 2, 1), side // 2
     middles, sides, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return middles, sides.astype(np.float32), colors
-
-
-def _block_splats(
-    camera: Camera, points: np.ndarray, sides: np.ndarray, colors: np.ndarray
-) -> Splats:
-    """Flat splats (N) at points (N, 3) that face a camera in which they are so many pixels wide."""
-    count = len(points)
-    depth = camera.project(points)[1]
-    width = BLOCK_WIDTH * sides * depth / camera.fl_x
-    log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
-    rotation = np.repeat(
-        from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1)), count, axis=0
-    )
-    sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (colors - 0.5) / SH_C0
-    return Splats(
-        points.astype(np.float32), rotation.astype(np.float32), log_scale.astype(np.float32),
-        np.full(count, START_OPACITY, np.float32), sh, np.zeros(count, np.int32), np.ones(count, bool),
-    )  # fmt: skip
