@@ -33,8 +33,8 @@ compared."""
 TEXTURE_PART_TIMESTEPS, PART_TIMESTEPS = 12, 24
 """At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
 LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
-"""Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture
-shows."""
+"""Weight of landmarks beside the images; of those on eyeballs and lids, where no texture shows
+reflections, nor which of the two is seen."""
 REGION_SCALE_M = 0.004
 """Median distance of a region's landmarks from the head at which the region's weight has fallen to
 a quarter."""
@@ -398,7 +398,7 @@ class _Solver:
             own = self.head.landmark_region == region
             if (own & (weight > 0)).any():
                 weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
-            weight[own] *= np.where(self.head.skin[own], LANDMARK_SHARE, INNER_SHARE)
+            weight[own] *= np.where(self.head.inner[own], INNER_SHARE, LANDMARK_SHARE)
         return np.asarray(weight)
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .appearance import LEVELS_M, light_basis, robust
 from .head_model import HeadModel
 from .photo_consistency import facing, in_sight
@@ -21,6 +22,8 @@ HEAD_POINTS = 5000
 top, because they are dense at eyes and lips."""
 FACE_RADIUS_M = 0.035
 """Distance from the landmarks beyond which there is hair and clothes."""
+LID_DISTANCE_M = 0.005
+"""From an eyeball's vertices, up to which a landmark is one of the lids' edges."""
 HELD_OUT = 8
 """One point of so many is not fitted, and tells whether the fit is better."""
 STEPS = (1, 2, 2, 3)
@@ -63,10 +66,11 @@ class DenseHead:
         self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
         self.count = model.n_expression
         self.landmarks = PosedPoints(self.head.model, places)
-        self.skin = large_parts(model)[places.face]
-        """(L,) bool: landmarks that are not on eyeballs or teeth."""
-        skin = reliable & self.skin
-        self.points = _face_points(person, places, skin if skin.any() else reliable)
+        skin = large_parts(model)[places.face]
+        self.inner = ~skin | _on_lids(model, places)
+        """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
+        used = reliable & skin
+        self.points = _face_points(person, places, used if used.any() else reliable)
         held = np.arange(len(self.points)) % HELD_OUT == 0
         self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
         self._posed = [PosedPoints(self.head.model, _some(self.points, rows)) for rows in self.rows]
@@ -182,6 +186,18 @@ class DenseHead:
 def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients, and pose with translation (18,)."""
     return values[:-RIGID_SIZE], values[-RIGID_SIZE:]
+
+
+def _on_lids(model: FlameModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) bool: places next to an eyeball."""
+    from scipy.spatial import cKDTree
+
+    eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
+    inside = model.v_template[(eyeballs > EYEBALL_WEIGHT).any(1)]
+    if not len(inside):
+        return np.zeros(len(places), bool)
+    distance, _ = cKDTree(inside).query(places.on(model.v_template, model.faces))
+    return np.asarray(distance < LID_DISTANCE_M)
 
 
 def _face_points(head: HeadModel, places: SurfacePoints, used: np.ndarray) -> SurfacePoints:

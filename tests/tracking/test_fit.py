@@ -361,13 +361,17 @@ def test_prior_keeps_weights_between_0_and_1():
     and lids that close beyond each other: the right-hand side is minus the slope of the penalty, by
     differences."""
     named = HeadModel(flame_model(None), "flame")
-    lids = [[named.model.expression_names.index(name) for name in lid] for lid in LID_SHAPES]
+    lids = [
+        [named.model.expression_names.index(name + side) for name in LID_SHAPES]
+        for side in ("Left", "Right")
+    ]
+    shares = np.array(list(LID_SHAPES.values()))
     count, rng = named.model.n_expression, np.random.default_rng(0)
     values = np.concatenate([rng.uniform(-1, 2, count), np.zeros(RIGID_SIZE)])
     values[lids[0]] = 0.9, 0.8  # each in its range
     pulled = (values[:count] < 0) | (values[:count] > 1)
     pulled[lids[0]] = True
-    pulled[lids[1]] |= values[lids[1]].sum() > 1
+    pulled[lids[1]] |= values[lids[1]] @ shares > 1
 
     def penalty(head, at):
         total = (parameter_precision(head) * at**2).sum() / 2
@@ -375,7 +379,7 @@ def test_prior_keeps_weights_between_0_and_1():
             beyond = np.maximum(at[:count] - 1, 0) + np.maximum(-at[:count], 0)
             total += (beyond**2).sum() / 2 / WEIGHT_EXCESS_SIGMA**2
             for lid in lids:
-                total += max(at[lid].sum() - 1, 0) ** 2 / 2 / WEIGHT_EXCESS_SIGMA**2
+                total += max(at[lid] @ shares - 1, 0) ** 2 / 2 / WEIGHT_EXCESS_SIGMA**2
         return total
 
     for head in (named, replace(named, model=replace(named.model, expression_names=()))):
