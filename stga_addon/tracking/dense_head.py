@@ -75,13 +75,6 @@ class DenseHead:
         self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
         self._posed = [PosedPoints(self.head.model, _some(self.points, rows)) for rows in self.rows]
         self._all = PosedPoints(self.head.model, self.points)
-        self._set_regions(places, reliable)
-        rest = np.zeros(len(self.active) + RIGID_SIZE)
-        smooth = _unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
-        self._bend = smooth - self._all.triangle_normals(*split(rest))
-        self._visible: dict[tuple[int, ...], np.ndarray] = {}
-
-    def _set_regions(self, places: SurfacePoints, reliable: np.ndarray) -> None:
         template, faces = self.head.model.v_template, self.head.model.faces
         height = places.on(template, faces)[:, 1]
         low, high = height[reliable].min(), height[reliable].max()
@@ -90,6 +83,10 @@ class DenseHead:
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
         self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
+        rest = np.zeros(len(self.active) + RIGID_SIZE)
+        smooth = _unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
+        self._bend = smooth - self._all.triangle_normals(*split(rest))
+        self._visible: dict[tuple[int, ...], np.ndarray] = {}
 
     def reduced(self, parameters: np.ndarray) -> np.ndarray:
         """The active ones of parameters (E + 18,) of a `HeadFit`."""
@@ -125,24 +122,20 @@ class DenseHead:
         kept by direction and by how far the mouth is open."""
         at, turn = self.positions(values), head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
-        seen = []
+        seen, faces = [], self.head.model.faces
         for camera in cameras:
             direction = (camera.position - at.mean(0)) @ turn
             steps = np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int)
             key = opening, *steps.tolist()
             if key not in self._visible:
-                self._visible[key] = self._visible_now(values, at, camera)
+                vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
+                normals = self.points.on(vertex_normals(vertices, faces), faces)
+                cosine = facing(camera, at, _unit(normals))
+                share = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
+                shown = in_sight(camera.scaled(share), vertices, faces, at)
+                self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
             seen.append(self._visible[key])
         return np.stack(seen)
-
-    def _visible_now(self, values: np.ndarray, at: np.ndarray, camera: Camera) -> np.ndarray:
-        faces = self.head.model.faces
-        vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
-        cosine = facing(camera, at, _unit(self.points.on(vertex_normals(vertices, faces), faces)))
-        small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
-        return np.where(
-            (cosine > MIN_COSINE) & in_sight(small, vertices, faces, at), cosine**2, 0.0
-        )
 
     def opening(self, values: np.ndarray) -> float:
         """Height in meters of the upper face above the chin."""
