@@ -33,6 +33,8 @@ TRANSLATION_SIGMA_M = 10.0
 ABSENT_SIGMA = 1e-6
 EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
 """Standard deviations of second differences from one timestep to the next."""
+LID_ACCELERATION = 1.0
+"""The same of LID_SHAPES: a blink closes the eyes within two or three frames of a video."""
 JUMP_SCALE = 3.0
 """Standard deviations of a second difference beyond which it is a cut rather than a motion."""
 MAX_ORDERED_CHANGE = 0.7
@@ -334,4 +336,7 @@ def acceleration_precision(model: FlameModel) -> np.ndarray:
         (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M),
         (model.n_expression, POSE_SIZE, TRANSLATION_SIZE),
     )
+    for column, name in enumerate(model.expression_names):
+        if name.removesuffix("Left").removesuffix("Right") in LID_SHAPES:
+            sigma[column] = LID_ACCELERATION
     return np.asarray(sigma**-2.0)

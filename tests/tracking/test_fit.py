@@ -209,6 +209,26 @@ def amounts_and_observations(head, amounts, noise):
     return one, places, observed
 
 
+def test_a_blink_of_one_timestep_is_followed():
+    """Catches lids that are smoothed like a mouth, and stay open in blinks of a video."""
+    model = flame_model(None)
+    one = person(HeadModel(model, "flame"), np.zeros(model.n_identity))
+    lid = np.flatnonzero(np.isin(model.faces, model.masks["left_eye_region"]).all(1))
+    faces = np.concatenate([lid[::20], np.arange(0, len(model.faces), 400)])
+    places = SurfacePoints(faces, np.full((len(faces), 3), 1 / 3))
+    truth = np.zeros((7, model.n_expression + RIGID_SIZE))
+    blink = model.expression_names.index("eyeBlinkLeft")
+    truth[3, blink] = 1
+    posed, root = PosedPoints(one.model, places), np.tile(np.eye(3), (len(faces), 1, 1))
+    observed = [
+        Observation(posed.positions(own[:-RIGID_SIZE], own[-RIGID_SIZE:]), root, np.ones(len(root)))
+        for own in truth
+    ]
+    solved = solve_take(one, places, observed, np.zeros_like(truth), ordered=True)[:, blink]
+    assert solved[3] > 0.8
+    assert max(solved[2], solved[4]) < 0.1
+
+
 def test_expressions_in_no_order_are_not_smoothed(head):
     """Catches brows that are raised at every third timestep and tracked at rest: beside surface
     points, landmarks count little, and less than smoothness over timesteps that do not follow each
