@@ -42,6 +42,10 @@ NECK_SLOPE = 0.35
 """Of the planes that divide the neck: it leans forward, and its nape ends higher than its front."""
 NECK_BOTTOM_CM, NECK_TOP_CM = -13.7, -4.7
 """Heights on the axis between which skin follows root and neck joint in part."""
+EYEBALL_SETBACK_CM, EYEBALL_RETRACTION_CM = 0.07, 0.1
+"""How far eyeballs lie behind ICT-FaceKit's, and how far lids that close push them back, as they do
+in life (Evinger et al. 1984): else, eyeballs of other identities poke through their lids, which
+move along straight lines."""
 MIN_EYE_SHARE, MIN_LIPS_SHARE = 0.15, 0.45
 """Of a shape's largest displacement, at the edge of the region that it moves."""
 
@@ -55,7 +59,7 @@ def main(source: Path) -> None:
     kept, faces = _thinned(neutral, triangles, _detail(moved))
     identity = arrays["identity"][:IDENTITIES, kept].astype(np.float64)
     displacements = METERS_PER_UNIT * np.concatenate([identity, shapes[:, kept]])
-    template = neutral[kept]
+    template = neutral_head(arrays)[kept]
     write_npz(
         BUNDLED_HEAD,
         {
@@ -77,16 +81,28 @@ def main(source: Path) -> None:
     )
 
 
+def neutral_head(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """ICT-FaceKit's neutral head (V, 3) in centimeters, with the eyeballs set back."""
+    neutral = arrays["neutral"].astype(np.float64)
+    for part in (LEFT_EYEBALL, RIGHT_EYEBALL):
+        neutral[slice(*part), 2] -= EYEBALL_SETBACK_CM
+    return neutral
+
+
 def arkit_displacements(arrays: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], np.ndarray]:
-    """ARKit's names of ICT-FaceKit's expressions, and their displacements (E, V, 3) in
-    centimeters."""
+    """ARKit's names of ICT-FaceKit's expressions, and their displacements (E, V, 3) in centimeters,
+    with those of the eyeballs behind lids that close."""
     row = {str(name): number for number, name in enumerate(arrays["expression_names"])}
     names = tuple(name for name in ARKIT_SHAPES if name not in OPTIONAL)
     shapes = [
         sum(arrays["expression"][row[part]].astype(np.float64) for part in ict_names(name))
         for name in names
     ]
-    return names, np.stack(shapes)
+    displacements = np.stack(shapes)
+    for side, part in (("Left", LEFT_EYEBALL), ("Right", RIGHT_EYEBALL)):
+        lids = [names.index(shape + side) for shape in ("eyeBlink", "eyeLookDown")]
+        displacements[lids, slice(*part), 2] -= EYEBALL_RETRACTION_CM
+    return names, displacements
 
 
 def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:

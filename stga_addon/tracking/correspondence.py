@@ -12,7 +12,7 @@ from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
 from .fit import MIN_LANDMARKS
-from .mesh_image import shaded_image
+from .mesh_image import SKIN_RGB, shaded_image
 from .posed_points import SurfacePoints
 from .seen_surface import large_parts
 from .triangulation import Triangulation, triangulate
@@ -37,9 +37,11 @@ MIN_PICTURES = 3
 OPEN_JAW_WEIGHT, OPEN_JAW_RAD = 0.4, 0.2
 """Of ARKit's jawOpen, or of the jaw joint, by which lips part: on a closed mouth, the lower lip's
 inner landmarks are as near to the upper lip."""
-MIN_OPEN_GAIN = 0.25
-"""Share of its squared distances in both pictures that a place leaves that is better than
-another."""
+BLINKS = "eyeBlinkLeft", "eyeBlinkRight"
+EYE_JOINTS = JOINTS.index("left_eye"), JOINTS.index("right_eye")
+SCLERA_RGB, IRIS_RGB = (0.95, 0.93, 0.9), (0.15, 0.09, 0.05)
+IRIS_RADIUS = 0.4
+"""Share of the eyeball's radius."""
 MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
 MAX_RESIDUAL = 0.013
@@ -53,23 +55,27 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
     reliable.
 
     Renders the template from nine directions, triangulates what the detector finds and takes the
-    nearest points of the skin, or of an eyeball for the irises; with the mouth opened too, where
-    the model can. The model looks along +z with y up; `name` is what errors call it. Raises
-    StgaError where the detector does not see a face.
+    nearest points of the skin, or of an eyeball for the irises; where the model can, with the mouth
+    opened and the eyes closed too. The model looks along +z with y up; `name` is what errors call
+    it. Raises StgaError where the detector does not see a face.
     """
     neutral, faces = model.v_template, model.faces
-    located, count = _located(neutral, faces, detector)
+    colors = _colors(model)
+    located, count = _located(neutral, faces, colors, detector)
     if located is None:
         raise StgaError(
-            f"{name}: shows a face in {count} of {len(DIRECTIONS_DEG)} pictures from the front, expected at least "
-            f"{MIN_PICTURES}; it must look along +z with y up"
+            f"{name}: shows a face in {count} of {len(DIRECTIONS_DEG)} pictures from the front, "
+            f"expected at least {MIN_PICTURES}; it must look along +z with y up"
         )
+    seen = [(neutral, located.position)]
+    for mesh in _moved_heads(model):
+        found, _ = _located(mesh, faces, colors, detector)
+        seen += [] if found is None else [(mesh, found.position)]
+    # Of lids, the nearest points would lie on the eyeball, which does not blink.
     skin = np.flatnonzero(large_parts(model))
-    places = _on_skin(neutral, faces, skin, located.position)
-    opened = _open_mouth(model)
-    parted = None if opened is None else _located(opened, faces, detector)[0]
-    if opened is not None and parted is not None:
-        places = _on_own_lips(neutral, opened, faces, skin, places, located, parted)
+    meshes, positions = (np.concatenate(arrays, axis=1) for arrays in zip(*seen, strict=True))
+    on, _ = nearest_points(meshes, faces[skin], positions)
+    places = SurfacePoints(skin[on.face], on.barycentric)
     distance = np.linalg.norm(places.on(neutral, faces) - located.position, axis=1)
     extent = float(np.ptp(neutral, axis=0).max())
     reliable = (distance < MAX_SURFACE_DISTANCE * extent) & (
@@ -81,76 +87,48 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
         reliable[pupils] = True
     if reliable.sum() < MIN_LANDMARKS:
         raise StgaError(
-            f"{name}: {reliable.sum()} of {len(reliable)} landmarks that are found in its pictures lie on its surface, "
-            f"expected at least {MIN_LANDMARKS}"
+            f"{name}: {reliable.sum()} of {len(reliable)} landmarks that are found in its pictures "
+            f"lie on its surface, expected at least {MIN_LANDMARKS}"
         )
     return places, reliable
 
 
+def _colors(model: FlameModel) -> np.ndarray:
+    """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones."""
+    colors = np.tile(SKIN_RGB, (len(model.v_template), 1))
+    for joint in EYE_JOINTS:
+        eyeball = np.flatnonzero(model.weights[:, joint] > EYEBALL_WEIGHT)
+        at = model.v_template[eyeball]
+        if len(at):
+            away = (at - (at.min(0) + at.max(0)) / 2) / (np.ptp(at, axis=0).max() / 2)
+            iris = (np.hypot(away[:, 0], away[:, 1]) < IRIS_RADIUS) & (away[:, 2] > 0)
+            colors[eyeball] = np.where(iris[:, None], IRIS_RGB, SCLERA_RGB)
+    return colors
+
+
 def _located(
-    vertices: np.ndarray, faces: np.ndarray, detector: Detector
+    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, detector: Detector
 ) -> tuple[Triangulation | None, int]:
     """The landmarks in pictures of a mesh, and how many of these show a face; None where too few
     do."""
-    pictures = [
-        (camera, shaded_image(vertices, faces, camera)) for camera in picture_cameras(vertices)
-    ]
-    found = [(camera, detector.detect(picture)) for camera, picture in pictures]
-    seen = [(camera, shown[0]) for camera, shown in found if shown]
+    cameras = picture_cameras(vertices)
+    found = [detector.detect(shaded_image(vertices, faces, camera, colors)) for camera in cameras]
+    seen = [(camera, shown[0]) for camera, shown in zip(cameras, found, strict=True) if shown]
     if len(seen) < MIN_PICTURES:
         return None, len(seen)
     points = np.stack([face for _, face in seen])
     return triangulate([camera for camera, _ in seen], points, np.ones(points.shape[:2])), len(seen)
 
 
-def _on_skin(
-    vertices: np.ndarray, faces: np.ndarray, skin: np.ndarray, positions: np.ndarray
-) -> SurfacePoints:
-    """The nearest points of the triangles `skin`: those of lids would lie on the eyeball, which
-    does not blink."""
-    on, _ = nearest_points(vertices, faces[skin], positions)
-    return SurfacePoints(skin[on.face], on.barycentric)
-
-
-def _on_own_lips(
-    neutral: np.ndarray, opened: np.ndarray, faces: np.ndarray, skin: np.ndarray, places: SurfacePoints,
-    located: Triangulation, parted: Triangulation,
-) -> SurfacePoints:  # fmt: skip
-    """The places, where they do not open with the landmarks moved to the nearest skin that does.
-
-    neutral, opened (V, 3): the head with closed and open mouth, on which `located` and `parted`
-    are.
-    """
-    others = _on_skin(opened, faces, skin, parted.position)
-    pairs = ((neutral, located), (opened, parted))
-    before, after = (
-        np.sum([((on.on(mesh, faces) - seen.position) ** 2).sum(1) for mesh, seen in pairs], axis=0)
-        for on in (places, others)
-    )
-    motion = opened - neutral
-    moves = motion[faces[skin]].mean(1)
-    face, barycentric = places.face.copy(), places.barycentric.copy()
-    for row in np.flatnonzero(after < MIN_OPEN_GAIN * before):
-        wrong, right = (
-            np.linalg.norm(moves - on.on(motion, faces)[row], axis=1) for on in (places, others)
-        )
-        found = _on_skin(neutral, faces, skin[right < wrong], located.position[row : row + 1])
-        face[row], barycentric[row] = found.face[0], found.barycentric[0]
-    return SurfacePoints(face, barycentric)
-
-
-def _open_mouth(model: FlameModel) -> np.ndarray | None:
-    """The neutral head's vertices (V, 3) with the mouth open; None where no shape or joint is known
-    to open it."""
-    frame = neutral_frame(model)
-    if "jawOpen" in model.expression_names:
-        weights = OPEN_JAW_WEIGHT * (np.array(model.expression_names) == "jawOpen")
-        return flame_forward(model, np.zeros(model.n_identity), replace(frame, expr=weights))
-    if not model.weights[:, JOINTS.index("jaw")].any():
-        return None
-    return flame_forward(
-        model, np.zeros(model.n_identity), replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))
-    )
+def _moved_heads(model: FlameModel) -> list[np.ndarray]:
+    """The neutral head's vertices (V, 3) with the mouth open, and with the eyes closed, as far as
+    shapes or a joint are known that do it."""
+    frame, names = neutral_frame(model), np.array(model.expression_names)
+    weights = [OPEN_JAW_WEIGHT * (names == "jawOpen"), np.isin(names, BLINKS)]
+    frames = [replace(frame, expr=1.0 * own) for own in weights if len(names) and own.any()]
+    if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
+        frames = [replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))]
+    return [flame_forward(model, np.zeros(model.n_identity), own) for own in frames]
 
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:
@@ -173,23 +151,44 @@ def picture_cameras(vertices: np.ndarray) -> list[Camera]:
 def nearest_points(
     vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
 ) -> tuple[SurfacePoints, np.ndarray]:
-    """The points of a mesh nearest to `points` (N, 3), and their distances (N,)."""
+    """The points of a mesh nearest to `points` (N, D), and their distances (N,).
+
+    vertices (V, D): D is 3, or 3 times the number of poses of a mesh, side by side; squared
+    distances in all poses then add up.
+    """
     from scipy.spatial import cKDTree
-    from trimesh.triangles import closest_point, points_to_barycentric
 
     corners = vertices[faces]
     candidates = min(CANDIDATES, len(faces))
     _, near = cKDTree(corners.mean(1)).query(points, candidates)
     near = near.reshape(len(points), candidates)
-    repeated = np.repeat(points, candidates, axis=0)
-    closest = closest_point(corners[near.ravel()], repeated)  # type: ignore[no-untyped-call]
-    closest = closest.reshape(len(points), candidates, 3)
-    distance = np.linalg.norm(closest - points[:, None], axis=2)
-    best = distance.argmin(1)
-    rows = np.arange(len(points))
-    triangle, nearest = near[rows, best], closest[rows, best]
-    barycentric = points_to_barycentric(corners[triangle], nearest)  # type: ignore[no-untyped-call]
-    return SurfacePoints(triangle, np.nan_to_num(barycentric, nan=1 / 3)), distance[rows, best]
+    own = corners[near]
+    away = points[:, None] - own[:, :, 0]
+    one, other = own[:, :, 1] - own[:, :, 0], own[:, :, 2] - own[:, :, 0]
+    aa, ab, bb = (one * one).sum(2), (one * other).sum(2), (other * other).sum(2)
+    pa, pb = (away * one).sum(2), (away * other).sum(2)
+    tiny = np.finfo(np.float64).tiny
+    flat = np.maximum(aa * bb - ab**2, tiny)
+    u, v = (bb * pa - ab * pb) / flat, (aa * pb - ab * pa) / flat
+    within = (u >= 0) & (v >= 0) & (u + v <= 1)
+    third = np.clip((pb - pa + aa - ab) / np.maximum(aa - 2 * ab + bb, tiny), 0, 1)
+    first, second = (np.clip(p / np.maximum(q, tiny), 0, 1) for p, q in ((pa, aa), (pb, bb)))
+    # inside the triangle, or else on one of its edges
+    shares = np.stack(
+        [
+            np.stack([np.where(within, u, 0), first, np.zeros_like(u), 1 - third]),
+            np.stack([np.where(within, v, 0), np.zeros_like(u), second, third]),
+        ],
+        axis=-1,
+    )
+    distance = np.linalg.norm(
+        away - shares[..., :1] * one - shares[..., 1:] * other, axis=3
+    )  # (4, N, candidates)
+    kind, rows = distance.argmin(0), np.arange(len(points))
+    best = distance.min(0).argmin(1)
+    share = shares[kind[rows, best], rows, best]
+    barycentric = np.column_stack([1 - share.sum(1), share])
+    return SurfacePoints(near[rows, best], barycentric), distance.min(0)[rows, best]
 
 
 def _with_pupils(
@@ -198,7 +197,7 @@ def _with_pupils(
     """The places with the centers of the irises on the foremost points of the eyeballs, where the
     model has any."""
     face, barycentric, moved = places.face.copy(), places.barycentric.copy(), []
-    for joint in (JOINTS.index("left_eye"), JOINTS.index("right_eye")):
+    for joint in EYE_JOINTS:
         eyeball = np.flatnonzero((model.weights[model.faces, joint] > EYEBALL_WEIGHT).all(1))
         if not len(eyeball):
             continue

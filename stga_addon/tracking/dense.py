@@ -33,8 +33,8 @@ compared."""
 TEXTURE_PART_TIMESTEPS, PART_TIMESTEPS = 12, 24
 """At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
 LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
-"""Weight of landmarks beside the images; of those on eyeballs, whose reflections no texture
-shows."""
+"""Weight of landmarks beside the images; of those on eyeballs and lids, where no texture shows
+reflections, nor which of the two is seen."""
 REGION_SCALE_M = 0.004
 """Median distance of a region's landmarks from the head at which the region's weight has fallen to
 a quarter."""
@@ -246,7 +246,8 @@ class _Solver:
     def solve(
         self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
     ) -> _Solved:
-        """The parameters that explain a timestep best; before: another timestep and its result."""
+        """The parameters that explain a timestep best, or the start where none are better; before:
+        another timestep and its result."""
         visible = self.visible(shot, shot.start)
         best, error = self.started(shot, texture, shot.start, visible)
         if (error.regions > USUAL_FACTOR * usual).any():
@@ -266,26 +267,20 @@ class _Solver:
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
             best = self._descended(shot, texture, shot.start, visible, START_STEPS)
             best, visible = self._refined(shot, texture, best)
-        return self._judged(shot, texture, best, visible)
-
-    def _judged(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
-    ) -> _Solved:
-        """The result, or the start where the result is not better."""
         by_images = self._by_images(shot, visible)
-        old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, values))
+        old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, best))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
-            terms = self._terms(shot, texture, values, visible, 0, *self.head.linearized(values, 0))
+            terms = self._terms(shot, texture, best, visible, 0)[:2]
         else:
-            values = shot.start
+            best = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
-            terms = stiff, -prior_terms(self.head.head, values)[1]  # which the prior does not move
-        found, missed = (
-            self._evidence(shot, texture, values, visible),
-            self._missed(shot.landmarks, values),
+            terms = stiff, -prior_terms(self.head.head, best)[1]  # which the prior does not move
+        error, missed = (
+            self._evidence(shot, texture, best, visible),
+            self._missed(shot.landmarks, best),
         )
-        return _Solved(values, visible, terms, found, missed, better)
+        return _Solved(best, visible, terms, error, missed, better)
 
     def _evidence(
         self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
@@ -362,8 +357,7 @@ class _Solver:
     ) -> tuple[np.ndarray, float]:
         """A damped Gauss–Newton step, and the root mean square in meters of what it moves the
         points by."""
-        at, jacobian = self.head.linearized(values, level)
-        matrix, right = self._terms(shot, texture, values, visible, level, at, jacobian)
+        matrix, right, jacobian = self._terms(shot, texture, values, visible, level)
         precision, pull = prior_terms(self.head.head, values)
         matrix = matrix + np.diag(precision)
         matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
@@ -372,34 +366,27 @@ class _Solver:
         return step, float(np.sqrt(3 * np.mean((jacobian @ step) ** 2)))
 
     def _terms(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int, at: np.ndarray,
-        jacobian: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior.
-
-        at (M, 3), jacobian (M, 3, K + 18): of the level's points.
-        """
+        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior, and
+        derivatives (M, 3, K + 18) of the level's points."""
+        _, jacobian = self.head.linearized(values, level)
         curvature, slope = photo_term(
-            self.head, shot.views, self._by_images(shot, visible), texture, values, at, level
+            self.head, shot.views, self._by_images(shot, visible), texture, values, level
         )
-        share = len(self.head.rows[0]) / len(at)  # a level weighs the same with fewer points
+        # a level weighs the same with fewer points
+        share = len(self.head.rows[0]) / len(jacobian)
         flat = jacobian.reshape(-1, len(values))
-        weighted = replace(shot.landmarks, weight=self._landmark_weight(shot, values))
-        matrix, right = normal_equations(self.head.landmarks, values, weighted)
-        return matrix + share * flat.T @ (curvature @ jacobian).reshape(
-            flat.shape
-        ), right + share * flat.T @ slope.ravel()
-
-    def _landmark_weight(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
-        """(L,): whole where landmarks are the better evidence; of other regions whose landmarks are
-        far from the head, less."""
         missed, weight = self._missed(shot.landmarks, values), shot.landmarks.weight.copy()
         for region in np.flatnonzero(~shot.by_landmarks):
             own = self.head.landmark_region == region
-            if (own & (weight > 0)).any():
+            if (own & (weight > 0)).any():  # far from the head, they count less
                 weight[own] *= robust(np.median(missed[own & (weight > 0)]), REGION_SCALE_M)
-            weight[own] *= np.where(self.head.skin[own], LANDMARK_SHARE, INNER_SHARE)
-        return np.asarray(weight)
+            weight[own] *= np.where(self.head.inner[own], INNER_SHARE, LANDMARK_SHARE)
+        weighted = replace(shot.landmarks, weight=weight)
+        matrix, right = normal_equations(self.head.landmarks, values, weighted)
+        matrix = matrix + share * flat.T @ (curvature @ jacobian).reshape(flat.shape)
+        return matrix, right + share * flat.T @ slope.ravel(), jacobian
 
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
         """(L,) distance in meters of the landmarks from the head, as far as the cameras determine

@@ -9,6 +9,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
+from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .appearance import LEVELS_M, light_basis, robust
 from .head_model import HeadModel
 from .photo_consistency import facing, in_sight
@@ -21,6 +22,8 @@ HEAD_POINTS = 5000
 top, because they are dense at eyes and lips."""
 FACE_RADIUS_M = 0.035
 """Distance from the landmarks beyond which there is hair and clothes."""
+LID_DISTANCE_M = 0.005
+"""From an eyeball's vertices, up to which a landmark is one of the lids' edges."""
 HELD_OUT = 8
 """One point of so many is not fitted, and tells whether the fit is better."""
 STEPS = (1, 2, 2, 3)
@@ -63,21 +66,15 @@ class DenseHead:
         self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
         self.count = model.n_expression
         self.landmarks = PosedPoints(self.head.model, places)
-        self.skin = large_parts(model)[places.face]
-        """(L,) bool: landmarks that are not on eyeballs or teeth."""
-        skin = reliable & self.skin
-        self.points = _face_points(person, places, skin if skin.any() else reliable)
+        skin = large_parts(model)[places.face]
+        self.inner = ~skin | _on_lids(model, places)
+        """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
+        used = reliable & skin
+        self.points = _face_points(person, places, used if used.any() else reliable)
         held = np.arange(len(self.points)) % HELD_OUT == 0
         self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
         self._posed = [PosedPoints(self.head.model, _some(self.points, rows)) for rows in self.rows]
         self._all = PosedPoints(self.head.model, self.points)
-        self._set_regions(places, reliable)
-        rest = np.zeros(len(self.active) + RIGID_SIZE)
-        smooth = _unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
-        self._bend = smooth - self._all.triangle_normals(*split(rest))
-        self._visible: dict[tuple[int, ...], np.ndarray] = {}
-
-    def _set_regions(self, places: SurfacePoints, reliable: np.ndarray) -> None:
         template, faces = self.head.model.v_template, self.head.model.faces
         height = places.on(template, faces)[:, 1]
         low, high = height[reliable].min(), height[reliable].max()
@@ -86,6 +83,10 @@ class DenseHead:
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
         self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
+        rest = np.zeros(len(self.active) + RIGID_SIZE)
+        smooth = _unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
+        self._bend = smooth - self._all.triangle_normals(*split(rest))
+        self._visible: dict[tuple[int, ...], np.ndarray] = {}
 
     def reduced(self, parameters: np.ndarray) -> np.ndarray:
         """The active ones of parameters (E + 18,) of a `HeadFit`."""
@@ -121,24 +122,20 @@ class DenseHead:
         kept by direction and by how far the mouth is open."""
         at, turn = self.positions(values), head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
-        seen = []
+        seen, faces = [], self.head.model.faces
         for camera in cameras:
             direction = (camera.position - at.mean(0)) @ turn
             steps = np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int)
             key = opening, *steps.tolist()
             if key not in self._visible:
-                self._visible[key] = self._visible_now(values, at, camera)
+                vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
+                normals = self.points.on(vertex_normals(vertices, faces), faces)
+                cosine = facing(camera, at, _unit(normals))
+                share = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
+                shown = in_sight(camera.scaled(share), vertices, faces, at)
+                self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
             seen.append(self._visible[key])
         return np.stack(seen)
-
-    def _visible_now(self, values: np.ndarray, at: np.ndarray, camera: Camera) -> np.ndarray:
-        faces = self.head.model.faces
-        vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
-        cosine = facing(camera, at, _unit(self.points.on(vertex_normals(vertices, faces), faces)))
-        small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
-        return np.where(
-            (cosine > MIN_COSINE) & in_sight(small, vertices, faces, at), cosine**2, 0.0
-        )
 
     def opening(self, values: np.ndarray) -> float:
         """Height in meters of the upper face above the chin."""
@@ -182,6 +179,18 @@ class DenseHead:
 def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients, and pose with translation (18,)."""
     return values[:-RIGID_SIZE], values[-RIGID_SIZE:]
+
+
+def _on_lids(model: FlameModel, places: SurfacePoints) -> np.ndarray:
+    """(N,) bool: places next to an eyeball."""
+    from scipy.spatial import cKDTree
+
+    eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
+    inside = model.v_template[(eyeballs > EYEBALL_WEIGHT).any(1)]
+    if not len(inside):
+        return np.zeros(len(places), bool)
+    distance, _ = cKDTree(inside).query(places.on(model.v_template, model.faces))
+    return np.asarray(distance < LID_DISTANCE_M)
 
 
 def _face_points(head: HeadModel, places: SurfacePoints, used: np.ndarray) -> SurfacePoints:

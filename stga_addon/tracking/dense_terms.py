@@ -71,11 +71,15 @@ def samples(
 
 
 def photo_term(
-    head: DenseHead, views: Sequence[PyramidView], visible: np.ndarray, texture: Texture, values: np.ndarray,
-    at: np.ndarray, level: int,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Gauss–Newton terms of the points `at` (M, 3) of a level: H (M, 3, 3) and b (M, 3) by their
-    positions."""
+    head: DenseHead,
+    views: Sequence[PyramidView],
+    visible: np.ndarray,
+    texture: Texture,
+    values: np.ndarray,
+    level: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss–Newton terms of the points of a level: H (M, 3, 3) and b (M, 3) by their positions."""
+    at = head.level_positions(values, level)
     matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
     basis, rows = head.light_basis(values, level), head.rows[level]
     for view, seen in zip(views, visible, strict=True):
@@ -113,9 +117,14 @@ def photo_term(
 
 
 def misfit(
-    head: DenseHead, views: Sequence[PyramidView], visible: np.ndarray, texture: Texture, values: np.ndarray,
-    points: int, level: int,
-) -> Misfit:  # fmt: skip
+    head: DenseHead,
+    views: Sequence[PyramidView],
+    visible: np.ndarray,
+    texture: Texture,
+    values: np.ndarray,
+    points: int,
+    level: int,
+) -> Misfit:
     """How badly a level's images are explained at the points of a level."""
     at, basis, rows = (
         head.level_positions(values, points),
@@ -139,9 +148,14 @@ def misfit(
 
 
 def _residual(
-    view: PyramidView, texture: Texture, shown: np.ndarray, basis: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+    view: PyramidView,
+    texture: Texture,
+    shown: np.ndarray,
+    basis: np.ndarray,
+    weight: np.ndarray,
+    rows: np.ndarray,
     level: int,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Channels (M, 3) that the view shows minus those of the lit texture, in NOISE_LEVELS."""
     target = texture.values[view.key][level][rows]
     light = fitted_light(shown, target, basis, weight, texture.lights[view.key])

@@ -1,7 +1,7 @@
 """From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and
 pose."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -135,9 +135,13 @@ def fit_head(
     several = [t for t in timesteps if len(take[t].cameras) > 1]
     spread = evenly_spread(several or timesteps, IDENTITY_TIMESTEPS)
     neutral = places.on(head.model.v_template, head.model.faces)
-    scale = 1.0  # without several cameras, the head's own size decides
-    found = {t: triangulated(take[t], reliable, neutral, scale) for t in spread}
-    world = _average([_aligned(found[t], neutral, reliable, metric) for t in spread])
+    # without several cameras, the head's own size decides
+    found = {t: triangulated(take[t], reliable, neutral, 1.0) for t in spread}
+    aligned = [_aligned(found[t], neutral, reliable, metric) for t in spread]
+    size = float(np.median([one.scale for one in aligned]))
+    u, _, vt = np.linalg.svd(np.sum([one.rotation for one in aligned], axis=0))
+    centers = [-one.rotation.T @ one.translation / one.scale for one in aligned]
+    world = Similarity(size, u @ vt, -size * u @ vt @ np.median(centers, axis=0))
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
     solved, ordered = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE)), True
     for number in range(ROUNDS):
@@ -256,14 +260,6 @@ def _aligned(
     """The similarity that brings the landmarks onto the neutral head."""
     use = found.seen & reliable
     return similarity(found.position[use], neutral[use], metric)
-
-
-def _average(found: Sequence[Similarity]) -> Similarity:
-    scale = float(np.median([one.scale for one in found]))
-    u, _, vt = np.linalg.svd(np.sum([one.rotation for one in found], axis=0))
-    rotation = u @ vt
-    centers = [-one.rotation.T @ one.translation / one.scale for one in found]
-    return Similarity(scale, rotation, -scale * rotation @ np.median(centers, axis=0))
 
 
 def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:

@@ -110,18 +110,27 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
     ]
     if not sum(base.shape[2] for base in bases):
         raise StgaError(
-            f"{path}: has neither identity nor expression, the components that a head is fitted with"
+            f"{path}: has neither identity nor expression, components that a head is fitted with"
         )
     faces = arrays["faces"]
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
         raise StgaError(
-            f"{path}: faces is {faces.dtype} of shape {faces.shape}, expected whole numbers (any, 3)"
+            f"{path}: faces is {faces.dtype} of shape {faces.shape}, "
+            "expected whole numbers (any, 3)"
         )
     if faces.min() < 0 or faces.max() >= count:
         raise StgaError(
-            f"{path}: faces names vertices {faces.min()} to {faces.max()}, expected 0 to {count - 1}"
+            f"{path}: faces names vertices {faces.min()} to {faces.max()}, "
+            f"expected 0 to {count - 1}"
         )
-    regressor, weights = _skeleton(path, arrays, count)
+    given = [key for key in ("J_regressor", "weights") if key in arrays]
+    if len(given) == 1:
+        raise StgaError(f"{path}: has {given[0]} alone; joints need both J_regressor and weights")
+    weights = np.eye(len(JOINTS))[np.zeros(count, int)]
+    regressor = np.full((len(JOINTS), count), 1 / count)
+    if given:
+        regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), count))
+        weights = _floats(path, arrays, "weights", (count, len(JOINTS)))
     return FlameModel(
         v_template=mean,
         shapedirs=np.concatenate(bases, axis=2),
@@ -137,48 +146,29 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
 def checked(path: Path, head: HeadModel) -> HeadModel:
     """The head model. Raises StgaError where it is not of a head's size in meters, or holds numbers
     that none has."""
-    for name, (array, limit) in _bounds(head).items():
-        largest = float(np.abs(array).max(initial=0))
-        if largest > limit:
-            raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
-    extent = float(np.ptp(head.model.v_template, axis=0).max())
-    if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
-        raise StgaError(
-            f"{path}: the head measures {extent:.3g}, expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
-        )
-    return head
-
-
-def _bounds(head: HeadModel) -> dict[str, tuple[np.ndarray, float]]:
-    """Name in the file -> array, and what its numbers may reach."""
     model = head.model
     if head.layout == "flame":
-        shapes = {"shapedirs": model.shapedirs, "posedirs": model.posedirs}
+        template, shapes = "v_template", {"shapedirs": model.shapedirs, "posedirs": model.posedirs}
     else:
-        shapes = {
-            "identity": model.shapedirs[..., : model.n_identity],
-            "expression": model.shapedirs[..., model.n_identity :],
-        }
-    return {
-        "v_template" if head.layout == "flame" else "mean": (model.v_template, MAX_COORDINATE_M),
+        identity, expression = np.split(model.shapedirs, [model.n_identity], axis=2)
+        template, shapes = "mean", {"identity": identity, "expression": expression}
+    bounds = {
+        template: (model.v_template, MAX_COORDINATE_M),
         **{name: (array, MAX_COMPONENT_M) for name, array in shapes.items()},
         "J_regressor": (model.j_regressor, MAX_JOINT_SHARE),
         "weights": (model.weights, MAX_JOINT_SHARE),
     }
-
-
-def _skeleton(
-    path: Path, arrays: dict[str, np.ndarray], count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    given = [key for key in ("J_regressor", "weights") if key in arrays]
-    if len(given) == 1:
-        raise StgaError(f"{path}: has {given[0]} alone; joints need both J_regressor and weights")
-    if given:
-        regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), count))
-        return regressor, _floats(path, arrays, "weights", (count, len(JOINTS)))
-    weights = np.zeros((count, len(JOINTS)))
-    weights[:, 0] = 1
-    return np.full((len(JOINTS), count), 1 / count), weights
+    for name, (array, limit) in bounds.items():
+        largest = float(np.abs(array).max(initial=0))
+        if largest > limit:
+            raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
+    extent = float(np.ptp(model.v_template, axis=0).max())
+    if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
+        raise StgaError(
+            f"{path}: the head measures {extent:.3g}, "
+            f"expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
+        )
+    return head
 
 
 def _floats(

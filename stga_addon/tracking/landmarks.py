@@ -126,7 +126,8 @@ def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
     if not (np.abs(seen) <= MAX_PIXELS).all():
         raise StgaError(
-            f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, as far as no image reaches"
+            f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, "
+            "as far as no image reaches"
         )
     return CameraLandmarks(
         timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence
@@ -247,7 +248,9 @@ def _detect(
     """The faces (N, 2) of each timestep."""
     found = []
     for timestep in timesteps:
-        found.append(_distinct(detector.detect(camera.image(timestep))))
+        faces = detector.detect(camera.image(timestep))
+        others = [face for face in faces[1:] if _overlap(faces[0], face) < MIN_OVERLAP]
+        found.append(faces[:1] + others)
         step()
     return found
 
@@ -260,22 +263,14 @@ def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> Camer
     faces = [own[0] if len(own) == 1 else None for own in seen]
     if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
         raise StgaError(
-            f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of {len(camera.timesteps)} frames "
-            f"with two faces, the first at timestep {several[0]}; expected one person"
+            f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of "
+            f"{len(camera.timesteps)} frames with two faces, the first at timestep {several[0]}; "
+            "expected one person"
         )
     count = next((len(face) for face in faces if face is not None), 0)
     points = np.stack([np.zeros((count, 2)) if face is None else face for face in faces])
     confidence = np.tile([[float(face is not None)] for face in faces], (1, count))
     return CameraLandmarks(np.array(camera.timesteps), points, confidence)
-
-
-def _distinct(faces: list[np.ndarray]) -> list[np.ndarray]:
-    """The faces without those that are the first one found again."""
-    return [
-        face
-        for number, face in enumerate(faces)
-        if number == 0 or _overlap(faces[0], face) < MIN_OVERLAP
-    ]
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:

@@ -26,12 +26,15 @@ JOINT_SIGMA_RAD = {
 the root's."""
 WEIGHT_EXCESS_SIGMA = 0.1
 """By which a coefficient that is a weight from 0 to 1 leaves that range."""
-LID_SHAPES = ("eyeBlinkLeft", "eyeLookDownLeft"), ("eyeBlinkRight", "eyeLookDownRight")
-"""Lower the same lid, which is closed where their weights add up to 1."""
+LID_SHAPES = {"eyeBlink": 1.0, "eyeLookDown": 0.57}
+"""Shares by which shapes close an eye; it is closed where their weights, times these, add up to
+1."""
 TRANSLATION_SIGMA_M = 10.0
 ABSENT_SIGMA = 1e-6
 EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
 """Standard deviations of second differences from one timestep to the next."""
+LID_ACCELERATION = 1.0
+"""The same of LID_SHAPES: a blink closes the eyes within two or three frames of a video."""
 JUMP_SCALE = 3.0
 """Standard deviations of a second difference beyond which it is a cut rather than a motion."""
 MAX_ORDERED_CHANGE = 0.7
@@ -304,8 +307,8 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
     the same shape.
 
     `parameter_precision`, and where expressions are weights from 0 to 1 a pull back into that
-    range, also of the sum of LID_SHAPES, whose matrix is replaced by a diagonal one that is never
-    smaller.
+    range, also of what LID_SHAPES add up to, whose matrix is replaced by a diagonal one that is
+    never smaller.
     """
     precision = np.broadcast_to(parameter_precision(head), values.shape).copy()
     right = -precision * values
@@ -314,15 +317,16 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
         excess = weights - np.clip(weights, 0, 1)
         precision[..., :-RIGID_SIZE] += (excess != 0) / WEIGHT_EXCESS_SIGMA**2
         right[..., :-RIGID_SIZE] -= excess / WEIGHT_EXCESS_SIGMA**2
-        for lid in LID_SHAPES:
-            columns = [
-                head.model.expression_names.index(name)
-                for name in lid
-                if name in head.model.expression_names
-            ]
-            beyond = np.maximum(weights[..., columns].sum(-1, keepdims=True) - 1, 0)
-            precision[..., columns] += len(lid) * (beyond > 0) / WEIGHT_EXCESS_SIGMA**2
-            right[..., columns] -= beyond / WEIGHT_EXCESS_SIGMA**2
+        for side in ("Left", "Right"):
+            lid = {
+                head.model.expression_names.index(name + side): share
+                for name, share in LID_SHAPES.items()
+                if name + side in head.model.expression_names
+            }
+            columns, shares = list(lid), np.array(list(lid.values()))
+            beyond = np.maximum((weights[..., columns] * shares).sum(-1, keepdims=True) - 1, 0)
+            precision[..., columns] += (beyond > 0) * shares * shares.sum() / WEIGHT_EXCESS_SIGMA**2
+            right[..., columns] -= beyond * shares / WEIGHT_EXCESS_SIGMA**2
     return precision, right
 
 
@@ -332,4 +336,7 @@ def acceleration_precision(model: FlameModel) -> np.ndarray:
         (EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M),
         (model.n_expression, POSE_SIZE, TRANSLATION_SIZE),
     )
+    for column, name in enumerate(model.expression_names):
+        if name.removesuffix("Left").removesuffix("Right") in LID_SHAPES:
+            sigma[column] = LID_ACCELERATION
     return np.asarray(sigma**-2.0)

@@ -1,9 +1,13 @@
 """The head model that comes with the package, against ICT-FaceKit's own arrays and rigid motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.development.arkit_shapes import ict_names
 from stga_addon.development.bundled_head import collapsed
 from stga_addon.driving.head_map import head_map
@@ -13,9 +17,10 @@ from stga_addon.flame.forward import FlameFrame, flame_forward, joint_positions,
 from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, key_regions, torso_faces
 from stga_addon.flame.sequence import FlameSequence
 from stga_addon.flame.teeth import flame_model, lip_pairs
+from stga_addon.tracking.solve import LID_SHAPES
 
 MAX_BYTES, MIN_TRIANGLES, MAX_TRIANGLES = 6e6, 20_000, 26_000
-METERS_PER_UNIT = 0.01
+METERS_PER_UNIT, SETBACK_M = 0.01, 0.0007
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +66,7 @@ def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
     side."""
     with np.load(shared_data / "ict_facekit.npz") as source:
         distance, of = cKDTree(METERS_PER_UNIT * source["neutral"].astype(np.float64)).query(
-            head.v_template
+            head.v_template + [0, 0, SETBACK_M] * (head.weights[:, 3:].max(1) == 1)[:, None]
         )
         assert distance.max() < 1e-7
         row = {str(name): number for number, name in enumerate(source["expression_names"])}
@@ -71,6 +76,7 @@ def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
         ]
         wanted = np.concatenate([source["identity"], expressions])[:, of].astype(np.float64)
     missed = np.abs(np.moveaxis(head.shapedirs, 2, 0) - METERS_PER_UNIT * wanted)
+    missed[:, head.weights[:, 3:].max(1) == 1] = 0  # pushed back by lids
     assert np.quantile(missed, 0.999) <= SHAPE_STEP_M / 2 + 1e-9  # some vertices coincide
 
 
@@ -92,6 +98,47 @@ def test_eyeballs_turn_in_their_lids(head):
         np.concatenate([head.masks[f"{s}_eyeball"] for s in ("left", "right")]),
     )
     np.testing.assert_array_equal(looking[skin], straight[skin])
+
+
+def seen_eyeball(model, shape, **weights):
+    """Square millimeters of the left eyeball that are seen from the front between the lids, and
+    through their skin."""
+    frame = replace(neutral_frame(model), expr=expression(model, **weights))
+    mesh, joint = flame_forward(model, shape, frame), JOINTS.index("left_eye")
+    at = mesh[model.masks["left_eyeball"]].mean(0)
+    eye, pixel_mm = at + np.array([0, 0, 0.5]), 0.5
+    camera = look_at(eye, at, 80, 80, 80 / 0.08)
+    is_ball = (model.weights[model.faces, joint] == 1).all(1)
+    lids = np.isin(model.faces, model.masks["left_eye_region"]).all(1)
+    a, b, c = np.moveaxis(mesh[model.faces], 1, 0)
+    lids &= (np.cross(b - a, c - a) * (eye - a)).sum(1) > 0
+    first, _ = rasterize(mesh, model.faces, camera)
+    skin = np.flatnonzero(~is_ball)
+    behind, _ = rasterize(mesh, model.faces[skin], camera)
+    ball, skin_behind = (first >= 0) & is_ball[first], (behind >= 0) & lids[skin[behind]]
+    return pixel_mm**2 * np.array([(ball & ~skin_behind).sum(), (ball & skin_behind).sum()])
+
+
+def test_lids_close_before_the_eyeballs(head):
+    """Catches eyeballs that poke through lids on their way, of people other than the average, and
+    lids that do not close where tracking takes them to be closed."""
+    average, rng = np.zeros(head.n_identity), np.random.default_rng(0)
+    people = [average, *rng.normal(size=(4, head.n_identity))]
+    looking_down = {"eyeLookDownLeft": 1.0, "eyeBlinkLeft": 1 - LID_SHAPES["eyeLookDown"]}
+    for weights in (
+        {"eyeBlinkLeft": 0.5},
+        {"eyeBlinkLeft": 1.0},
+        {"eyeLookDownLeft": 0.5},
+        {"eyeLookDownLeft": 1.0},
+        looking_down,
+    ):
+        assert max(seen_eyeball(head, person, **weights)[1] for person in people) < 5
+    opening = seen_eyeball(head, average)[0]
+    assert opening > 150
+    for weights in ({"eyeBlinkLeft": 1.0}, looking_down):
+        assert seen_eyeball(head, average, **weights)[0] < 0.1 * opening
+    looking_down["eyeBlinkLeft"] -= 0.2
+    assert seen_eyeball(head, average, **looking_down)[0] > 0.1 * opening
 
 
 def test_neck_turns_the_skull_alone(head):

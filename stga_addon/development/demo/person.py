@@ -22,6 +22,7 @@ from ..bundled_head import (
     SKIN,
     TEETH,
     arkit_displacements,
+    neutral_head,
     skinning_weights,
 )
 
@@ -140,7 +141,7 @@ def whole_head(arrays: Mapping[str, np.ndarray]) -> FlameModel:
     Its vertices that the bundled head has are where that head's are.
     """
     bundled = flame_model(None)
-    neutral = arrays["neutral"].astype(np.float64)
+    neutral = neutral_head(arrays)
     names, expression = arkit_displacements(arrays)
     displacements = np.concatenate(
         [arrays["identity"][: bundled.n_identity].astype(np.float64), expression]
