@@ -95,7 +95,8 @@ def test_a_file_from_a_start_frame(scene):
 def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> None:
     """A run's file, whose parameters are disturbed."""
     tracking = RefinedTracking(capture, "stga")
-    refined = tracking.tracked + rng.normal(0, 0.05, tracking.tracked.shape)
+    refined = tracking.parameters.copy()
+    refined[:, :-3] += rng.normal(0, 0.05, tracking.tracked.shape)
     write_tracking(folder, tracking.sequence, refined, tracking.tracked)
 
 

@@ -159,6 +159,7 @@ SET_BY_PANEL = {
     "track_footage": {
         "footage",
         "model",
+        "avatar",
         "directory",
         "cameras",
         "focal",
