@@ -28,7 +28,8 @@ TARGET = Target(this_platform(), "{}.{}".format(*sys.version_info[:2]), ("4.2.0"
 KERNEL_BITS = Path(__file__).with_name("raster") / "kernel_bits.py"
 BITS = """
 import contextlib, runpy
-with open(os.environ["NUMBA_CACHE_DIR"] + "/bits.txt", "w") as file, contextlib.redirect_stdout(file):
+path = os.environ["NUMBA_CACHE_DIR"] + "/bits.txt"
+with open(path, "w") as file, contextlib.redirect_stdout(file):
     runpy.run_path({!r})
 print("""
 SCRIPT = compiled_kernels.SCRIPT.replace("from", "os.cpu_count = lambda: 1\nfrom", 1)

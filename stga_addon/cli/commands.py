@@ -359,12 +359,13 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
         perform_in_folder(options.folder, bar.say, bar.report, bool(options.resume))
 
 
+TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("out", "avatar")]
+"""What `stga avatar` takes of `stga track`."""
 COMMANDS = {
     "avatar": Command(
         "Make an avatar from footage: track, train, and write a report and a .blend file. Called "
         "again with the same arguments, it continues where it was interrupted.", _avatar,
-        ((Track, *(spec.name for spec in option_fields(Track) if spec.name not in ("out", "avatar"))),
-         AvatarOptions, TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
+        ((Track, *TRACKED_AS), AvatarOptions, TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
         may_lack=("model",),
     ),
     "track": _asking(Track, may_lack=("model",)),

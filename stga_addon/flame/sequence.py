@@ -159,8 +159,8 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 
     VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a
     GaussianAvatars avatar, and plain files of expression and pose, whose fields may have the names
-    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`, TORSO_SHIFT a shift of the torso
-    (`torso_shapes`). Timesteps count from 0,
+    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`, TORSO_SHIFT a shift of the
+    torso (`torso_shapes`). Timesteps count from 0,
     unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
     """
     return motion_of(path, read_npz(path), model)

@@ -36,7 +36,8 @@ def write_capture(
 
     parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3),
     where there are any. With four cameras or more, the one nearest to the middle is held out as
-    `val`; timesteps at which no camera saw a face, as behind a hand, are `test`. Raises StgaError where `out` cannot be written.
+    `val`; timesteps at which no camera saw a face, as behind a hand, are `test`. Raises StgaError
+    where `out` cannot be written.
     """
     views = [view for view in footage.views() if view[0] in parameters]
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
