@@ -365,7 +365,8 @@ COMMANDS = {
     "avatar": Command(
         "Make an avatar from footage: track, train, and write a report and a .blend file. Called "
         "again with the same arguments, it continues where it was interrupted.", _avatar,
-        ((Track, *TRACKED_AS), AvatarOptions, TrainingSettings, (SelectionOptions, "threshold"), (Train, "device")),
+        ((Track, *TRACKED_AS), AvatarOptions, TrainingSettings,
+         (SelectionOptions, "threshold"), (Train, "device")),
         may_lack=("model",),
     ),
     "track": _asking(Track, may_lack=("model",)),
