@@ -10,6 +10,8 @@ class Effect:
     """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that
     switch it.
 
+    title        what it gives, in two or three words for everybody
+    price        of it for everybody: one of "free", "slower" and "larger"
     on, off      changes to `TrainingSettings`
     offset       the driven offset (`avatar.offsets.table`) that it trains, if any
     added_later  whether a continuation may switch it on in a run that went without: only where it
@@ -17,6 +19,8 @@ class Effect:
     """
 
     name: str
+    title: str
+    price: str
     cost: str
     on: Mapping[str, Any] = field(default_factory=dict)
     off: Mapping[str, Any] = field(default_factory=dict)
@@ -31,10 +35,12 @@ WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
 
 
-def _effect(name: str, cost: str, setting: str = "", **values: Any) -> Effect:
+def _effect(
+    name: str, title: str, price: str, cost: str, setting: str = "", **values: Any
+) -> Effect:
     """An effect; setting: that is true where it is on, and false where it is off."""
     switches = [{setting: on} if setting else {} for on in (True, False)]
-    return Effect(name, cost, **{"on": switches[0], "off": switches[1], **values})
+    return Effect(name, title, price, cost, **{"on": switches[0], "off": switches[1], **values})
 
 
 _SHAPES = "shape keys and drivers in Blender"
@@ -43,53 +49,90 @@ _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "
 _EFFECTS = (
     _effect(
         "view-color",
+        "Moving highlights",
+        "slower",
         "3, 8 or 15 coefficients more a splat and channel",
         off={"sh_degree": 0, "sh_steps": ()},
     ),
-    _effect("exposure", "a pass over each image when it is read"),
-    _effect("antialiasing", "a root a splat", "antialiased"),
+    _effect("exposure", "Even brightness", "free", "a pass over each image when it is read"),
+    _effect("antialiasing", "Sharp from afar", "free", "a root a splat", "antialiased"),
     _effect(
         "background",
+        "Clean outline",
+        "slower",
         "a pass over the image in every iteration, and one when it is read where the backdrop is "
         "not of one color",
         on={"random_background": True, "backdrop": "plain"},
         off={"random_background": False, "backdrop": "plain"},
     ),
-    _effect("hull-points", "a splat for every 4 mm beside the mesh", "hull_points"),
-    _effect("depth-limits", "none: splats are smaller and nearer to their triangles", on=_LIMITS),
+    _effect(
+        "hull-points",
+        "Hair beyond face",
+        "larger",
+        "a splat for every 4 mm beside the mesh",
+        "hull_points",
+    ),
+    _effect(
+        "depth-limits",
+        "No stray splats",
+        "free",
+        "none: splats are smaller and nearer to their triangles",
+        on=_LIMITS,
+    ),
     _effect(
         "density",
+        "Finer detail",
+        "slower",
         "up to a quarter more splats, more in the preset final",
         off={"density_interval": 0},
     ),
     _effect(
         "selection",
+        "Moving parts only",
+        "free",
         "none: local iterations are cheaper than global ones",
         on={"strategy": "selective"},
         off={"strategy": "global"},
     ),
     _effect(
         "strain-color",
+        "Color of wrinkles",
+        "slower",
         f"3 coefficients more a splat and channel, {_STRAIN}",
         "strain_color",
         added_later=True,
     ),
     _effect(
         "strain-position",
+        "Shape of wrinkles",
+        "slower",
         f"9 coefficients a triangle, {_STRAIN}",
         offset="strain_position",
         added_later=True,
     ),
-    _effect(RELIGHT, "seconds after training, and 30 bytes a vertex in the avatar file"),
-    _effect(WORLD, "seconds to a minute after training, and a file of its own"),
-    _effect("teeth", "splats on 168 triangles", "teeth"),
-    _effect("torso", "none: splats below the neck follow other triangles", "torso"),
-    _effect("neck", f"9 {_SHAPES}"),
-    _effect("jaw", f"9 {_SHAPES}"),
-    _effect("eyes", f"18 {_SHAPES}"),
-    _effect("dynamic-offsets", "a mesh a frame beside the parameters"),
+    _effect(
+        RELIGHT,
+        "Other lighting",
+        "slower",
+        "seconds after training, and 30 bytes a vertex in the avatar file",
+    ),
+    _effect(
+        WORLD, "Room behind", "slower", "seconds to a minute after training, and a file of its own"
+    ),
+    _effect("teeth", "Teeth", "free", "splats on 168 triangles", "teeth"),
+    _effect(
+        "torso", "Shoulders", "free", "none: splats below the neck follow other triangles", "torso"
+    ),
+    _effect("neck", "Turning neck", "free", f"9 {_SHAPES}"),
+    _effect("jaw", "Turning jaw", "free", f"9 {_SHAPES}"),
+    _effect("eyes", "Turning eyes", "free", f"18 {_SHAPES}"),
+    _effect(
+        "dynamic-offsets", "Recorded details", "larger", "a mesh a frame beside the parameters"
+    ),
     _effect(
         "tracking",
+        "Better tracking",
+        "slower",
         "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
         "head's motion",
         "tracking",

@@ -308,7 +308,8 @@ def test_adding_a_rig_keeps_the_active_object(source):
     bpy.context.view_layer.objects.active = mine
     head = import_head(motion_capture(flame_sequence(flame_model()), source))
     assert bpy.context.view_layer.objects.active == mine
-    assert set(bpy.data.objects) == {mine, head, head.parent, rig_of(head)}
+    shape = bpy.data.objects["STGA Bone"]
+    assert set(bpy.data.objects) == {mine, head, head.parent, rig_of(head), shape}
 
 
 def test_a_saved_rig_shows_the_same(source, tmp_path):

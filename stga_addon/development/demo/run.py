@@ -143,7 +143,7 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     from ...scene.blend_file import go_to_frame, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats
 
-    name = show_on_head(avatar, head, "//avatar.npz", FRAMES_PER_SECOND).name
+    name = show_on_head(avatar, head, "//run/avatar.npz", FRAMES_PER_SECOND).name
     save_file(path)
     open_file(path)
     worst = 0.0

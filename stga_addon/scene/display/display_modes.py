@@ -107,6 +107,10 @@ SH_BANDS = tuple(
 POINT_MATERIAL = "STGA Points"
 GAUSSIAN_MATERIAL = "STGA Gaussians"
 DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
+DISK = 0.7
+"""Radius of the disk that an octahedron of radius 1 shows whole."""
+DOT_SIZE = 1.8
+"""Radius of a dot in mean standard deviations, at which dots leave no holes."""
 EXTENT = 3.0
 """Standard deviations from a quad's center to its sides; a Gaussian is below 1.2 % there."""
 
@@ -122,8 +126,17 @@ def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bp
 
 
 def _point_shader(nodes: Nodes) -> Any:
-    """Emits the color of a point cloud's points, with their opacity."""
-    return _emission(nodes, *_color_and_opacity(nodes, "GEOMETRY"))
+    """Emits the colors of points; cuts disks out of the octahedra around them that EEVEE draws."""
+    color, opacity = _color_and_opacity(nodes, "GEOMETRY")
+    kinds = "ShaderNodeNewGeometry", "ShaderNodePointInfo"
+    geometry, point = (nodes.add(kind).outputs for kind in kinds)
+    offset = nodes.vector("SUBTRACT", geometry["Position"], point["Position"])
+    along = nodes.vector("DOT_PRODUCT", offset, geometry["Incoming"])
+    length2 = nodes.vector("DOT_PRODUCT", offset, offset)
+    distance2 = nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))
+    limit = nodes.math("MULTIPLY", point["Radius"], DISK)
+    inside = nodes.math("LESS_THAN", distance2, nodes.math("MULTIPLY", limit, limit))
+    return _emission(nodes, color, nodes.math("MULTIPLY", opacity, inside))
 
 
 def _gaussian_shader(nodes: Nodes) -> Any:
@@ -178,7 +191,7 @@ NATIVE = "Native Splats"
 LIMITS = {
     AS_TRAINED: "Exact in viewports and by the engine STGA Splats; "
     "EEVEE and Cycles render camera quads",
-    POINTS: "Fast: round, of each splat's mean size",
+    POINTS: "Fast: a dot for each splat, in one color; for Material Preview",
     QUADS: "For EEVEE and Cycles; right through the scene's camera only",
     NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
 }
@@ -210,9 +223,9 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
 
 
 def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    # A point has one radius: the mean of the three standard deviations.
+    # A point has one radius.
     scale = nodes.attribute(WORLD_SCALE, "FLOAT_VECTOR")
-    mean = nodes.math("DIVIDE", nodes.vector("DOT_PRODUCT", scale, (1, 1, 1)), 3)
+    mean = nodes.vector("DOT_PRODUCT", scale, (DOT_SIZE / DISK / 3,) * 3)
     inputs = {"Mesh": splats, "Selection": visible, "Radius": nodes.math("MULTIPLY", mean, size)}
     points = nodes.out("GeometryNodeMeshToPoints", inputs)
     # EEVEE does not sort the points of a point cloud.

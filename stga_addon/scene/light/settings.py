@@ -1,6 +1,7 @@
 """How a scene lights its avatars: properties of a scene, saved with the .blend file."""
 # mypy: disable-error-code="valid-type"
 
+from collections.abc import Callable
 from typing import Any
 
 import bpy
@@ -9,6 +10,15 @@ from ...light.values import SKIN_ROUGHNESS
 
 PROPERTY = "stga_lighting"
 """The scene's `LightingSettings`."""
+
+
+MODE_CHANGED: list[Callable[[Any], None]] = []
+"""What is called with a scene whose mode was chosen."""
+
+
+def _mode_changed(settings: Any, context: Any) -> None:
+    for call in MODE_CHANGED:
+        call(settings.id_data)
 
 
 class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
@@ -22,6 +32,7 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
             ("scene", "Scene", "The scene's lights and world"),
             ("mix", "Mix", "Between both"),
         ),
+        update=_mode_changed,
     )
     mix: bpy.props.FloatProperty(
         name="Mix", description="Share of the scene's light",

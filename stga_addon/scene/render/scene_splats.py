@@ -1,6 +1,7 @@
 """A scene's visible splats, posed, and their relit colors stored for EEVEE and Cycles."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import bpy
@@ -184,6 +185,20 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
     write_attributes(splat_object.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", values)}, "POINT")
     splat_object.data[tags.RELIT_FRAME] = scene.frame_current
     splat_object.data.update()
+
+
+def level_exposure(cache: SplatCache) -> float | None:
+    """Stops at which the open scene's light makes its avatars as bright as they were recorded; None
+    where it does not light any. Raises StgaError as `visible_layers` does."""
+    depsgraph, recorded, lit = bpy.context.evaluated_depsgraph_get(), 0.0, 0.0
+    for layer in visible_layers(depsgraph, cache):
+        if (relit := layer.relit) is not None:
+            eye = relit.mesh.mean(0) + np.array((0.0, 0.0, 1.0))
+            as_lit = replace(relit.lighting, mode="scene", exposure=0.0)
+            lit += relit.relighter.radiance(relit.mesh, eye, as_lit, relit.casters).mean()
+            as_recorded = replace(as_lit, mode="recorded")
+            recorded += relit.relighter.radiance(relit.mesh, eye, as_recorded).mean()
+    return float(np.log2(recorded / lit)) if recorded > 0 and lit > 0 else None
 
 
 def forget_frame(splat_object: Any) -> bool:

@@ -41,7 +41,7 @@ class GpuDisplay:
         self._handlers: list[Any] = []
         self._scene_target: Any = None
         self._renderer: SplatRenderer | None = None
-        self._cache = SplatCache()
+        self.cache = SplatCache()
         self.problem, self.failed = "", False
 
     def start(self) -> None:
@@ -60,12 +60,12 @@ class GpuDisplay:
 
     def forget(self) -> None:
         """Free what belongs to the open file."""
-        self._renderer, self._scene_target, self._cache = None, None, SplatCache()
+        self._renderer, self._scene_target, self.cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
 
     def scene_changed(self) -> None:
         """Read what throws shadows onto heads again."""
-        self._cache.light.casters.forget()
+        self.cache.light.casters.forget()
 
     def _before(self) -> None:
         """Keep the framebuffer of the scene's colors, before that of the overlays is bound."""
@@ -99,7 +99,7 @@ class GpuDisplay:
         def is_wanted(shown: Any) -> bool:
             return everything or display_mode(shown) == AS_TRAINED
 
-        layers = visible_layers(depsgraph, self._cache, space, is_wanted)
+        layers = visible_layers(depsgraph, self.cache, space, is_wanted)
         if not layers:
             if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
                 self._renderer = None  # frees its textures

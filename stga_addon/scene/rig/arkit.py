@@ -1,111 +1,93 @@
-"""ARKit's 52 shapes: controls on a FLAME rig, and heads with shape keys of these names."""
+"""ARKit's 52 shapes: shape keys of these names, which FLAME heads are given."""
 
 from typing import Any
 
 import numpy as np
 
-from ...driving.head_map import PRODUCTS, HeadMap
-from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, arkit_name
-from ...driving.shapes import MOUTH_CLOSE
+from ...driving.head_map import PRODUCTS, HeadMap, features
+from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance, arkit_name
+from ...driving.shapes import JAW_OPEN
 from ...errors import StgaError
-from ..arrays import add_driver, write_curve
+from ...flame.forward import flame_forward
+from ...flame.sequence import FlameSequence
+from ..arrays import add_driver, flat_floats, key_points, write_curve
 from ..compat import action_curves, push_down_action
-from .keyframes import (
-    check_keyable,
-    expression_key,
-    key_turns,
-    key_value_path,
-    property_path,
-    rotation_path,
-    start_action,
-)
+from .keyframes import check_keyable, key_value_path, start_action
 
-SUMS = "stga_arkit_sums"
-"""Property of the rig: partial sums of the expressions, and the axis-angles of jaw and eyes."""
-JOINT_ROWS = {"jaw": (0, 1, 2), "left_eye": (3, 4, 5), "right_eye": (6, 7, 8)}
-MAX_EXPRESSION = 255
-"""Characters of a driver's expression, by Blender's limit."""
-VARIABLES = "abcdefghijklmnpqrstuvwxyz"
-"""Of the shapes in a partial sum; o is jawOpen."""
-NEGLIGIBLE = 1e-4
-"""Coefficient of a shape that is left out of an expression's sum."""
+ARKIT_MAP = "stga_arkit_map"
+"""Property of a FLAME head that was given the shapes: parameters (expression, jaw, eyes) by
+feature of their weights (`head_map.features`)."""
+NEGLIGIBLE_M = 1e-5
+"""Displacement of a product of two shapes that gets no shape key."""
 
 
-def has_controls(rig: Any) -> bool:
-    """Whether a rig has the 52 controls."""
-    return SUMS in rig
+def has_shapes(head: Any) -> bool:
+    """Whether a FLAME head was given ARKit's shapes."""
+    return ARKIT_MAP in head
 
 
-def add_controls(head: Any, rig: Any, found: HeadMap) -> None:
-    """Add a slider per ARKit shape to the rig, which drives expressions, jaw and eyes by arithmetic
-    alone.
-
-    Driven sliders and bones take their values from the controls, not from keyframes;
-    `remove_controls` gives them back. Controls that are there already keep their values and
-    keyframes.
-    """
-    remove_drivers(head, rig)
-    for name, reach in zip(ARKIT_SHAPES, found.reach.tolist(), strict=True):
-        if name not in rig:
-            rig[name] = 0.0
-        rig.id_properties_ui(name).update(
-            min=-1.0, max=2.0, soft_min=0.0, soft_max=1.0, default=0.0,
-            description=f"ARKit's {name}; this head does {100 * reach:.0f} % of it",
-        )  # fmt: skip
-    linear = np.concatenate([found.expressions[:COUNT], found.jaw, found.eyes], axis=1)
-    products = np.zeros_like(linear)
-    products[PRODUCTS, : found.expressions.shape[1]] = found.expressions[COUNT:]
-    parts = [_parts(linear[:, column], products[:, column]) for column in range(linear.shape[1])]
-    rig[SUMS] = [0.0] * sum(map(len, parts))
-    slot, sums = 0, list[dict[str, tuple[Any, str]]]()
-    for column_parts in parts:
-        sums.append({})
-        for letter, (text, columns) in zip(VARIABLES, column_parts, strict=False):
-            shapes = ["jawOpen", *(ARKIT_SHAPES[column] for column in columns)]
-            sources = [(rig, property_path(shape)) for shape in shapes]
-            variables = dict(zip("o" + VARIABLES, sources, strict=False))
-            add_driver(rig, property_path(SUMS), slot, text, variables)
-            sums[-1][letter] = rig, f"{property_path(SUMS)}[{slot}]"
-            slot += 1
-    count, keys = found.expressions.shape[1], head.data.shape_keys
-    for component, variables in enumerate(sums[:count]):
-        key = expression_key(head, component)
-        if variables and key in keys.key_blocks:
-            add_driver(keys, key_value_path(key), -1, "+".join(variables), variables)
-    for joint, rows in JOINT_ROWS.items():
-        # A quaternion by its axis-angle, each of whose components is at most one sum.
-        terms = zip("abc", (sums[count + row] for row in rows), strict=True)
-        variables = {letter: term["a"] for letter, term in terms if term}
-        if variables:
-            squared = "+".join(f"{letter}*{letter}" for letter in variables)
-            length, path = f"sqrt({squared}+1e-12)", rotation_path(joint)
-            add_driver(rig, path, 0, f"cos({length}/2)", variables)
-            for element, letter in enumerate("abc", 1):
-                text = f"{letter}*sin({length}/2)/{length}" if letter in variables else "0"
-                add_driver(rig, path, element, text, variables)
+def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements (52, V, 3) of a person's neutral mesh by each shape at 1, and (PRODUCTS, V, 3)
+    by what each of PRODUCTS at 1 adds to jawOpen at 1, or takes from it; meters."""
+    open_jaw = np.eye(COUNT)[JAW_OPEN]
+    weights = np.concatenate([np.zeros((1, COUNT)), np.eye(COUNT), np.eye(COUNT)[PRODUCTS]])
+    weights[1 + COUNT :] += open_jaw
+    frames = found.frames(Performance(np.arange(len(weights)), weights, None, 1.0))
+    meshes = np.stack(
+        [
+            flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
+            for frame in frames
+        ]
+    )
+    alone, pairs = meshes[1 : 1 + COUNT] - meshes[0], meshes[1 + COUNT :] - meshes[0]
+    pairs = pairs - alone[PRODUCTS] - alone[JAW_OPEN]
+    pairs[PRODUCTS == JAW_OPEN] = 0
+    return alone, pairs
 
 
-def remove_controls(head: Any, rig: Any) -> None:
-    """Remove the controls: expressions, jaw and eyes play their own again."""
-    remove_drivers(head, rig)
-    if rig.animation_data is not None and rig.animation_data.action is not None:
-        curves, controls = action_curves(rig), control_paths().values()
-        for curve in [curve for curve in curves if curve.data_path in controls]:
-            curves.remove(curve)
-    for name in ARKIT_SHAPES:
-        rig.pop(name, None)
+def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) -> None:
+    """Give a FLAME head the shape keys of `head_shapes`, beside its own animation; those of
+    products are driven. Sliders that it has already keep their values and keyframes."""
+    keys = head.data.shape_keys
+    basis = key_points(keys.reference_key)
+    named = list(zip(ARKIT_SHAPES, alone, strict=True))
+    named += [
+        (f"{ARKIT_SHAPES[column]} * jawOpen", displacement)
+        for column, displacement in zip(PRODUCTS.tolist(), pairs, strict=True)
+        if np.abs(displacement).max() > NEGLIGIBLE_M
+    ]
+    for name, displacement in named:
+        key = keys.key_blocks.get(name)
+        if key is None:
+            key = head.shape_key_add(name=name, from_mix=False)
+            key.value = 0.0  # a key made from a script starts at 1
+            factors = [(keys, key_value_path(factor)) for factor in name.split(" * ")]
+            if len(factors) == 2:
+                variables = dict(zip("ab", factors, strict=True))
+                add_driver(keys, key_value_path(name), -1, "a*b", variables)
+        key.points.foreach_set("co", flat_floats(basis + displacement))
+    rows = np.zeros((len(found.expressions), found.expressions.shape[1] + 9))
+    rows[:, :-9] = found.expressions
+    rows[:COUNT, -9:] = np.concatenate([found.jaw, found.eyes], axis=1)
+    head[ARKIT_MAP] = rows.ravel().tolist()
 
 
-def remove_drivers(head: Any, rig: Any) -> None:
-    """Remove the drivers of `add_controls`, where there are any."""
-    if not has_controls(rig):
-        return
-    for owner in (rig, head.data.shape_keys):
-        for driver in [] if owner.animation_data is None else list(owner.animation_data.drivers):
-            paths = [target.data_path for v in driver.driver.variables for target in v.targets]
-            if any(path.startswith(property_path(SUMS)) for path in [driver.data_path, *paths]):
-                owner.animation_data.drivers.remove(driver)
-    del rig[SUMS]
+def shape_parameters(head: Any) -> np.ndarray | None:
+    """(E + 9,) expression, and axis-angles of jaw and eyes, that the sliders of `add_shapes` stand
+    for; None without them."""
+    if not has_shapes(head):
+        return None
+    keys = head.data.shape_keys.key_blocks
+    weights = np.array([[keys[name].value if name in keys else 0.0 for name in ARKIT_SHAPES]])
+    found = features(weights)[0]
+    return np.asarray(found @ np.reshape(head[ARKIT_MAP], (len(found), -1)))
+
+
+def key_shapes(head: Any, start: int, weights: np.ndarray) -> None:
+    """Add keyframes of weights (T, 52), one row per Blender frame from `start` on, to the action of
+    a head's shape keys."""
+    paths = {column: key_value_path(name) for name, column in COLUMN.items()}
+    _write_weights(action_curves(head.data.shape_keys), paths, start, weights)
 
 
 def shape_key_names(head: Any) -> dict[int, str]:
@@ -116,37 +98,35 @@ def shape_key_names(head: Any) -> dict[int, str]:
 
 
 def apply_weights(
-    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str,
-    as_strip: bool = False, neck: np.ndarray | None = None,
-) -> None:  # fmt: skip
+    owner: Any,
+    paths: dict[int, str],
+    weights: np.ndarray,
+    start: int,
+    name: str,
+    as_strip: bool = False,
+) -> None:
     """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T,
     52), one row per Blender frame from `start` on.
 
-    neck  (T, 3) axis-angle of the neck, where the owner is a rig; None: it keeps its own animation
     The previous animation is kept as `rig.motion.apply_motion` keeps it. Raises StgaError as
     `check_keyable` does.
     """
-    bones = [] if neck is None else ["neck"]
-    check_keyable(owner, bones)
-    replaced = {*paths.values(), *map(rotation_path, bones)}
+    check_keyable(owner)
+    replaced = set(paths.values())
     start_action(owner, f"{owner.name} {name}", lambda path: path in replaced, as_strip)
-    numbers = range(start, start + len(weights))
-    curves, at = action_curves(owner), np.asarray(numbers)
-    for column, path in paths.items():
-        values = weights[:, column]
-        # a shape that never moves: once
-        keyed = slice(None) if (values != values[0]).any() else slice(1)
-        write_curve(curves, path, 0, at[keyed], values[keyed])
-    if neck is not None:
-        key_turns(owner, "neck", numbers, neck)
+    _write_weights(action_curves(owner), paths, start, weights)
     owner.animation_data.action.use_fake_user = True
     if as_strip:
         push_down_action(owner, extrapolation="NOTHING")
 
 
-def control_paths() -> dict[int, str]:
-    """Column of the 52 -> data path of its control on the rig."""
-    return {column: property_path(name) for name, column in COLUMN.items()}
+def _write_weights(curves: Any, paths: dict[int, str], start: int, weights: np.ndarray) -> None:
+    at = np.arange(start, start + len(weights))
+    for column, path in paths.items():
+        values = weights[:, column]
+        # a shape that never moves: once
+        keyed = slice(None) if (values != values[0]).any() else slice(1)
+        write_curve(curves, path, 0, at[keyed], values[keyed])
 
 
 def checked_shape_keys(head: Any) -> dict[int, str]:
@@ -157,25 +137,3 @@ def checked_shape_keys(head: Any) -> dict[int, str]:
             f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names (jawOpen)"
         )
     return {column: key_value_path(name) for column, name in names.items()}
-
-
-def _parts(linear: np.ndarray, products: np.ndarray) -> list[tuple[str, list[int]]]:
-    """Expressions within Blender's limit that add up to a parameter, and their variables."""
-    found: list[tuple[str, list[int]]] = []
-    text = ""
-    columns: list[int] = []
-    for column in np.flatnonzero(np.abs(linear) + np.abs(products) > NEGLIGIBLE).tolist():
-        factor, product = float(linear[column]), float(products[column])
-        for _ in range(2):
-            variable = VARIABLES[len(columns)]
-            # mouthClose counts up to jawOpen (`effective_weights`).
-            value = f"min({variable},max(o,0))" if column == MOUTH_CLOSE else variable
-            term = f"{factor:+.4e}*{value}"
-            if abs(product) > NEGLIGIBLE:
-                term = f"+{value}*({factor:.4e}{product:+.4e}*o)"
-            if len(text) + len(term) <= MAX_EXPRESSION and len(columns) + 1 < len(VARIABLES):
-                break
-            found.append((text, columns))
-            text, columns = "", []
-        text, columns = text + term, [*columns, column]
-    return [*found, (text, columns)] if columns else found

@@ -18,7 +18,7 @@ from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
@@ -27,6 +27,7 @@ from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import tags
 from ..arrays import add_driver, flat_floats
 from ..objects import Warn, leave_edit_mode, log_warning, place, remove
+from .arkit import ARKIT_MAP
 from .keyframes import (
     EXPRESSION_NAMES,
     MAX_SLIDER,
@@ -44,6 +45,7 @@ from .keyframes import (
     sum_property,
 )
 
+BONE_SHAPE = "STGA Bone"
 BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
 # meters along an axis that a joint may be off when all sliders are at their limits
 NEGLIGIBLE_DISPLACEMENT = 1e-6
@@ -95,6 +97,8 @@ def add_rig(
     modifier.object = rig
     modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
     modifier.use_deform_preserve_volume = False
+    _draw_at_skin(rig, basis, model.weights, joint_positions(model, basis))
+    head.pop(ARKIT_MAP, None)  # of shape keys that an earlier import had
     if model.expression_names:
         head[EXPRESSION_NAMES] = ",".join(model.expression_names)
     for name, component in sliders.items():
@@ -203,6 +207,27 @@ def _place_armature(
         bone.rotation_mode = "QUATERNION"
         bone.lock_location = [joint > 0] * 3
     return rig
+
+
+def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> None:
+    """Draw jaw and eyes from their joints to the skin in front: as bones they point up, because
+    their rest orientation is FLAME's."""
+    shape = bpy.data.objects.get(BONE_SHAPE)
+    if shape is None:
+        mesh = bpy.data.meshes.new(BONE_SHAPE)
+        ring = [(0.1, 0.1, 0), (0, 0.1, 0.1), (-0.1, 0.1, 0), (0, 0.1, -0.1)]
+        sides = [(end, 2 + k, 2 + (k + 1) % 4) for end in (0, 1) for k in range(4)]
+        mesh.from_pydata([(0, 0, 0), (0, 1, 0), *ring], [], sides)
+        shape = bpy.data.objects.new(BONE_SHAPE, mesh)  # in no collection
+    for name in ("jaw", "left_eye", "right_eye"):
+        joint, bone = JOINTS.index(name), rig.pose.bones[name]
+        moved = basis[weights[:, joint] > 0.5] - joints[joint]
+        rig.data.bones[name].hide = not len(moved)  # a jaw that a shape moves
+        if len(moved):
+            tip = Vector(moved[(moved[:, 2] - np.abs(moved[:, 0])).argmax()])
+            bone.custom_shape, bone.use_custom_shape_bone_size = shape, False
+            bone.custom_shape_scale_xyz = (tip.length,) * 3
+            bone.custom_shape_rotation_euler = tip.to_track_quat("Y", "Z").to_euler()
 
 
 def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:

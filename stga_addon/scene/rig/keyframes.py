@@ -48,9 +48,11 @@ def posing_bone(head: Any) -> str:
     return "neck" if EXPRESSION_NAMES in head else "jaw"
 
 
-def is_expression_key(name: str) -> bool:
-    """Whether a head with a FLAME rig has the shape key for one of its expression components."""
-    return name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
+def expression_keys(head: Any) -> list[str]:
+    """The shape keys that a head has of its expression components, in their order."""
+    named = head.get(EXPRESSION_NAMES, "").split(",")
+    names = [block.name for block in head.data.shape_keys.key_blocks]
+    return [name for name in names if name.startswith(EXPRESSION_KEY) or name in named]
 
 
 def slider_components(model: FlameModel) -> dict[str, int]:
@@ -184,7 +186,8 @@ def key_current_pose(head: Any, rig: Any, frame: int) -> None:
     for curve in action_curves(head.data.shape_keys):
         name = curve.data_path.partition('"')[2].partition('"')[0]
         value, before = head.data.shape_keys.key_blocks[name].value, curve.evaluate(frame)
-        if not is_expression_key(name) or abs(value - before) < UNCHANGED:
+        is_expression = name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
+        if not is_expression or abs(value - before) < UNCHANGED:
             continue
         if len(curve.keyframe_points) == 1:  # the motion never moves this slider
             for neighbor in (frame - 1, frame + 1):

@@ -14,20 +14,20 @@ from ...driving.performance import ARKIT_SHAPES
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
-from ...flame.quaternions import from_axis_angle, to_axis_angle
+from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from ..arrays import evaluated_vertices, key_points
 from ..blend_file import iterate_frames
 from ..compat import push_down_action
 from ..objects import Warn, log_warning
-from .arkit import has_controls, shape_key_names
+from .arkit import has_shapes, key_shapes, shape_key_names, shape_parameters
 from .flame_rig import rig_of
 from .keyframes import (
     OFFSET_KEY,
     animated_by,
     check_keyable,
     expression_key,
-    is_expression_key,
+    expression_keys,
     is_of_parts,
     key_motion,
     key_tracked_offsets,
@@ -52,6 +52,7 @@ def apply_motion(
     as_strip: bool = False,
     warn: Warn = log_warning,
     tracked: tuple[FlameSequence, Sequence[float]] | None = None,
+    weights: np.ndarray | None = None,
 ) -> None:
     """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
 
@@ -59,8 +60,9 @@ def apply_motion(
     parts are replaced, and the old action stays in the file. As a strip, both are in the NLA
     editor, and the new one has effect only where it lasts. tracked: the sequence that the head was
     imported from and the Blender frame of each of its timesteps, where its per-frame offsets are to
-    play along; without, they stay zero. Raises StgaError where the head has no rig, or one that
-    cannot take the motion; nothing is changed then.
+    play along; without, they stay zero. weights: (T, 52) of ARKit's shapes, which play along on a
+    head that was given them; without, those stay zero. Raises StgaError where the head has no rig,
+    or one that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
     check_keyable(rig, JOINTS)
@@ -70,7 +72,7 @@ def apply_motion(
         if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
             raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
     # Coefficients of the sliders that the motion lacks are zero.
-    sliders = sum(is_expression_key(key.name) for key in head.data.shape_keys.key_blocks)
+    sliders = len(expression_keys(head))
     frames = [
         replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
         for each in frames
@@ -79,6 +81,8 @@ def apply_motion(
     for owner in owners:
         start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
     key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
+    if "expression" in parts and has_shapes(head):
+        key_shapes(head, start, np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights)
     if "expression" in parts and offset_keys(head):
         if tracked is None:
             key_zero_offsets(head, rig, start)
@@ -140,14 +144,14 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
         vectors[name] = to_axis_angle(np.array((above @ rotations[name]).to_quaternion()))
     root, above = bones["root"], bones.get(parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
-    expressions = [expression_key(head, k) for k in range(model.n_expression)]
+    expr = np.array([_key_value(head, expression_key(head, k)) for k in range(model.n_expression)])
     offsets = [
         value * (key_points(key) - key_points(key.relative_key))
         for key in offset_keys(head)
         if (value := _key_value(head, key.name))
     ]
     return FlameFrame(
-        expr=np.array([_key_value(head, name) for name in expressions]),
+        expr=_with_shapes(head, expr, vectors),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],
@@ -155,6 +159,19 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
         eyes_pose=np.concatenate([vectors["left_eye"], vectors["right_eye"]]),
         dynamic_offset=np.sum(offsets, axis=0) if offsets else None,
     )
+
+
+def _with_shapes(head: Any, expr: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
+    """The expression with what ARKit's sliders add to it; turns of jaw and eyes are exchanged for
+    those with them."""
+    found = shape_parameters(head)
+    if found is None:
+        return expr
+    for joint, row in zip(("jaw", "left_eye", "right_eye"), (-9, -6, -3), strict=True):
+        own = np.array([found[row : row + 3 or None], turns[joint]])
+        slider, bone = from_axis_angle(own)
+        turns[joint] = to_axis_angle(multiply(bone, slider))
+    return np.asarray(expr + found[: len(expr)])
 
 
 def _key_value(head: Any, name: str) -> float:
@@ -175,7 +192,7 @@ class LivePose:
     def __init__(self, head: Any, rig: Any) -> None:
         """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
         self._head, self._rig = head.name, None if rig is None else rig.name
-        self.takes_frames = rig is not None and not has_controls(rig)
+        self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
         self._sliders = np.empty(len(keys), np.float32)
         keys.foreach_get("value", self._sliders)
@@ -185,16 +202,14 @@ class LivePose:
             named = shape_key_names(head).items()
             self._rows = {column: names.index(name) for column, name in named}
             return
-        expressions = [row for row, name in enumerate(names) if is_expression_key(name)]
-        self._rows = dict(enumerate(expressions))
-        self._values[expressions] = 0.0
-        self._values[[name.startswith(OFFSET_KEY) for name in names]] = 0.0
+        own = expression_keys(head)
+        still = {*own, *(ARKIT_SHAPES if has_shapes(head) else ())}
+        self._values[[name in still or name.startswith(OFFSET_KEY) for name in names]] = 0.0
+        self._rows = dict(enumerate(map(names.index, own)))
         bones = rig.pose.bones
         self._turns = {joint: tuple(bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
         self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
         self._properties: dict[str, Any] = {name: tuple(rig[name]) for name in self._offsets}
-        if not self.takes_frames:
-            self._properties |= {name: rig[name] for name in ARKIT_SHAPES}
 
     @property
     def is_there(self) -> bool:
@@ -212,18 +227,12 @@ class LivePose:
         turns = [frame.neck_pose, frame.jaw_pose, frame.eyes_pose[:3], frame.eyes_pose[3:]]
         self._set_turns(dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True)))
 
-    def set_weights(self, weights: Sequence[float] | np.ndarray, neck: np.ndarray) -> None:
-        """Set the 52 weights, and turn the neck of a FLAME head by an axis-angle (3,)."""
+    def set_weights(self, weights: Sequence[float] | np.ndarray) -> None:
+        """Set the 52 weights on the shape keys of a head without a rig."""
         limited = np.clip(weights, *WEIGHT_RANGE)
-        if self._rig is None:
-            for column, row in self._rows.items():
-                self._values[row] = limited[column]
-            self._set_sliders(self._values)
-            return
-        rig = bpy.data.objects[self._rig]
-        for name, value in zip(ARKIT_SHAPES, limited.tolist(), strict=True):
-            rig[name] = value
-        self._set_turns({"neck": from_axis_angle(neck[None])[0]})
+        for column, row in self._rows.items():
+            self._values[row] = limited[column]
+        self._set_sliders(self._values)
 
     def restore(self) -> None:
         """Give back what was there before the first live pose."""
@@ -277,8 +286,11 @@ def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
     names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
     expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
-    turns = np.stack([bones[bone].rotation_quaternion for bone in LIVE_JOINTS[1:]])
-    jaw, left, right = to_axis_angle(turns)
-    zero = np.zeros(3)
-    frame = FlameFrame(expr, zero, zero, jaw, zero, np.concatenate([left, right]))
+    turns = {
+        bone: to_axis_angle(np.array(bones[bone].rotation_quaternion))
+        for bone in ("jaw", "left_eye", "right_eye")
+    }
+    expr, zero = _with_shapes(head, expr, turns), np.zeros(3)
+    eyes = np.concatenate([turns["left_eye"], turns["right_eye"]])
+    frame = FlameFrame(expr, zero, zero, turns["jaw"], zero, eyes)
     return {part: float(values[0]) for part, values in outside([frame], trained).items()}
