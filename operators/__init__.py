@@ -5,17 +5,20 @@ from typing import Any
 
 import bpy
 
-from . import drive, ids, monitor, prepare
+from . import arkit_controls, drive, ids, monitor, pose, prepare
 from .common import register_classes, unregister_classes
 
 MODULES = (
-    ".avatar_from_video", ".track", ".track_correct", ".export_head_model", ".open_demo", ".import_capture",
-    ".import_motion", ".import_meshes", ".select", ".analyze", ".train", ".continue_run", ".select_extension",
-    ".request", ".failure_report", ".training_python", ".pose", ".show", ".light", ".preview_images", ".render_video",
-    ".apply_motion", ".arkit_controls", ".drive", ".drive_video", ".import_ply", ".export", ".export_cameras",
+    ".avatar_from_video", ".track", ".track_correct", ".export_head_model", ".open_demo",
+    ".import_capture", ".import_motion", ".import_meshes", ".select", ".analyze", ".train",
+    ".continue_run", ".select_extension", ".request", ".failure_report", ".training_python",
+    ".pose", ".show", ".light", ".preview_images", ".render_video", ".apply_motion",
+    ".arkit_controls", ".drive", ".drive_video", ".import_ply", ".export", ".export_cameras",
     ".export_performance", ".drop",
 )  # fmt: skip
 """Whose operators and file handlers are registered."""
+PARTS = (prepare, monitor, arkit_controls, drive, pose)
+"""With handlers, timers or keys."""
 CLASSES = tuple(
     thing
     for module in (import_module(name, __package__) for name in MODULES)
@@ -44,15 +47,13 @@ def register() -> None:
     register_classes(CLASSES)
     bpy.types.TOPBAR_MT_file_import.append(_import_menu)
     bpy.types.TOPBAR_MT_file_export.append(_export_menu)
-    prepare.register()
-    monitor.register()
-    drive.register()
+    for part in PARTS:
+        part.register()
 
 
 def unregister() -> None:
-    drive.unregister()
-    monitor.unregister()
-    prepare.unregister()
+    for part in reversed(PARTS):
+        part.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
     bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
     unregister_classes(CLASSES)

@@ -21,14 +21,10 @@ from ..stga_addon.driving.open_motion import (
 from ..stga_addon.driving.performance import EXCHANGEABLE, parts_kept
 from ..stga_addon.driving.read_performance import is_performance, read_performance
 from ..stga_addon.errors import StgaError
+from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.rig.arkit import (
-    apply_weights,
-    checked_shape_keys,
-    control_paths,
-    has_controls,
-)
+from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, has_shapes
 from ..stga_addon.scene.rig.motion import (
     WEIGHT_RANGE,
     apply_motion,
@@ -50,6 +46,7 @@ from .common import (
     path_property,
     reporting,
     rig_or_none,
+    tell,
 )
 from .options import option_property
 
@@ -80,7 +77,8 @@ def exchange_property(pair: str) -> Any:
     """Whether left and right of a pair of shapes (`EXCHANGEABLE`) are exchanged."""
     return bpy.props.BoolProperty(
         name=f"Exchange {pair.capitalize()} Sides",
-        description=f"Of a face performance: exchange {pair}Left and {pair}Right, which some senders exchange",
+        description=f"Of a face performance: exchange {pair}Left and {pair}Right, which some "
+        "senders exchange",
         options={"SKIP_SAVE"},
     )
 
@@ -95,13 +93,15 @@ class ApplyMotion(bpy.types.Operator, FileImport):
 
     filepath: path_property(
         "File",
-        "FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a face performance: CSV "
-        "of Live Link Face or Audio2Face, its take folder, JSON of named weights, iFacialMocap's text",
+        "FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a face "
+        "performance: CSV of Live Link Face or Audio2Face, its take folder, JSON of named "
+        "weights, iFacialMocap's text",
         options={"SKIP_SAVE"},
     )
     source: bpy.props.StringProperty(
         name="Source",
-        description="Another imported head instead of a file: its motion in the scene's frame range",
+        description="Another imported head instead of a file: its motion in the scene's frame "
+        "range",
         options={"SKIP_SAVE"},
     )
     expression: _part_property("Expression", "Apply the expression")
@@ -112,24 +112,21 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     strength: option_property(MotionOptions, "strength", soft_max=2.0, options={"SKIP_SAVE"})
     own_offsets: bpy.props.BoolProperty(
         name="Own Offsets",
-        description="The motion is this head's own, refined by training: keep its tracked per-frame offsets, if any",
+        description="The motion is this head's own, refined by training: keep its tracked "
+        "per-frame offsets, if any",
         options={"SKIP_SAVE"},
     )
     start: bpy.props.IntProperty(
-        name="Start Frame",
-        description="Frame of the first keyframe",
-        default=1,
-        min=0,
+        name="Start Frame", description="Frame of the first keyframe", default=1, min=0,
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     neutral: option_property(MotionOptions, "neutral", labels=NEUTRAL_LABELS, options={"SKIP_SAVE"})
     stay_trained: bpy.props.FloatProperty(
         name="Stay Trained",
-        description="Lead expression, jaw and eyes softly back to the range of the head's own recording; 1: fully",
-        min=0.0,
-        max=1.0,
-        options={"SKIP_SAVE"},
-    )
+        description="Lead expression, jaw and eyes softly back to the range of the head's own "
+        "recording; 1: fully",
+        min=0.0, max=1.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
     smoothing: option_property(MotionOptions, "smoothing", soft_max=0.2, options={"SKIP_SAVE"})
     mirror: option_property(MotionOptions, "mirror", options={"SKIP_SAVE"})
     face_gain: _gain_property("Face Gain", "the face's shapes")
@@ -138,31 +135,31 @@ class ApplyMotion(bpy.types.Operator, FileImport):
     head_gain: _gain_property("Head Gain", "the head's rotation, which turns the neck")
     shape_gains: bpy.props.StringProperty(
         name="Shape Gains",
-        description="Of a face performance: factors of single shapes, which take the place of their part's, such as "
-        "jawOpen=0.8 cheekPuff=0",
+        description="Of a face performance: factors of single shapes, which take the place of "
+        "their part's, such as jawOpen=0.8 cheekPuff=0",
         options={"SKIP_SAVE"},
     )
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
+    sliders: bpy.props.BoolProperty(
+        name="Face Sliders",
+        description="Of a face performance: keyframe the sliders that are named as its shapes, "
+        "where the head has them, in place of expressions, jaw and eyes; easier to edit, and a "
+        "little less exact",
+        options={"SKIP_SAVE"},
+    )
     fps: bpy.props.FloatProperty(
         name="Recorded At",
-        description="Frames per second of the recording; 0: one timestep for each frame of the scene. A face "
-        "performance has its own times",
-        min=0.0,
-        max=1000.0,
-        options={"SKIP_SAVE"},
-    )
+        description="Frames per second of the recording; 0: one timestep for each frame of the "
+        "scene. A face performance has its own times",
+        min=0.0, max=1000.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
     speed: bpy.props.FloatProperty(
-        name="Speed",
-        description="2: twice as fast; 0.5: half as fast",
-        default=1.0,
-        min=0.01,
-        max=100.0,
-        options={"SKIP_SAVE"},
-    )
+        name="Speed", description="2: twice as fast; 0.5: half as fast", default=1.0, min=0.01,
+        max=100.0, options={"SKIP_SAVE"},
+    )  # fmt: skip
     place: bpy.props.EnumProperty(
-        name="As",
-        description="Where the keyframes go; the earlier animation is kept in the file",
+        name="As", description="Where the keyframes go; the earlier animation is kept in the file",
         items=(
             ("action", "New Action", "A copy of the head's action with the chosen parts replaced"),
             (
@@ -172,20 +169,19 @@ class ApplyMotion(bpy.types.Operator, FileImport):
             ),
         ),
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     fit_range: bpy.props.BoolProperty(
         name="Extend Frame Range",
-        description="Extend the scene's frame range to the end of the motion",
-        default=True,
+        description="Extend the scene's frame range to the end of the motion", default=True,
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     filename_ext = ".npz"
     filter_glob: file_filter(".npz", ".csv", ".json", ".txt")
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:
         if properties.own_offsets:
-            return "Animate this head with its tracking as refined by training; its earlier animation is kept"
+            return "Animate this head with its tracking as refined by training; the earlier is kept"
         return ""  # that of the class
 
     poll = classmethod(needs_rig_or_shapes)
@@ -228,15 +224,15 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         return name, len(frames)
 
     def _apply_performance(self, scene: Any, head: Any, path: Path, parts: list[str]) -> int:
-        """Apply a face performance to controls, shape keys of its names, or expressions and bones;
-        returns the number of frames."""
+        """Apply a face performance to expressions and bones, or to shape keys of its names; returns
+        the number of frames."""
         performance, options = read_performance(path), self._options()
         rate = scene.render.fps / scene.render.fps_base / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
         if performance.lost:
             self._warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
-        rig = rig_or_none(head)
-        if rig is not None and not has_controls(rig):
+        rig, as_strip = rig_or_none(head), self.place == "strip"
+        if rig is not None and not (self.sliders and has_shapes(head)):
             motion = performed(
                 performance,
                 flame_of(capture_of(head), head.name),
@@ -247,25 +243,23 @@ class ApplyMotion(bpy.types.Operator, FileImport):
             )
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
-            apply_motion(
-                head, frames, self.start, path.stem, parts, self.place == "strip", self._warn
-            )
+            apply_motion(head, frames, self.start, path.stem, parts, as_strip, self._warn)
             return len(frames)
         chosen = {"face": self.expression, "jaw": self.jaw, "eyes": self.eyes, "head": self.neck}
         kept = parts_kept(performance, tuple(part for part in chosen if chosen[part]))
         prepared = prepared_performance(kept, options, rate)
-        owner, paths = (
-            (head.data.shape_keys, checked_shape_keys(head))
-            if rig is None
-            else (rig, control_paths())
-        )
         weights = np.clip(prepared.weights, *WEIGHT_RANGE)
-        neck = None
-        if rig is not None and self.neck:
-            neck = (
-                np.zeros((len(weights), 3)) if prepared.head is None else head_turns(prepared.head)
-            )
-        apply_weights(owner, paths, weights, self.start, path.stem, self.place == "strip", neck)
+        if rig is None:
+            paths = checked_shape_keys(head)
+            apply_weights(head.data.shape_keys, paths, weights, self.start, path.stem, as_strip)
+            return len(weights)
+        still, turns = np.zeros(3), np.zeros((len(weights), 3))
+        turns = turns if prepared.head is None else head_turns(prepared.head)
+        frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
+        parts = list({*parts, "expression"})  # on which the sliders would act
+        apply_motion(
+            head, frames, self.start, path.stem, parts, as_strip, self._warn, weights=weights
+        )
         return len(weights)
 
     def _options(self) -> MotionOptions:
@@ -348,7 +342,7 @@ class ApplyMotion(bpy.types.Operator, FileImport):
         )
 
     def _warn(self, sentence: str) -> None:
-        self.report({"WARNING"}, sentence)
+        tell(self, "WARNING", sentence)
 
 
 def _recorded(context: Any, path: Path, head: Any) -> FlameSequence:

@@ -1,22 +1,30 @@
-"""Adds and removes sliders named as ARKit's blend shapes."""
+"""Gives FLAME heads sliders named as ARKit's blend shapes."""
 
+from contextlib import suppress
+from threading import Thread
 from typing import Any, ClassVar
 
 import bpy
+import numpy as np
+from bpy.app.handlers import persistent
 
-from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.scene.rig.arkit import add_controls, has_controls, remove_controls
-from ..stga_addon.scene.rig.flame_rig import rig_of
-from . import ids
-from .common import capture_of, flame_of, head_of, needs_rig, reporting, rig_or_none, scene_settings
+from ..stga_addon.capture.open import open_capture
+from ..stga_addon.driving.head_map import HeadMap, head_map
+from ..stga_addon.errors import StgaError
+from ..stga_addon.scene.rig.arkit import add_shapes, has_shapes, head_shapes
+from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES
+from . import ids, monitor
+from .common import capture_source, flame_of, head_of, needs_rig, reporting, rig_or_none
+
+POLL_INTERVAL_S = 0.3
+Shapes = tuple[HeadMap, np.ndarray, np.ndarray]
 
 
 class AddArkitControls(bpy.types.Operator):
-    """Add 52 sliders named as ARKit's blend shapes, which drive expressions, jaw and eyes without
-    Python"""
+    """Add 52 sliders named as ARKit's blend shapes: jawOpen, mouthSmileLeft, …"""
 
     bl_idname = ids.ADD_ARKIT_CONTROLS
-    bl_label = "Add ARKit Controls"
+    bl_label = "Add Face Sliders"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     poll = classmethod(needs_rig)
@@ -24,27 +32,74 @@ class AddArkitControls(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         head = head_of(context)
-        add_controls(head, rig_of(head), head_map(flame_of(capture_of(head), head.name), head.name))
+        add_shapes(head, *_compute_shapes(capture_source(head), head.name))
         return {"FINISHED"}
 
 
-class RemoveArkitControls(bpy.types.Operator):
-    """Remove the ARKit sliders and their keyframes; expressions, jaw and eyes play their own
-    animation again"""
+def _compute_shapes(source: tuple[Any, ...], name: str) -> Shapes:
+    """Seconds of work. Raises StgaError for a head whose face ARKit's shapes do not fit."""
+    sequence = flame_of(open_capture(*source), name)
+    found = head_map(sequence, name)
+    return found, *head_shapes(sequence, found)
 
-    bl_idname = ids.REMOVE_ARKIT_CONTROLS
-    bl_label = "Remove ARKit Controls"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if not needs_rig(cls, context):
-            return False
-        rig = rig_or_none(scene_settings(context).head)
-        return rig is not None and has_controls(rig)
+def needs_sliders(head: Any) -> bool:
+    """Whether a head has neither expressions with ARKit's names nor the sliders."""
+    rig = rig_or_none(head)
+    return rig is not None and EXPRESSION_NAMES not in head and not has_shapes(head)
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        head = head_of(context)
-        remove_controls(head, rig_of(head))
-        return {"FINISHED"}
+
+def begin_sliders(head: Any) -> None:
+    """Give a head that needs them its sliders as soon as a thread has computed them; scripts call
+    the operator."""
+    if monitor.has_timer() and needs_sliders(head) and head.library is None:
+        monitor.watch(_Sliders(head))
+
+
+preparing: set[str] = set()
+"""Names of heads whose sliders are being computed."""
+
+
+class _Sliders:
+    """What a thread computes for a head, which is looked up by its name: undo moves it."""
+
+    def __init__(self, head: Any) -> None:
+        self._head, self._made = head.name, list[Shapes]()
+        self._thread = Thread(target=self._make, args=(capture_source(head),), daemon=True)
+        self._thread.start()
+        preparing.add(self._head)
+
+    def _make(self, source: tuple[Any, ...]) -> None:
+        with suppress(StgaError):  # the operator says what is wrong
+            self._made.append(_compute_shapes(source, self._head))
+
+    def tick(self) -> float | None:
+        if self._thread.is_alive() or bpy.app.is_job_running("RENDER"):
+            return POLL_INTERVAL_S
+        preparing.discard(self._head)
+        head = bpy.data.objects.get(self._head)
+        if self._made and needs_sliders(head):
+            if head.mode == "EDIT":
+                return POLL_INTERVAL_S
+            add_shapes(head, *self._made[0])
+            monitor.push_undo()
+            monitor.redraw()
+        return None
+
+    def close(self) -> None:
+        preparing.discard(self._head)
+
+
+@persistent
+def _after_load(_: Any) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            begin_sliders(getattr(scene, ids.SETTINGS).head)
+
+
+def register() -> None:
+    bpy.app.handlers.load_post.append(_after_load)
+
+
+def unregister() -> None:
+    bpy.app.handlers.load_post.remove(_after_load)

@@ -52,10 +52,10 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
     focal: option_property(Track, "focal", "Focal Length", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python interpreter that tracks and trains; empty: that of the preferences, or Blender's own",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE", "HIDDEN"},
-    )
+        description="Python interpreter that tracks and trains; empty: that of the preferences, "
+        "or Blender's own",
+        subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"},
+    )  # fmt: skip
     filter_glob: file_filter(*VIDEO_SUFFIXES)
 
     @classmethod

@@ -1,5 +1,7 @@
 """Shared by the operators: error reports, polls, paths, and the capture behind a head."""
 
+import os
+import re
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -18,19 +20,45 @@ from ..stga_addon.scene.rig.arkit import shape_key_names
 from ..stga_addon.scene.rig.flame_rig import rig_of
 from . import ids
 
+MAX_REPORT_CHARACTERS = 90
+"""Of what popup and status bar show of a report."""
+PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
+
 
 def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
     """Decorator of `execute`: a StgaError becomes the operator's error report, without a
     traceback."""
 
     def guarded(self: Any, context: Any) -> set[str]:
+        setattr(context.window_manager, ids.MESSAGE, "")
         try:
             return execute(self, context)
         except StgaError as error:
-            self.report({"ERROR"}, str(error))
+            tell(self, "ERROR", str(error))
             return {"CANCELLED"}
 
     return guarded
+
+
+def tell(operator: Any, kind: str, sentence: str) -> None:
+    """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in the
+    panel."""
+    brief, manager = short_sentence(sentence), bpy.context.window_manager
+    operator.report({kind}, sentence if bpy.app.background else brief)
+    # an operator that was called by another has told it at length
+    if brief != short_sentence(getattr(manager, ids.MESSAGE)):
+        setattr(manager, ids.MESSAGE, sentence)
+
+
+def short_sentence(sentence: str) -> str:
+    """At most MAX_REPORT_CHARACTERS: files without their folders, then the first of its clauses."""
+    text = PARENT_FOLDERS.sub("", sentence)
+    if len(text) <= MAX_REPORT_CHARACTERS:
+        return text
+    begin = text[: MAX_REPORT_CHARACTERS - 1]
+    ends = [begin.rfind(mark) for mark in ("; ", ". ", ", ", " (")]
+    end = max(ends) if max(ends) > MAX_REPORT_CHARACTERS / 3 else begin.rfind(" ")
+    return f"{begin[:end]}…"
 
 
 def scene_settings(context: Any) -> Any:
@@ -150,6 +178,8 @@ class FileImport(ImportHelper):
         if self.filepath:
             result: set[str] = self.execute(context)  # type: ignore[attr-defined]
             return result
+        if bpy.data.filepath:  # else Blender proposes the .blend file's own name
+            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), "")
         return super().invoke(context, event)  # type: ignore[no-any-return]
 
 
@@ -157,7 +187,8 @@ def flame_property() -> Any:
     """FLAME model of an import operator."""
     return path_property(
         "FLAME Model",
-        "FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; empty: that of the preferences",
+        "FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; empty: "
+        "that of the preferences",
         options={"SKIP_SAVE"},
     )
 

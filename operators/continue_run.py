@@ -24,8 +24,8 @@ class RefineOptions:
 
     group: bpy.props.StringProperty(
         name="Vertex Group",
-        description="Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the selected "
-        "triangles are refined instead",
+        description="Vertex group whose triangles are refined; empty: the active one. In Edit "
+        "Mode, the selected triangles are refined instead",
     )
     seconds: option_property(
         RefineRequest, "seconds", description="Training time", default=20.0, min=0.1
@@ -58,19 +58,13 @@ class Refine(TrainingOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
         options={"SKIP_SAVE"},
     )
     first: bpy.props.IntProperty(
-        name="First Frame",
-        description="First frame to train on",
-        default=-1,
-        min=-1,
+        name="First Frame", description="First frame to train on", default=-1, min=-1,
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     last: bpy.props.IntProperty(
-        name="Last Frame",
-        description="Last frame to train on; -1: all frames",
-        default=-1,
-        min=-1,
+        name="Last Frame", description="Last frame to train on; -1: all frames", default=-1, min=-1,
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -126,7 +120,8 @@ def _painted_region(head: Any, group: str) -> np.ndarray:
         found = head.vertex_groups.get(group) if group else head.vertex_groups.active
         if found is None:
             raise StgaError(
-                f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in Edit Mode"
+                f"{head.name}: has no vertex group '{group}' to refine; paint one, or select in "
+                "Edit Mode"
             )
         weights = read_triangle_weights(head, found.name)
         where = f"no triangle has all its corners in the vertex group '{found.name}'"

@@ -31,6 +31,7 @@ from .common import (
     reporting,
     rig_or_none,
     scene_settings,
+    tell,
 )
 from .live_session import LiveSession, Target, live_options
 from .options import option_property
@@ -42,50 +43,41 @@ class DriveOptions:
     """What the panel stores about driving live; annotations of `ui.properties.DriveSettings`."""
 
     source: bpy.props.EnumProperty(
-        name="Source",
-        description="What sends the face",
+        name="Source", description="What sends the face",
         items=[(name, source.label, source.hint) for name, source in SOURCES.items()],
-    )
+    )  # fmt: skip
     address: bpy.props.StringProperty(
         name="Listen On",
-        description="Address of this computer on which packets are received. "
-        f"{LOOPBACK}: from this computer alone; 0.0.0.0: from every computer and phone of the network",
+        description=f"Address of this computer on which packets are received. {LOOPBACK}: from "
+        "this computer alone; 0.0.0.0: from every computer and phone of the network",
         default=LOOPBACK,
     )
     port: bpy.props.IntProperty(
-        name="Port",
-        description="UDP port; 0: the source's usual one",
-        min=0,
-        max=MAX_PORT,
+        name="Port", description="UDP port; 0: the source's usual one", min=0, max=MAX_PORT,
         default=0,
-    )
+    )  # fmt: skip
     phone: bpy.props.StringProperty(
         name="Phone", description="IP address that the app on the phone shows", default=LOOPBACK
     )
     strength: option_property(MotionOptions, "strength", soft_max=2.0)
     smoothing: bpy.props.FloatProperty(
-        name="Smoothing",
-        description="Time constant in seconds; the head follows later by as much",
-        min=0.0,
-        soft_max=0.2,
-        max=MAX_SMOOTHING_S,
-    )
+        name="Smoothing", description="Time constant in seconds; the head follows later by as much",
+        min=0.0, soft_max=0.2, max=MAX_SMOOTHING_S,
+    )  # fmt: skip
     stay_trained: bpy.props.FloatProperty(
         name="Stay Trained",
-        description="Lead expression, jaw and eyes softly back to the range of the head's own recording; 1: fully. On "
-        "heads without ARKit controls",
-        min=0.0,
-        max=1.0,
-    )
+        description="Lead expression, jaw and eyes softly back to the range of the head's own "
+        "recording; 1: fully",
+        min=0.0, max=1.0,
+    )  # fmt: skip
     mirror: option_property(MotionOptions, "mirror")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
     takes: path_property(
         "Takes",
         "Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
-        "DIR_PATH",
-        default="//stga_takes",
-    )
+        "DIR_PATH", default="//stga_takes",
+    )  # fmt: skip
 
 
 class MeasureRange(bpy.types.Operator):
@@ -125,8 +117,8 @@ class DriveLive(bpy.types.Operator):
             and not bpy.app.online_access
         ):
             raise StgaError(
-                f"{source.label}: receives from other devices, but online access is off in Blender's preferences "
-                f"(System > Network); allow it, or listen on {LOOPBACK}"
+                f"{source.label}: receives from other devices, but online access is off in "
+                f"Blender's preferences (System > Network); allow it, or listen on {LOOPBACK}"
             )
         rig = rig_or_none(head)
         pose = LivePose(head, rig)
@@ -250,7 +242,7 @@ def _apply(operator: Any, context: Any, recording: Recording) -> None:
     """Write the take and apply it. Raises StgaError."""
     folder, warning = takes_folder(context)
     if warning:
-        operator.report({"WARNING"}, warning)
+        tell(operator, "WARNING", warning)
     path = live_session.write_take(recording, folder)
     options = live_options(scene_settings(context).drive, recording.rest is not None)
     try:

@@ -61,7 +61,8 @@ def npz_kind(path: Path) -> str:
     if names & MOTION_FIELDS:
         return "motion"
     raise StgaError(
-        f"{path}: is neither an avatar (no header) nor a FLAME motion (none of {', '.join(FRAME_FIELDS)})"
+        f"{path}: is neither an avatar (no header) nor a FLAME motion (none of "
+        f"{', '.join(FRAME_FIELDS)})"
     )
 
 

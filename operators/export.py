@@ -36,6 +36,7 @@ from .common import (
     path_property,
     reporting,
     scene_settings,
+    tell,
 )
 from .export_range import RangeExport
 from .export_web import exact_motion, scene_playback
@@ -62,10 +63,9 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         "Avatar", "Avatar file (.npz); empty: the one shown", options={"SKIP_SAVE"}
     )
     format: bpy.props.EnumProperty(
-        name="Format",
-        description="File format",
+        name="Format", description="File format",
         items=tuple((name, format.label, format.description) for name, format in FORMATS.items()),
-    )
+    )  # fmt: skip
 
     filter_glob: file_filter(*SUFFIXES)
     motion_only: option_property(Export, "motion_only")
@@ -192,7 +192,7 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         return {"CANCELLED"}
 
     def _warn(self, sentence: str) -> None:
-        self.report({"WARNING"}, sentence)
+        tell(self, "WARNING", sentence)
 
 
 @lru_cache(maxsize=8)

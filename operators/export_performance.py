@@ -1,5 +1,6 @@
 """Exports what the head plays as curves of ARKit's shapes, for other characters."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import bpy
@@ -18,6 +19,7 @@ from .common import (
     needs_rig,
     path_property,
     reporting,
+    tell,
 )
 
 
@@ -41,9 +43,7 @@ class ExportPerformance(bpy.types.Operator, ExportHelper):
         path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
         own = flame_of(capture_of(head), head.name)
         frames = range(scene.frame_start, scene.frame_end + 1)
-        motion = sample_motion(
-            head, own, frames, lambda sentence: self.report({"WARNING"}, sentence)
-        )
+        motion = sample_motion(head, own, frames, partial(tell, self, "WARNING"))
         write_performance(path, captured_performance(motion, head.name, frames_per_second(scene)))
         self.report({"INFO"}, f"Exported {len(frames)} frames to {path}")
         return {"FINISHED"}

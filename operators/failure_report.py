@@ -22,9 +22,8 @@ class CopyReport(bpy.types.Operator):
     directory: bpy.props.StringProperty(
         name="Folder",
         description="Status folder of the worker; empty: that of the scene's training",
-        subtype="DIR_PATH",
-        options={"SKIP_SAVE"},
-    )
+        subtype="DIR_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     @reporting
     def execute(self, context: Any) -> set[str]:

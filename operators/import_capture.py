@@ -1,13 +1,13 @@
 """Imports a capture: the tracked head and the cameras."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
-from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
+from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, has_transforms
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head
@@ -15,7 +15,8 @@ from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
-from . import ids
+from . import ids, monitor
+from .arkit_controls import begin_sliders
 from .common import (
     FileImport,
     file_filter,
@@ -26,8 +27,12 @@ from .common import (
     path_property,
     reporting,
     scene_settings,
+    tell,
 )
 from .prepare import begin_preparing
+
+FOLDERS_ABOVE_FILE = 3
+"""In which the capture of an image, mask, mesh or parameter file is looked for."""
 
 
 class ImportCapture(bpy.types.Operator, FileImport):
@@ -39,20 +44,17 @@ class ImportCapture(bpy.types.Operator, FileImport):
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     filepath: path_property(
-        "File",
-        "Transforms file of the capture, such as transforms_train.json; or its folder",
-        options={"SKIP_SAVE"},
+        "File", "Folder of the capture, or any file in it", options={"SKIP_SAVE"}
     )
     directory: path_property(
         "Capture",
-        "Folder of the capture, with its transforms files or meshes; not needed where a file is given",
-        "DIR_PATH",
-        options={"SKIP_SAVE"},
-    )
+        "Folder of the capture, with its transforms files or meshes; not needed where a file is "
+        "given",
+        "DIR_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
     flame: flame_property()
     principal_point: bpy.props.EnumProperty(
-        name="Principal Point",
-        description="Meaning of cx and cy in the transforms files",
+        name="Principal Point", description="Meaning of cx and cy in the transforms files",
         items=(
             (
                 "vhap",
@@ -63,10 +65,11 @@ class ImportCapture(bpy.types.Operator, FileImport):
             ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
         ),
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     correctives: bpy.props.EnumProperty(
         name="Correctives",
-        description="FLAME joints that get pose correctives: shape keys, with drivers, that correct the mesh",
+        description="FLAME joints that get pose correctives: shape keys, with drivers, that "
+        "correct the mesh",
         items=(
             ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
             (
@@ -78,11 +81,11 @@ class ImportCapture(bpy.types.Operator, FileImport):
     )
     set_up_scene: bpy.props.BoolProperty(
         name="Set Up Scene",
-        description="Set the scene's resolution, camera and frame rate to those of the capture, and its view transform "
-        "to Standard, which the splats' colors are trained for",
+        description="Set the scene's resolution, camera and frame rate to those of the capture, "
+        "and its view transform to Standard, which the splats' colors are trained for",
         default=True,
     )
-    filter_glob: file_filter(".json")
+    filter_glob: file_filter("")
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -100,15 +103,13 @@ class ImportCapture(bpy.types.Operator, FileImport):
 
 
 def _capture_folder(path: Path) -> Path:
-    """The folder of a capture that is given by its folder or a transforms file. Raises StgaError
+    """The folder of a capture that is given by its folder or by any file in it. Raises StgaError
     for another file."""
-    if not path.is_file():
-        return path
-    if path.suffix.lower() == ".json" and path.name.startswith("transforms"):
-        return path.parent
-    raise StgaError(
-        f"{path}: is not a transforms file; choose a capture's transforms_train.json, or its folder"
-    )
+    inside = [] if path.is_dir() else path.parents[:FOLDERS_ABOVE_FILE]
+    folder = next((parent for parent in inside if has_transforms(parent)), path)
+    if folder.is_file():
+        raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
+    return folder
 
 
 def bring_in(
@@ -122,11 +123,10 @@ def bring_in(
 ) -> None:
     """Import what `open_capture` reads from `source`, and make it the scene's head. Raises
     StgaError."""
-
-    def warn(sentence: str) -> None:
-        operator.report({"WARNING"}, sentence)
-
-    capture = _open(context, source, flame, principal_point)
+    warn = partial(tell, operator, "WARNING")
+    has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
+    model = None if has_model else flame_model_path(context, flame)
+    capture = open_capture(source, flame=model, principal_point=principal_point)
     is_first = not any(is_head(thing) for thing in context.scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
@@ -134,8 +134,15 @@ def bring_in(
     head[tags.PRINCIPAL_POINT] = principal_point
     head[tags.TRACKED] = is_tracked(capture.root)
     scene_settings(context).head = head
-    _show_first_frame(context.scene, capture)
-    _select_only(context, head)
+    scene, objects = context.scene, context.view_layer.objects
+    scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+    scene.frame_set(capture.timesteps[0])
+    leave_edit_mode()
+    for thing in objects.selected:
+        thing.select_set(False)
+    if objects.get(head.name) is head:
+        head.select_set(True)
+        objects.active = head
     if is_first:  # later on, a cube that is shown was shown by the user
         _hide_start_up_cube(context)
     middle = central(cameras)
@@ -144,25 +151,14 @@ def bring_in(
     if context.window is not None and not bpy.app.background:
         frame_head(head, middle, [context.window.screen])
     if set_up_scene and cameras:
-        configure_scene(context.scene, capture, middle, warn=warn)
+        configure_scene(scene, capture, middle, warn=warn)
     for sentence in capture.warnings:
         warn(sentence)
-    counts = f"{len(capture.timesteps)} timesteps, {len(capture.faces)} triangles, {len(cameras)} cameras"
-    operator.report({"INFO"}, counts)
+    counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
+    operator.report({"INFO"}, ", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
+    begin_sliders(head)
+    monitor.show_panel()
     begin_preparing(context)
-
-
-def _open(context: Any, source: Path, flame: str, principal_point: str) -> Capture:
-    """The capture, with the FLAME model that is given, else its own, else that of the preferences.
-    Raises StgaError."""
-    has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
-    model = None if has_model else flame_model_path(context, flame)
-    return open_capture(source, flame=model, principal_point=principal_point)
-
-
-def _show_first_frame(scene: Any, capture: Capture) -> None:
-    scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
-    scene.frame_set(capture.timesteps[0])
 
 
 def _hide_start_up_cube(context: Any) -> None:
@@ -176,13 +172,3 @@ def _hide_start_up_cube(context: Any) -> None:
     if cube.matrix_world.is_identity and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
         cube.hide_set(True)
         cube.hide_render = True
-
-
-def _select_only(context: Any, head: Any) -> None:
-    """Select the head and nothing else, as Blender's importers do."""
-    leave_edit_mode()
-    for thing in context.view_layer.objects.selected:
-        thing.select_set(False)
-    if context.view_layer.objects.get(head.name) is head:
-        head.select_set(True)
-        context.view_layer.objects.active = head

@@ -27,7 +27,8 @@ class ImportMotion(bpy.types.Operator, FileImport):
         path = file_path(self.filepath, "motion")
         if flame_model_path(context, self.flame) is None:
             raise StgaError(
-                f"{path}: holds FLAME parameters; choose your FLAME model in the add-on's preferences"
+                f"{path}: holds FLAME parameters; choose your FLAME model in the add-on's "
+                "preferences"
             )
         bring_in(self, context, path, self.flame)
         return {"FINISHED"}

@@ -24,14 +24,13 @@ class ImportPly(bpy.types.Operator, FileImport):
     filename_ext = ".ply"
     filter_glob: file_filter(".ply")
     up: bpy.props.EnumProperty(
-        name="Up",
-        description="Axis of the file that points up",
+        name="Up", description="Axis of the file that points up",
         items=(
             ("Y", "Y", "Captures tracked with FLAME, and what this add-on exports"),
             ("-Y", "-Y", "Scenes reconstructed with COLMAP"),
             ("Z", "Z", "Blender's up axis"),
         ),
-    )
+    )  # fmt: skip
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -9,10 +9,9 @@ from time import monotonic
 from typing import Any
 
 import bpy
-import numpy as np
 from bpy.app.handlers import persistent
 
-from ..stga_addon.driving.head_map import HeadMap, head_turns
+from ..stga_addon.driving.head_map import HeadMap
 from ..stga_addon.driving.inverse import write_performance
 from ..stga_addon.driving.live.sources import (
     REQUEST_INTERVAL_S,
@@ -155,9 +154,7 @@ class LiveSession:
             frames, _ = frames_of(target.map, row, options, target.trained)
             target.pose.set_frame(frames[0])
         else:
-            row = at_strength(row, options)
-            turn = np.zeros(3) if row.head is None else head_turns(row.head)[0]
-            target.pose.set_weights(row.weights[0], turn)
+            target.pose.set_weights(at_strength(row, options).weights[0])
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
                 if area.type == "VIEW_3D":

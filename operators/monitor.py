@@ -35,7 +35,7 @@ from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.tracking.folder import SPLIT_FILES
-from ..stga_addon.training.run.folder import AVATAR, TRACKING
+from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker.status import (
     WorkerSnapshot,
@@ -46,6 +46,7 @@ from ..stga_addon.worker.status import (
 from . import ids
 from .common import is_head
 from .results import IN_SCENE, loader
+from .show import run_of
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a
@@ -350,7 +351,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             _remove(state.kind, folder)
         case states.PushUndo():
             if has_timer():  # later: saving the scene's state takes as long as a slice
-                bpy.app.timers.register(_push_undo, first_interval=SLICE_INTERVAL_S)
+                bpy.app.timers.register(push_undo, first_interval=SLICE_INTERVAL_S)
         case states.Redraw():
             redraw()
     return None
@@ -401,7 +402,8 @@ def _read_picture(folder: Path | None) -> Curve | None:
     )
 
 
-def _push_undo() -> None:
+def push_undo() -> None:
+    """Let undo come back to what is in the file now."""
     if bpy.ops.ed.undo_push.poll():
         bpy.ops.ed.undo_push(message="Show Result")
 
@@ -444,6 +446,34 @@ def _end_unawaited() -> None:
 
 
 @persistent
+def _before_save(path: str) -> None:
+    _rebase(bpy.data.filepath, path)
+
+
+@persistent
+def _after_save(path: str) -> None:
+    if bpy.data.filepath != path:  # a copy was saved
+        _rebase(path, bpy.data.filepath)
+
+
+def _rebase(old: str, new: str) -> None:
+    """Let scenes find their run and avatar from another .blend file: relative where they lie beside
+    it or below, so that all can be moved together."""
+    beside = Path(new).parent
+    own = [scene for scene in bpy.data.scenes if scene.library is None]
+    for settings in [getattr(scene, ids.SETTINGS) for scene in own]:
+        for name in ("run_folder", "avatar"):
+            value = getattr(settings, name)
+            place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
+            if not value or (value.startswith("//") and not old) or not place.exists():
+                continue
+            is_beside = place.is_relative_to(beside)
+            moved = f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
+            if moved != value:
+                setattr(settings, name, moved)
+
+
+@persistent
 def _after_load(_: Any) -> None:
     loader.close()
     _close_watched()
@@ -468,6 +498,8 @@ def _adopt(scene: Any) -> None:
         if settings.splats is None and len(shown) == 1:
             settings.splats = shown[0]
             settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
+    if not has_run(Path(bpy.path.abspath(settings.run_folder))):
+        settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
 
 def show_panel() -> None:
@@ -488,14 +520,23 @@ class _Sidebar:
         return None if open_sidebar(ids.TAB, screens) or not self._attempts else CHECK_INTERVAL_S
 
 
+HANDLERS = (
+    (bpy.app.handlers.load_post, _after_load),
+    (bpy.app.handlers.save_pre, _before_save),
+    (bpy.app.handlers.save_post, _after_save),
+)
+
+
 def register() -> None:
-    bpy.app.handlers.load_post.append(_after_load)
+    for handlers, handler in HANDLERS:
+        handlers.append(handler)
     _start_timer()
 
 
 def unregister() -> None:
-    bpy.app.handlers.load_post.remove(_after_load)
-    for timer in (tick, _push_undo):
+    for handlers, handler in HANDLERS:
+        handlers.remove(handler)
+    for timer in (tick, push_undo):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     loader.close()

@@ -49,6 +49,41 @@ class PoseHead(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class TurnJaw(bpy.types.Operator):
+    """Open and close the mouth: R turns the jaw about its hinge, from whatever side it is seen"""
+
+    bl_idname = ids.TURN_JAW
+    bl_label = "Turn the Jaw"
+    bl_options: ClassVar[set[str]] = {"INTERNAL"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        chosen = [bone.name for bone in context.selected_pose_bones or ()]
+        return chosen == ["jaw"] and context.active_object.get(tags.KIND) == tags.RIG
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        hinge = (True, False, False)
+        bpy.ops.transform.rotate("INVOKE_DEFAULT", orient_type="LOCAL", constraint_axis=hinge)
+        return {"FINISHED"}
+
+
 def is_posing(context: Any, rig: Any) -> bool:
     """Whether this rig is in Pose mode."""
     return context.view_layer.objects.active is rig and rig.mode == "POSE"
+
+
+_keymap_items: list[tuple[Any, Any]] = []
+
+
+def register() -> None:
+    """R turns a jaw about its hinge; without a window, Blender has no keys."""
+    keys = bpy.context.window_manager.keyconfigs.addon
+    if keys is not None:
+        keymap = keys.keymaps.new(name="Pose")
+        _keymap_items.append((keymap, keymap.keymap_items.new(ids.TURN_JAW, "R", "PRESS")))
+
+
+def unregister() -> None:
+    for keymap, item in _keymap_items:
+        keymap.keymap_items.remove(item)
+    _keymap_items.clear()

@@ -1,10 +1,11 @@
-"""Shows splats in the viewport as EEVEE and Cycles render them."""
+"""Chooses how splats are displayed, and the shading that shows it."""
 
 from typing import Any, ClassVar
 
 import bpy
 
-from ..stga_addon.scene.display.display_modes import LIMITS, POINTS, QUADS
+from ..stga_addon.scene.compat import NATIVE_SPLATS
+from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
 from ..stga_addon.scene.display.splat_nodes import DISPLAY
 from ..stga_addon.scene.display.splat_object import (
     set_input,
@@ -14,7 +15,37 @@ from ..stga_addon.scene.display.splat_object import (
 )
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import ids
-from .common import polled, reporting
+from .common import polled, reporting, scene_settings, tell
+
+GRAY = ("WIREFRAME", "SOLID")
+"""Kinds of shading that show colors of splats as trained only."""
+OFFERED = [mode for mode in LIMITS if mode != NATIVE or NATIVE_SPLATS]
+
+
+class ChooseDisplay(bpy.types.Operator):
+    """Choose how the splats are displayed, in a shading that shows their colors"""
+
+    bl_idname = ids.CHOOSE_DISPLAY
+    bl_label = "Display"
+    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+
+    display: bpy.props.EnumProperty(
+        name="Display", items=[(mode, mode, LIMITS[mode]) for mode in OFFERED]
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        splats = scene_settings(context).splats
+        return polled(cls, splats is not None and splats.library is None, "Show an avatar first")
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        set_input(scene_settings(context).splats, DISPLAY, self.display)
+        space = context.space_data
+        is_viewport = getattr(space, "type", "") == "VIEW_3D"  # a script has none
+        if is_viewport and self.display != AS_TRAINED and space.shading.type in GRAY:
+            space.shading.type = "MATERIAL"
+        return {"FINISHED"}
 
 
 class PreviewImages(bpy.types.Operator):
@@ -41,11 +72,10 @@ class PreviewImages(bpy.types.Operator):
             context.space_data.shading.type = "RENDERED" if shows_nodes(scene) else "MATERIAL"
             if scene.camera is not None:
                 context.space_data.region_3d.view_perspective = "CAMERA"
-        hint = view_transform_hint(scene)
-        self.report(
-            {"WARNING" if hint else "INFO"},
-            f"{mode}: {LIMITS[mode]}" + (f". {hint}" if hint else ""),
-        )
+        if hint := view_transform_hint(scene):
+            tell(self, "WARNING", hint)
+        else:
+            self.report({"INFO"}, f"{mode}: {LIMITS[mode]}")
         return {"FINISHED"}
 
 

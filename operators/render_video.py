@@ -59,8 +59,7 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         "File or Folder", "An .mp4 file, or a folder for PNGs", options={"SKIP_SAVE"}
     )
     path: bpy.props.EnumProperty(
-        name="Camera",
-        description="How the camera moves",
+        name="Camera", description="How the camera moves",
         items=(
             (
                 "turntable",
@@ -73,23 +72,19 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
                 "The scene's camera and animation, from the scene's first to its last frame",
             ),
         ),
-    )
+    )  # fmt: skip
     format: bpy.props.EnumProperty(
-        name="Format",
-        description="What is written",
+        name="Format", description="What is written",
         items=(
             ("mp4", "MP4", "One video file, H.264"),
             ("png", "PNG Sequence", "One PNG per image; with alpha where the film is transparent"),
         ),
-    )
+    )  # fmt: skip
     angle: bpy.props.FloatProperty(
         name="Angle",
         description="Of the turntable, to both sides; 0: the sides that the capture's cameras saw",
-        subtype="ANGLE",
-        min=0.0,
-        max=2 * pi,
-        default=0.0,
-    )
+        subtype="ANGLE", min=0.0, max=2 * pi, default=0.0,
+    )  # fmt: skip
     seconds: option_property(Render, "seconds", min=0.1, soft_max=60.0)
     filename_ext = ""
     filter_glob: file_filter(".mp4")

@@ -85,7 +85,8 @@ class Select(bpy.types.Operator):
         share = 100 * sum(moving) / len(moving) if moving else 0.0
         self.report(
             {"INFO"},
-            f"{len(moving)} of {len(selection)} frames select triangles, {share:.0f} % of the head on average",
+            f"{len(moving)} of {len(selection)} frames select triangles, {share:.0f} % of the head "
+            "on average",
         )
         return {"FINISHED"}
 
@@ -143,14 +144,11 @@ class HeatMap(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     show: bpy.props.BoolProperty(
-        name="Show",
-        description="Off: restore the head's own colors",
-        default=True,
+        name="Show", description="Off: restore the head's own colors", default=True,
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     of: bpy.props.EnumProperty(
-        name="Of",
-        description="What the colors show",
+        name="Of", description="What the colors show",
         items=(
             ("SELECTION", "Selection", "How often each triangle is selected"),
             (
@@ -160,13 +158,11 @@ class HeatMap(bpy.types.Operator):
             ),
         ),
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
     directory: path_property(
-        "Run Folder",
-        "Folder of the run whose residuals are shown",
-        "DIR_PATH",
+        "Run Folder", "Folder of the run whose residuals are shown", "DIR_PATH",
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
 
     poll = classmethod(needs_own_head)
 

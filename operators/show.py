@@ -1,5 +1,7 @@
 """Shows an avatar file as splats that follow the head."""
 
+import os
+from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
@@ -8,6 +10,7 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes
 from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
+from ..stga_addon.training.run.folder import has_run
 from . import ids
 from .common import (
     FileImport,
@@ -17,6 +20,7 @@ from .common import (
     needs_head,
     reporting,
     scene_settings,
+    tell,
 )
 
 
@@ -43,14 +47,22 @@ class ShowAvatar(bpy.types.Operator, FileImport):
         avatar = read_avatar(path)
         show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
         show_world(path, head)
-        scene_settings(context).avatar = self.filepath
+        settings = scene_settings(context)
+        settings.avatar = self.filepath
+        settings.run_folder = run_of(self.filepath) or settings.run_folder
         if self.hide_head and head.library is not None:
-            self.report(
-                {"WARNING"},
-                f"{head.name}: is linked, and covers the splats in renders; hide it in its file",
+            sentence = (
+                f"{head.name}: is linked, and covers the splats in renders; hide it in its file"
             )
+            tell(self, "WARNING", sentence)
         self.report({"INFO"}, f"{len(avatar.splats)} splats")
         return {"FINISHED"}
+
+
+def run_of(avatar: str) -> str:
+    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
+    folder = os.path.dirname(avatar)
+    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
 
 
 def show(

@@ -26,13 +26,12 @@ class TrackOptions:
     stop: option_property(Track, "stop")
     step: option_property(Track, "step")
     mattes: bpy.props.EnumProperty(
-        name="Mattes",
-        description="Masks that tell the person from the background",
+        name="Mattes", description="Masks that tell the person from the background",
         items=[
             *((name, name.title(), text.capitalize()) for name, text in MATTES.items()),
             ("folder", "Folder", "Those of a folder, named as the images"),
         ],
-    )
+    )  # fmt: skip
     matte_folder: path_property(
         "Matte Folder", "Folder of masks, named as the images of the footage", "DIR_PATH"
     )
@@ -49,10 +48,10 @@ class TrackFootage(bpy.types.Operator, TrackOptions):
     landmarks: option_property(Track, "landmarks", subtype="DIR_PATH", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python interpreter that tracks; empty: that of the preferences, or Blender's own",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
+        description="Python interpreter that tracks; empty: that of the preferences, or Blender's "
+        "own",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
 
     @classmethod
     def poll(cls, context: Any) -> bool:

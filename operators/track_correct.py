@@ -44,10 +44,9 @@ class ViewFootage(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     step: bpy.props.IntProperty(
-        name="Step",
-        description="1: the next camera, -1: the one before, 0: enter and leave",
+        name="Step", description="1: the next camera, -1: the one before, 0: enter and leave",
         options={"SKIP_SAVE"},
-    )
+    )  # fmt: skip
 
     @classmethod
     def poll(cls, context: Any) -> bool:

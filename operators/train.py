@@ -51,10 +51,10 @@ class DeviceOptions:
     )
     adapter: bpy.props.StringProperty(
         name="GPU",
-        description="Name of the GPU; empty: the first. The list is that of the last test of the Python",
-        search=list_adapters,
-        search_options={"SUGGESTION"},
-    )
+        description="Name of the GPU; empty: the first. The list is that of the last test of the "
+        "Python",
+        search=list_adapters, search_options={"SUGGESTION"},
+    )  # fmt: skip
 
 
 class TrainOptions(DeviceOptions):
@@ -75,14 +75,14 @@ class TrainingOperator:
     iterations: option_property(TrainingSettings, "iterations", options={"SKIP_SAVE"})
     python: bpy.props.StringProperty(
         name="Python",
-        description="Python interpreter that trains; empty: that of the preferences, or Blender's own",
-        subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )
+        description="Python interpreter that trains; empty: that of the preferences, or Blender's "
+        "own",
+        subtype="FILE_PATH", options={"SKIP_SAVE"},
+    )  # fmt: skip
     wait: bpy.props.BoolProperty(
         name="Wait",
-        description="Return when training has ended, as always without a window; "
-        "Blender's own Python trains then, if it has the packages",
+        description="Return when training has ended, as always without a window; Blender's own "
+        "Python trains then, if it has the packages",
         options={"SKIP_SAVE"},
     )
 
@@ -103,12 +103,14 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     seed: option_property(TrainingSettings, "seed", options={"SKIP_SAVE"})
     effects: bpy.props.StringProperty(
         name="Effects",
-        description="NAME=on or NAME=off, separated by spaces, for effects that the capture should not decide",
+        description="NAME=on or NAME=off, separated by spaces, for effects that the capture "
+        "should not decide",
         options={"SKIP_SAVE"},
     )
     resume: bpy.props.BoolProperty(
         name="Resume",
-        description="Continue the run in the folder with the settings and budget that it was started with",
+        description="Continue the run in the folder with the settings and budget that it was "
+        "started with",
         options={"SKIP_SAVE"},
     )
 

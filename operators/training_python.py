@@ -96,10 +96,9 @@ class TestPython(bpy.types.Operator):
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     python: bpy.props.StringProperty(
-        name="Python",
-        description="The interpreter to test; empty: the one that trains",
+        name="Python", description="The interpreter to test; empty: the one that trains",
         subtype="FILE_PATH",
-    )
+    )  # fmt: skip
 
     @classmethod
     def poll(cls, context: Any) -> bool:

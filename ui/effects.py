@@ -7,6 +7,7 @@ import bpy
 from ..operators import ids
 from ..operators.common import scene_settings
 from ..stga_addon.jobs.table import Kind
+from ..stga_addon.training.effect_catalog import EFFECTS
 from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -26,13 +27,15 @@ class EffectsPanel(SidebarPanel, bpy.types.Panel):
             self._draw_effect(context, row)
 
     def _draw_effect(self, context: Any, row: Any) -> None:
-        box = self.layout.column(align=True)
-        split = box.split(factor=0.6)
-        split.label(
-            text=row.name.replace("-", " ").capitalize(), icon="CHECKMARK" if row.on else "REMOVE"
-        )
-        split.prop(row, "choice", text="")
-        reasons = box.column(align=True)
-        reasons.active = False
-        for text in (row.reason, f"Cost: {row.cost}" if row.on else ""):
-            draw_text(reasons, context, text, "BLANK1")
+        effect, box = EFFECTS[row.name], self.layout.column(align=True)
+        line = box.row(align=True)
+        arrow = "DISCLOSURE_TRI_DOWN" if row.is_open else "DISCLOSURE_TRI_RIGHT"
+        line.prop(row, "is_open", text="", icon=arrow, emboss=False)
+        line.label(text=effect.title, icon="CHECKMARK" if row.on else "REMOVE")
+        price = line.row()
+        price.active, price.alignment = row.on, "RIGHT"
+        price.label(text=effect.price)
+        if row.is_open:
+            box.row().prop(row, "choice", expand=True)
+            for text in (f"{row.name}: {row.reason}", f"Cost: {row.cost}"):
+                draw_text(box, context, text, "BLANK1")

@@ -1,5 +1,6 @@
 """The panel Lighting: which light avatars show. Images that show another one say so."""
 
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -8,11 +9,13 @@ from bpy.app.handlers import persistent
 
 from ..operators import ids
 from ..operators.common import scene_settings
+from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display.splat_object import shows_nodes, stored_light
 from ..stga_addon.scene.light.scene_light import world_light
-from ..stga_addon.scene.light.settings import lighting_settings
-from ..stga_addon.scene.render.scene_splats import light_hint
+from ..stga_addon.scene.light.settings import MODE_CHANGED, lighting_settings
+from ..stga_addon.scene.render import viewport_display
+from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from .request import draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -65,8 +68,19 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         for name in ("exposure", "white", "roughness", "specular", "shadows", "world", "lights"):
             column.prop(settings, name)
         if settings.world and world_light(context.scene.world) is None:
-            text = "The world's nodes are not understood: a Background with a color or an environment texture is"
-            draw_text(layout, context, text, "ERROR")
+            draw_text(layout, context, "Of worlds, colors and environment textures count", "ERROR")
+
+
+def _begin_exposure(scene: Any) -> None:
+    """Light avatars as brightly as they were recorded, until an exposure is chosen."""
+    settings = lighting_settings(scene)
+    if settings.mode != "recorded" and not settings.is_property_set("exposure"):
+        if bpy.context.window is not None:
+            bpy.context.window.cursor_set("WAIT")  # until the mouse moves
+        with suppress(StgaError):  # the display says what is wrong
+            exposure = level_exposure(viewport_display.display.cache)
+            if exposure is not None:
+                settings.exposure = exposure
 
 
 @persistent
@@ -97,10 +111,12 @@ def _pop_up(hint: str) -> None:
 
 
 def register() -> None:
+    MODE_CHANGED.append(_begin_exposure)
     bpy.app.handlers.render_init.append(_before_job)
     bpy.app.handlers.render_pre.append(_before_image)
 
 
 def unregister() -> None:
+    MODE_CHANGED.remove(_begin_exposure)
     bpy.app.handlers.render_init.remove(_before_job)
     bpy.app.handlers.render_pre.remove(_before_image)

@@ -1,15 +1,14 @@
-"""The Motion step: applying the motion of others, and sliders for expression and identity."""
+"""The Motion step: applying the motion of others, and sliders of the face."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import bpy
 
 from ..operators import ids
+from ..operators.arkit_controls import needs_sliders, preparing
 from ..operators.common import is_head, rig_or_none, scene_settings
 from ..stga_addon.driving.performance import ARKIT_SHAPES
-from ..stga_addon.scene.rig.arkit import has_controls
-from ..stga_addon.scene.rig.keyframes import IDENTITY_KEY, is_expression_key, property_path
+from ..stga_addon.scene.rig.keyframes import EXPRESSION_KEY, IDENTITY_KEY
 from ..stga_addon.scene.rig.motion import outside_now, stored_range
 from .sidebar import SidebarPanel
 
@@ -31,22 +30,26 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
             ).source = settings.motion_source.name
 
 
-class ArkitPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_arkit"
-    bl_label = "ARKit Controls"
+class FacePanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "STGA_PT_face"
+    bl_label = "Face"
     bl_parent_id = MotionPanel.bl_idname
-    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return rig_or_none(scene_settings(context).head) is not None
 
     def draw(self, context: Any) -> None:
         head = scene_settings(context).head
-        rig = rig_or_none(head)
-        if rig is None or not has_controls(rig):
+        if head.name in preparing:
+            self.layout.label(text="Sliders follow in a moment", icon="TIME")
+            return
+        if needs_sliders(head):
             self.layout.operator(ids.ADD_ARKIT_CONTROLS, icon="ADD")
             return
-        column = self.layout.column(align=True)
-        for name in ARKIT_SHAPES:
-            column.prop(rig, property_path(name), text=name, slider=True)
-        self.layout.operator(ids.REMOVE_ARKIT_CONTROLS, icon="X")
+        column, keys = self.layout.column(align=True), head.data.shape_keys.key_blocks
+        for name in [name for name in ARKIT_SHAPES if name in keys]:
+            column.prop(keys[name], "value", text=name, slider=True)
 
 
 class TrainedPanel(SidebarPanel, bpy.types.Panel):
@@ -73,35 +76,32 @@ class TrainedPanel(SidebarPanel, bpy.types.Panel):
             self.layout.progress(factor=min(beyond, 1.0), text=text)
 
 
-class _Sliders(SidebarPanel):
+class CoefficientsPanel(SidebarPanel, bpy.types.Panel):
+    """Sliders of a FLAME head without names: of expression, and of other persons."""
+
+    bl_idname = "STGA_PT_coefficients"
+    bl_label = "Coefficients"
     bl_parent_id = MotionPanel.bl_idname
     bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
-    belongs: ClassVar[Any]
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        return bool(_sliders(context, cls.belongs))
+        return bool(_coefficients(context))
 
     def draw(self, context: Any) -> None:
-        column = self.layout.column(align=True)
-        for key in _sliders(context, self.belongs)[:MAX_SLIDERS]:
-            column.prop(key, "value", text=key.name, slider=True)
+        for keys in _coefficients(context):
+            column = self.layout.column(align=True)
+            for key in keys[:MAX_SLIDERS]:
+                column.prop(key, "value", text=key.name, slider=True)
 
 
-class ExpressionPanel(_Sliders, bpy.types.Panel):
-    bl_idname = "STGA_PT_expression"
-    bl_label = "Expression"
-    belongs = staticmethod(is_expression_key)
-
-
-class IdentityPanel(_Sliders, bpy.types.Panel):
-    bl_idname = "STGA_PT_identity"
-    bl_label = "Identity"
-    belongs = staticmethod(lambda name: name.startswith(IDENTITY_KEY))
-
-
-def _sliders(context: Any, belongs: Callable[[str], bool]) -> list[Any]:
+def _coefficients(context: Any) -> list[list[Any]]:
     head = scene_settings(context).head
     if not is_head(head) or head.data.shape_keys is None:
         return []
-    return [key for key in head.data.shape_keys.key_blocks if belongs(key.name)]
+    keys = head.data.shape_keys.key_blocks
+    found = [
+        [key for key in keys if key.name.startswith(prefix)]
+        for prefix in (EXPRESSION_KEY, IDENTITY_KEY)
+    ]
+    return [part for part in found if part]

@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ..operators import ids, monitor
-from ..operators.common import is_head, rig_or_none, scene_settings
+from ..operators.common import is_head, package, rig_or_none, scene_settings
 from ..operators.open_demo import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
@@ -17,6 +17,7 @@ from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
 from ..stga_addon.worker.status import WorkerState
+from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .request import draw_end, draw_running
 from .sidebar import SidebarPanel
 from .text import draw_text
@@ -33,6 +34,7 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING)
         )
         making = monitor.state_of(context.scene, Kind.AVATAR)
+        _draw_message(layout, context)
         if draw_running(layout, context, Kind.AVATAR):
             draw_text(
                 layout,
@@ -52,13 +54,15 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_text(
                 layout,
                 context,
-                f"{done}: the head is imported when it is done. Go on working, save, or quit Blender",
+                f"{done}: the head is imported when it is done. Go on working, save, or quit "
+                "Blender",
             )
         elif not is_head(settings.head) and settings.splats is None:
             draw_text(
                 layout,
                 context,
-                "Choose a video of a face. Or import a capture: a tracked head, its cameras and their images",
+                "Choose a video of a face. Or import a capture: a tracked head, its cameras and "
+                "their images",
             )
             draw_missing_python(layout, context)
             layout.operator(ids.AVATAR_FROM_VIDEO, text="Avatar from Video…", icon="FILE_MOVIE")
@@ -86,6 +90,26 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             draw_missing_python(layout, context)
 
 
+def _draw_message(layout: Any, context: Any) -> None:
+    """Draw what the last operator could not do, as a whole, with the button that helps."""
+    text = getattr(context.window_manager, ids.MESSAGE)
+    if not text:
+        return
+    box = layout.box()
+    row = box.row()
+    row.label(text="Not Done", icon="ERROR")
+    close = row.operator("wm.context_set_string", text="", icon="X", emboss=False)
+    close.data_path, close.value = f"window_manager.{ids.MESSAGE}", ""
+    draw_text(box, context, text)
+    if PYTHON_VARIABLE in text:
+        draw_missing_python(box, context)
+    elif "FLAME model" in text:
+        show = box.operator("preferences.addon_show", text="Choose It", icon="PREFERENCES")
+        show.module = package()
+    elif "not been saved" in text:
+        box.operator("wm.save_mainfile", text="Save the File", icon="FILE_TICK")
+
+
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
     """Buttons that bring a shown avatar to life."""
     layout.label(text="Orbit the avatar, or try", icon="INFO")
@@ -99,6 +123,9 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
         text = "Done Posing" if posing else "Pose the Head"
         column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
         if posing:
+            mouth = settings.head.data.shape_keys.key_blocks.get("jawOpen")
+            if mouth is not None:
+                column.prop(mouth, "value", text="Open Mouth", slider=True)
             draw_text(
                 column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO"
             )

@@ -6,6 +6,7 @@ import bpy
 
 from ..operators import ids
 from ..operators.common import is_head, register_classes, scene_settings, unregister_classes
+from ..operators.preview_images import GRAY
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
@@ -23,7 +24,7 @@ from . import lighting
 from .continue_panel import ContinuePanel
 from .drive import DrivePanel
 from .effects import EffectsPanel
-from .motion import ArkitPanel, ExpressionPanel, IdentityPanel, MotionPanel, TrainedPanel
+from .motion import CoefficientsPanel, FacePanel, MotionPanel, TrainedPanel
 from .next_step import NextStepPanel
 from .render_panel import RenderPanel
 from .select_panel import SelectedFrames, SelectPanel
@@ -33,7 +34,6 @@ from .track_panel import TrackCheckPanel, TrackOptionsPanel, TrackPanel
 from .train_panel import TrainOptionsPanel, TrainPanel
 
 DISPLAY_INPUTS = (
-    splat_nodes.DISPLAY,
     splat_nodes.SIZE,
     splat_nodes.OPACITY_THRESHOLD,
     splat_nodes.PERCENTAGE,
@@ -56,7 +56,8 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "head")
         if is_head(settings.head):
             layout.label(
-                text=f"{len(settings.head[tags.TIMESTEPS])} timesteps, {len(settings.head.data.polygons)} triangles"
+                text=f"{len(settings.head[tags.TIMESTEPS])} timesteps, "
+                f"{len(settings.head.data.polygons)} triangles"
             )
             _draw_visibility(layout, context, settings.head.parent)
 
@@ -93,6 +94,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         except StgaError as error:
             layout.label(text=str(error), icon="ERROR")
             return
+        mode = display_mode(splats)
+        layout.operator_menu_enum(ids.CHOOSE_DISPLAY, "display", text=f"Display: {mode}")
         column = layout.column(align=True)
         for name in DISPLAY_INPUTS:
             identifier = input_identifier(modifier, name)
@@ -101,17 +104,15 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
                 column.prop(owner, prop, text=name)
         if viewport_display.display.problem:
             draw_text(layout, context, viewport_display.display.problem, "ERROR")
-        mode = display_mode(splats)
         if mode == AS_TRAINED:
             layout.operator(ids.PREVIEW_IMAGES, icon="SHADING_RENDERED")
             return
         if viewport_display.is_engine_view(context):  # shows every display as trained
             return
         draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
-        if context.space_data.shading.type in ("WIREFRAME", "SOLID"):
-            layout.label(text="Solid mode shows no splat colors", icon="INFO")
-            preview = layout.operator("wm.context_set_enum", text="Use Material Preview")
-            preview.data_path, preview.value = "space_data.shading.type", "MATERIAL"
+        if context.space_data.shading.type in GRAY:
+            show = layout.operator(ids.CHOOSE_DISPLAY, text="Show Colors", icon="SHADING_TEXTURE")
+            show.display = mode
         elif view_transform_hint(context.scene):
             layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator(ids.STANDARD_VIEW)
@@ -132,11 +133,10 @@ CLASSES = (
     ShowPanel,
     lighting.LightingPanel,
     MotionPanel,
+    FacePanel,
     DrivePanel,
     TrainedPanel,
-    ArkitPanel,
-    ExpressionPanel,
-    IdentityPanel,
+    CoefficientsPanel,
     RenderPanel,
 )
 

@@ -17,20 +17,22 @@ class Preferences(bpy.types.AddonPreferences):
 
     flame_model: path_property(
         "FLAME Model",
-        "Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; "
-        "needed for captures tracked with FLAME, and never part of this add-on",
+        "Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; needed for captures "
+        "tracked with FLAME, and never part of this add-on",
     )
 
     training_python: bpy.props.StringProperty(
         name="Python",
-        description="An interpreter that has torch, numba and what else tracking and training need; empty: Blender's "
-        f"own, which has it all with the complete edition. The variable {PYTHON_VARIABLE} takes precedence",
+        description="An interpreter that has torch, numba and what else tracking and training "
+        "need; empty: Blender's own, which has it all with the complete edition. The variable "
+        f"{PYTHON_VARIABLE} takes precedence",
         subtype="FILE_PATH",
     )
 
     render_device: bpy.props.EnumProperty(
         name="Rendering Device",
-        description="Device that renders splats for videos, and for images where Blender has no GPU context",
+        description="Device that renders splats for videos, and for images where Blender has no "
+        "GPU context",
         items=(
             ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
             ("cpu", "CPU", "The processor"),

@@ -31,6 +31,16 @@ def _forget_rows(settings: Any, context: Any) -> None:
     settings.preset_timing = ""
 
 
+def _current_row(settings: Any) -> int:
+    frames = [row.frame for row in settings.selected_frames]
+    frame = settings.id_data.frame_current
+    return frames.index(frame) if frame in frames else -1
+
+
+def _go_to_row(settings: Any, row: int) -> None:
+    settings.id_data.frame_set(settings.selected_frames[row].frame)
+
+
 def preset_times(settings: Any) -> dict[str, float]:
     """Preset -> seconds of training on this machine; empty before the capture was analyzed."""
     return dict(json.loads(settings.preset_timing or "{}"))
@@ -46,17 +56,19 @@ class EffectRow(bpy.types.PropertyGroup):
     """Row of the table of effects, `name` is the effect's; filled by `operators.analyze`."""
 
     choice: bpy.props.EnumProperty(
-        name="Choice",
-        description="Whether training models this effect",
+        name="Choice", description="Whether training models this effect",
         items=(
             ("auto", "Auto", "Decided by analyzing the capture"),
             ("on", "On", "Always"),
             ("off", "Off", "Never"),
         ),
-    )
+    )  # fmt: skip
     on: bpy.props.BoolProperty(name="On")
     reason: bpy.props.StringProperty(name="Reason")
     cost: bpy.props.StringProperty(name="Cost")
+    is_open: bpy.props.BoolProperty(
+        name="Details", description="Choose whether it is on, and see why and at what cost it is"
+    )
 
 
 class TrackSettings(TrackOptions, bpy.types.PropertyGroup):
@@ -93,11 +105,9 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     # function; Blender does not.
 
     head: bpy.props.PointerProperty(
-        name="Head",
-        description="Imported head that the steps work on",
-        type=bpy.types.Object,
+        name="Head", description="Imported head that the steps work on", type=bpy.types.Object,
         update=_forget_rows,
-    )
+    )  # fmt: skip
     track: bpy.props.PointerProperty(type=TrackSettings)
     # absolute path of the current or last tracking
     tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})
@@ -106,12 +116,13 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     avatar_folder: bpy.props.StringProperty(options={"HIDDEN"})
     avatar_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it has reached the scene
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
-    selected_row: bpy.props.IntProperty(options={"HIDDEN"})
-    motion_source: bpy.props.PointerProperty(
-        name="From",
-        description="Another imported head, whose motion is applied to this one",
-        type=bpy.types.Object,
+    selected_row: bpy.props.IntProperty(
+        name="Frame", description="Go to this frame", get=_current_row, set=_go_to_row
     )
+    motion_source: bpy.props.PointerProperty(
+        name="From", description="Another imported head, whose motion is applied to this one",
+        type=bpy.types.Object,
+    )  # fmt: skip
     drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: bpy.props.PointerProperty(
         name="Splats", description="Splats whose display is set here", type=bpy.types.Object
@@ -125,15 +136,13 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
     live_preview: bpy.props.BoolProperty(
-        name="Live Preview",
-        description="Update the splats every few seconds during training",
+        name="Live Preview", description="Update the splats every few seconds during training",
         default=True,
-    )
+    )  # fmt: skip
     show_result: bpy.props.BoolProperty(
         name="Show When Trained",
-        description="Show the avatar on the head when training has finished",
-        default=True,
-    )
+        description="Show the avatar on the head when training has finished", default=True,
+    )  # fmt: skip
     # absolute path of the current or last run
     training_run: bpy.props.StringProperty(options={"HIDDEN"})
     result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its avatar has reached the scene
@@ -154,8 +163,10 @@ CLASSES = (
 def register() -> None:
     register_classes(CLASSES)
     setattr(bpy.types.Scene, ids.SETTINGS, bpy.props.PointerProperty(type=SceneSettings))
+    setattr(bpy.types.WindowManager, ids.MESSAGE, bpy.props.StringProperty())
 
 
 def unregister() -> None:
+    delattr(bpy.types.WindowManager, ids.MESSAGE)
     delattr(bpy.types.Scene, ids.SETTINGS)
     unregister_classes(CLASSES)

@@ -13,7 +13,7 @@ from .sidebar import SidebarPanel
 
 
 class SelectedFrames(bpy.types.UIList):
-    """Frame, triangles and splats of each frame; a click goes to the frame."""
+    """Frame, triangles and splats of each frame; the row of the scene's frame is chosen."""
 
     bl_idname = "STGA_UL_selected_frames"
 
@@ -30,9 +30,7 @@ class SelectedFrames(bpy.types.UIList):
         row = layout.row()
         row.active = item.triangles > 0
         for value in (item.frame, item.triangles, item.splats):
-            jump = row.operator("wm.context_set_int", text=f"{value:,}", emboss=False)
-            jump.data_path, jump.value = "scene.frame_current", item.frame
-        row.label(icon="PLAY" if item.frame == context.scene.frame_current else "BLANK1")
+            row.label(text=f"{value:,}")
 
 
 class SelectPanel(SidebarPanel, bpy.types.Panel):
@@ -78,7 +76,6 @@ def _draw_table(layout: Any, settings: Any) -> None:
     heading = layout.row()
     for text in ("Frame", "Triangles", "Splats"):
         heading.label(text=text)
-    heading.label(icon="BLANK1")
     layout.template_list(
         SelectedFrames.bl_idname,
         "",

@@ -32,8 +32,10 @@ class TrackPanel(SidebarPanel, bpy.types.Panel):
         if tracking.subject is not None:
             box = draw_end(layout, context, tracking)
             draw_text(box, context, tracking.snapshot.status.detail)
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
         for name in ("footage", "cameras", "model", "avatar", "directory"):
-            layout.prop(settings.track, name)
+            column.prop(settings.track, name)
         text = "Track with Avatar" if settings.track.avatar else "Track"
         track = layout.operator(ids.TRACK_FOOTAGE, text=text, icon="CON_FOLLOWTRACK")
         set_options(track, settings.track, TrackOptions)
