@@ -1,4 +1,4 @@
-"""Face performances: Apply Motion, ARKit controls, and heads with ARKit's shape keys."""
+"""Face performances: Apply Motion, face sliders, and heads with ARKit's shape keys."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +9,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from flame.small_head import small_head, write_flame  # noqa: E402
+from mathutils import Euler  # noqa: E402
 
 from stga_addon.driving.head_map import head_map  # noqa: E402
 from stga_addon.driving.inverse import write_performance  # noqa: E402
@@ -22,6 +23,7 @@ from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.motion import apply_motion, sample_pose  # noqa: E402
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 1e-5
@@ -81,38 +83,74 @@ def test_apply_a_performance(scene):
     np.testing.assert_allclose(at(16), expected(scene, 3, True), atol=TOLERANCE_M)
 
 
-def test_controls(scene):
-    """Catches a control that moves something else than the map says, needs Python at playback, or
-    stays behind; and a neck that loses the head's rotation, or turns where it was not chosen."""
-    before = at(1)
+def weights_of(**weights: float) -> np.ndarray:
+    return np.array([weights.get(name, 0.0) for name in ARKIT_SHAPES])
+
+
+def posed(scene, weights: np.ndarray) -> np.ndarray:
+    (frame,) = scene.map.frames(Performance(np.zeros(1), weights[None], None, 30.0))
+    return flame_forward(scene.own.model, scene.own.shape, frame)
+
+
+def test_sliders(scene):
+    """Catches a slider that moves something else than the map says, that stops the head's own
+    animation or needs Python at playback, a jaw that its bone turns no more, and parameters that
+    are sampled without the sliders."""
+    before = [at(frame) for frame in range(3)]
     assert bpy.ops.stga.add_arkit_controls() == {"FINISHED"}
-    head = the_head()
-    rig = rig_of(head)
-    drivers = [*rig.animation_data.drivers, *head.data.shape_keys.animation_data.drivers]
-    assert all(driver.driver.is_simple_expression and driver.driver.is_valid for driver in drivers)
+    head, model = the_head(), scene.own.model
+    keys = head.data.shape_keys
+    assert set(ARKIT_SHAPES) <= set(keys.key_blocks.keys())
+    assert all(driver.driver.is_simple_expression for driver in keys.animation_data.drivers)
+    for frame in range(3):
+        np.testing.assert_allclose(at(frame), before[frame], atol=1e-7)
     zero = np.zeros(3)
     neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
-    np.testing.assert_allclose(
-        at(1), flame_forward(scene.own.model, scene.own.shape, neutral), atol=TOLERANCE_M
-    )
-    for row in (1, 2):
-        for name in ARKIT_SHAPES:
-            rig[name] = float(scene.weights[row, COLUMN[name]])
-        rig.update_tag()
+    apply_motion(head, [neutral], 1, "neutral")
+    bpy.context.scene.frame_set(1)
+    keys.animation_data.action = None
+    for weights in (
+        weights_of(jawOpen=1),
+        weights_of(mouthSmileLeft=1),
+        weights_of(jawOpen=1, mouthPucker=1),
+        weights_of(jawOpen=1, mouthClose=1),
+        weights_of(eyeLookUpLeft=1),
+    ):
+        for name, weight in zip(ARKIT_SHAPES, weights.tolist(), strict=True):
+            keys.key_blocks[name].value = weight
         bpy.context.view_layer.update()
-        np.testing.assert_allclose(at(1), expected(scene, row, False), atol=2 * TOLERANCE_M)
-    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=1, neck=False) == {"FINISHED"}
-    np.testing.assert_allclose(at(4), expected(scene, 3, False), atol=2 * TOLERANCE_M)
-    assert rig["jawOpen"] == pytest.approx(scene.weights[3, COLUMN["jawOpen"]], abs=1e-5)
-    assert bpy.ops.stga.remove_arkit_controls() == {"FINISHED"}
-    assert not any(name in rig for name in ARKIT_SHAPES)
-    np.testing.assert_allclose(at(1), before, atol=1e-7)
+        np.testing.assert_allclose(evaluated_vertices(head), posed(scene, weights), atol=1e-5)
+        found = sample_pose(head, model)
+        np.testing.assert_allclose(
+            flame_forward(model, scene.own.shape, found), posed(scene, weights), atol=1e-5
+        )
+    bone = rig_of(head).pose.bones["jaw"]
+    keys.key_blocks["jawOpen"].value = 0.5
+    bone.rotation_quaternion = Euler((0.1, 0, 0)).to_quaternion()
+    bpy.context.view_layer.update()
+    assert sample_pose(head, model).jaw_pose[0] == pytest.approx(
+        0.1 + 0.5 * scene.map.jaw[COLUMN["jawOpen"], 0], abs=1e-5
+    )
+
+
+def test_a_performance_on_sliders(scene):
+    """Catches keyframes of a performance that add up with the head's own expression, that stay when
+    another motion is applied, and a neck that does not turn."""
     bpy.ops.stga.add_arkit_controls()
+    keys = the_head().data.shape_keys.key_blocks
     for start, place in ((10, "action"), (20, "strip")):
-        assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=start, place=place) == {
-            "FINISHED"
-        }
-        np.testing.assert_allclose(at(start + 3), expected(scene, 3, True), atol=2 * TOLERANCE_M)
+        options = {"start": start, "place": place, "sliders": True}
+        assert bpy.ops.stga.apply_motion(filepath=str(scene.take), **options) == {"FINISHED"}
+        bpy.context.scene.frame_set(start + 3)
+        for name in ("jawOpen", "mouthFunnel", "browInnerUp"):
+            assert keys[name].value == pytest.approx(scene.weights[3, COLUMN[name]], abs=1e-5)
+        assert not any(abs(keys[f"expr_{k:03d}"].value) > 1e-6 for k in range(10))
+        turned = flame_forward(
+            scene.own.model, scene.own.shape, sample_pose(the_head(), scene.own.model)
+        )
+        np.testing.assert_allclose(turned, expected(scene, 3, True), atol=1e-5)
+    assert bpy.ops.stga.apply_motion(filepath=str(scene.take), start=10) == {"FINISHED"}
+    np.testing.assert_allclose(at(13), expected(scene, 3, True), atol=TOLERANCE_M)
 
 
 def test_curves_come_back_from_an_action(scene, tmp_path):

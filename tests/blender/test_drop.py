@@ -51,17 +51,18 @@ def test_drops_are_accepted_by_the_viewport_only():
         assert not poll(SimpleNamespace(area=None))
 
 
-def test_transforms_file_stands_for_its_capture(tmp_path):
-    """Catches a drop that imports nothing, and one that takes any JSON file for a capture."""
+def test_a_file_stands_for_its_capture(tmp_path):
+    """Catches a file browser that opens a capture by one of its files only, or by the name of the
+    .blend file that Blender proposes, and one that takes any file for a capture."""
     folder = write_mesh_capture(tmp_path / "capture")
-    for name in ("notes.json", "regions.json"):
-        (folder / name).write_text("{}")
-        with pytest.raises(RuntimeError, match=rf"{name}: is not a transforms file; choose"):
-            bpy.ops.stga.import_capture(filepath=str(folder / name))
-    assert bpy.ops.stga.import_capture(filepath=str(folder / "transforms_train.json")) == {
-        "FINISHED"
-    }
-    assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
+    image = next(folder.rglob("*.png"))
+    for given in (folder / "transforms_train.json", image, folder / "demo.blend"):
+        bpy.ops.wm.read_homefile(use_empty=True)
+        assert bpy.ops.stga.import_capture(filepath=str(given)) == {"FINISHED"}
+        assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
+    (tmp_path / "notes.json").write_text("{}")
+    with pytest.raises(RuntimeError, match=r"notes.json: is in no capture; choose"):
+        bpy.ops.stga.import_capture(filepath=str(tmp_path / "notes.json"))
 
 
 def test_avatar_is_shown(head, tmp_path):

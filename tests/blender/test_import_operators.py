@@ -60,7 +60,8 @@ def ball_avatar(path: Path) -> Path:
 
 def state_of_file() -> dict[str, list[str]]:
     kinds = (
-        "objects", "meshes", "actions", "armatures", "collections", "node_groups", "materials", "cameras", "images",
+        "objects", "meshes", "actions", "armatures", "collections", "node_groups", "materials",
+        "cameras", "images",
     )  # fmt: skip
     return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds}
 

@@ -37,11 +37,11 @@ from .captures import closure  # noqa: E402
 pytestmark = pytest.mark.usefixtures("extension")
 
 OPERATORS = (
-    "track_footage", "view_footage", "mark_key", "solve_again", "export_head_model", "open_demo", "import_capture",
-    "import_motion", "import_meshes", "select", "toggle_region", "count_selected", "heat_map", "analyze_capture",
-    "avatar_from_video", "train", "refine", "extend", "cancel", "dismiss", "copy_report", "test_python",
-    "show_avatar", "apply_motion", "standard_view", "preview_images", "render_video", "import_ply",
-    "export_avatar", "export_cameras", "open_npz",
+    "track_footage", "view_footage", "mark_key", "solve_again", "export_head_model", "open_demo",
+    "import_capture", "import_motion", "import_meshes", "select", "toggle_region", "count_selected",
+    "heat_map", "analyze_capture", "avatar_from_video", "train", "refine", "extend", "cancel",
+    "dismiss", "copy_report", "test_python", "show_avatar", "apply_motion", "standard_view",
+    "preview_images", "render_video", "import_ply", "export_avatar", "export_cameras", "open_npz",
 )  # fmt: skip
 
 
@@ -143,7 +143,8 @@ def test_options_are_those_of_the_request(extension):
         assert (shown[name].hard_min, shown[name].default) == (least, field.default or 0), name
         assert "default" not in shown[name].description
     assert shown["stop"].description == "Timestep to stop before; 0: all"
-    assert {item.identifier for item in bpy.ops.stga.train.get_rna_type().properties["strategy"].enum_items} == {
+    strategy = bpy.ops.stga.train.get_rna_type().properties["strategy"]
+    assert {item.identifier for item in strategy.enum_items} == {
         "global", "selective", "gaussian-avatars",
     }  # fmt: skip
     given = SimpleNamespace(

@@ -28,6 +28,9 @@ class Layout:
         self.texts.append(text or name)
         return SimpleNamespace()
 
+    def operator_menu_enum(self, name, prop, text=""):
+        self.texts.append(text)
+
     def label(self, text="", **_):
         self.texts.append(text)
 
@@ -97,6 +100,7 @@ def draw(extension, name: str = "") -> list[str]:
             region_3d=SimpleNamespace(view_perspective="PERSP"),
         ),
         view_layer=bpy.context.view_layer,
+        window_manager=bpy.context.window_manager,
         screen=SimpleNamespace(is_animation_playing=False),
     )
     layout = Layout()

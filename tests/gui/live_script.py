@@ -33,10 +33,14 @@ def packet(number: int, t: float) -> bytes:
     """A face that speaks, smiles, blinks and turns, after t seconds."""
     wave = lambda hertz, phase=0.0: 0.5 - 0.5 * np.cos(2 * np.pi * (hertz * t + phase))  # noqa: E731
     values = {
-        "jawOpen": 0.7 * wave(1.1) * wave(0.23), "mouthSmileLeft": wave(0.35), "mouthSmileRight": wave(0.35),
-        "browInnerUp": wave(0.35, 0.3), "mouthPucker": 0.8 * wave(0.35, 0.5) * wave(0.7),
-        "eyeBlinkLeft": float((t % 2.5) < 0.2), "eyeBlinkRight": float((t % 2.5) < 0.2),
-    }  # fmt: skip
+        "jawOpen": 0.7 * wave(1.1) * wave(0.23),
+        "mouthSmileLeft": wave(0.35),
+        "mouthSmileRight": wave(0.35),
+        "browInnerUp": wave(0.35, 0.3),
+        "mouthPucker": 0.8 * wave(0.35, 0.5) * wave(0.7),
+        "eyeBlinkLeft": float((t % 2.5) < 0.2),
+        "eyeBlinkRight": float((t % 2.5) < 0.2),
+    }
     head = (
         0.35 * np.sin(2 * np.pi * 0.2 * t),
         0.12 * np.sin(2 * np.pi * 0.31 * t),

@@ -41,7 +41,10 @@ BEHIND = linear_to_srgb(np.array([0.2, 0.3, 0.4]))
 BLACK = np.zeros(3)
 
 
-PROBE = "import bpy, gpu, os; print('BACKEND', gpu.platform.backend_type_get(), flush=True); os._exit(0)"
+PROBE = (
+    "import bpy, gpu, os; print('BACKEND', gpu.platform.backend_type_get(), flush=True); "
+    "os._exit(0)"
+)
 
 
 def has_vulkan() -> bool:

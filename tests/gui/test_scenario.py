@@ -74,7 +74,8 @@ def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
     for name, times in seen["held up ms"].items():
         wall, cpu = (max(column) for column in zip(*times, strict=True)) if times else (0, 0)
         print(
-            f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms of processor time"
+            f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms "
+            f"of processor time"
         )
     return seen
 

@@ -1,0 +1,176 @@
+"""What a newcomer meets in the first hour: messages that can be read, a .blend file that knows its
+run, names of sliders."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from capture.factory import write_mesh_capture  # noqa: E402
+from light.scenes import lit_avatar  # noqa: E402
+
+from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
+from stga_addon.scene.compat import enable_nodes  # noqa: E402
+from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
+from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+from stga_addon.training.effect_catalog import EFFECTS  # noqa: E402
+
+from .test_operators import write_ball_avatar  # noqa: E402
+from .test_panel import draw  # noqa: E402
+
+LACKS = (
+    "/opt/blender/5.2/python/bin/python3.13 (Python 3.13.2) lacks torch, numba, scipy, pillow. "
+    "Install the complete "
+    "edition of the add-on, or choose a Python that has them in its preferences or by STGA_PYTHON"
+)
+BUTTONS = {
+    LACKS: "Choose a Python in Preferences",
+    "run folder: //run is relative to the .blend file, which has not been saved yet": "Save the "
+    "File",
+    "/captures/anna: was tracked with FLAME and needs a FLAME model": "Choose It",
+}
+
+
+@pytest.fixture
+def head(extension, tmp_path):
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    return bpy.context.scene.stga.head
+
+
+@pytest.mark.parametrize("sentence", BUTTONS)
+def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
+    """Catches a remedy in the part that popup and status bar cut off, and an error that stays when
+    the next click succeeds."""
+    monkeypatch.setattr(extension.ui.train_panel, "has_training_python", lambda context: False)
+    common, reports = extension.operators.common, []
+
+    def fail(self, context):
+        raise extension.stga_addon.errors.StgaError(sentence)
+
+    class Operator:
+        def report(self, kind, text):
+            reports.append((kind, text))
+
+    assert common.reporting(fail)(Operator(), bpy.context) == {"CANCELLED"}
+    assert reports == [({"ERROR"}, sentence)], "without a window there is no panel"
+    brief = common.short_sentence(sentence)
+    assert len(brief) <= 90
+    assert "/" not in brief.replace("//", "")
+    texts = draw(extension, "next_step")
+    assert sentence in texts
+    assert BUTTONS[sentence] in texts
+    assert common.reporting(lambda self, context: {"FINISHED"})(Operator(), bpy.context)
+    assert sentence not in draw(extension, "next_step")
+
+
+def test_the_file_knows_its_run(extension, head, tmp_path):
+    """Catches Resume and Show Residuals that look into an empty folder: after an avatar was shown,
+    after the file was moved along with its run, and after it was saved elsewhere."""
+    settings, folder = bpy.context.scene.stga, tmp_path / "work"
+    (folder / "run").mkdir(parents=True)
+    (folder / "run/run.json").write_text("{}")
+    write_ball_avatar(folder / "run/avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(folder / "run/avatar.npz"))
+    assert settings.run_folder == str(folder / "run")
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
+    assert (settings.run_folder, settings.avatar) == ("//run", "//run/avatar.npz")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "copy.blend"), copy=True)
+    assert settings.run_folder == "//run"
+    shutil.move(folder, tmp_path / "moved")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "moved/head.blend"))
+    settings = bpy.context.scene.stga
+    assert Path(bpy.path.abspath(settings.run_folder)) == tmp_path / "moved/run"
+    (tmp_path / "elsewhere").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "elsewhere/head.blend"))
+    assert settings.run_folder == str(tmp_path / "moved/run")
+
+
+def test_a_file_made_without_the_panel_knows_its_run(extension, head, tmp_path):
+    """Catches demo.blend, whose panel proposes a folder without a run."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/run.json").write_text("{}")
+    write_ball_avatar(tmp_path / "run/avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "run/avatar.npz"))
+    settings = bpy.context.scene.stga
+    settings.splats[tags.AVATAR] = "//run/avatar.npz"
+    for name in ("head", "splats", "avatar", "run_folder"):
+        settings.property_unset(name)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "demo.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
+    assert bpy.context.scene.stga.run_folder == "//run"
+
+
+def test_effects_are_a_line_each(extension, head):
+    """Catches paragraphs of figures where a name, a state and a price were asked for, and figures
+    that cannot be found."""
+    settings = bpy.context.scene.stga
+    for name in EFFECTS:
+        row = settings.effects.add()
+        row.name, row.reason, row.cost = name, f"{name} is 13.2 mm", f"{name} takes 3 coefficients"
+    texts = draw(extension, "effects")
+    assert texts[1:] == [text for each in EFFECTS.values() for text in (each.title, each.price)]
+    assert all(len(each.title) <= 20 for each in EFFECTS.values())
+    assert {each.price for each in EFFECTS.values()} == {"free", "slower", "larger"}
+    settings.effects["jaw"].is_open = True
+    details = {"jaw: jaw is 13.2 mm", "Cost: jaw takes 3 coefficients"}
+    assert details <= set(draw(extension, "effects"))
+
+
+def test_the_chosen_row_is_that_of_the_frame(head):
+    """Catches a highlight that stays on the first row when another row, or the timeline, is
+    clicked."""
+    bpy.ops.stga.select(threshold=0.0005)
+    scene = bpy.context.scene
+    for row, frame in enumerate(settings_row.frame for settings_row in scene.stga.selected_frames):
+        scene.stga.selected_row = row
+        assert scene.frame_current == frame
+    scene.frame_set(scene.stga.selected_frames[0].frame)
+    assert scene.stga.selected_row == 0
+    scene.frame_set(999)
+    assert scene.stga.selected_row == -1
+
+
+def test_a_display_is_chosen_with_a_shading_that_shows_it(extension, head, tmp_path):
+    """Catches gray splats in Solid mode after another display was chosen."""
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    shading = area.spaces.active.shading
+    shading.type = "SOLID"
+    with bpy.context.temp_override(window=window, area=area):
+        bpy.ops.stga.choose_display(display=POINTS)
+    assert (display_mode(bpy.context.scene.stga.splats), shading.type) == (POINTS, "MATERIAL")
+
+
+def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
+    """Catches an avatar that the start-up world washes out, and an exposure that a click takes
+    back."""
+    avatar, scene = lit_avatar(), bpy.context.scene
+    mesh = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
+    scene.collection.objects.link(mesh)
+    bpy.context.view_layer.update()
+    scene.stga.splats = show_avatar(avatar, mesh)
+    scene.world = bpy.data.worlds.new("world")
+    enable_nodes(scene.world).nodes["Background"].inputs["Strength"].default_value = 40.0
+    lighting = scene.stga_lighting
+    lighting.mode = "scene"
+    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    eye, relit = np.array((0.0, 0.0, 1.0)), layer.relit
+    recorded = replace(relit.lighting, mode="recorded")
+    means = [
+        relit.relighter.radiance(relit.mesh, eye, each).mean()
+        for each in (relit.lighting, recorded)
+    ]
+    assert lighting.exposure < -1
+    assert means[0] == pytest.approx(means[1], rel=0.05)
+    lighting.exposure = 1.5
+    lighting.mode = "recorded"
+    lighting.mode = "scene"
+    assert lighting.exposure == 1.5
