@@ -159,6 +159,7 @@ def test_options_are_those_of_the_request(extension):
 SET_BY_PANEL = {
     "track_footage": {
         "footage",
+        "avatar",
         "model",
         "avatar",
         "directory",

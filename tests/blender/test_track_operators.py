@@ -163,7 +163,7 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
     perform_in_folder(out / "job")
     monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    assert extension.operators.monitor.tick() is None
+    extension.operators.monitor.tick()
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert bpy.context.scene.stga.tracking_shown
 
