@@ -159,7 +159,6 @@ def test_options_are_those_of_the_request(extension):
 SET_BY_PANEL = {
     "track_footage": {
         "footage",
-        "avatar",
         "model",
         "avatar",
         "directory",
