@@ -14,7 +14,16 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.rig.arkit import add_shapes, has_shapes, head_shapes
 from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES
 from . import ids, monitor
-from .common import capture_source, flame_of, head_of, needs_rig, reporting, rig_or_none
+from .common import (
+    capture_source,
+    flame_of,
+    head_of,
+    needs_rig,
+    polled,
+    reporting,
+    rig_or_none,
+    scene_settings,
+)
 
 POLL_INTERVAL_S = 0.3
 Shapes = tuple[HeadMap, np.ndarray, np.ndarray]
@@ -27,7 +36,10 @@ class AddArkitControls(bpy.types.Operator):
     bl_label = "Add Face Sliders"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    poll = classmethod(needs_rig)
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        has_names = EXPRESSION_NAMES in (scene_settings(context).head or {})
+        return needs_rig(cls, context) and polled(cls, not has_names, "The head has its sliders")
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -192,6 +192,7 @@ def select() -> Iterator[Callable[[], bool]]:
 
 def press() -> Iterator[Callable[[], bool]]:
     """Call every operator that can be called here as its button does, and undo it."""
+    bpy.ops.wm.open_mainfile(filepath=str(FOLDER / "first.blend"))
     seen["pressed"], seen["messages"] = [], {}
     names = {name for name in vars(ids).values() if str(name).startswith("stga.")}
     for name in sorted(names - {f"stga.{each}" for each in WORKERS}):
@@ -259,8 +260,7 @@ def choose_file() -> Iterator[Callable[[], bool]]:
 def steps() -> Iterator[Callable[[], bool]]:
     clock = Clock()
     for step in (
-        install, open_demo, misunderstand, train, pose, turntable, page, display, select, press,
-        reopen, choose_file,
+        install, open_demo, misunderstand, train, pose, turntable, page, display, select, reopen, press, choose_file,
     ):  # fmt: skip
         yield from step()
     clock.note("all_s")
