@@ -260,7 +260,8 @@ def choose_file() -> Iterator[Callable[[], bool]]:
 def steps() -> Iterator[Callable[[], bool]]:
     clock = Clock()
     for step in (
-        install, open_demo, misunderstand, train, pose, turntable, page, display, select, reopen, press, choose_file,
+        install, open_demo, misunderstand, train, pose, turntable, page, display, select,
+        reopen, press, choose_file,
     ):  # fmt: skip
         yield from step()
     clock.note("all_s")
