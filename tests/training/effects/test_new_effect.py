@@ -43,7 +43,9 @@ def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
     monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, 2, growth, 1.0))
     monkeypatch.setitem(
-        EFFECTS, "toy-growth", Effect("toy-growth", "6 numbers", offset=NAME, added_later=True)
+        EFFECTS,
+        "toy-growth",
+        Effect("toy-growth", "Head grows", "larger", "6 numbers", offset=NAME, added_later=True),
     )
     monkeypatch.setitem(
         RULES, "toy-growth", lambda facts: Verdict(facts.timesteps > 1, "the head grows")
