@@ -94,9 +94,10 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
 
 
 def _colors(model: FlameModel) -> np.ndarray:
-    """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones."""
+    """(V, 3) of the pictures: a detector needs irises to tell open eyes from closed ones, of models
+    whose eyes are closed in some."""
     colors = np.tile(SKIN_RGB, (len(model.v_template), 1))
-    for joint in EYE_JOINTS:
+    for joint in EYE_JOINTS if BLINKS[0] in model.expression_names else ():
         eyeball = np.flatnonzero(model.weights[:, joint] > EYEBALL_WEIGHT)
         at = model.v_template[eyeball]
         if len(at):
