@@ -71,30 +71,16 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             draw_text(layout, context, "Of worlds, colors and environment textures count", "ERROR")
 
 
-EXPOSURE_TRIES, EXPOSURE_INTERVAL_S = 5, 0.5
-
-
-def _begin_exposure(scene: Any, tries: int = EXPOSURE_TRIES) -> None:
-    """Light avatars as brightly as they were recorded, until an exposure is chosen; splats that
-    are not lit yet, as of an avatar that has just been trained, a little later."""
+def _begin_exposure(scene: Any) -> None:
+    """Light avatars as brightly as they were recorded, until an exposure is chosen."""
     settings = lighting_settings(scene)
-    if settings.mode == "recorded" or settings.is_property_set("exposure"):
-        return
-    if bpy.context.window is not None:
-        bpy.context.window.cursor_set("WAIT")  # until the mouse moves
-    exposure = None
-    with suppress(StgaError):  # the display says what is wrong
-        exposure = level_exposure(viewport_display.display.cache)
-    if exposure is not None:
-        settings.exposure = exposure
-    elif tries and not bpy.app.background:
-        again = partial(_begin_exposure_by_name, scene.name, tries - 1)
-        bpy.app.timers.register(again, first_interval=EXPOSURE_INTERVAL_S)
-
-
-def _begin_exposure_by_name(name: str, tries: int) -> None:
-    if name in bpy.data.scenes:
-        _begin_exposure(bpy.data.scenes[name], tries)
+    if settings.mode != "recorded" and not settings.is_property_set("exposure"):
+        if bpy.context.window is not None:
+            bpy.context.window.cursor_set("WAIT")  # until the mouse moves
+        with suppress(StgaError):  # the display says what is wrong
+            exposure = level_exposure(viewport_display.display.cache)
+            if exposure is not None:
+                settings.exposure = exposure
 
 
 @persistent

@@ -79,7 +79,7 @@ def blender(command: list[str], home: Path, *arguments: object, background: bool
     kept = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(("PYTHON", "BLENDER", "STGA"))
+        if not name.startswith(("PYTHON", "BLENDER", "STGA", "NUMBA"))
     }
     full = [*offline(), *command, *(["--background"] if background else []), *map(str, arguments)]
     done = subprocess.run(
