@@ -93,6 +93,12 @@ def blender(command: list[str], home: Path, *arguments: object, background: bool
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
+def install(command: list[str], home: Path, archive: Path) -> None:
+    """Install the zip of an edition, and enable it."""
+    extension = ("--command", "extension", "install-file", "--repo", "user_default", "--enable")
+    blender(command, home, *extension, archive)
+
+
 def files_of(home: Path) -> set[str]:
     """All files in a home folder but those that Blender itself writes: its settings, caches and
     lists."""
@@ -130,17 +136,7 @@ def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         new = complete_zip(command, folder / name_of(command), demo)
         blender(command, home, "--command", "extension", "validate", new)
         old = with_version(new, OLD_VERSION, folder / "old.zip")
-        blender(
-            command,
-            home,
-            "--command",
-            "extension",
-            "install-file",
-            "--repo",
-            "user_default",
-            "--enable",
-            old,
-        )
+        install(command, home, old)
         old.unlink()  # gigabytes
     return home
 
@@ -178,17 +174,7 @@ def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
     while not (run / "job/preview.npz").exists() and inspect_worker(run / "job").state.is_alive:
         time.sleep(0.2)
     new = next((home.parent / name_of(command)).glob("*.zip"))
-    blender(
-        command,
-        home,
-        "--command",
-        "extension",
-        "install-file",
-        "--repo",
-        "user_default",
-        "--enable",
-        new,
-    )
+    install(command, home, new)
     assert inspect_worker(run / "job").state.is_alive, "the training ended before the update"
     manifest = next(
         home.glob(f".config/blender/{short(seen['version'])}/extensions/user_default/stga/*.toml")

@@ -10,7 +10,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from blender.test_real_blender import blender, complete_zip
+from blender.test_real_blender import blender, complete_zip, install
 
 from stga_addon.development.demo.capture import unpack_capture
 
@@ -29,17 +29,7 @@ def test_the_first_hour(tmp_path: Path) -> None:
     home.mkdir()
     pictures = Path(os.environ.get("STGA_GUI_FOLDER", tmp_path))
     pictures.mkdir(exist_ok=True)
-    blender(
-        BLENDER,
-        home,
-        "--command",
-        "extension",
-        "install-file",
-        "--repo",
-        "user_default",
-        "--enable",
-        archive,
-    )
+    install(BLENDER, home, archive)
     blender(BLENDER, home, "--python", SCRIPT, "--", pictures, background=False)
     seen = json.loads((pictures / "result.json").read_text())
     print(seen)

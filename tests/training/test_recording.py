@@ -11,11 +11,12 @@ from PIL import Image
 from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
+from stga_addon.tracking.folder import TorsoPoints, read_torso_points, write_torso_points
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
     AVATAR_MISFIT,
     avatar_person,
-    scaled_capture,
+    scale_capture,
     track_recording,
 )
 from stga_addon.worker.helpers import Helpers
@@ -47,7 +48,8 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
         darker = np.where(mask[..., None] > 0, image * GAIN + OFFSET, image)
         Image.fromarray(darker.astype(np.uint8)).save(path)
     write_json(root / "tracking.json", {"image_misfit": {}, "meters_per_unit": 1.0})
-    scaled_capture(root, root / "model.npz", SCALE)
+    scale_capture(root, root / "model.npz", SCALE)
+    write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
     return run, root
 
 
@@ -65,6 +67,9 @@ def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
     ]
     assert sizes[1] / sizes[0] == pytest.approx(1 / SCALE, abs=0.004)
     assert read_json(root / "tracking.json")["meters_per_unit"] == pytest.approx(1, abs=0.004)
+    torso = read_torso_points(root)
+    assert torso is not None
+    np.testing.assert_allclose(torso.at, 1, atol=0.004)
     away = millimeters(open_capture(root, root / "model.npz"), lost[1])
     tracked = millimeters(*lost)
     assert np.median(away[:-1] / tracked[:-1]) < 0.4

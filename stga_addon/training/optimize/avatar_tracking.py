@@ -249,9 +249,9 @@ class _Tracker:
         self._backend = CpuBackend(settings, self._frames, state)
 
     def solve(self, timestep: int) -> tuple[np.ndarray, float, float, float]:
-        """Parameters (E + 18,), what was minimized before and after, and the misfit; as tracked
-        where no view shows it."""
-
+        """Parameters (E + 18,) with the torso's shift, and the scale where it is sought, after the
+        expressions; what was minimized before and after; and the misfit. As tracked where no view
+        shows the timestep."""
         frame = self._sequence.frame(timestep).parameters
         tracked = np.insert(frame, len(frame) - RIGID_SIZE, np.zeros(self._added))
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
@@ -268,11 +268,11 @@ class _Tracker:
         energies: list[float] = []
         for height in heights:
             shots = [self._read(view, height) for view in views]
-            found, *energies = self._descended(timestep, shots, tracked, found, renderings)
+            found, *energies = self._minimize(timestep, shots, tracked, found, renderings)
         self._change = found - tracked
         return found, energies[0], energies[1], self._misfit(found, shots)
 
-    def _descended(
+    def _minimize(
         self,
         timestep: int,
         shots: Sequence[tuple[View, np.ndarray]],

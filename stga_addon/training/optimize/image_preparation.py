@@ -40,7 +40,7 @@ EXPOSURE_PRIOR, EXPOSURE_SCALE, EXPOSURE_ITERATIONS = 1e-3, 0.08, 4
 and the difference in 0…1 beyond which pixels are outliers."""
 
 
-def fitted_exposure(
+def fit_exposure(
     drawn: np.ndarray,
     seen: np.ndarray,
     usual: np.ndarray | None = None,

@@ -15,19 +15,20 @@ from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
 from ...flame.forward import joint_positions, shaped_vertices
-from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
+from ...flame.sequence import torso_offset, torso_shapes, with_identity
 from ...render.render import render_avatar
 from ...tracking.fit import HeadFit
-from ...tracking.folder import REPORT_FILE, SPLIT_FILES
+from ...tracking.folder import (
+    REPORT_FILE,
+    SPLIT_FILES,
+    read_torso_points,
+    write_torso_points,
+)
 from ...tracking.head_model import HeadModel
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
-from ..optimize.avatar_tracking import (
-    ROOT,
-    AvatarTracking,
-    track_by_avatar,
-)
-from ..optimize.image_preparation import fitted_exposure
+from ..optimize.avatar_tracking import ROOT, AvatarTracking, track_by_avatar
+from ..optimize.image_preparation import fit_exposure
 from ..settings import TrainingSettings
 from .folder import AVATAR, open_refined, read_run
 
@@ -49,7 +50,9 @@ def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
     """The head of a run's avatar as `tracking.track` takes a person, and the file of its FLAME
     model, None of the bundled head. Raises StgaError where its capture was not tracked with
     either."""
-    sequence, flame = _sequence(run), read_run(run).flame
+    sequence = open_refined(run).flame
+    if sequence is None:
+        raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
     fit = HeadFit(
         HeadModel(with_identity(sequence).model, "flame"),
         sequence.shape,
@@ -57,7 +60,7 @@ def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
         Similarity(1.0, np.eye(3), np.zeros(3)),
         sequence.static_offset,
     )
-    return fit, flame
+    return fit, read_run(run).flame
 
 
 def track_recording(
@@ -72,7 +75,7 @@ def track_recording(
     timesteps = open_capture(root, read_run(run).flame).timesteps
     report(0, len(timesteps))
     factor = _fit_scale(run, root, helpers, lambda: report(0, len(timesteps)))
-    avatar, settings, capture = _opened(run, root, factor)
+    avatar, settings, capture = _open(run, root, factor)
     assert capture.flame is not None
     rows = _exposure(avatar, settings, capture)
     parts = [
@@ -80,7 +83,7 @@ def track_recording(
         for first in range(0, len(timesteps), PART_TIMESTEPS)
     ]
     found = helpers.map(
-        _tracked_part, parts, lambda done: report(min(done, len(timesteps)), len(timesteps)), True
+        _track_part, parts, lambda done: report(min(done, len(timesteps)), len(timesteps)), True
     )
     columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     tracked = AvatarTracking(timesteps, **columns)
@@ -99,7 +102,7 @@ def track_recording(
     return tracked
 
 
-def _tracked_part(
+def _track_part(
     run: Path,
     root: Path,
     factor: float,
@@ -108,7 +111,7 @@ def _tracked_part(
     scales: bool,
     step: Step,
 ) -> dict[str, np.ndarray]:
-    avatar, settings, capture = _opened(run, root, factor)
+    avatar, settings, capture = _open(run, root, factor)
     settings = replace(settings, exposure=tuple(map(tuple, exposure)))
 
     def report(done: int, total: int) -> bool:
@@ -125,20 +128,20 @@ def _tracked_part(
 def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], None]) -> float:
     """Scale the capture's world such that the head is as large as the avatar's; landmarks alone are
     off by some percent. One camera does not see scale. Returns the factor."""
-    avatar, settings, capture = _opened(run, root, 1.0)
+    avatar, settings, capture = _open(run, root, 1.0)
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     if len(cameras) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     rows = _exposure(avatar, settings, capture)
     parts = [(run, root, 1.0, rows, [timestep], True) for timestep in chosen]
-    found = helpers.map(_tracked_part, parts, lambda done: report(), True)
+    found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
-    scaled_capture(root, read_run(run).flame, factor)
+    scale_capture(root, read_run(run).flame, factor)
     return factor
 
 
-def scaled_capture(root: Path, flame: Path | None, factor: float) -> None:
+def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
     """Scale a tracked capture's world about its origin; the heads keep their size."""
     capture = open_capture(root, flame)
     assert capture.flame is not None
@@ -156,6 +159,9 @@ def scaled_capture(root: Path, flame: Path | None, factor: float) -> None:
         moved = arrays["translation"] + (factor - 1) * (joints[ROOT] + frame.translation)
         arrays["translation"] = moved.astype(np.float32)
         write_npz(root / PARAMETERS / f"{timestep:05d}.npz", arrays)
+    torso = read_torso_points(root)
+    if torso is not None:
+        write_torso_points(root, replace(torso, at=factor * torso.at))
     stored = read_json(root / REPORT_FILE)
     write_json(
         root / REPORT_FILE, {**stored, "meters_per_unit": factor * stored["meters_per_unit"]}
@@ -163,18 +169,11 @@ def scaled_capture(root: Path, flame: Path | None, factor: float) -> None:
 
 
 @lru_cache(1)
-def _opened(run: Path, root: Path, factor: float) -> tuple[Avatar, TrainingSettings, Capture]:
+def _open(run: Path, root: Path, factor: float) -> tuple[Avatar, TrainingSettings, Capture]:
     """Of the capture once it was scaled by the factor."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     return read_avatar(run / AVATAR), stored.settings, capture
-
-
-def _sequence(run: Path) -> FlameSequence:
-    capture = open_refined(run)
-    if capture.flame is None:
-        raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
-    return capture.flame
 
 
 def _exposure(
@@ -187,17 +186,17 @@ def _exposure(
     rows = []
     for camera, views in by_camera.items():
         chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
-        pixels = [_compared(avatar, settings, capture, view) for view in chosen]
+        pixels = [_head_colors(avatar, settings, capture, view) for view in chosen]
         both = [np.concatenate(side, axis=1) for side in zip(*pixels, strict=True)]
-        usual = fitted_exposure(both[0], both[1])
+        usual = fit_exposure(both[0], both[1])
         for view, (drawn, seen) in zip(chosen, pixels, strict=True):
-            own = fitted_exposure(drawn, seen, usual, CAMERA_WEIGHT)
+            own = fit_exposure(drawn, seen, usual, CAMERA_WEIGHT)
             scaled = own * np.array([[1.0], [255.0]])
             rows.append((float(camera), *scaled.ravel().tolist(), float(view.timestep)))
     return tuple(rows)
 
 
-def _compared(
+def _head_colors(
     avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colors (3, N) in 0…1 of the avatar and of the image, on the head."""
