@@ -1,5 +1,6 @@
 """Conversion between motions of FLAME heads and performances in ARKit's 52 blend shapes."""
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,24 +9,33 @@ import numpy as np
 from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..driving.head_map import person_of
-from ..driving.inverse import captured_performance, write_performance
-from ..driving.open_motion import MotionOptions, adapted, performed, prepared_performance
+from ..driving.inverse import captured_performance, head_angles, write_performance
+from ..driving.open_motion import Motion, MotionOptions, adapted, performed, prepared_performance
 from ..driving.performance import Performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
-from ..files import write_npz
+from ..files import read_json, write_npz
 from ..flame.model import EXPRESSION_NAMES
-from ..flame.sequence import FRAME_FIELDS, FlameSequence
+from ..flame.quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
+from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
 from ..flame.teeth import flame_model
 from ..options import like, option
 from ..progress import Progress, Report, Say
+from ..tracking.folder import AVATAR_MISFIT, REPORT_FILE, is_written
 from ..tracking.footage.sources import is_video
+from ..training.run.folder import open_refined, read_run
 from .avatar_source import findings, motion_options_field
 from .results import Written
+from .track import MAX_MISFIT, Track, track
 from .train import Train
 
 SHAPES_SUFFIX = ".csv"
+TRACKING_SUFFIX, CHECK_SUFFIX = ".tracking", ".check"
+"""Of the folders beside the result, in which an avatar tracks, and in which it does a few
+timesteps first."""
+CHECKED_TIMESTEPS = 8
+"""Spread over the footage, which show whether the avatar is the performer's."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +43,8 @@ class ConvertMotion:
     """Convert a face performance (ARKit's 52 shapes) to a FLAME motion, or the other way."""
 
     source: Path = option(
-        "a performance (CSV, JSON, text, take folder), a video of a face, FLAME parameters (.npz), "
-        "or a capture tracked with FLAME", flag="MOTION",
+        "a performance (CSV, JSON, text, take folder), a video of a face (with --avatar: footage), "
+        "FLAME parameters (.npz), or a capture tracked with FLAME", flag="MOTION",
     )  # fmt: skip
     output: Path = option(
         "ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE"
@@ -43,6 +53,10 @@ class ConvertMotion:
     head: Path | None = option(
         "capture whose identity a performance moves (default: average)", None, metavar="CAPTURE"
     )
+    avatar: Path | None = option(
+        "run of the performer's avatar: it tracks footage more exactly than the face networks, "
+        "which do where the footage shows somebody else", None, metavar="RUN",
+    )  # fmt: skip
     fps: float | None = option("of the result (default: as recorded)", None, above=0)
     options: MotionOptions = motion_options_field()
 
@@ -61,8 +75,12 @@ class ConvertMotion:
 def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     """Write the motion or the performance. Raises StgaError."""
     report(Progress(stage="Converting"))
-    options = request.options
-    if is_video(request.source):
+    options, tracked = request.options, None
+    if request.avatar is not None:
+        tracked = _tracked_by_avatar(request, request.avatar, report, say)
+    if tracked is not None:
+        performance = _performance_of_head(tracked)
+    elif is_video(request.source):
         from ..driving.face_video import watched_performance
 
         performance = watched_performance(request.source, report)
@@ -71,19 +89,75 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     else:
         performance = _shapes_of_motion(request)
         options = replace(options, neutral="none")  # which the parameters were put on already
+    lines: tuple[str, ...] = ()
     if request.writes_shapes:
         write_performance(request.output, prepared_performance(performance, options, request.fps))
-        return Written(request.output)
-    if request.head is None:
-        model = flame_model(request.flame)
-        person = person_of(model, model.v_template)
     else:
-        person = _flame_motion(open_capture(request.head, request.flame), "identity")
-    motion = performed(performance, person, str(request.flame), options, fps=request.fps)
-    write_motion(request.output, motion.sequence)
-    count = len(motion.sequence.timesteps)
-    written = f"{request.output}: {count} timesteps at {motion.fps:g} frames per second"
-    return Written(request.output, (*findings(motion), written))
+        if tracked is not None and request.head is None:
+            motion = _resampled(tracked, request)
+        else:
+            person = _person(request)
+            motion = performed(performance, person, str(request.flame), options, fps=request.fps)
+        write_motion(request.output, motion.sequence)
+        count = len(motion.sequence.timesteps)
+        written = f"{request.output}: {count} timesteps at {motion.fps:g} frames per second"
+        lines = (*findings(motion), written)
+    for suffix in (TRACKING_SUFFIX, CHECK_SUFFIX):
+        shutil.rmtree(f"{request.output}{suffix}", ignore_errors=True)
+    return Written(request.output, lines)
+
+
+def _person(request: ConvertMotion) -> FlameSequence:
+    if request.head is not None:
+        return _flame_motion(open_capture(request.head, request.flame), "identity")
+    if request.avatar is not None:
+        return _flame_motion(open_refined(request.avatar), "identity")
+    model = flame_model(request.flame)
+    return person_of(model, model.v_template)
+
+
+def _tracked_by_avatar(
+    request: ConvertMotion, avatar: Path, report: Report, say: Say
+) -> Capture | None:
+    """The footage tracked by the avatar, in folders beside the result with which a cancelled
+    request goes on; None where some of its timesteps look like somebody else."""
+    from ..tracking.footage.open import open_footage
+
+    count, flame = len(open_footage(request.source).timesteps), read_run(avatar).flame
+    for suffix, step in ((CHECK_SUFFIX, max(1, count // CHECKED_TIMESTEPS)), (TRACKING_SUFFIX, 1)):
+        out = Path(f"{request.output}{suffix}")
+        if not is_written(out):
+            track(Track(request.source, None, out, avatar=avatar, step=step), report, say)
+        misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]
+        share = float(np.median(list(misfit.values())))
+        if share > MAX_MISFIT:
+            say(f"warning: the avatar does not explain {share:.0%} of the head's pixels: is it of "
+                "another person? The face networks detect the motion")  # fmt: skip
+            return None
+    say(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
+    return open_capture(out, flame)
+
+
+def _performance_of_head(tracked: Capture) -> Performance:
+    """ARKit's shapes of a tracked capture, with the head's turns from its first timestep on."""
+    sequence = _flame_motion(tracked, "parameters of expression and pose")
+    fps = playback_fps(tracked, numbered=True)
+    performance = captured_performance(sequence, str(tracked.root), fps)
+    poses = np.stack([sequence.frame(timestep).pose for timestep in sequence.timesteps])
+    root, neck = (to_matrices(from_axis_angle(poses[:, joint])) for joint in (0, 1))
+    turned = root @ neck
+    turns = to_axis_angle(from_matrices(turned @ turned[0].T))
+    return replace(performance, head=head_angles(turns))
+
+
+def _resampled(tracked: Capture, request: ConvertMotion) -> Motion:
+    """The parameters of a tracked capture, a timestep per 1/fps seconds, with the options."""
+    sequence = _flame_motion(tracked, "parameters of expression and pose")
+    rate = playback_fps(tracked, numbered=True)
+    fps = request.fps or rate
+    frames, _ = adapted(retimed(sequence, rate / fps), request.options)
+    known = dict(enumerate(frames))
+    return Motion(replace(sequence, timesteps=tuple(known), frame=known.__getitem__), fps)
 
 
 def _shapes_of_motion(request: ConvertMotion) -> Performance:

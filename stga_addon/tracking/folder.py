@@ -20,6 +20,9 @@ MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own":
 TORSO_KEY = "torso"
 """Of the report; null where the motion could not be told."""
 POINTS_FILE = "torso_points.npz"
+AVATAR_MISFIT = "avatar"
+"""Beside the regions of the face in the report's `image_misfit`: what the avatar that tracked does
+not explain."""
 
 
 def image_name(timestep: int, camera: int, suffix: str = ".png") -> str:

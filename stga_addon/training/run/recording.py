@@ -19,6 +19,7 @@ from ...flame.sequence import torso_offset, torso_shapes, with_identity
 from ...render.render import render_avatar
 from ...tracking.fit import HeadFit
 from ...tracking.folder import (
+    AVATAR_MISFIT,
     REPORT_FILE,
     SPLIT_FILES,
     read_torso_points,
@@ -42,8 +43,6 @@ SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
-AVATAR_MISFIT = "avatar"
-"""In a tracking's report, beside the regions of the face: what the avatar does not explain."""
 
 
 def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
@@ -75,11 +74,12 @@ def track_recording(
     timesteps = open_capture(root, read_run(run).flame).timesteps
     report(0, len(timesteps))
     factor = _fit_scale(run, root, helpers, lambda: report(0, len(timesteps)))
-    avatar, settings, capture = _open(run, root, factor)
+    of = run, (run / AVATAR).stat().st_mtime_ns, root, factor
+    avatar, settings, capture = _open(*of)
     assert capture.flame is not None
     rows = _exposure(avatar, settings, capture)
     parts = [
-        (run, root, factor, rows, timesteps[first : first + PART_TIMESTEPS], False)
+        (*of, rows, timesteps[first : first + PART_TIMESTEPS], False)
         for first in range(0, len(timesteps), PART_TIMESTEPS)
     ]
     found = helpers.map(
@@ -104,6 +104,7 @@ def track_recording(
 
 def _track_part(
     run: Path,
+    trained_ns: int,
     root: Path,
     factor: float,
     exposure: Sequence[Sequence[float]],
@@ -111,7 +112,7 @@ def _track_part(
     scales: bool,
     step: Step,
 ) -> dict[str, np.ndarray]:
-    avatar, settings, capture = _open(run, root, factor)
+    avatar, settings, capture = _open(run, trained_ns, root, factor)
     settings = replace(settings, exposure=tuple(map(tuple, exposure)))
 
     def report(done: int, total: int) -> bool:
@@ -128,13 +129,14 @@ def _track_part(
 def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], None]) -> float:
     """Scale the capture's world such that the head is as large as the avatar's; landmarks alone are
     off by some percent. One camera does not see scale. Returns the factor."""
-    avatar, settings, capture = _open(run, root, 1.0)
+    of = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0
+    avatar, settings, capture = _open(*of)
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     if len(cameras) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     rows = _exposure(avatar, settings, capture)
-    parts = [(run, root, 1.0, rows, [timestep], True) for timestep in chosen]
+    parts = [(*of, rows, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
     scale_capture(root, read_run(run).flame, factor)
@@ -169,8 +171,11 @@ def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
 
 
 @lru_cache(1)
-def _open(run: Path, root: Path, factor: float) -> tuple[Avatar, TrainingSettings, Capture]:
-    """Of the capture once it was scaled by the factor."""
+def _open(
+    run: Path, trained_ns: int, root: Path, factor: float
+) -> tuple[Avatar, TrainingSettings, Capture]:
+    """Of the capture once it was scaled by the factor; trained_ns: when the avatar's file was
+    written."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     return read_avatar(run / AVATAR), stored.settings, capture
