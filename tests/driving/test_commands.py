@@ -1,23 +1,34 @@
 """Performances on the command line: rendered, exported, and converted."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture
 from command_line import stga
 from flame.small_head import small_head, write_flame
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
+from stga_addon.export.playback import DEFAULT_FPS
+from stga_addon.files import write_json
 from stga_addon.flame.forward import flame_forward, neutral_frame
 from stga_addon.flame.sequence import read_motion, sequence_mesh
+from stga_addon.jobs.track import MAX_MISFIT
+from stga_addon.render.video import video_writer
+from stga_addon.tracking.folder import AVATAR_MISFIT, REPORT_FILE
+from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.settings import TrainingSettings
 
 pytestmark = pytest.mark.slow
 
@@ -122,3 +133,54 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     ply = ["export", files["a.npz"], "--format", "ply", "--mirror", "--out", tmp_path / "b.ply"]
     assert main([str(a) for a in ply]) == 2
     assert "--mirror: has no effect without --motion" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("misfit", [0.1, 0.8])
+def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit):
+    """Catches a motion that is not what the avatar tracked, another rate or head, turns that get
+    lost in ARKit's shapes, somebody else's avatar that is believed, and folders that stay. Given:
+    what tracking finds."""
+    root, run, video, steps = tmp_path / "capture", tmp_path / "run", tmp_path / "face.mp4", []
+    write_flame_capture(root)
+    rng = np.random.default_rng(0)
+    model = small_head(0)
+    for path in [*(root / "flame_param").iterdir(), root / "canonical_flame_param.npz"]:
+        sizes = {"expr": model.n_expression, "rotation": 3, "jaw_pose": 3, "neck_pose": 3}
+        values = {name: rng.normal(0, 0.1, (1, size)) for name, size in sizes.items()}
+        other = {"shape": np.zeros(model.n_identity), "translation": rng.normal(0, 0.1, (1, 3))}
+        np.savez(path, **values, **other)
+    run.mkdir()
+    write_run(run, Run(root, files["flame.npz"], "vhap", TrainingSettings(iterations=1)))
+    with video_writer(video, 25) as append:
+        for _ in range(20):
+            append(np.full((64, 64, 3), 100, np.uint8))
+
+    def tracked(request, report, say):
+        steps.append(request.step)
+        shutil.copytree(root, request.out)
+        write_json(request.out / REPORT_FILE, {"image_misfit": {AVATAR_MISFIT: {"0": misfit}}})
+
+    def watched(path, report):
+        return Performance(np.arange(2) / 25, np.full((2, 52), 0.5), np.zeros((2, 3)), 25)
+
+    monkeypatch.setattr("stga_addon.jobs.convert_motion.track", tracked)
+    monkeypatch.setattr("stga_addon.driving.face_video.watched_performance", watched)
+    drive = ["drive", video, "--avatar", run, "--out"]
+    assert stga(*drive, tmp_path / "a.npz", "--fps", 2 * DEFAULT_FPS) == 0
+    assert stga(*drive, tmp_path / "a.csv") == 0
+    motion, head = read_motion(tmp_path / "a.npz", model), read_performance(tmp_path / "a.csv").head
+    assert not [*tmp_path.glob("*.tracking"), *tmp_path.glob("*.check")]
+    if misfit > MAX_MISFIT:
+        assert steps == [2, 2]
+        assert head is None  # does not turn
+        return
+    assert steps == [2, 1, 2, 1]
+    own = open_capture(root, files["flame.npz"]).flame
+    frames = [own.frame(timestep) for timestep in own.timesteps]
+    for timestep, frame in zip(own.timesteps, frames, strict=True):
+        found = motion.frame(2 * timestep).parameters
+        np.testing.assert_allclose(found, frame.parameters, atol=1e-6)
+    root_joint, neck = (Rotation.from_rotvec([f.pose[joint] for f in frames]) for joint in (0, 1))
+    turned = root_joint * neck
+    expected = (turned * turned[0].inv()).as_euler("YXZ")
+    np.testing.assert_allclose(head[np.array(own.timesteps)], expected, atol=1e-4)

@@ -11,10 +11,14 @@ from PIL import Image
 from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
-from stga_addon.tracking.folder import TorsoPoints, read_torso_points, write_torso_points
+from stga_addon.tracking.folder import (
+    AVATAR_MISFIT,
+    TorsoPoints,
+    read_torso_points,
+    write_torso_points,
+)
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
-    AVATAR_MISFIT,
     avatar_person,
     scale_capture,
     track_recording,
