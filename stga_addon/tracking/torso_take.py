@@ -52,9 +52,10 @@ class PosedTorso:
     shift: np.ndarray | None = None
 
 
-Heads, Motion = Mapping[int, np.ndarray], Mapping[int, PosedTorso]
-"""By timestep: parameters (E + 18,), and the torso with them."""
-Motions, Rows = Mapping[str, Motion], dict[str, np.ndarray]
+Heads = Mapping[int, np.ndarray]  # Timestep -> parameters (E + 18,)
+Motion = Mapping[int, PosedTorso]  # By timestep
+Motions = Mapping[str, Motion]
+Rows = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
