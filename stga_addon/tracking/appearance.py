@@ -8,16 +8,14 @@ import numpy as np
 
 from ..capture.camera import Camera
 
-LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)
-"""Pixel sizes of the pyramid at the head."""
+LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)  # Pixel sizes of the pyramid at the head
 BLUR_PX = 0.8
 """Standard deviation of the blur, so that differences of neighboring pixels are derivatives."""
 DETAIL_PX = 2.5
 """Of the neighborhood whose mean is taken off the luma: the rest hardly depends on lighting."""
 COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
 """Luma, and redness, in which lips differ from skin."""
-CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])
-"""Of luma, detail and redness."""
+CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])  # Of luma, detail and redness
 NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
@@ -31,8 +29,7 @@ MIN_SHADING, MAX_SHADING = 0.2, 4.0
 OWN_VIEW_PRIOR = 6.0
 """Observations of all cameras beside a camera's own: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
-MAX_SAMPLES = 1 << 14
-"""Of an image at a time: OpenCV takes less than 2^15."""
+MAX_SAMPLES = 1 << 14  # Of an image at a time: OpenCV takes less than 2^15
 MIN_OBSERVATIONS = 1.0
 """Sum of the weights of the views of a point, below which its texture is not known."""
 

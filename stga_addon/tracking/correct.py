@@ -26,8 +26,7 @@ from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
 """In a corrected capture: the parameters as they were solved without keys."""
-DEFAULT_SPAN = 12
-"""Timesteps before and after a key that it may change."""
+DEFAULT_SPAN = 12  # Timesteps before and after a key that it may change
 
 
 def correct_capture(

@@ -40,8 +40,7 @@ inner landmarks are as near to the upper lip."""
 BLINKS = "eyeBlinkLeft", "eyeBlinkRight"
 EYE_JOINTS = JOINTS.index("left_eye"), JOINTS.index("right_eye")
 SCLERA_RGB, IRIS_RGB = (0.95, 0.93, 0.9), (0.15, 0.09, 0.05)
-IRIS_RADIUS = 0.4
-"""Share of the eyeball's radius."""
+IRIS_RADIUS = 0.4  # Share of the eyeball's radius
 MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
 MAX_RESIDUAL = 0.013

@@ -25,8 +25,7 @@ from .solve import Observation, acceleration_precision, normal_equations, prior_
 
 MIN_TIMESTEPS = 6
 """Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
-SETTLED_WEIGHT = 0.1
-"""Least weight of a timestep in the texture of a settled take."""
+SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
 TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
 """Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are
 compared."""
@@ -50,16 +49,14 @@ is better."""
 LAST_STEPS, LAST_ROUNDS = ((1, 12), (0, 4)), 2
 """The same for its result where other points are visible than at the start, as in a mouth that
 opens."""
-OPENINGS_M = 0.008, 0.016
-"""By which the chin is moved for further starts."""
+OPENINGS_M = 0.008, 0.016  # By which the chin is moved for further starts
 USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
 DAMPING = 1e-3
 CONVERGED_STEP_M = 1e-4
 """Root mean square of the points' motion in a step, after which a level is done."""
-MAX_TURN = 0.3
-"""Of a joint in one step, in radians."""
+MAX_TURN = 0.3  # Of a joint in one step, in radians
 SETTLED_GAIN = 0.01
 """By which a region's misfit has to fall for a settled timestep to be changed: below it, the
 surface that several cameras see is the better evidence."""

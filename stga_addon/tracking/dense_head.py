@@ -20,28 +20,19 @@ from .solve import prior_terms
 HEAD_POINTS = 5000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on
 top, because they are dense at eyes and lips."""
-FACE_RADIUS_M = 0.035
-"""Distance from the landmarks beyond which there is hair and clothes."""
+FACE_RADIUS_M = 0.035  # Distance from the landmarks beyond which there is hair and clothes
 LID_DISTANCE_M = 0.005
 """From an eyeball's vertices, up to which a landmark is one of the lids' edges."""
-HELD_OUT = 8
-"""One point of so many is not fitted, and tells whether the fit is better."""
-STEPS = (1, 2, 2, 3)
-"""By level: one point of so many is fitted."""
+HELD_OUT = 8  # One point of so many is not fitted, and tells whether the fit is better
+STEPS = (1, 2, 2, 3)  # By level: one point of so many is fitted
 REGIONS = ("lower face", "middle face", "eyes", "brows")
-REGION_EDGES = (0.4, 0.62, 0.735)
-"""Of the landmarks' height on the neutral head."""
-UPPER_FACE = 2
-"""Regions from this one on stay where they are when the mouth opens."""
-CHIN_SHARE = 0.12
-"""Landmarks in this lowest share of the landmarks' height are the chin's."""
-CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])
-"""In which an opening jaw moves it, in the head's axes."""
+REGION_EDGES = (0.4, 0.62, 0.735)  # Of the landmarks' height on the neutral head
+UPPER_FACE = 2  # Regions from this one on stay where they are when the mouth opens
+CHIN_SHARE = 0.12  # Landmarks in this lowest share of the landmarks' height are the chin's
+CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])  # In which an opening jaw moves it, in the head's axes
 OPENING_SIGMA_M = 0.002
-MIN_COSINE = 0.25
-"""Of the angle between normal and camera, below which a point is not compared."""
-VISIBILITY_SIDE_PX = 110
-"""Size of the depth image that hidden points are found in."""
+MIN_COSINE = 0.25  # Of the angle between normal and camera, below which a point is not compared
+VISIBILITY_SIDE_PX = 110  # Size of the depth image that hidden points are found in
 DIRECTIONS, OPENING_STEP_M = 8, 0.008
 """Steps of a direction's coordinates, and of the chin's height, within which a head hides the same
 of itself."""

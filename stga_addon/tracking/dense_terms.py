@@ -22,8 +22,7 @@ from .appearance import (
 from .dense_head import REGIONS, DenseHead
 from .solve import prior_terms
 
-POINT_SHARE = 0.25
-"""Weight of a point in a view: neighboring points share pixels."""
+POINT_SHARE = 0.25  # Weight of a point in a view: neighboring points share pixels
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
 """By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
 FLOW_LEVEL, FLOW_POINTS, FLOW_ITERATIONS = 1, 2, 4
@@ -228,8 +227,7 @@ def flow_targets(at: np.ndarray, before: Sequence[PyramidView], now: Sequence[Py
         yield view.key, level.camera, pixels + sampled([flow.calc(*pictures, None)], pixels)[0]
 
 
-MIN_FLOW_SIDE_PX = 32
-"""Smaller images are too small for the patches of DIS."""
+MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:

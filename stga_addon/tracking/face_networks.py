@@ -18,16 +18,11 @@ from ..errors import StgaError
 
 FOLDER = Path(__file__).with_name("networks")
 FACE_FILE, PERSON_FILE = FOLDER / "face_landmarker.task", FOLDER / "selfie_segmentation.tflite"
-MIN_DETECTION_SCORE = 0.3
-"""MediaPipe's default, 0.5, misses near-profile views."""
-MIN_PRESENCE = 0.5
-"""Of a face in the crop, as the landmarks' network sees it."""
-MAX_FACES = 2
-"""Faces that are looked for: a second one in a frame is reported."""
-MAX_BOX_OVERLAP = 0.5
-"""Intersection over union beyond which two detected boxes are of one face."""
-CROP_SCALE = 1.5
-"""Side of the landmarks' crop, in sides of the detected box."""
+MIN_DETECTION_SCORE = 0.3  # MediaPipe's default, 0.5, misses near-profile views
+MIN_PRESENCE = 0.5  # Of a face in the crop, as the landmarks' network sees it
+MAX_FACES = 2  # Faces that are looked for: a second one in a frame is reported
+MAX_BOX_OVERLAP = 0.5  # Intersection over union beyond which two detected boxes are of one face
+CROP_SCALE = 1.5  # Side of the landmarks' crop, in sides of the detected box
 DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""

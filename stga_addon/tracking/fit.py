@@ -16,8 +16,7 @@ from .posed_points import PosedPoints, SurfacePoints, head_rotation
 from .solve import Observation, in_order, person, solve_identity, solve_take
 from .triangulation import Triangulation, rays, triangulate
 
-IDENTITY_TIMESTEPS = 12
-"""Timesteps, spread over the take, that identity is solved from."""
+IDENTITY_TIMESTEPS = 12  # Timesteps, spread over the take, that identity is solved from
 ROUNDS = 3
 MAX_HEAD_SCALE = 1.25
 """Size of a head, or its inverse, relative to the average one, beyond which the cameras' world is
@@ -25,13 +24,11 @@ not in meters."""
 MIN_VISIBILITY = 1e-3
 """Weight of a landmark that a camera cannot see; what no camera sees is still better guessed than
 left open."""
-RESIDUAL_SCALE_M = 0.004
-"""Landmarks whose rays miss each other by much more are not used."""
+RESIDUAL_SCALE_M = 0.004  # Landmarks whose rays miss each other by much more are not used
 MAX_RESIDUALS = 25.0
 """In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the
 smallest number."""
-MIN_LANDMARKS = 4
-"""Of a timestep that the head is fitted to: fewer do not determine a pose."""
+MIN_LANDMARKS = 4  # Of a timestep that the head is fitted to: fewer do not determine a pose
 MIN_FACE_PIXELS, MIN_FACE_M = 1.0, 0.01
 """Extents of the landmarks in an image and on the head, below which they are no face but a
 point."""

@@ -27,8 +27,7 @@ CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
 """Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
 MIN_TURN_DEG = 20.0
 """Between two timesteps; below it, what lies nearer cannot be told from what is larger."""
-USUAL_SIGMA = 0.35
-"""Standard deviation of the inverse focal length about that of a phone, relative."""
+USUAL_SIGMA = 0.35  # Standard deviation of the inverse focal length about that of a phone, relative
 NEAREST, FARTHEST = 2.0, 0.2
 """Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
 OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
@@ -37,8 +36,7 @@ nothing of focal lengths, and beyond that in one of them."""
 SOLVES, ROUNDS, CONVERGED = 6, 2, 0.01
 """Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit
 before; and the relative change after which no more are tried."""
-MAX_SCALE_DIFFERENCE = 0.043
-"""Of a camera from the median of all; 5 % of focal length show."""
+MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
 MAX_SIDE_DEG = 60.0
 """Between the way the head faces and a camera, beyond which its landmarks are not compared: on the
 path-traced head, scales of single views have a standard deviation of 0.01 up to here, and of 0.03

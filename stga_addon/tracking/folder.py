@@ -17,8 +17,7 @@ KEPT_FOLDER = "unfinished"
 """Of results of parts, with which an interrupted tracking goes on; removed at its end."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
-TORSO_KEY = "torso"
-"""Of the report; null where the motion could not be told."""
+TORSO_KEY = "torso"  # Of the report; null where the motion could not be told
 POINTS_FILE = "torso_points.npz"
 AVATAR_MISFIT = "avatar"
 """Beside the regions of the face in the report's `image_misfit`: what the avatar that tracked does

@@ -27,8 +27,7 @@ MAX_TWO_FACES_SHARE = 0.34
 MIN_PART_TIMESTEPS = 50
 """Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
 decodes a video from the key frame before it, or from the beginning."""
-MIN_OVERLAP = 0.3
-"""Two faces whose boxes share this much of their area are one, found twice."""
+MIN_OVERLAP = 0.3  # Two faces whose boxes share this much of their area are one, found twice
 
 Report = Callable[[str, int, int], None]
 """Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not

@@ -25,12 +25,10 @@ from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
 
-PART_TIMESTEPS = 24
-"""At most, of the parts of a camera that are worked on at once."""
+PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
 """Median over the tracked head, below which the network does not see the person there."""
-LIKELY, SURE, UNLIKELY = 0.5, 0.9, 0.1
-"""Probabilities of a person."""
+LIKELY, SURE, UNLIKELY = 0.5, 0.9, 0.1  # Probabilities of a person
 MAX_CUT_SIDE_PX = 400
 """Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
 CUT_ITERATIONS = 2
@@ -38,8 +36,7 @@ CUT_MARGIN_SHARE = 0.04
 """Error of the network's outline, as a share of the head's size (root of its area in the image)."""
 HEAD_MARGIN_SHARE = 0.06
 """Error of the tracked head's outline, of the head's size: further inside are surely persons."""
-BAND_SHARE = 0.018
-"""Half of the soft band's width, as a share of the head's size."""
+BAND_SHARE = 0.018  # Half of the soft band's width, as a share of the head's size
 NEIGHBORHOOD_SHARES = (0.03, 0.12)
 """Standard deviations of the neighborhoods that colors are means of, of the head's size."""
 FAR_WEIGHT = 0.02

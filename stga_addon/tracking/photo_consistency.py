@@ -8,17 +8,14 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import rasterize
 
-PATCH_SAMPLES = 9
-"""Samples along each side of a patch."""
-MAX_CAMERAS = 6
-"""Cameras that a patch is compared in: those that see it most squarely."""
+PATCH_SAMPLES = 9  # Samples along each side of a patch
+MAX_CAMERAS = 6  # Cameras that a patch is compared in: those that see it most squarely
 MIN_COSINE = 0.35
 """Of the angle between normal and camera: beyond 70°, a patch is too foreshortened."""
 MIN_CORRELATION = 0.5
 NOISE_LEVELS = 2.0
 """Standard deviation of image noise, of 255: patches of less contrast do not correlate."""
-OCCLUSION_M = 0.004
-"""A point this far behind the nearest surface is hidden."""
+OCCLUSION_M = 0.004  # A point this far behind the nearest surface is hidden
 DEPTH_IMAGE_SIDE = 300
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 

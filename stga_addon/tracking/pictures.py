@@ -22,27 +22,21 @@ from .head_model import HeadModel
 from .posed_points import SurfacePoints
 from .write_capture import posed_mesh
 
-SIZE = 256
-"""Width and height of a picture in pixels: Blender's icons are square."""
+SIZE = 256  # Width and height of a picture in pixels: Blender's icons are square
 FIRST_CAMERAS, SHOWN_FRAMES = 3, 4
 """Most cameras of the first frame's fit; most frames of a picture, two in each direction."""
-COLUMNS, ROWS = 4, 5
-"""Of the contact sheet."""
-PICTURE = 200, 250
-"""Width and height in pixels of a view; beside it stands the same with the mesh."""
+COLUMNS, ROWS = 4, 5  # Of the contact sheet
+PICTURE = 200, 250  # Width and height in pixels of a view; beside it stands the same with the mesh
 GAP, CAPTION, MARGIN = 8, 18, 12
 TILE_SIZE = 2 * PICTURE[0], PICTURE[1] + CAPTION
 NAME_WIDTH, CELL_HEIGHT, MAX_CHART_ROWS = 130, 12, 48
-HEAD_MARGIN = 0.08
-"""Of the head's box in the image, on every side."""
+HEAD_MARGIN = 0.08  # Of the head's box in the image, on every side
 MESH_OPACITY = 0.6
-MATTE_COLOR, MATTE_OPACITY = (0, 150, 60), 0.75
-"""Drawn over what lies outside a view's matte."""
+MATTE_COLOR, MATTE_OPACITY = (0, 150, 60), 0.75  # Drawn over what lies outside a view's matte
 BACKGROUND, TEXT, NO_FACE = (24, 26, 30), (225, 228, 232), (70, 74, 80)
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
 """Of no error, half of the color scale and its end."""
-COLOR_SCALE_END = 3.0
-"""In medians of all errors."""
+COLOR_SCALE_END = 3.0  # In medians of all errors
 
 Errors = Mapping[str, Mapping[int, float]]
 """Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""

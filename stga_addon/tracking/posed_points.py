@@ -36,6 +36,12 @@ def head_rotation(parameters: np.ndarray) -> np.ndarray:
     return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
 
 
+def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """(N, 3) of length 1; shorter ones than `least` stay near 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, least))
+
+
 class PosedPoints:
     """The model's arrays at surface points; parameters are K coefficients and P = 18 numbers of
     pose and translation.

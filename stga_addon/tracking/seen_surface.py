@@ -31,8 +31,7 @@ OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
 MAX_COSINE = 0.25
 """Of the angle between normal and camera: points within 15° of the outline move it."""
-RIM_COSINE = 0.5
-"""The same of a triangle: those farther from the outline are not drawn."""
+RIM_COSINE = 0.5  # The same of a triangle: those farther from the outline are not drawn
 PICTURE_SIDE, MAX_ENLARGEMENT = 600, 2
 """The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
 SAMPLES_PER_PIXEL = 4

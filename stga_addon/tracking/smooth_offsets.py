@@ -8,13 +8,11 @@ from .posed_points import SurfacePoints
 
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
-SMOOTHING_M = 0.009
-"""Length over which offsets are smoothed."""
+SMOOTHING_M = 0.009  # Length over which offsets are smoothed
 OFFSET_SIGMA_M = 0.03
 """Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
 OFFSET_ITERATIONS = 5
-MAX_COTANGENT = 5.0
-"""Of an angle, 11°: those of needles would outweigh all others."""
+MAX_COTANGENT = 5.0  # Of an angle, 11°: those of needles would outweigh all others
 SURFACE_SIGMA_M = 0.0005
 
 

@@ -8,14 +8,14 @@ Where that leaves much unexplained, because shoulders were lifted or a chin was 
 torso is shifted as well; and its cloth bends, where that explains more.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
 from ..capture.model import evenly_spread
-from ..flame.forward import axis_angle_matrices, cross_matrices
+from ..flame.forward import RIGID_SIZE, axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
 from ..worker.helpers import Helpers, Step
 from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, robust, sampled
@@ -40,6 +40,7 @@ from .torso_take import (
     Carrier,
     Motion,
     PosedTorso,
+    Rows,
     SeenPoints,
     TorsoPose,
     TorsoShot,
@@ -48,29 +49,26 @@ from .torso_take import (
     axis_angle,
     compared,
     head_turn,
-    joint_rotation,
     seen_points,
 )
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
 """Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
-TIE = 1e-3
-"""Difference in the trace of rotations that time decides."""
-MIN_POINTS = 200
-"""Of all cameras together, below which the torso is not seen."""
-START_LEVEL = 2
-"""Level of the pyramid in which starts are compared."""
+TIE = 1e-3  # Difference in the trace of rotations that time decides
+MIN_POINTS = 200  # Of all cameras together, below which the torso is not seen
+START_LEVEL = 2  # Level of the pyramid in which starts are compared
 COARSE_STEPS, FINE_STEPS = ((3, 3), (2, 3)), ((1, 4), (0, 2))
 """Levels and Gauss–Newton steps in each, for every start, and for the best one."""
 CHANGE_SIGMA_RAD, CHANGE_SIGMA_M = 0.1, 0.01
 """Standard deviations of the torso's rotation and shift from one timestep to the next."""
-MAX_STEP, CONVERGED_STEP = 0.15, 1e-4
-"""Radians, meters."""
+MAX_STEP, CONVERGED_STEP = 0.15, 1e-4  # Radians, meters
 COMPARED_TIMESTEPS = 24
 """Spread over the take, at which motions are compared; depths are found at some of them."""
 MIN_GAIN, MIN_OWN_GAIN = 0.1, 0.05
 """Share by which the misfit has to fall for the torso not to ride on the head, and to move instead
 of being still, or to be shifted as well."""
+
+Plan = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,12 @@ def follow_torso(
     unchanged, torso = dict(parameters), torso_faces(fit.head.model)
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
         return FollowedTorso(fit, unchanged)
-    middle = _middle_timestep(parameters)
+    # The timestep with the head's most average turn, where the torso is taken to be straight; of a
+    # head that does not turn, the middle of the take
+    turns = np.stack([head_turn(parameters[timestep]) for timestep in sorted(parameters)])
+    late = np.abs(np.linspace(-1, 1, len(turns)))
+    mean = ((turns * turns.mean(0)).sum((1, 2)) - TIE * late).argmax()
+    middle = sorted(parameters)[int(mean)]
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     present = [camera for camera in footage.cameras if middle in camera.timesteps]
     masked = [camera for camera in present if camera.mask(middle) is not None]
@@ -135,25 +138,21 @@ def follow_torso(
     bending = None
     if bends and name == "shifted":
         bending = found_bending(take, motions[name], points, some, walk)
-    return _followed(fit, take, motions[name], bending, decided, points)
+    return replace(_followed(fit, take, motions[name], bending, decided), points=points)
 
 
 def _followed(
-    fit: HeadFit,
-    take: TorsoTake,
-    posed: Motion,
-    bending: Bending | None,
-    motion: TorsoMotion,
-    points: TorsoPoints,
+    fit: HeadFit, take: TorsoTake, posed: Motion, bending: Bending | None, motion: TorsoMotion
 ) -> FollowedTorso:
     """The take with the motion that was chosen."""
-    turns = [np.linalg.norm(joint_rotation(own.parameters, NECK)) for own in posed.values()]
+    necks = [own.parameters[-RIGID_SIZE:][3 * NECK : 3 * NECK + 3] for own in posed.values()]
+    bends = [] if bending is None else bending.bends.values()
     shifts = [np.linalg.norm(own.shift) for own in posed.values() if own.shift is not None]
     motion = replace(
         motion,
-        turn_deg=max(float(np.degrees(turn)) for turn in turns),
+        turn_deg=float(np.degrees(np.linalg.norm(necks, axis=1).max())),
         shift_mm=1000 * float(max(shifts, default=0.0)),
-        bend_mm=0.0 if bending is None else 1000 * bending.largest,
+        bend_mm=1000 * max((float(np.linalg.norm(b, axis=1).max()) for b in bends), default=0.0),
     )
     shifted = {
         t: take.with_offset(own, 0.0 if bending is None else bending.at(t))
@@ -166,49 +165,33 @@ def _followed(
         static = bending.drape + (0 if fit.static_offset is None else fit.static_offset)
         fit = replace(fit, head=with_offset(fit.head, bending.drape), static_offset=static)
         offsets = {t: offset - bending.drape for t, offset in offsets.items()}
-    return FollowedTorso(fit, heads, offsets, motion, points)
+    return FollowedTorso(fit, heads, offsets, motion)
 
 
 def _motions(
     take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays
 ) -> dict[str, Motion]:
     """The motions that a torso may have; some: first followed to find the points' depth."""
-    everything = sorted(take.parameters)
     seen = at_depth(take, seen, {})["stereo"]
-    (rough,) = _poses(walk, [(take, seen, False)], some)
+    (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
     seen = at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
-    both = [(take, seen, shifts) for shifts in (False, True)]
-    turned, shifted = _poses(walk, both, everything)
+    both = [_Follower(take, seen, shifts) for shifts in (False, True)]
+    turned, shifted = _poses(walk, both, take.parameters)
+    still = dict.fromkeys(take.parameters, turned[seen.timestep])
     return {
         "head": {t: PosedTorso(values) for t, values in take.parameters.items()},
-        "still": take.motion(dict.fromkeys(everything, turned[seen.timestep]), rigid=False),
+        "still": take.motion(still, rigid=False),
         "turned": take.motion(turned, rigid=False),
         "shifted": take.motion(shifted, rigid=True),
     }
 
 
-def _middle_timestep(parameters: Mapping[int, np.ndarray]) -> int:
-    """The timestep with the head's most average turn, where the torso is taken to be straight."""
-    timesteps = sorted(parameters)
-    turns = np.stack([head_turn(parameters[timestep]) for timestep in timesteps])
-    # of a head that does not turn, the middle of the take
-    late = np.abs(np.linspace(-1, 1, len(timesteps)))
-    return timesteps[int(((turns * turns.mean(0)).sum((1, 2)) - TIE * late).argmax())]
-
-
 def _poses(
-    walk: BothWays, parts: Sequence[tuple[TorsoTake, SeenPoints, bool]], timesteps: Sequence[int]
+    walk: BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
 ) -> list[dict[int, TorsoPose]]:
-    """For each of `_Follower`'s arguments, the torso's pose by timestep."""
-    found = walk.along(_follow, parts, parts[0][1].timestep, timesteps)
+    """For each follower, the torso's pose by timestep."""
+    found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
     return [{timestep: TorsoPose(**arrays) for timestep, arrays in own.items()} for own in found]
-
-
-def _follow(
-    take: TorsoTake, seen: SeenPoints, shifts: bool, way: Sequence[int], step: Step
-) -> dict[str, np.ndarray]:
-    poses = _Follower(take, seen, shifts).follow(way, step)
-    return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
 
 
 class _Follower:
@@ -216,61 +199,50 @@ class _Follower:
 
     def __init__(self, take: TorsoTake, seen: SeenPoints, shifts: bool) -> None:
         """shifts: whether the torso is rigid, and shifted as well as turned."""
-        self._take, self._seen, self._shifts = take, seen, shifts
+        self._take, self.seen, self._shifts = take, seen, shifts
         self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
         self._carrier = Carrier(take, take.with_torso(seen.timestep, self._first, shifts), seen.at)
 
-    def follow(self, way: Sequence[int], step: Step) -> list[TorsoPose]:
-        """At the timesteps of a way, which begins with the one whose points are followed."""
+    def follow(self, way: Sequence[int], step: Step) -> Rows:
+        """Poses at the timesteps of a way, which begins with the one whose points are followed."""
         poses, shot = [self._first], self._take.shot(way[0])
         for before, timestep in pairwise(way):
-            now = self._take.shot(timestep)
-            poses.append(self._solved(timestep, now, before, shot, poses[-1]))
+            now, pose = self._take.shot(timestep), poses[-1]
+            starts = [pose, self._by_flow(timestep, now, before, shot, pose)]
+            if self._shifts:  # where it was in the world
+                moved = self._take.pivot(before) - self._take.pivot(timestep)
+                starts.append(TorsoPose(pose.turn, pose.shift + moved))
+            starts = [self._descended(timestep, now, start, pose, COARSE_STEPS) for start in starts]
+            misfits = []
+            for start in starts:
+                at = self._posed(timestep, start)
+                share, shown = self.seen.unexplained(now, at, START_LEVEL)
+                use = shown & self.seen.fitted
+                misfits.append(float(share[use].mean()) if use.any() else 1.0)
+            best = starts[int(np.argmin(misfits))]
+            poses.append(self._descended(timestep, now, best, pose, FINE_STEPS))
             shot = now
             step()
-        return poses
-
-    def _solved(
-        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, pose: TorsoPose
-    ) -> TorsoPose:
-        """The pose at a timestep, from that at the one before."""
-        starts = [pose, self._by_flow(timestep, shot, before, shot_before, pose)]
-        if self._shifts:  # where it was in the world
-            moved = self._take.pivot(before) - self._take.pivot(timestep)
-            starts.append(TorsoPose(pose.turn, pose.shift + moved))
-        starts = [self._descended(timestep, shot, start, pose, COARSE_STEPS) for start in starts]
-        misfits = []
-        for start in starts:
-            at = self._posed(timestep, start)
-            share, shown = self._seen.unexplained(shot, at, START_LEVEL)
-            use = shown & self._seen.fitted
-            misfits.append(float(share[use].mean()) if use.any() else 1.0)
-        return self._descended(timestep, shot, starts[int(np.argmin(misfits))], pose, FINE_STEPS)
+        return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
 
     def _descended(
-        self,
-        timestep: int,
-        shot: TorsoShot,
-        pose: TorsoPose,
-        usual: TorsoPose,
-        plan: Sequence[tuple[int, int]],
+        self, timestep: int, shot: TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Plan
     ) -> TorsoPose:
         """The pose after up to so many steps in each level of the plan; usual: the prior's."""
         for level, steps in plan:
             for _ in range(steps):
                 at, by_pose = self._linearized(timestep, pose)
-                matrix, right = _prior(pose, usual)
+                terms = []
                 for number, rows in self._visible(shot, at):
                     own = shot.views[number].levels[level]
-                    residual = self._seen.residual(shot, number, rows, at[rows], level)
+                    residual = self.seen.residual(shot, number, rows, at[rows], level)
                     pixels, _ = own.camera.project(at[rows])
                     slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
                     share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
                     weight = (POINT_SHARE / (1 + share) ** 2)[:, None] * CHANNEL_WEIGHTS
-                    matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
-                    right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)
-                pose, size = self._stepped(pose, matrix, right)
+                    terms.append((weight, rate, residual))
+                pose, size = self._moved(pose, usual, terms)
                 if size < CONVERGED_STEP:
                     break
         return pose
@@ -282,33 +254,28 @@ class _Follower:
         old, found = self._posed(before, pose), pose
         flows = flow_targets(old, list(shot_before.views.values()), list(shot.views.values()))
         targets = {key[0]: (camera, target) for key, camera, target in flows}
-        shown = self._visible(shot_before, old)
+        shown = [own for own in self._visible(shot_before, old) if own[0] in targets]
         for _ in range(FLOW_ITERATIONS):
             at, by_pose = self._linearized(timestep, found)
-            matrix, right = _prior(found, pose)
-            for number, rows in (own for own in shown if own[0] in targets):
+            terms = []
+            for number, rows in shown:
                 camera, target = targets[number]
                 miss = camera.project(at[rows])[0] - target[rows]
                 weight = FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
                 rate = projection_derivative(camera, at[rows]) @ by_pose[rows]
-                matrix = matrix + np.einsum("n,nci,ncj->ij", weight, rate, rate)
-                right = right - np.einsum("n,nci,nc->i", weight, rate, miss)
-            found, _ = self._stepped(found, matrix, right)
+                terms.append((np.repeat(weight[:, None], 2, 1), rate, miss))
+            found, _ = self._moved(found, pose, terms)
         return found
 
     def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
         """Number of each camera that sees any of its fitted points, and the rows of these."""
-        fitted = self._seen.fitted
-        chosen = [
-            (number, rows[fitted[rows] & shot.shows(number, at[rows])])
-            for number, rows in self._seen.rows.items()
-            if number in shot.views
-        ]
+        known = [(number, rows) for number, rows in self.seen.rows.items() if number in shot.views]
+        chosen = [(n, r[self.seen.fitted[r] & shot.shows(n, at[r])]) for n, r in known]
         return [own for own in chosen if len(own[1])]
 
     def _posed(self, timestep: int, pose: TorsoPose) -> np.ndarray:
         torso = self._take.with_torso(timestep, pose, self._shifts)
-        return self._carrier.carried(torso)(self._seen.at)
+        return self._carrier.carried(torso)(self.seen.at)
 
     def _linearized(self, timestep: int, pose: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3), and derivatives (N, 3, 6) by a small rotation in front of the
@@ -317,21 +284,20 @@ class _Follower:
         by_turn = -cross_matrices(at - pose.shift - self._take.pivot(timestep))
         return at, np.concatenate([by_turn, np.broadcast_to(np.eye(3), by_turn.shape)], axis=2)
 
-    def _stepped(
-        self, pose: TorsoPose, matrix: np.ndarray, right: np.ndarray
+    def _moved(
+        self, pose: TorsoPose, usual: TorsoPose, terms: Sequence[tuple[np.ndarray, ...]]
     ) -> tuple[TorsoPose, float]:
-        """The pose after a Gauss–Newton step by 6 numbers, and the step's length."""
-        free = 6 if self._shifts else 3
+        """The pose after a Gauss–Newton step, which keeps it near the usual one, and the step's
+        length; terms: weights (M, C), derivatives (M, C, 6) and residuals (M, C)."""
+        precision = np.repeat([CHANGE_SIGMA_RAD**-2, CHANGE_SIGMA_M**-2], 3)
+        away = np.concatenate([axis_angle(pose.turn @ usual.turn.T), pose.shift - usual.shift])
+        matrix, right, free = np.diag(precision), -precision * away, 6 if self._shifts else 3
+        for weight, rate, residual in terms:
+            matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
+            right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)
         step = np.zeros(6)
         step[:free] = np.linalg.solve(matrix[:free, :free], right[:free])
         size = float(np.linalg.norm(step))
         step *= min(1.0, MAX_STEP / max(size, 1e-12))
         turn = axis_angle_matrices(step[None, :3])[0] @ pose.turn
         return TorsoPose(turn, pose.shift + step[3:]), size
-
-
-def _prior(pose: TorsoPose, usual: TorsoPose) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (6, 6) and right-hand side (6,) of a step, by which the pose is near the usual one."""
-    precision = np.repeat([CHANGE_SIGMA_RAD**-2, CHANGE_SIGMA_M**-2], 3)
-    away = np.concatenate([axis_angle(pose.turn @ usual.turn.T), pose.shift - usual.shift])
-    return np.diag(precision), -precision * away

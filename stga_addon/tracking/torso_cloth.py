@@ -17,21 +17,13 @@ from typing import Any
 import numpy as np
 
 from ..capture.mesh_geometry import rasterize
-from ..flame.forward import axis_angle_matrices
 from ..flame.model import FlameModel, torso_faces
 from ..worker.helpers import Step
 from .appearance import NOISE_LEVELS, sampled
 from .dense_terms import MIN_FLOW_SIDE_PX, inside, projection_derivative
 from .folder import TorsoPoints
-from .torso_take import (
-    HELD_OUT,
-    ROOT,
-    BothWays,
-    PosedTorso,
-    TorsoShot,
-    TorsoTake,
-    joint_rotation,
-)
+from .posed_points import head_rotation
+from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake
 
 BLOCK_PX = 12
 """Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether bending is right."""
@@ -41,26 +33,20 @@ FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
 """Of optical flow, and the share of the pixels that count as independent of each other."""
 FLOW_OUTLIER_PX, CHANGE_OUTLIER_LEVELS = 4.0, 5 * NOISE_LEVELS
 """Distance, and difference of what flow matches, beyond which flow is wrong."""
-PIXEL_STEP = 3
-"""One of so many pixels is fitted."""
-MIN_GAIN = 0.05
-"""Share by which the misfit has to fall for the torso to bend."""
-STEPS = 4
-"""Gauss–Newton steps for each timestep."""
-HELD = 1e10
-"""Precision that holds a vertex."""
+PIXEL_STEP = 3  # One of so many pixels is fitted
+MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
+STEPS = 4  # Gauss–Newton steps for each timestep
+HELD = 1e10  # Precision that holds a vertex
 DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
 """Over which points' depths are averaged; sum of weights from which the surface is seen."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
 """From the base of the neck, as seen from the front: from straight down to the person's left."""
-SLOPE = 0.8
-"""Of the angle around the neck: shoulders slope down."""
+SLOPE = 0.8  # Of the angle around the neck: shoulders slope down
 REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
 """Of a direction to both sides; smoothing of what is found in them, in steps."""
 MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
 """Of a direction: points from which it is seen, share that the mesh reaches, how far beyond."""
-FULL_HEIGHT = 0.5
-"""Height (see `TorsoSheet`) from which vertices lie on the surface alone."""
+FULL_HEIGHT = 0.5  # Height (see `TorsoSheet`) from which vertices lie on the surface alone
 
 
 @dataclass(frozen=True)
@@ -159,30 +145,21 @@ class Bending:
         whole[self.vertices] += self.bends[timestep]
         return whole
 
-    @property
-    def largest(self) -> float:
-        """Meters by which a vertex leaves the rigid torso."""
-        return max(float(np.linalg.norm(bend, axis=1).max()) for bend in self.bends.values())
-
 
 def found_bending(
-    take: TorsoTake,
-    motion: Mapping[int, PosedTorso],
-    points: TorsoPoints,
-    some: Sequence[int],
-    walk: BothWays,
+    take: TorsoTake, motion: Motion, points: TorsoPoints, some: Sequence[int], walk: BothWays
 ) -> Bending | None:
     """How a torso with a rigid motion bends; None where images are not explained better so."""
     sheet = torso_sheet(take.model)
     if sheet is None:
         return None
     first = motion[points.timestep]
-    turn, at = _axes(first), _rigid(take, first, sheet.vertices)
-    base = take.base(first.parameters) + (0.0 if first.shift is None else first.shift)
-    before = (at - base) @ turn
+    turn, base = head_rotation(first.parameters), take.joints(first.parameters)[0]
+    base = base + first.parameters[-3:] + first.shift
+    before = (take.rigid(first, sheet.vertices) - base) @ turn
     drape = draped(sheet, before, (points.at - base) @ turn) - before
     cloth = _Cloth(take, sheet, motion, points.timestep, drape)
-    (found,) = walk.along(_bend, [(cloth,)], points.timestep, sorted(motion))
+    (found,) = walk.along(_Cloth.follow, [cloth], points.timestep, motion)
     bends = {timestep: arrays["bend"] for timestep, arrays in found.items()}
     rigid, bent = cloth.misfit(bends, [t for t in some if t != points.timestep])
     if not bent < (1 - MIN_GAIN) * rigid:
@@ -192,26 +169,11 @@ def found_bending(
     return Bending(sheet.vertices, whole, bends)
 
 
-def _axes(torso: PosedTorso) -> np.ndarray:
-    """(3, 3) from the torso's axes to the world's."""
-    return np.asarray(axis_angle_matrices(joint_rotation(torso.parameters, ROOT)[None])[0])
-
-
-def _rigid(take: TorsoTake, torso: PosedTorso, vertices: np.ndarray) -> np.ndarray:
-    """(N, 3) of vertices (N,) of a rigid torso."""
-    assert torso.shift is not None
-    return np.asarray(take.rigid(torso.parameters, vertices) + torso.shift)
-
-
 @dataclass(frozen=True)
 class _Reference:
-    """What a camera shows of the sheet at the first timestep, in P pixels.
-
-    shown    (H, W) bool
-    luma     (H, W) uint8
-    corners  (P, 3) rows of the sheet's vertices, and barycentric (P, 3) coordinates
-    fitted   (P,) bool
-    """
+    """What a camera shows of the sheet at the first timestep, in P pixels: where (H, W), its luma
+    (H, W) uint8, of the pixels rows (P, 3) of the sheet's vertices, barycentric coordinates (P, 3),
+    and whether they are fitted (P,)."""
 
     shown: np.ndarray
     luma: np.ndarray
@@ -238,20 +200,11 @@ class _Returned:
     visible: np.ndarray
 
 
-def _bend(cloth: "_Cloth", way: Sequence[int], step: Step) -> dict[str, np.ndarray]:
-    return {"bend": np.stack(cloth.follow(way, step))}
-
-
 class _Cloth:
     """How the sheet bends: (N, 3) offsets of its vertices in the torso's axes, in meters."""
 
     def __init__(
-        self,
-        take: TorsoTake,
-        sheet: TorsoSheet,
-        motion: Mapping[int, PosedTorso],
-        first: int,
-        drape: np.ndarray,
+        self, take: TorsoTake, sheet: TorsoSheet, motion: Motion, first: int, drape: np.ndarray
     ) -> None:
         """motion: of the rigid torso; drape (N, 3): that draws the sheet over the surface, in the
         torso's axes; first: the timestep that the others are compared with."""
@@ -266,42 +219,40 @@ class _Cloth:
         shot = take.shot(first)
         self._references = {number: self._reference(shot, number) for number in shot.views}
 
-    def follow(self, way: Sequence[int], step: Step) -> list[np.ndarray]:
+    def follow(self, way: Sequence[int], step: Step) -> Rows:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
         bends = [np.zeros_like(self._drape)]
         for timestep in way[1:]:
             shot, bend = self._take.shot(timestep), bends[-1]
             for _ in range(STEPS):
-                bend = self._stepped(timestep, shot, bend)
+                bend = self._moved(timestep, shot, bend)
             bends.append(bend)
             step()
-        return bends
+        return {"bend": np.stack(bends)}
 
-    def misfit(
-        self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]
-    ) -> tuple[float, float]:
+    def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> list[float]:
         """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
         total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
         for timestep in timesteps:
             shot = self._take.shot(timestep)
             for number in self._numbers(shot):
                 reference = self._references[number]
-                each = (rigid, bends[timestep])
+                each = rigid, bends[timestep]
                 both = [self._returned(timestep, shot, number, bend) for bend in each]
                 use = both[0].visible & both[1].visible & ~reference.fitted
                 change = np.stack([own.luma.astype(float) - reference.luma for own in both])
                 squared = change[:, *reference.pixels][:, use] ** 2
                 total += (squared / (CHANGE_OUTLIER_LEVELS**2 + squared)).sum(1)
                 count += int(use.sum())
-        return float(total[0] / max(count, 1)), float(total[1] / max(count, 1))
+        return [float(own) for own in total / max(count, 1)]
 
     def _numbers(self, shot: TorsoShot) -> list[int]:
         """Of the cameras that see the sheet at first and now, in images of one size."""
-        known = [(n, self._references[n]) for n in shot.views if n in self._references]
         return [
             number
-            for number, own in known
-            if own.corners.size
+            for number, own in self._references.items()
+            if number in shot.views
+            and own.corners.size
             and shot.views[number].levels[0].channels.shape[:2] == own.shown.shape
             and min(own.shown.shape) >= MIN_FLOW_SIDE_PX
         ]
@@ -324,9 +275,9 @@ class _Cloth:
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
-        torso = self._motion[timestep]
-        rigid = _rigid(self._take, torso, self._sheet.vertices)
-        return np.asarray(rigid + (self._drape + bend) @ _axes(torso).T)
+        torso, drawn = self._motion[timestep], self._drape + bend
+        rigid = self._take.rigid(torso, self._sheet.vertices)
+        return np.asarray(rigid + drawn @ head_rotation(torso.parameters).T)
 
     @staticmethod
     def _visible(shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
@@ -347,12 +298,12 @@ class _Cloth:
         luma[reference.pixels] = values.astype(np.uint8)
         return _Returned(luma, at, source, self._visible(shot, number, at))
 
-    def _stepped(self, timestep: int, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
+    def _moved(self, timestep: int, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
         """The offsets after a Gauss–Newton step."""
         from scipy.sparse import csr_array, diags_array
 
         matrix, right = self._precision, -(self._precision @ bend.ravel())
-        axes = _axes(self._motion[timestep])
+        axes = head_rotation(self._motion[timestep].parameters)
         for number in self._numbers(shot):
             reference, now = self._references[number], self._returned(timestep, shot, number, bend)
             miss, weight = _missed(reference, now)

@@ -1,8 +1,9 @@
 """A tracked take in which the torso is followed: its frames, the head's parameters with any
 orientation of it, the points that cameras see at it, and which motion the images agree with."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -20,24 +21,20 @@ from .dense_terms import OUTLIER_SQUARED, PyramidView, inside
 from .fit import HeadFit
 from .footage.model import FootageCamera
 from .landmarks import Report
-from .posed_points import PosedPoints, SurfacePoints
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, unit
 from .write_capture import posed_mesh
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
 HEAD_MARGIN = 0.03
 """Around the head's silhouette, where hair and chin may be; share of the image's height."""
-PLAIN_LEVEL = 128
-"""Gray that stands for everything outside the mask."""
-OFFSET_STEPS = 6
-"""After which offsets, which move joints, which move vertices, are those wanted."""
-EVIDENCE_LEVEL = 1
-"""Level of the pyramid in which motions are compared."""
+PLAIN_LEVEL = 128  # Gray that stands for everything outside the mask
+OFFSET_STEPS = 6  # After which offsets, which move joints, which move vertices, are those wanted
+EVIDENCE_LEVEL = 1  # Level of the pyramid in which motions are compared
 POINT_STEP_M, MAX_POINTS = 0.005, 800
 """Distance between points at the torso, and how many of them a camera has at most."""
 BLOCK_POINTS, HELD_OUT = 4, 3
 """Side of blocks in points; one of so many is not fitted, and tells which motion is right."""
-MASK_MARGIN = 0.01
-"""Around the mask, whose edge is compared as well; share of the image's height."""
+MASK_MARGIN = 0.01  # Around the mask, whose edge is compared as well; share of the image's height
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
 """Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
 DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
@@ -48,18 +45,17 @@ ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
 
 @dataclass(frozen=True)
 class PosedTorso:
-    """Parameters (E + 18,) of a head with its torso.
-
-    shift  (3,) meters, from where the neck's joint holds the torso, which is rigid then; None: the
-           model's weights blend it with the neck
-    """
+    """Parameters (E + 18,) of a head with its torso; shift (3,) meters, from where the neck's joint
+    holds the torso, which is rigid then; None: the model's weights blend it with the neck."""
 
     parameters: np.ndarray
     shift: np.ndarray | None = None
 
 
-Motion = Mapping[int, PosedTorso]
-"""By timestep."""
+Heads = Mapping[int, np.ndarray]  # Timestep -> parameters (E + 18,)
+Motion = Mapping[int, PosedTorso]  # By timestep
+Motions = Mapping[str, Motion]
+Rows = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -88,14 +84,11 @@ class TorsoShot:
 
 
 class TorsoTake:
-    """The take: images by timestep, and the head's parameters with any turn of the torso."""
+    """The take: images by timestep, and the head's parameters with any turn of the torso, whose
+    triangles (F,) bool are given."""
 
     def __init__(
-        self,
-        fit: HeadFit,
-        parameters: Mapping[int, np.ndarray],
-        cameras: Sequence[FootageCamera],
-        torso: np.ndarray,
+        self, fit: HeadFit, parameters: Heads, cameras: Sequence[FootageCamera], torso: np.ndarray
     ) -> None:
         self.model, self.parameters = fit.head.model, parameters
         self.cameras, self.torso, self._fit = cameras, torso, fit
@@ -106,43 +99,37 @@ class TorsoTake:
 
     def with_torso(self, timestep: int, pose: TorsoPose, rigid: bool) -> PosedTorso:
         """The timestep's head, where it is, on the torso; rigid: which may be shifted as well."""
-        root, neck = self._unposed_joints(timestep)
-        parameters = with_root(self.parameters[timestep], pose.turn, neck - root)
-        return PosedTorso(parameters, pose.shift if rigid else None)
+        parameters = self.parameters[timestep]
+        root, neck = self.joints(parameters)
+        turned = with_root(parameters, pose.turn, neck - root)
+        return PosedTorso(turned, pose.shift if rigid else None)
 
     def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> dict[int, PosedTorso]:
         """The torso posed at each timestep."""
         return {t: self.with_torso(t, pose, rigid) for t, pose in poses.items()}
 
-    def rigid(self, parameters: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        """(N, 3) where the root joint alone carries some vertices (N,)."""
-        expr, rigid = parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
-        root = self._joints[0] + self._joint_dirs[0] @ expr
+    def rigid(self, torso: PosedTorso, vertices: np.ndarray) -> np.ndarray:
+        """(N, 3) where a torso that is shifted carries some vertices (N,)."""
+        assert torso.shift is not None
+        expr, (root, _) = torso.parameters[:-RIGID_SIZE], self.joints(torso.parameters)
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
-        turn = axis_angle_matrices(rigid[None, :3])[0]
-        return np.asarray((rest - root) @ turn.T + root + rigid[-3:])
+        turned = (rest - root) @ head_rotation(torso.parameters).T
+        return np.asarray(turned + root + torso.parameters[-3:] + torso.shift)
 
     def with_offset(
         self, torso: PosedTorso, bend: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted, and
-        bent.
-
-        bend (V, 3): offsets in meters, in the torso's axes, which the root joint turns. Offsets
-        move the joints as well, which FLAME finds from vertices; the translation undoes that for
-        the head.
-        """
-        assert torso.shift is not None
+        bent by `bend` (V, 3) meters in its own axes. Offsets move FLAME's joints as well; the
+        translation undoes that for the head."""
         model, parameters = self.model, torso.parameters.copy()
         offset = np.zeros_like(model.v_template)
         share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
         moved = np.flatnonzero(share)
         before = posed_mesh(self._fit, parameters)[moved]
-        apart = self.rigid(parameters, moved) + torso.shift - before
-        wanted = before + share[moved, None] * apart
-        root = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
-        wanted += np.broadcast_to(bend, offset.shape)[moved] @ root.T
-        turns = axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
+        wanted = before + share[moved, None] * (self.rigid(torso, moved) - before)
+        wanted += np.broadcast_to(bend, offset.shape)[moved] @ head_rotation(parameters).T
+        turns = joint_turns(parameters)
         for joint, parent in enumerate(model.parents.tolist()):
             turns[joint] = turns[parent] @ turns[joint] if parent >= 0 else turns[joint]
         skin = np.einsum("vj,jab->vab", model.weights[moved], turns)
@@ -154,19 +141,15 @@ class TorsoTake:
             parameters[-3:] = torso.parameters[-3:] - by_offset
         return parameters, offset
 
-    def base(self, parameters: np.ndarray) -> np.ndarray:
-        """(3,) the root joint, inside the base of the neck."""
-        root = self._joints[0] + self._joint_dirs[0] @ parameters[:-RIGID_SIZE]
-        return np.asarray(root + parameters[-3:])
-
     def pivot(self, timestep: int) -> np.ndarray:
         """(3,) what the torso turns about: the joint of the neck."""
-        parameters, (root, neck) = self.parameters[timestep], self._unposed_joints(timestep)
-        turn = axis_angle_matrices(joint_rotation(parameters, ROOT)[None])[0]
-        return np.asarray(root + turn @ (neck - root) + parameters[-3:])
+        parameters = self.parameters[timestep]
+        root, neck = self.joints(parameters)
+        return np.asarray(root + head_rotation(parameters) @ (neck - root) + parameters[-3:])
 
-    def _unposed_joints(self, timestep: int) -> np.ndarray:
-        return np.asarray(self._joints + self._joint_dirs @ self.parameters[timestep][:-RIGID_SIZE])
+    def joints(self, parameters: np.ndarray) -> np.ndarray:
+        """(2, 3) root, inside the base of the neck, and neck, before posing."""
+        return np.asarray(self._joints + self._joint_dirs @ parameters[:-RIGID_SIZE])
 
     def mesh(self, parameters: np.ndarray) -> np.ndarray:
         """(V, 3) of the head with these parameters."""
@@ -195,29 +178,24 @@ class TorsoTake:
 
 
 class BothWays:
-    """Work along a take, from one timestep to both ends, on which each timestep's result begins
-    with that before: by helping processes, each on a way."""
+    """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
     def __init__(self, helpers: Helpers, report: Report, total: int) -> None:
         self._helpers, self._report, self._done, self._total = helpers, report, 0, total
 
     def along(
-        self,
-        work: Callable[..., dict[str, np.ndarray]],
-        parts: Sequence[tuple],
-        first: int,
-        timesteps: Sequence[int],
-    ) -> list[dict[int, dict[str, np.ndarray]]]:
-        """For each part, by timestep, rows of the arrays that work(*part, way, step) gives."""
-        later = [first, *(t for t in timesteps if t > first)]
-        earlier = [first, *(t for t in reversed(timesteps) if t < first)]
-        every, done = [(*part, way) for part in parts for way in (later, earlier)], self._done
+        self, follow: Callable[..., Rows], who: Sequence[Any], first: int, timesteps: Iterable[int]
+    ) -> list[dict[int, Rows]]:
+        """For each of `who`, by timestep, rows of the arrays that follow(who, way, step) gives."""
+        later = [first, *sorted(t for t in timesteps if t > first)]
+        earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
+        every, done = [(own, way) for own in who for way in (later, earlier)], self._done
 
         def count(number: int) -> None:
             self._report("Torso", done + number, self._total)
 
-        found, results = self._helpers.map(work, every, count, keep=True), []
-        self._done += len(parts) * (len(later) + len(earlier) - 2)
+        found, results = self._helpers.map(follow, every, count, keep=True), []
+        self._done += len(who) * (len(later) + len(earlier) - 2)
         for both in zip(found[::2], found[1::2], strict=True):
             rows = {
                 t: {name: array[row] for name, array in own.items()}
@@ -230,11 +208,8 @@ class BothWays:
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
     """Parameters (E + 18,) with the root joint in another orientation (3, 3), and the head in its
-    place.
-
-    arm (3,): from the root joint to the neck's, before posing.
-    """
-    before, neck = _root_and_neck(parameters)
+    place; arm (3,): from the root joint to the neck's, before posing."""
+    before, neck = joint_turns(parameters)[[ROOT, NECK]]
     changed = parameters.copy()
     rigid = changed[-RIGID_SIZE:]
     rigid[3 * ROOT : 3 * ROOT + 3] = axis_angle(rotation)
@@ -245,18 +220,13 @@ def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> 
 
 def head_turn(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) orientation of the head in the world."""
-    root, neck = _root_and_neck(parameters)
+    root, neck = joint_turns(parameters)[[ROOT, NECK]]
     return np.asarray(root @ neck)
 
 
-def _root_and_neck(parameters: np.ndarray) -> np.ndarray:
-    both = np.stack([joint_rotation(parameters, joint) for joint in (ROOT, NECK)])
-    return axis_angle_matrices(both)
-
-
-def joint_rotation(parameters: np.ndarray, joint: int) -> np.ndarray:
-    """(3,) axis-angle of a joint in (E + 18,) parameters."""
-    return np.asarray(parameters[-RIGID_SIZE:][3 * joint : 3 * joint + 3])
+def joint_turns(parameters: np.ndarray) -> np.ndarray:
+    """(5, 3, 3) rotations of the joints in (E + 18,) parameters, each before its parent's."""
+    return axis_angle_matrices(parameters[-RIGID_SIZE:-3].reshape(-1, 3))
 
 
 def axis_angle(rotation: np.ndarray) -> np.ndarray:
@@ -269,15 +239,11 @@ def grown(where: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(binary_dilation(where, iterations=max(1, round(share * len(where)))))
 
 
-# Points
-
-
 @dataclass(frozen=True)
 class SeenPoints:
     """N points below the head as the cameras see them at one timestep.
 
-    rows       number of a camera -> the rows of its own points: how deep they lie is a guess that
-               other cameras lack
+    rows       number of a camera -> the rows of its own points, whose depth is a guess
     at, ray    (N, 3) meters; unit vectors away from their camera
     fitted     (N,) bool: points that the motion is fitted to
     reference  by level, the images' channels (N, 3)
@@ -298,22 +264,10 @@ class SeenPoints:
         share, seen = np.zeros(len(at)), np.zeros(len(at), bool)
         for number, rows in self.rows.items():
             if number in shot.views:
-                share[rows] = self.share(shot, number, rows, at[rows], level)
+                residual = self.residual(shot, number, rows, at[rows], level)
+                share[rows] = explained_share(residual, level)
                 seen[rows] = shot.shows(number, at[rows])
         return share, seen
-
-    def share(
-        self,
-        shot: TorsoShot,
-        number: int,
-        rows: np.ndarray,
-        at: np.ndarray,
-        level: int,
-        weights: np.ndarray = CHANNEL_WEIGHTS,
-    ) -> np.ndarray:
-        """(M,), 0 to 1: how little a camera's image at points (M, 3) looks like the reference."""
-        squared = self.residual(shot, number, rows, at, level) ** 2 @ weights
-        return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
 
     def residual(
         self, shot: TorsoShot, number: int, rows: np.ndarray, at: np.ndarray, level: int
@@ -324,14 +278,22 @@ class SeenPoints:
         return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
 
 
+def explained_share(
+    residual: np.ndarray, level: int, weights: np.ndarray = CHANNEL_WEIGHTS
+) -> np.ndarray:
+    """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
+    squared = residual**2 @ weights
+    return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
+
+
 def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
     shot, mesh = take.shot(timestep), take.mesh(take.parameters[timestep])
-    at, rays, fitted = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, bool)]
-    reference: list[list[np.ndarray]] = [[np.zeros((0, 3), np.float32)] for _ in OUTLIER_SQUARED]
-    numbers, count = {}, 0
+    none, dark = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    found = [(none, none, np.zeros(0, bool), *(dark for _ in OUTLIER_SQUARED))]
+    rows_of, count = {}, 0
     for number, view in shot.views.items():
         camera, mask = view.camera, shot.masks[number]
         pixels, depth = camera.project(mesh[take.model.faces].mean(1))
@@ -347,15 +309,12 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
             continue
         own = camera.unproject(places[kept], depth[nearest[kept]])
         block = (rows // BLOCK_POINTS + columns // BLOCK_POINTS).ravel()[kept]
-        away = own - camera.position
-        at, fitted = [*at, own], [*fitted, block % HELD_OUT != 0]
-        rays.append(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
-        for values, level in zip(reference, view.levels, strict=False):
-            values += sampled([level.channels], level.camera.project(own)[0])
-        numbers[number] = count + np.arange(len(own))
+        shades = [sampled([v.channels], v.camera.project(own)[0])[0] for v in view.levels]
+        found.append((own, own - camera.position, block % HELD_OUT != 0, *shades))
+        rows_of[number] = count + np.arange(len(own))
         count += len(own)
-    every, ray, use = np.concatenate(at), np.concatenate(rays), np.concatenate(fitted)
-    return SeenPoints(timestep, numbers, every, ray, use, list(map(np.concatenate, reference)))
+    at, away, fitted, *reference = map(np.concatenate, zip(*found, strict=True))
+    return SeenPoints(timestep, rows_of, at, unit(away), fitted, reference)
 
 
 class Carrier:
@@ -388,34 +347,28 @@ class Carrier:
         if torso.shift is None:
             corners = self._corners.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         else:
-            corners = self._take.rigid(values, self._vertices) + torso.shift
+            corners = self._take.rigid(torso, self._vertices)
         return face_frames(corners, self._triangles, self._neutral)
 
 
 def compared(
-    take: TorsoTake,
-    seen: Mapping[str, SeenPoints],
-    motions: Mapping[str, Motion],
-    timesteps: Sequence[int],
+    take: TorsoTake, seen: Mapping[str, SeenPoints], motions: Motions, timesteps: Sequence[int]
 ) -> dict[str, float]:
     """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
-    first, total, count = seen["head"], dict.fromkeys(motions, 0.0), 0
-    start = first.timestep
+    start, total, count = seen["head"].timestep, np.zeros(len(motions)), 0
     carriers = {name: Carrier(take, own[start], seen[name].at) for name, own in motions.items()}
     for timestep in (t for t in timesteps if t != start):
-        shot, use, shares = take.shot(timestep), ~first.fitted, {}
+        shot, found = take.shot(timestep), []
         for name, own in motions.items():
             at = carriers[name].carried(own[timestep])(seen[name].at)
-            shares[name], shown = seen[name].unexplained(shot, at, EVIDENCE_LEVEL)
-            use = use & shown
-        count += int(use.sum())
-        total = {name: total[name] + float(share[use].sum()) for name, share in shares.items()}
-    return {name: value / max(count, 1) for name, value in total.items()}
+            found.append(seen[name].unexplained(shot, at, EVIDENCE_LEVEL))
+        shares, shown = map(np.stack, zip(*found, strict=True))
+        use = shown.all(0) & ~seen["head"].fitted
+        count, total = count + int(use.sum()), total + shares[:, use].sum(1)
+    return dict(zip(motions, (total / max(count, 1)).tolist(), strict=True))
 
 
-def at_depth(
-    take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]
-) -> dict[str, SeenPoints]:
+def at_depth(take: TorsoTake, seen: SeenPoints, motions: Motions) -> dict[str, SeenPoints]:
     """Motion -> the points at the depths along their rays at which other cameras, and other
     timesteps of the motion, look like them; "stereo": of other cameras alone."""
     candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]
@@ -423,7 +376,8 @@ def at_depth(
     for number, rows in seen.rows.items():
         for other in shot.views.keys() - {number}:
             for cost, at in zip(stereo, candidates, strict=True):
-                share = seen.share(shot, other, rows, at[rows], EVIDENCE_LEVEL, ALONG_CAMERAS)
+                residual = seen.residual(shot, other, rows, at[rows], EVIDENCE_LEVEL)
+                share = explained_share(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
                 cost[rows] += np.where(shot.shows(other, at[rows]), share, UNSEEN_COST)
     costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
     carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}

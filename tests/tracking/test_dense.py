@@ -27,11 +27,9 @@ from stga_addon.worker.helpers import Helpers
 from .test_fit import places_on, seen
 
 JAW = 2
-OPENINGS = 0.0, 0.0, 0.1, 0.25, 0.4, 0.45, 0.3, 0.05
-"""Radians of the jaw at each timestep."""
+OPENINGS = 0.0, 0.0, 0.1, 0.25, 0.4, 0.45, 0.3, 0.05  # Radians of the jaw at each timestep
 BROWS_UP, BROWS_DOWN = EXPRESSIONS.index("brows_up"), EXPRESSIONS.index("brows_down")
-DETECTOR_PULL = 1 / 3
-"""Share of the jaw's motion that landmarks do not follow."""
+DETECTOR_PULL = 1 / 3  # Share of the jaw's motion that landmarks do not follow
 
 
 @dataclass(frozen=True)

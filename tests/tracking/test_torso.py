@@ -59,8 +59,7 @@ from .test_fit import places_on
 
 SIZE = 105, 142
 TIMESTEPS = 6
-SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)
-"""Of what turns, at each timestep."""
+SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)  # Of what turns, at each timestep
 LIFT_M = 0.012 * np.sin(1.3 * np.arange(TIMESTEPS))[:, None] * [0.5, 1.0, 0.2]
 """By which shoulders are shifted at each timestep."""
 SLIDE_M = 0.01 * np.sin(0.9 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
@@ -358,7 +357,7 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     bending = Bending(cloth, drape, bent) if bends else None
     take = TorsoTake(fit, tracked, (), torso_faces(model))
     decided = TorsoMotion("own", {"head": 0.5, "still": 0.4, "own": 0.2}, 0.0)
-    followed = _followed(fit, take, posed, bending, decided, TorsoPoints(5, np.zeros((0, 3))))
+    followed = _followed(fit, take, posed, bending, decided)
     share = np.minimum(model.weights[:, [ROOT]] / MIN_TORSO_WEIGHT, 1)
     assert (share[cloth] > 0).all()
     for timestep, torso in posed.items():

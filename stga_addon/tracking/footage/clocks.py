@@ -8,14 +8,10 @@ import numpy as np
 from ...errors import StgaError
 from .video import Video, VideoFrames, opened_video
 
-SOUND_RATE_HZ, SOUND_HOP = 16000, 32
-"""Sound is compared by its loudness every 2 ms."""
-MIN_OVERLAP_S = 1.0
-"""Shared time below which two recordings are not compared."""
-MOTION_SIZE = 32
-"""Pixels of an image's sides, in which motion is measured."""
-MIN_CORRELATION = 0.2
-"""Correlation below which nothing is shared."""
+SOUND_RATE_HZ, SOUND_HOP = 16000, 32  # Sound is compared by its loudness every 2 ms
+MIN_OVERLAP_S = 1.0  # Shared time below which two recordings are not compared
+MOTION_SIZE = 32  # Pixels of an image's sides, in which motion is measured
+MIN_CORRELATION = 0.2  # Correlation below which nothing is shared
 MIN_DISTINCTION = 1.5
 """Times that the best lag's score exceeds that of any farther than NEIGHBORHOOD_S away."""
 NEIGHBORHOOD_S = 0.2

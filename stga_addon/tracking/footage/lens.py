@@ -15,8 +15,7 @@ ZOOM_RANGE, ZOOM_STEPS = (0.5, 2.0), 30
 """Of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 BORDER_POINTS = 33
 """Points along a side of the image at which it is checked that all of it was recorded."""
-CACHED_MAPS = 32
-"""Lenses whose maps are kept: 6 bytes a pixel each."""
+CACHED_MAPS = 32  # Lenses whose maps are kept: 6 bytes a pixel each
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,7 @@ class ImageFrames:
         return image if is_plain(image) else None
 
 
-Frames = ImageFrames | VideoFrames
-"""The frames of one camera as they were recorded."""
+Frames = ImageFrames | VideoFrames  # The frames of one camera as they were recorded
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from ...errors import StgaError, shorten
 from .lens import Lens
 from .shots import Shot, numbers, pinhole, read_text, read_xml
 
-PROJECTIONS = {"frame": "perspective", "fisheye": "fisheye"}
-"""Metashape's."""
+PROJECTIONS = {"frame": "perspective", "fisheye": "fisheye"}  # Metashape's
 FILM_WIDTH_MM = 36.0
 """Of the 35 mm film that focal lengths are given for; it stands for the image's longer side."""
 REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")

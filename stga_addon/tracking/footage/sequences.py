@@ -44,8 +44,7 @@ class FrameRange:
         return before_stop and timestep >= self.start and (timestep - self.start) % self.step == 0
 
 
-Sequence = Video | list[Path]
-"""A camera's recording: a video, or images in order."""
+Sequence = Video | list[Path]  # A camera's recording: a video, or images in order
 
 
 def open_sequence(files: Path | list[Path]) -> Sequence:

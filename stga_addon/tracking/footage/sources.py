@@ -13,8 +13,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf
 CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's."""
 MASK_FOLDERS = ("masks", "fg_masks")
-PLATE_FOLDER = "plates"
-"""Holds an image without the person for each camera, of its name."""
+PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
 MAX_DEPTH, MAX_FILES = 4, 1_000_000
 
 

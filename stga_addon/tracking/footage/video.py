@@ -15,8 +15,7 @@ from ...capture.images import read_mask
 from ...capture.model import View
 from ...errors import StgaError
 
-MIN_HD_LINES = 720
-"""From here on, videos without a stated color matrix are in that of HD (BT.709)."""
+MIN_HD_LINES = 720  # From here on, videos without a stated color matrix are in that of HD (BT.709)
 
 TIMED_CONTAINERS = ("mov", "matroska")
 """FFmpeg's names of containers that store when each packet is shown."""
