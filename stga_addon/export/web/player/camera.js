@@ -3,7 +3,7 @@
 // around a point.
 
 /**
- * @import { Player } from './player.js'
+ * @import { Player } from './stga-avatar.js'
  * @import { Camera, Vector, View } from './types.js'
  * @typedef {[number, number]} Point pixels of the page
  */

@@ -244,7 +244,7 @@ export class FaceFrames {
   // Arrays of the data file, and the convention of the embedding; strain is computed where splats
   // follow it.
   /**
-   * @param {Pick<Arrays, 'faces' | 'neutral'> & Partial<Arrays>} arrays
+   * @param {Arrays} arrays
    * @param {string} convention
    */
   constructor(arrays, convention) {
@@ -268,7 +268,7 @@ export class FaceFrames {
       ? offsets.map(([name, Signal]) => ({
           signal: new Signal(strain),
           components: Signal.components,
-          coefficients: /** @type {Values} */ (arrays[name]?.values),
+          coefficients: arrays[name].values,
         }))
       : [];
   }

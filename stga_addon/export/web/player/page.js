@@ -28,10 +28,7 @@ const RANGES = {
 
 export class LightControls {
   // Fill and show `section` for an avatar whose light is known.
-  /**
-   * @param {HTMLElement} section
-   * @param {StgaAvatar} avatar
-   */
+  /** @param {HTMLElement} section @param {StgaAvatar} avatar */
   constructor(section, avatar) {
     this.avatar = avatar;
     /** @type {Kind} */
@@ -71,11 +68,7 @@ export class LightControls {
     this.showKind();
   }
 
-  /**
-   * @param {HTMLElement} section
-   * @param {string} name
-   * @param {typeof RANGES['turn']} range
-   */
+  /** @param {HTMLElement} section @param {string} name @param {typeof RANGES['turn']} range */
   addRange(section, name, { label, kinds, low, high, value, format }) {
     const [row, output, input] = sliderRow(section, 'range', label, low, high);
     [input.value, input.name] = [String(value), name];

@@ -3,7 +3,7 @@
 // background.
 
 /**
- * @import { LightPass } from './light_pass.js'
+ * @import { LightPass } from './light.js'
  * @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js'
  */
 
@@ -128,10 +128,7 @@ export function deleteTarget(gl, target) {
 export class Renderer {
   // Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw
   // them.
-  /**
-   * @param {WebGL2RenderingContext} gl
-   * @param {Data} data
-   */
+  /** @param {WebGL2RenderingContext} gl @param {Data} data */
   constructor(gl, data) {
     if (!gl.getExtension('EXT_color_buffer_float')) {
       throw new RendererError(
@@ -356,10 +353,7 @@ const MAX_KEY = DIGITS * DIGITS - 1;
 
 export class DepthSort {
   // xyz (3·N) of splats sorted by triangle, and how many each triangle has.
-  /**
-   * @param {ArrayLike<number>} xyz
-   * @param {ArrayLike<number>} splatsPerFace
-   */
+  /** @param {ArrayLike<number>} xyz @param {ArrayLike<number>} splatsPerFace */
   constructor(xyz, splatsPerFace) {
     this.xyz = xyz;
     this.splatsPerFace = splatsPerFace;
