@@ -3,7 +3,10 @@
 // reflects it. Axes are those of the data file's meshes; the rules are those of STGA for Blender's
 // light/.
 
-/** @import { Arrays, Data, LightOfCapture, Lighting, LitBy, Program, Sun, Values, Vector } from './types.js' */
+/**
+ * @import { Arrays, Data, LightOfCapture, Lighting, LitBy } from './types.js'
+ * @import { Program, Sun, Values, Vector } from './types.js'
+ */
 
 import { bounds } from './camera.js';
 import { FaceFrames } from './face_frames.js';
@@ -65,10 +68,7 @@ export function litBy(lighting, up) {
 }
 
 // Add an environment whose axes a rotation takes to those of the head; returns its sun.
-/**
- * @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => { toward: Vector;
- *   color: Vector; } | null}
- */
+/** @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => Sun | null} */
 function addEnvironment(world, name, rotation) {
   if (!Object.hasOwn(ENVIRONMENTS, name))
     throw new RangeError(`There is no environment "${name}".`);
@@ -95,9 +95,8 @@ function fromUpright(up, turn) {
 /** @type {(values: ArrayLike<number>, count: number, name: string) => void} */
 function check(values, count, name) {
   if (values.length !== count || !Array.from(values).every(Number.isFinite)) {
-    throw new RangeError(
-      `Lighting: ${name} holds something else than finite numbers, or too few or too many.`,
-    );
+    const problem = 'holds something else than finite numbers, or too few or too many';
+    throw new RangeError(`Lighting: ${name} ${problem}.`);
   }
 }
 
@@ -188,11 +187,7 @@ function addPoint(light, toward, color) {
 
 // The rotation (3×3, row by row) that best takes vertices to others (both 3·V), by weights (V): the
 // orthogonal factor of their weighted covariance (Higham's iteration).
-/**
- * @param {ArrayLike<number>} from
- * @param {ArrayLike<number>} to
- * @param {ArrayLike<number>} weights
- */
+/** @type {(from: Values, to: Values, weights: Values) => number[]} */
 function rigidRotation(from, to, weights) {
   let m = covariance(from, to, weights);
   for (let k = 0; k < 30; k++) {
@@ -210,10 +205,7 @@ function rigidRotation(from, to, weights) {
 }
 
 // Σ weight · to · fromᵀ about the weighted means, over its norm.
-/**
- * @type {(from: ArrayLike<number>, to: ArrayLike<number>, weights: ArrayLike<number>) =>
- *   number[]}
- */
+/** @type {(from: Values, to: Values, weights: Values) => number[]} */
 function covariance(from, to, weights) {
   const sums = { from: [0, 0, 0], to: [0, 0, 0], weight: 0 };
   const m = Array(9).fill(0);
@@ -251,37 +243,25 @@ const MIN_OPEN = 0.3; // share of the sky that a vertex must see to count as lit
 class Bounce {
   // Neutral vertices (3·V), triangles (3·F) with their areas, and the share of the sky that
   // vertices see (V).
-  /**
-   * @param {Values} neutral
-   * @param {Values} faces
-   * @param {ArrayLike<number>} areas
-   * @param {ArrayLike<number>} occlusion
-   */
-  constructor(neutral, faces, areas, occlusion) {
+  /** @param {Values[]} arrays */
+  constructor([neutral, faces, areas, occlusion]) {
     this.occlusion = occlusion;
     this.weight = new Float64Array(occlusion.length);
     for (let c = 0; c < faces.length; c++) {
       if (occlusion[faces[c]] > MIN_OPEN) this.weight[faces[c]] += areas[Math.floor(c / 3)];
     }
-    this.cell = new Int32Array(occlusion.length);
-    this.cells = 0;
-    /** Cells between neighbors along x, y and z; the outermost cells are empty. */
-    this.strides = this.placeInCells(neutral);
-    this.sumOfWeights = this.around(this.weight);
-  }
-
-  /** @param {Values} neutral */
-  placeInCells(neutral) {
     const [low, high] = box(neutral);
     const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
       Math.floor((value - low[axis]) / CELL_M) + 1;
     const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
-    for (let v = 0; v < this.cell.length; v++) {
-      const [x, y, z] = [0, 1, 2].map(axis => place(neutral[3 * v + axis], axis));
-      this.cell[v] = (x * ny + y) * nz + z;
-    }
+    this.cell = Int32Array.from(occlusion, (_, v) => {
+      const [x, y, z] = vector(axis => place(neutral[3 * v + axis], axis));
+      return (x * ny + y) * nz + z;
+    });
     this.cells = nx * ny * nz;
-    return [ny * nz, nz, 1];
+    /** Cells between neighbors along x, y and z; the outermost cells are empty. */
+    this.strides = [ny * nz, nz, 1];
+    this.sumOfWeights = this.around(this.weight);
   }
 
   // Sum of values (V) in each vertex's cell and the 26 around it.
@@ -311,8 +291,8 @@ class Bounce {
       for (let v = 0; v < weight.length; v++) channel[v] = weight[v] * arriving[3 * v + c];
       const near = this.around(channel);
       for (let v = 0; v < weight.length; v++) {
-        out[3 * v + c] +=
-          ((1 - occlusion[v]) * SKIN[c] * near[v]) / Math.max(sumOfWeights[v], 1e-12);
+        const mean = near[v] / Math.max(sumOfWeights[v], 1e-12);
+        out[3 * v + c] += (1 - occlusion[v]) * SKIN[c] * mean;
       }
     }
   }
@@ -367,7 +347,8 @@ export class LightPass {
     this.count = arrays.xyz.shape[0];
     const frames = new FaceFrames({ faces: arrays.faces, neutral: arrays.neutral }, convention);
     frames.placeFrames(Float64Array.from(this.neutral));
-    this.bounce = new Bounce(this.neutral, this.faces, frames.neutralArea, light('occlusion'));
+    const areas = frames.neutralArea;
+    this.bounce = new Bounce([this.neutral, this.faces, areas, light('occlusion')]);
     this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
     this.lashCorners = light('lash_corners');
     this.lashes = light('lash_face').length;
@@ -469,8 +450,8 @@ export class LightPass {
   // Compute the colors seen from a camera (world to camera, row-major); returns their texture.
   // Textures are the renderer's, and the framebuffer and viewport are others afterwards.
   /**
-   * @type {(camera: ArrayLike<number>, splats: WebGLTexture, tail: WebGLTexture, frames:
-   *   WebGLTexture) => WebGLTexture}
+   * @type {(camera: Float64Array, splats: WebGLTexture, tail: WebGLTexture, frames: WebGLTexture)
+   *   => WebGLTexture}
    */
   draw(camera, splats, tail, frames) {
     const { gl, colors, view, light } = this;
@@ -479,10 +460,10 @@ export class LightPass {
     gl.viewport(0, 0, colors.width, colors.height);
     gl.useProgram(program);
     const { surfaceTexture, vertexTexture, shadows } = this;
-    const textures = { uSplats: splats, uTail: tail, uFaces: frames, uSurface: surfaceTexture };
-    Object.entries({ ...textures, uVertices: vertexTexture, uShadows: shadows.texture }).forEach(
-      ([name, bound], unit) => bindTexture(gl, unit, bound, uniforms[name]),
-    );
+    const names = ['uSplats', 'uTail', 'uFaces', 'uSurface', 'uVertices', 'uShadows'];
+    const textures = [splats, tail, frames, surfaceTexture, vertexTexture, shadows.texture];
+    for (const [unit, bound] of textures.entries())
+      bindTexture(gl, unit, bound, uniforms[names[unit]]);
     this.setSun(uniforms);
     gl.uniform1f(uniforms.uTexel, view.texel);
     const world = light.world.map((value, k) => GLOSSY[Math.floor(k / 3)] * value);
@@ -567,32 +548,22 @@ function surfaceTexels(arrays, frames) {
 }
 
 // The point of a splat (xyz in its triangle's frame) in space.
-/**
- * @param {Float64Array} world rows of the frames
- * @param {number} face
- * @param {Values} xyz
- * @param {number} splat
- * @returns {Vector}
- */
+/** @type {(world: Float64Array, face: number, xyz: Values, splat: number) => Vector} */
 function placed(world, face, xyz, splat) {
   const [x, y, z] = xyz.subarray(3 * splat, 3 * splat + 3);
-  const part = (/** @type {number} */ k) =>
-    world[k] * x + world[k + 1] * y + world[k + 2] * z + world[k + 3];
-  return [part(12 * face), part(12 * face + 4), part(12 * face + 8)];
+  return vector(row => {
+    const at = 12 * face + 4 * row;
+    return world[at] * x + world[at + 1] * y + world[at + 2] * z + world[at + 3];
+  });
 }
 
 // Barycentric coordinates of a point in the plane of a triangle, clamped to it.
-/**
- * @type {(a: ArrayLike<number>, b: ArrayLike<number>, c: ArrayLike<number>, point: Vector) =>
- *   number[]}
- */
+/** @type {(a: Values, b: Values, c: Values, point: Vector) => number[]} */
 function nearestWeights(a, b, c, point) {
   const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
-  const uu = dotProduct(first, first);
-  const uv = dotProduct(first, second);
-  const vv = dotProduct(second, second);
+  const [uu, uv, pu] = [first, second, offset].map(each => dotProduct(each, first));
+  const [vv, pv] = [dotProduct(second, second), dotProduct(offset, second)];
   const area = Math.max(uu * vv - uv * uv, 1e-30);
-  const [pu, pv] = [dotProduct(offset, first), dotProduct(offset, second)];
   const [u, v] = [(vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area];
   const clamped = [1 - u - v, u, v].map(weight => Math.max(0, Math.min(1, weight)));
   const sum = clamped[0] + clamped[1] + clamped[2];
