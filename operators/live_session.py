@@ -20,7 +20,6 @@ from ..stga_addon.driving.live.sources import (
     Recording,
     Stream,
     eased,
-    resting,
     row_of,
 )
 from ..stga_addon.driving.open_motion import (
@@ -106,7 +105,7 @@ class LiveSession:
         face."""
         if not self._recent:
             raise StgaError("Drive: no face has been received yet")
-        self.rest = resting(list(self._recent))
+        self.rest = row_of(*self._recent)
 
     def show_again(self) -> None:
         """Pose the head as it was shown last, after an animation has posed it."""

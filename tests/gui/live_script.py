@@ -25,7 +25,7 @@ PORT, RATE, SECONDS, PICTURES_PER_SECOND = 21111, 60, 10.0, 10
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 sessions = sys.modules[f"{extension}.operators.live_session"]
-names = sys.modules[f"{extension}.stga_addon.driving.live.live_link_face"].PACKET_SHAPES
+names = sys.modules[f"{extension}.stga_addon.driving.live.decoders"].PACKET_SHAPES
 bpy.context.preferences.view.show_splash = False
 
 

@@ -3,7 +3,7 @@
 import ipaddress
 import socket
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import median
@@ -16,7 +16,7 @@ from .. import read_performance
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
 from ..read_performance import DEFAULT_FPS, MAX_FPS, MAX_ROWS
-from . import live_link_face, vmc
+from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]
 """The frame that a datagram completes, if any, and what is known of its sender from then on."""
@@ -53,7 +53,7 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
 
 SOURCES = {
     "live_link_face": Source(
-        "Live Link Face", 11111, _single(live_link_face.decode),
+        "Live Link Face", 11111, _single(decode_live_link_face),
         hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no "
         "such weights",
     ),
@@ -62,7 +62,7 @@ SOURCES = {
         "A request is sent to the phone, which answers until it is closed",
     ),
     "vmc": Source(
-        "VMC (OSC)", 39539, lambda data, known: vmc.decode(data, known or vmc.Received()),
+        "VMC (OSC)", 39539, lambda data, known: decode_vmc(data, known or Received()),
         hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are "
         "left out",
     ),
@@ -87,9 +87,8 @@ class Receiver:
         self.phone = str(checked_address("phone's address", phone)) if source.request else ""
         where = checked_address("address to listen on", address)
         self._asked = float("-inf")
-        self._socket = socket.socket(
-            socket.AF_INET6 if where.version == 6 else socket.AF_INET, socket.SOCK_DGRAM
-        )
+        family = socket.AF_INET6 if where.version == 6 else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
             self._socket.bind((str(where), self.port))
@@ -105,14 +104,10 @@ class Receiver:
     def read(self) -> list[tuple[str, bytes]]:
         """Sender's address and bytes of the datagrams that wait, up to MAX_DATAGRAMS."""
         found: list[tuple[str, bytes]] = []
-        while len(found) < MAX_DATAGRAMS:
-            try:
+        with suppress(OSError):  # nothing waits; or Windows: a request did not reach the phone
+            while len(found) < MAX_DATAGRAMS:
                 data, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
-            except (BlockingIOError, InterruptedError):
-                break
-            except OSError:  # Windows reports here that a request did not reach the phone
-                break
-            found.append((sender[0], data))
+                found.append((sender[0], data))
         return found
 
     def ask(self, now: float) -> None:
@@ -196,9 +191,7 @@ class Stream:
     _known: OrderedDict[str, Any] = field(default_factory=OrderedDict)
     _time: float | None = None
     _steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
-    _arrivals: deque[tuple[float, float | None]] = field(
-        default_factory=lambda: deque(maxlen=ARRIVALS)
-    )
+    _arrivals: deque[Any] = field(default_factory=lambda: deque(maxlen=ARRIVALS))
 
     def receive(self, address: str, data: bytes, now: float) -> FacePacket | None:
         """Take a datagram; its frame, if it is the followed sender's, in order, with a face."""
@@ -220,7 +213,7 @@ class Stream:
             return None
         self._arrivals.append((now, packet.time))
         self.has_face = packet.weights is not None
-        if packet.weights is None:
+        if not self.has_face:
             return None
         self.latest = packet
         return packet
@@ -288,21 +281,17 @@ MAX_LEAD_S = 5.0
 4 s while Blender is busy. Beyond it, the clock was set, or is another's."""
 
 
-def row_of(packet: FacePacket) -> Performance:
-    """A packet with a face as a performance of one row."""
-    assert packet.weights is not None
-    head = None if packet.head is None else np.array([packet.head])
-    return Performance(np.zeros(1), packet.weights[None], head, DEFAULT_FPS)
+def row_of(*packets: FacePacket) -> Performance:
+    """The mean of packets with a face, one at least, as a performance of one row."""
+    found = _rows_of(packets, np.zeros(1), DEFAULT_FPS)
+    head = None if found.head is None else found.head.mean(0, keepdims=True)
+    return replace(found, weights=found.weights.mean(0, keepdims=True), head=head)
 
 
-def resting(packets: list[FacePacket]) -> Performance:
-    """The mean of packets with a face, one at least, as one row."""
-    rows = [row_of(packet) for packet in packets]
-    heads = [row.head for row in rows if row.head is not None]
-    weights = np.mean([row.weights for row in rows], axis=0)
-    return replace(
-        rows[-1], weights=weights, head=np.mean(heads, axis=0) if len(heads) == len(rows) else None
-    )
+def _rows_of(packets: Sequence[FacePacket], times: np.ndarray, fps: float) -> Performance:
+    heads = [packet.head for packet in packets if packet.head is not None]
+    head = np.array(heads) if len(heads) == len(packets) else None
+    return Performance(times, np.array([packet.weights for packet in packets]), head, fps)
 
 
 def eased(
@@ -341,9 +330,8 @@ class Recording:
             before, last, step = self._times[-1], self._packets[-1], now - self._arrived
             if packet.time is not None:
                 own = -1.0 if last.time is None else packet.time - last.time
-                has_jumped = (
-                    own <= 0 or before + own > now + MAX_LEAD_S or packet.subject != last.subject
-                )
+                leads = before + own > now + MAX_LEAD_S
+                has_jumped = own <= 0 or leads or packet.subject != last.subject
                 step = max(step, MIN_STEP_S) if has_jumped else own
             time = before + step
             if step < MIN_STEP_S or len(self._times) >= MAX_ROWS:
@@ -359,10 +347,6 @@ class Recording:
         """What was recorded, with the resting face taken off; None for fewer than two rows."""
         if len(self._times) < 2:
             return None
-        rows = [row_of(packet) for packet in self._packets]
-        heads = [row.head for row in rows if row.head is not None]
         times = np.array(self._times) - self._times[0]
-        weights = np.concatenate([row.weights for row in rows])
-        head = np.concatenate(heads) if len(heads) == len(rows) else None
-        raw = Performance(times, weights, head, 1 / float(np.median(np.diff(times))))
+        raw = _rows_of(self._packets, times, 1 / float(np.median(np.diff(times))))
         return corrected(raw, MotionOptions(exchange=self.exchange), self.rest)

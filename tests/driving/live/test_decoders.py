@@ -11,8 +11,12 @@ from hypothesis import strategies as st
 
 from stga_addon.driving import read_performance
 from stga_addon.driving.head_map import head_turns
-from stga_addon.driving.live import live_link_face as link
-from stga_addon.driving.live import vmc
+from stga_addon.driving.live.decoders import (
+    Received,
+    decode_live_link_face,
+    decode_vmc,
+    osc_messages,
+)
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN
 
 from . import wire
@@ -26,7 +30,7 @@ def test_live_link_face():
     """Catches values at the place of the CSV's columns, where jaw and mouth have the right first, a
     time in frames, and head angles taken from the eyes."""
     weights = wire.mixed(0)
-    packet = link.decode(wire.live_link_face(weights, 120, (0.1, -0.2, 0.3), "Änne"))
+    packet = decode_live_link_face(wire.live_link_face(weights, 120, (0.1, -0.2, 0.3), "Änne"))
     assert packet is not None
     assert as_dict(packet.weights) == pytest.approx(weights)
     assert packet.head == pytest.approx((0.1, -0.2, 0.3))
@@ -38,18 +42,18 @@ def test_live_link_face_with_other_counts():
     """Catches senders of 51 or 52 shapes that are refused, and a packet without a face that is
     taken as one at rest."""
     weights = wire.mixed(1)
-    packet = link.decode(wire.live_link_face(weights, count=51))
+    packet = decode_live_link_face(wire.live_link_face(weights, count=51))
     assert as_dict(packet.weights) == pytest.approx({**weights, "tongueOut": 0.0})
     assert packet.head is None
     assert "tongueOut" not in packet.names
-    assert as_dict(link.decode(wire.live_link_face(weights, count=52)).weights) == pytest.approx(
-        weights
-    )
+    assert as_dict(
+        decode_live_link_face(wire.live_link_face(weights, count=52)).weights
+    ) == pytest.approx(weights)
     for absent in (wire.live_link_face({}, count=0), wire.live_link_face({}, count=0) + b"\0"):
-        packet = link.decode(absent)
+        packet = decode_live_link_face(absent)
         assert packet is not None
         assert packet.weights is None
-    assert link.decode(wire.live_link_face({}, count=30)) is None
+    assert decode_live_link_face(wire.live_link_face({}, count=30)) is None
 
 
 def test_packets_of_pylivelinkface():
@@ -65,7 +69,7 @@ def test_packets_of_pylivelinkface():
         + struct.pack("!II", 60, 1)
         + struct.pack("!B61f", 61, *values)
     )
-    packet = link.decode(data)
+    packet = decode_live_link_face(data)
     assert packet.subject == name.decode()
     assert packet.time == pytest.approx((600 + 0.47295) / 60, abs=1e-5)
     assert as_dict(packet.weights)["jawLeft"] == pytest.approx(values[15])
@@ -108,18 +112,18 @@ def bundle(*messages: bytes) -> bytes:
 def test_vmc_by_hand():
     """Catches values that count before they are applied, are forgotten between two datagrams, or of
     VRM's own expressions, whose A is no shape of ARKit."""
-    packet, known = vmc.decode(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), vmc.Received())
+    packet, known = decode_vmc(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), Received())
     assert packet is None
-    packet, known = vmc.decode(
+    packet, known = decode_vmc(
         bundle(blend("MouthSmile_L", 0.25), bundle(blend("cheekPuff", 0.75), APPLY)), known
     )
     expected = {"jawOpen": 0.5, "mouthSmileLeft": 0.25, "cheekPuff": 0.75}
     assert {name: value for name, value in as_dict(packet.weights).items() if value} == expected
     assert set(packet.names) == set(expected)
-    packet, _ = vmc.decode(bundle(blend("jawOpen", 0.0), APPLY), known)
+    packet, _ = decode_vmc(bundle(blend("jawOpen", 0.0), APPLY), known)
     assert as_dict(packet.weights)["cheekPuff"] == 0.75
     assert (
-        vmc.decode(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), vmc.Received())
+        decode_vmc(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), Received())
         is None
     )
 
@@ -129,7 +133,7 @@ def test_vmc_with_python_osc():
     datagrams."""
     message = pytest.importorskip("pythonosc.osc_message_builder")
     bundles = pytest.importorskip("pythonosc.osc_bundle_builder")
-    weights, known = wire.mixed(3), vmc.Received()
+    weights, known = wire.mixed(3), Received()
 
     def written(address: str, *values: object) -> object:
         builder = message.OscMessageBuilder(address)
@@ -142,11 +146,11 @@ def test_vmc_with_python_osc():
     for name, value in weights.items():
         builder.add_content(written("/VMC/Ext/Blend/Val", name[0].upper() + name[1:], value))
     builder.add_content(written("/VMC/Ext/Blend/Apply"))
-    packet, known = vmc.decode(builder.build().dgram, known)
+    packet, known = decode_vmc(builder.build().dgram, known)
     assert as_dict(packet.weights) == pytest.approx(weights)
     assert packet.time == 12.5
     mixed = written("/x/y", 1, 2.5, "text", b"blob", True, False)
-    assert vmc.messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
+    assert osc_messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -159,7 +163,7 @@ def test_vmc_head(axis):
     where = osc_text("/VMC/Ext/Bone/Pos") + osc_text(",sfffffff") + osc_text("Head") + struct.pack(
         ">7f", 0, 1, 0, *quaternion
     )  # fmt: skip
-    packet, _ = vmc.decode(bundle(where, blend("jawOpen", 0), APPLY), vmc.Received())
+    packet, _ = decode_vmc(bundle(where, blend("jawOpen", 0), APPLY), Received())
     turn = head_turns(np.array([packet.head]))[0]
     expected = np.zeros(3)
     expected[axis] = angle if axis == 0 else -angle
@@ -187,13 +191,13 @@ def malformed(rng: np.random.Generator) -> bytes:
 def test_ten_thousand_malformed_packets():
     """Catches an exception of any decoder, and weights or angles that are not finite."""
     rng = np.random.default_rng(0)
-    known = vmc.Received()
+    known = Received()
     for _ in range(10_000):
         data = malformed(rng)
-        decoded = vmc.decode(data, known)
+        decoded = decode_vmc(data, known)
         known = known if decoded is None else decoded[1]
         for packet in (
-            link.decode(data),
+            decode_live_link_face(data),
             read_performance.parse_packet(data),
             decoded and decoded[0],
         ):
@@ -206,8 +210,8 @@ def test_ten_thousand_malformed_packets():
 @given(st.binary(max_size=200))
 def test_any_bytes(data):
     """Catches an exception that mutated packets do not reach."""
-    link.decode(data)
-    link.decode(b"\x06" + data)
+    decode_live_link_face(data)
+    decode_live_link_face(b"\x06" + data)
     read_performance.parse_packet(data)
-    vmc.decode(data, vmc.Received())
-    vmc.messages(b"#bundle\0" + data)
+    decode_vmc(data, Received())
+    osc_messages(b"#bundle\0" + data)

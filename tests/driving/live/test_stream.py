@@ -15,7 +15,6 @@ from stga_addon.driving.live.sources import (
     Stream,
     eased,
     leaves_this_machine,
-    resting,
     row_of,
 )
 from stga_addon.driving.performance import COLUMN
@@ -188,7 +187,7 @@ def test_recording():
     first = stream.receive(
         "a", wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0)), 0.0
     )
-    recording = Recording(7, resting([first]), ("mouth",))
+    recording = Recording(7, row_of(first), ("mouth",))
     for frame in (0, 1, 2, 5):
         data = wire.live_link_face({"jawOpen": 1.0, "mouthLeft": 0.5}, 100 + frame, (0.4, 0, 0))
         recording.add(stream.receive("a", data, 3.0 * frame), 3.0 * frame)

@@ -17,7 +17,7 @@ try {
   const results = [];
   for (let frame = 0; frame < motion.frames; frame++) {
     motion.sample(frame);
-    frames.update(rig.pose(motion.coefficients, motion.pose, motion.translation));
+    frames.update(rig.pose(motion));
     frames.compose(camera, texels);
     const order = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values).sort(texels);
     results.push({

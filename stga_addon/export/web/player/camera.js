@@ -3,12 +3,12 @@
 // around a point.
 
 /**
- * @import { Player } from './player.js'
+ * @import { Player } from './stga-avatar.js'
  * @import { Camera, Vector, View } from './types.js'
  * @typedef {[number, number]} Point pixels of the page
  */
 
-import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js';
+import { box, crossed, difference, dotProduct, scaled, unit, vector } from './vector.js';
 
 const MAX_ELEVATION = 1.54; // radians; short of the pole, where "up" has no direction
 const MIN_DISTANCE_M = 0.02;
@@ -17,28 +17,19 @@ const MIN_DISTANCE_M = 0.02;
 // camera, row-major.
 /** @type {(view: View) => Camera} */
 export function cameraOfView(view) {
-  const { size, focal, center } = view;
-  return {
-    size: [...size],
-    focal: [...focal],
-    center: [...center],
-    matrix: Float64Array.from(view.world_to_camera),
-  };
+  const { size, focal, center } = structuredClone(view);
+  return { size, focal, center, matrix: Float64Array.from(view.world_to_camera) };
 }
 
 // The same camera for a canvas of another size, with the whole of its picture in the middle.
 /** @type {(camera: Camera, width: number, height: number) => Camera} */
 export function fitted(camera, width, height) {
-  const scale = Math.min(width / camera.size[0], height / camera.size[1]);
-  return {
-    size: [width, height],
-    focal: [camera.focal[0] * scale, camera.focal[1] * scale],
-    center: [
-      width / 2 + (camera.center[0] - camera.size[0] / 2) * scale,
-      height / 2 + (camera.center[1] - camera.size[1] / 2) * scale,
-    ],
-    matrix: camera.matrix,
-  };
+  const { size, focal, center, matrix } = camera;
+  const scale = Math.min(width / size[0], height / size[1]);
+  const x = width / 2 + (center[0] - size[0] / 2) * scale;
+  const y = height / 2 + (center[1] - size[1] / 2) * scale;
+  const scaledFocal = /** @type {Point} */ (focal.map(length => length * scale));
+  return { size: [width, height], focal: scaledFocal, center: [x, y], matrix };
 }
 
 // A camera in front (+z, y up) of the points (3·V) for data without views.
@@ -102,11 +93,8 @@ export function dollied(camera, pivot, factor) {
 // (radians).
 /** @type {(camera: Camera, direction: Vector, yaw: number, pitch: number) => Vector} */
 export function turnedAsSeen(camera, direction, yaw, pitch) {
-  return rotatedAbout(
-    rotatedAbout(direction, row(camera.matrix, 1), -yaw),
-    row(camera.matrix, 0),
-    pitch,
-  );
+  const aside = rotatedAbout(direction, row(camera.matrix, 1), -yaw);
+  return rotatedAbout(aside, row(camera.matrix, 0), pitch);
 }
 
 // Rotate about a world axis through `pivot`, which stays where it is in the picture.
@@ -127,19 +115,15 @@ function rotatedAbout(v, axis, angle) {
   const [cosine, sine] = [Math.cos(angle), Math.sin(angle)];
   const side = crossed(axis, v);
   const along = dotProduct(axis, v) * (1 - cosine);
-  const part = (/** @type {number} */ k) => v[k] * cosine + side[k] * sine + axis[k] * along;
-  return [part(0), part(1), part(2)];
+  return vector(k => v[k] * cosine + side[k] * sine + axis[k] * along);
 }
 
 /** @type {(matrix: Float64Array, k: number) => Vector} */
-function row(matrix, k) {
-  return [matrix[4 * k], matrix[4 * k + 1], matrix[4 * k + 2]];
-}
+const row = (matrix, k) => vector(c => matrix[4 * k + c]);
 
 /** @type {(matrix: Float64Array, point: Vector) => Vector} */
 function inCamera(matrix, point) {
-  const part = (/** @type {number} */ k) => dotProduct(row(matrix, k), point) + matrix[4 * k + 3];
-  return [part(0), part(1), part(2)];
+  return vector(k => dotProduct(row(matrix, k), point) + matrix[4 * k + 3]);
 }
 
 const ORBIT_PER_PIXEL = 0.008; // radians
@@ -148,15 +132,13 @@ const WHEEL_LINE_PX = 16;
 const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 
 // Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its
-// sun; `changed()` after each move of the camera, `lit()` after each of the sun. Of two fingers,
-// the middle pans and the distance zooms.
+// sun; `changed` hears of "camerachange" and "lightchange". Of two fingers, the middle pans and the
+// distance zooms.
 /**
- * @param {HTMLElement} element
- * @param {() => Player | null} player
- * @param {() => void} changed
- * @param {() => void} lit
+ * @type {(element: HTMLElement, player: () => Player | null,
+ *   changed: (event: string) => void) => void}
  */
-export function addControls(element, player, changed, lit) {
+export function addControls(element, player, changed) {
   /** @type {Map<number, Point>} */
   const pointers = new Map();
   element.addEventListener('contextmenu', event => event.preventDefault());
@@ -175,49 +157,34 @@ export function addControls(element, player, changed, lit) {
     const after = [...pointers.values()];
     const { camera, data, lighting, pivot } = shown;
     const [dx, dy] = middle(after).map((place, axis) => place - middle(before)[axis]);
+    const [yaw, pitch] = [dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL];
     if (event.altKey && after.length === 1 && lighting?.sun) {
-      const toward = turnedAsSeen(
-        camera,
-        lighting.sun.toward,
-        dx * ORBIT_PER_PIXEL,
-        dy * ORBIT_PER_PIXEL,
-      );
+      const toward = turnedAsSeen(camera, lighting.sun.toward, yaw, pitch);
       shown.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
-      lit();
+      changed('lightchange');
       return;
     }
     if (after.length === 1 && !event.shiftKey && event.buttons <= 1) {
-      shown.camera = orbited(
-        camera,
-        pivot,
-        data.header.up,
-        -dx * ORBIT_PER_PIXEL,
-        dy * ORBIT_PER_PIXEL,
-      );
+      shown.camera = orbited(camera, pivot, data.header.up, -yaw, pitch);
     } else {
-      const scale = Math.max(
-        camera.size[0] / element.clientWidth,
-        camera.size[1] / element.clientHeight,
-      );
+      const { clientWidth, clientHeight } = element;
+      const scale = Math.max(camera.size[0] / clientWidth, camera.size[1] / clientHeight);
       [shown.camera, shown.pivot] = panned(camera, pivot, dx * scale, dy * scale);
     }
     if (after.length > 1)
       shown.camera = dollied(shown.camera, shown.pivot, distance(before) / distance(after));
-    changed();
+    changed('camerachange');
   });
-  element.addEventListener(
-    'wheel',
-    event => {
-      const shown = player();
-      if (!shown) return;
-      event.preventDefault();
-      const pixels = event.deltaY * (event.deltaMode === 1 ? WHEEL_LINE_PX : 1);
-      const limited = Math.max(-MAX_WHEEL_PX, Math.min(MAX_WHEEL_PX, pixels));
-      shown.camera = dollied(shown.camera, shown.pivot, Math.exp(limited * ZOOM_PER_WHEEL_PIXEL));
-      changed();
-    },
-    { passive: false },
-  );
+  // prettier-ignore
+  element.addEventListener('wheel', event => {
+    const shown = player();
+    if (!shown) return;
+    event.preventDefault();
+    const pixels = event.deltaY * (event.deltaMode === 1 ? WHEEL_LINE_PX : 1);
+    const limited = Math.max(-MAX_WHEEL_PX, Math.min(MAX_WHEEL_PX, pixels));
+    shown.camera = dollied(shown.camera, shown.pivot, Math.exp(limited * ZOOM_PER_WHEEL_PIXEL));
+    changed('camerachange');
+  }, { passive: false });
 }
 
 /** @param {Point[]} points one or two */

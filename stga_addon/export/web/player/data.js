@@ -34,13 +34,12 @@ export async function readData(bytes) {
 
 /** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Uint8Array>} */
 async function inflate(bytes) {
+  const inflated = new DecompressionStream('gzip');
+  /** @type {Uint8Array<ArrayBuffer>[]} */
   const chunks = [];
   let size = 0;
   try {
-    const reader = new Blob([bytes])
-      .stream()
-      .pipeThrough(new DecompressionStream('gzip'))
-      .getReader();
+    const reader = new Blob([bytes]).stream().pipeThrough(inflated).getReader();
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
       chunks.push(part.value);
       size += part.value.length;
@@ -49,23 +48,15 @@ async function inflate(bytes) {
   } catch (error) {
     throw error instanceof DataError ? error : new DataError('The avatar data is damaged.');
   }
-  const raw = new Uint8Array(size);
-  let at = 0;
-  for (const chunk of chunks) {
-    raw.set(chunk, at);
-    at += chunk.length;
-  }
-  return raw;
+  return new Uint8Array(await new Blob(chunks).arrayBuffer());
 }
 
 /** @type {(bytes: Uint8Array) => any} */
 function parseHeader(bytes) {
   try {
     const header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes));
-    if (header && header.format === 'stga-web' && header.version === VERSION) return header;
-  } catch {
-    // reported below
-  }
+    if (header.format === 'stga-web' && header.version === VERSION) return header;
+  } catch {} // reported below
   throw new DataError('The header of the avatar data is damaged.');
 }
 
@@ -117,16 +108,12 @@ function decoded(name, entry, block, count) {
 // Throw a DataError unless header and arrays fit each other and hold usable values.
 /** @type {(header: any, arrays: Record<string, DataArray>) => void} */
 function checkData(header, arrays) {
-  const splats = size(arrays, 'xyz', 0);
-  const vertices = size(arrays, 'base', 0);
-  const faces = size(arrays, 'faces', 0);
-  const shapes = size(arrays, 'basis', 0);
-  const frames = size(arrays, 'coefficients', 0);
+  const [splats, vertices, faces, shapes, frames] = [
+    ...['xyz', 'base', 'faces', 'basis', 'coefficients'].map(name => size(arrays, name, 0)),
+  ];
   const joints = list(header.parents, 'parents').length;
-  require(vertices > 0 &&
-    faces > 0 &&
-    joints > 0 &&
-    frames > 0, 'number of vertices, triangles, joints or frames');
+  const isEmpty = !vertices || !faces || !joints || !frames;
+  require(!isEmpty, 'number of vertices, triangles, joints or frames');
   /** @type {Record<string, number[]>} */
   const shapesOf = {
     xyz: [splats, 3],
@@ -148,20 +135,22 @@ function checkData(header, arrays) {
     pose: [frames, joints, 3],
     translation: [frames, 3],
   };
-  if (arrays.selection) shapesOf.selection = [frames, Math.ceil(faces / 8)];
-  if (arrays.strain_color) shapesOf.strain_color = [splats, 3 * CHANNELS];
-  for (const [name, { components }] of Object.entries(SIGNALS)) {
-    if (arrays[name]) shapesOf[name] = [faces, 3 * components];
-  }
-  if (arrays.strain_range) shapesOf.strain_range = [faces, 6];
+  /** @type {Record<string, number[]>} */
+  const optional = {
+    selection: [frames, Math.ceil(faces / 8)],
+    strain_color: [splats, 3 * CHANNELS],
+    strain_range: [faces, 6],
+    sh: [splats, arrays.sh?.shape[1]],
+  };
+  for (const [name, { components }] of Object.entries(SIGNALS))
+    optional[name] = [faces, 3 * components];
+  for (const name in optional) if (arrays[name]) shapesOf[name] = optional[name];
   if (header.shapes) {
     const controls = list(header.shapes.names, 'shapes').length;
     const moved = size(arrays, 'shape_products', 1);
     require(moved <= shapes, 'shape_products');
-    Object.assign(shapesOf, {
-      shape_linear: [controls, moved + 9],
-      shape_products: [controls, moved],
-    });
+    shapesOf.shape_linear = [controls, moved + 9];
+    shapesOf.shape_products = [controls, moved];
   }
   if (header.light) {
     const { damping, recorded, typical } = header.light;
@@ -177,7 +166,7 @@ function checkData(header, arrays) {
       light_lash_corners: [lashes, 12],
     });
   }
-  if (arrays.sh) shapesOf.sh = [splats, arrays.sh.shape[1]];
+
   for (const [name, expected] of Object.entries(shapesOf)) {
     const { shape, values } = arrays[name] ?? { shape: [], values: [] };
     require(shape.join() === expected.join(), name);
@@ -189,47 +178,33 @@ function checkData(header, arrays) {
   for (const [name, past] of Object.entries(limits)) {
     require(arrays[name].values.every(value => isIndex(value, past)), name);
   }
-  require(arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0) ===
-    splats, 'splats_per_face');
-  require(list(header.parents, 'parents').every(
-    (parent, joint) => parent === -1 || isIndex(parent, joint),
-  ), 'parents');
-  checkHeader(header, joints, shapes);
-}
-
-/** @type {(header: any, joints: number, shapes: number) => void} */
-function checkHeader(header, joints, shapes) {
+  const counted = arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0);
+  require(counted === splats, 'splats_per_face');
+  for (const [joint, parent] of header.parents.entries())
+    require(parent === -1 || isIndex(parent, joint), 'parents');
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
   require(typeof header.antialiased === 'boolean', 'antialiased');
   require(typeof header.title === 'string', 'title');
   require(numbers([header.fps], 1) && header.fps > 0 && header.fps <= 1000, 'fps');
-  require(numbers(header.background, 3) &&
-    header.background.every(
-      (/** @type {number} */ value) => value >= 0 && value <= 1,
-    ), 'background');
+  require(numbers(header.background, 3), 'background');
+  require(Math.min(...header.background, 1 - Math.max(...header.background)) >= 0, 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
-  const names = list(header.joints, 'joints');
-  require(names.length === joints && names.every(name => typeof name === 'string'), 'joints');
+  require(strings(header.joints, 'joints').length === joints, 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
-    require(typeof slider?.name === 'string' &&
-      Number.isFinite(slider.reach) &&
-      slider.reach > 0 &&
-      isIndex(slider.component, shapes), 'sliders');
+    require(typeof slider?.name === 'string' && isIndex(slider.component, shapes), 'sliders');
+    require(slider.reach > 0 && Number.isFinite(slider.reach), 'sliders');
   }
   if (header.shapes) {
-    const { names: controls, opens, limited } = header.shapes;
-    require(controls.every((/** @type {unknown} */ name) => typeof name === 'string'), 'shapes');
-    require(controls.includes(opens) && controls.includes(limited), 'shapes');
+    const controls = strings(header.shapes.names, 'shapes');
+    require([header.shapes.opens, header.shapes.limited].every(n =>
+      controls.includes(n),
+    ), 'shapes');
   }
   for (const view of list(header.views, 'views')) {
-    require(typeof view?.name === 'string' && list(view.size, 'views').length === 2, 'views');
-    require(view.size.every(
-      (/** @type {unknown} */ side) => isIndex(side, MAX_VIEW_SIZE) && side !== 0,
-    ), 'views');
-    require(numbers(view.focal, 2) &&
-      Math.min(...view.focal) > 0 &&
-      numbers(view.center, 2), 'views');
-    require(numbers(view.world_to_camera, 16), 'views');
+    require(typeof view?.name === 'string' && numbers(view.size, 2), 'views');
+    for (const side of view.size) require(side && isIndex(side, MAX_VIEW_SIZE), 'views');
+    require(numbers(view.focal, 2) && Math.min(...view.focal) > 0, 'views');
+    require(numbers(view.center, 2) && numbers(view.world_to_camera, 16), 'views');
   }
 }
 
@@ -252,6 +227,12 @@ function numbers(value, count) {
 /** @type {(value: any, name: string) => any[]} */
 function list(value, name) {
   require(Array.isArray(value), name);
+  return value;
+}
+
+/** @type {(value: any, name: string) => string[]} */
+function strings(value, name) {
+  require(list(value, name).every(text => typeof text === 'string'), name);
   return value;
 }
 

@@ -29,24 +29,22 @@ export function sidesOf(faces, vertices, out = new Float64Array(3 * faces.length
   return out;
 }
 
-export class Strain {
-  // faces (3·F), sides of the neutral mesh, number of its vertices, range (6·F: lowest three,
-  // highest three) of strain; ±MAX_STRAIN without one.
-  /**
-   * @param {Values} faces
-   * @param {Float64Array} sides
-   * @param {number} vertices
-   * @param {Values} [range]
-   */
-  constructor(faces, sides, vertices, range) {
+class Strain {
+  // By the sides of the neutral triangles. Without a range (6·F: lowest three, highest three of a
+  // triangle) in the file, strain is within ±MAX_STRAIN.
+  /** @param {Arrays} arrays @param {Float64Array} sides */
+  constructor(arrays, sides) {
+    const faces = arrays.faces.values;
     this.faces = faces;
     const count = faces.length / 3;
     const limits = new Float32Array(6 * count);
-    this.range = range ?? limits.map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
+    this.range =
+      arrays.strain_range?.values ?? limits.map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
     this.values = new Float32Array(3 * count);
     this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral sides
     this.toTensor = new Float32Array(18 * count); // change of gram → tensor xx, yy, zz, xy, yz, zx
     this.toPlane = new Float32Array(18 * count); // tensor → along the first side, across it, shear
+    const vertices = arrays.neutral.shape[0];
     this.share = new Float64Array(vertices); // of a triangle in the means of vertex and triangle
     this.atVertex = new Float64Array(6 * vertices);
     for (const vertex of faces) this.share[vertex]++;
@@ -100,12 +98,7 @@ export class Strain {
     for (let v = 0, at = 0; v < share.length; v++) {
       for (const end = at + 6; at < end; at++) atVertex[at] *= share[v];
     }
-    this.gather();
-  }
-
-  /** Strain of every triangle from the tensors of its vertices. */
-  gather() {
-    const { faces, toPlane, atVertex, range, values } = this;
+    const { toPlane, range, values } = this;
     for (let f = 0; f < faces.length; f += 3) {
       const [i, j, k] = [6 * faces[f], 6 * faces[f + 1], 6 * faces[f + 2]];
       let along = 0;
@@ -126,7 +119,7 @@ export class Strain {
 }
 
 /** Strain around each triangle, which positions follow: 0 for a mesh at rest. */
-export class SmoothedStrain {
+class SmoothedStrain {
   static components = 3;
 
   // Of `strain` (Strain), which is to be updated first.
@@ -141,22 +134,24 @@ export class SmoothedStrain {
       const lowest = k + 3 * Math.floor(k / 3);
       this.rest[k] = Math.min(range[lowest + 3], Math.max(range[lowest], 0));
     }
-    const [edges, edgeCount] = edgesOf(faces);
-    this.edges = edges; // (3·F), each three times its index
-    this.edgeSum = new Float64Array(3 * edgeCount); // over all triangles at an edge
+    const vertices = strain.share.length;
+    /** @type {Map<number, number>} */
+    const index = new Map(); // of an edge by its ends, times three
+    const edges = Int32Array.from(faces, (vertex, c) => {
+      const next = faces[c % 3 < 2 ? c + 1 : c - 2];
+      const ends = Math.min(vertex, next) * vertices + Math.max(vertex, next);
+      if (!index.has(ends)) index.set(ends, 3 * index.size);
+      return /** @type {number} */ (index.get(ends));
+    });
+    this.edges = edges; // (3·F) from each corner to the next
+    this.edgeSum = new Float64Array(3 * index.size); // over all triangles at an edge
     this.ownFactor = new Float64Array(count);
     this.share = new Float64Array(count); // one over how many neighbors a triangle has and itself
-    this.weigh(edgeCount);
-  }
-
-  // The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor`
-  // leaves it once.
-  /** @param {number} edgeCount */
-  weigh(edgeCount) {
-    const { edges, ownFactor, share } = this;
-    const touching = new Int32Array(edgeCount);
+    // The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor`
+    // leaves it once.
+    const touching = new Int32Array(index.size);
     for (const edge of edges) touching[edge / 3]++;
-    for (let f = 0; f < share.length; f++) {
+    for (let f = 0; f < count; f++) {
       const own = edges.subarray(3 * f, 3 * f + 3);
       let held = 0;
       let itself = 0; // 3, or more where a degenerate triangle has one edge twice
@@ -164,15 +159,15 @@ export class SmoothedStrain {
         held += touching[edge / 3];
         for (const other of own) if (edge === other) itself++;
       }
-      ownFactor[f] = 1 - itself;
-      share[f] = 1 / (1 + held - itself);
+      this.ownFactor[f] = 1 - itself;
+      this.share[f] = 1 / (1 + held - itself);
     }
   }
 
   /** Follow the strain. */
   update() {
-    const { rest, strain, values } = this;
-    for (let k = 0; k < values.length; k++) values[k] = strain.values[k] - rest[k];
+    for (let k = 0; k < this.values.length; k++)
+      this.values[k] = this.strain.values[k] - this.rest[k];
     for (let round = 0; round < AVERAGING_ROUNDS; round++) this.average();
   }
 
@@ -200,28 +195,8 @@ export class SmoothedStrain {
   }
 }
 
-// [three times the index of the edge from each corner to the next (3·F), number of edges], by the
-// edges' ends.
-/** @type {(faces: Values) => [Int32Array, number]} */
-function edgesOf(faces) {
-  const vertices = faces.reduce((most, vertex) => Math.max(most, vertex), 0) + 1;
-  /** @type {Map<number, number>} */
-  const index = new Map();
-  const edges = Int32Array.from(faces, (vertex, c) => {
-    const next = faces[c % 3 < 2 ? c + 1 : c - 2];
-    const ends = Math.min(vertex, next) * vertices + Math.max(vertex, next);
-    const known = index.get(ends) ?? 3 * index.size;
-    index.set(ends, known);
-    return known;
-  });
-  return [edges, index.size];
-}
-
 // Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
-/**
- * @type {(a: ArrayLike<number>, b: ArrayLike<number>, factor: number, out: Float32Array, at:
- *   number) => void}
- */
+/** @type {(a: Vector, b: Vector, factor: number, out: Float32Array, at: number) => void} */
 function symmetricProduct(a, b, factor, out, at) {
   for (let k = 0; k < 3; k++) {
     const next = (k + 1) % 3;
@@ -243,10 +218,7 @@ export const FACE_FLOATS = 16;
 export class FaceFrames {
   // Arrays of the data file, and the convention of the embedding; strain is computed where splats
   // follow it.
-  /**
-   * @param {Pick<Arrays, 'faces' | 'neutral'> & Partial<Arrays>} arrays
-   * @param {string} convention
-   */
+  /** @param {Arrays} arrays @param {string} convention */
   constructor(arrays, convention) {
     const faces = arrays.faces.values;
     const neutral = arrays.neutral.values;
@@ -259,16 +231,14 @@ export class FaceFrames {
     this.neutralArea = neutralAreas(this.sides);
     const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
     const followsStrain = arrays.strain_color || offsets.length;
-    const range = arrays.strain_range?.values;
-    const vertices = neutral.length / 3;
-    const strain = followsStrain ? new Strain(faces, this.sides, vertices, range) : null;
+    const strain = followsStrain ? new Strain(arrays, this.sides) : null;
     this.strain = strain;
     /** Signals and their coefficients (3·S·F): for each of S components a vector in the frame. */
     this.offsets = strain
       ? offsets.map(([name, Signal]) => ({
           signal: new Signal(strain),
           components: Signal.components,
-          coefficients: /** @type {Values} */ (arrays[name]?.values),
+          coefficients: arrays[name].values,
         }))
       : [];
   }
@@ -293,11 +263,7 @@ export class FaceFrames {
     const sides = sidesOf(faces, vertices, this.sides);
     const [first, normal] = [new Float64Array(3), new Float64Array(3)];
     for (let f = 0, at = 0; f < this.count; f++, at += 9) {
-      let uu = 0;
-      let vv = 0;
-      let ww = 0;
-      let twice = 0;
-      let length = 0;
+      let [uu, vv, ww, twice, length] = [0, 0, 0, 0, 0];
       for (let k = 0; k < 3; k++) {
         const u = sides[at + k];
         const v = sides[at + 3 + k];
@@ -341,9 +307,7 @@ export class FaceFrames {
   moveOrigins(values, components, coefficients) {
     const { count, world } = this;
     for (let f = 0; f < count; f++) {
-      let x = 0;
-      let y = 0;
-      let z = 0;
+      let [x, y, z] = [0, 0, 0];
       for (let k = components * f; k < components * (f + 1); k++) {
         x += values[k] * coefficients[3 * k];
         y += values[k] * coefficients[3 * k + 1];
@@ -400,9 +364,7 @@ function neutralAreas(sides) {
 
 // Make first and normal of a triangle that is a line, or whose `first` has no length, perpendicular
 // unit vectors.
-/**
- * @type {(first: Float64Array, normal: Float64Array, isShort: boolean, isLine: boolean) => void}
- */
+/** @type {(first: Float64Array, normal: Float64Array, short: boolean, line: boolean) => void} */
 function substitute(first, normal, isShort, isLine) {
   const x = isShort ? [1, 0, 0] : unit(first);
   const isUpright = Math.abs(x[2]) > UPRIGHT_COSINE;

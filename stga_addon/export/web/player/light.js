@@ -3,13 +3,24 @@
 // reflects it. Axes are those of the data file's meshes; the rules are those of STGA for Blender's
 // light/.
 
-/** @import { Environment, Lighting, LitBy, Values, Vector } from './types.js' */
+/**
+ * @import { Arrays, Data, LightOfCapture, Lighting, LitBy } from './types.js'
+ * @import { Program, Sun, Values, Vector } from './types.js'
+ */
 
-import { box, crossed, dotProduct, matrixFromAxisAngle, scaled, unit } from './vector.js';
+import { bounds } from './camera.js';
+import { FaceFrames } from './face_frames.js';
+import { bindTexture, deleteTarget, floatTexture, makeTarget } from './renderer.js';
+import { paddedLength, program, updateTexture } from './renderer.js';
+import { LIFT_M, MAP_SIZE, SURFACE_TEXELS, TEXTURE_WIDTH, VERTEX_TEXELS } from './shaders.js';
+import { OVER_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER, SHADOW_VERTEX_SHADER } from './shaders.js';
+import { lightFragmentShader } from './shaders.js';
+import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js';
+import { matrixFromAxisAngle, vector } from './vector.js';
 
 // Built-in environments, y up and the face towards z: even radiance, lobes of radiance that falls
 // with the cosine, and a sun of irradiance `color` that throws shadows.
-/** @type {Record<string, Environment>} */
+/** @type {Record<string, { label: string, even: Vector, lobes: Sun[], sun?: Sun }>} */
 export const ENVIRONMENTS = {
   studio: {
     label: 'Soft studio',
@@ -52,18 +63,12 @@ export function litBy(lighting, up) {
   }
   const sun = lighting.sun ?? added;
   if (sun) check([...sun.toward, ...sun.color], 6, 'sun');
-  return {
-    world,
-    sun: sun && { toward: unit(sun.toward), color: [...sun.color] },
-    factor: 2 ** exposure,
-  };
+  const copy = sun && { toward: unit(sun.toward), color: sun.color };
+  return { world, sun: copy, factor: 2 ** exposure };
 }
 
 // Add an environment whose axes a rotation takes to those of the head; returns its sun.
-/**
- * @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => { toward: Vector;
- *   color: Vector; } | null}
- */
+/** @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => Sun | null} */
 function addEnvironment(world, name, rotation) {
   if (!Object.hasOwn(ENVIRONMENTS, name))
     throw new RangeError(`There is no environment "${name}".`);
@@ -90,16 +95,15 @@ function fromUpright(up, turn) {
 /** @type {(values: ArrayLike<number>, count: number, name: string) => void} */
 function check(values, count, name) {
   if (values.length !== count || !Array.from(values).every(Number.isFinite)) {
-    throw new RangeError(
-      `Lighting: ${name} holds something else than finite numbers, or too few or too many.`,
-    );
+    const problem = 'holds something else than finite numbers, or too few or too many';
+    throw new RangeError(`Lighting: ${name} ${problem}.`);
   }
 }
 
 // Spherical harmonics of degree 2, in which distant light is kept: nine coefficients of red, green
 // and blue each.
 
-export const HARMONICS = 9;
+const HARMONICS = 9;
 const DEGREE_0 = 0.28209479177387814;
 const DEGREE_1 = 0.4886025119029199;
 const MIXED = 1.0925484305920792; // xy, yz, xz
@@ -107,16 +111,12 @@ const UPRIGHT = 0.31539156525252005; // 3z² − 1
 const CROSSED = 0.5462742152960396; // x² − y²
 // Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi
 // and Hanrahan).
-export const COSINE_LOBE = [
-  Math.PI,
-  ...Array(3).fill((2 * Math.PI) / 3),
-  ...Array(5).fill(Math.PI / 4),
-];
+const COSINE_LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 0.25, 0.25, 0.25, 0.25, 0.25].map(k => k * Math.PI);
 
 // Basis functions of a unit vector, orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x²
 // − y².
 /** @param {ArrayLike<number>} direction */
-export function harmonicsOf(direction) {
+function harmonicsOf(direction) {
   const [x, y, z] = [direction[0], direction[1], direction[2]];
   const linear = [DEGREE_0, DEGREE_1 * y, DEGREE_1 * z, DEGREE_1 * x];
   const square = [UPRIGHT * (3 * z * z - 1), MIXED * x * z, CROSSED * (x * x - y * y)];
@@ -125,7 +125,7 @@ export function harmonicsOf(direction) {
 
 // Light of a color from everywhere.
 /** @param {ArrayLike<number>} color */
-export function evenLight(color) {
+function evenLight(color) {
   const light = new Float64Array(3 * HARMONICS);
   for (let c = 0; c < 3; c++) light[c] = color[c] / DEGREE_0;
   return light;
@@ -133,7 +133,7 @@ export function evenLight(color) {
 
 // Add radiance of a color that falls with the cosine around a direction.
 /** @type {(light: Float64Array, toward: Vector, color: ArrayLike<number>) => void} */
-export function addLobe(light, toward, color) {
+function addLobe(light, toward, color) {
   const values = harmonicsOf(toward);
   for (let k = 0; k < HARMONICS; k++) {
     for (let c = 0; c < 3; c++) light[3 * k + c] += COSINE_LOBE[k] * values[k] * color[c];
@@ -143,7 +143,7 @@ export function addLobe(light, toward, color) {
 // The same light in other axes: the rotation (3×3, row by row) takes old coordinates to new ones.
 // Degree 1 turns as a vector, degree 2 as a symmetric matrix.
 /** @type {(light: ArrayLike<number>, rotation: ArrayLike<number>) => Float64Array<ArrayBuffer>} */
-export function rotatedLight(light, rotation) {
+function rotatedLight(light, rotation) {
   const turned = new Float64Array(3 * HARMONICS);
   for (let c = 0; c < 3; c++) {
     const part = (/** @type {number} */ k) => light[3 * k + c];
@@ -151,21 +151,16 @@ export function rotatedLight(light, rotation) {
     const [xy, yz, xz] = [part(4), part(5), part(7)].map(value => (MIXED / 2) * value);
     const [up, across] = [UPRIGHT * part(6), CROSSED * part(8)];
     const m = turnedMatrix(rotation, [across - up, xy, xz, xy, -across - up, yz, xz, yz, 2 * up]);
-    const square = [
-      (2 * m[1]) / MIXED,
-      (2 * m[5]) / MIXED,
-      m[8] / (2 * UPRIGHT),
-      (2 * m[2]) / MIXED,
-    ];
-    [part(0), y, z, x, ...square, (m[0] - m[4]) / (2 * CROSSED)].forEach(
-      (value, k) => (turned[3 * k + c] = value),
-    );
+    const mixed = [m[1], m[5], m[2]].map(value => (2 * value) / MIXED);
+    const rest = [m[8] / (2 * UPRIGHT), mixed[2], (m[0] - m[4]) / (2 * CROSSED)];
+    const values = [part(0), y, z, x, mixed[0], mixed[1], ...rest];
+    for (const [k, value] of values.entries()) turned[3 * k + c] = value;
   }
   return turned;
 }
 
 /** @type {(rotation: ArrayLike<number>, v: ArrayLike<number>) => Vector} */
-export function turnedVector(rotation, v) {
+function turnedVector(rotation, v) {
   const part = (/** @type {number} */ k) =>
     rotation[k] * v[0] + rotation[k + 1] * v[1] + rotation[k + 2] * v[2];
   return [part(0), part(3), part(6)];
@@ -182,7 +177,7 @@ function turnedMatrix(rotation, m) {
 
 // Add light of an irradiance from one direction.
 /** @type {(light: Float64Array, toward: ArrayLike<number>, color: ArrayLike<number>) => void} */
-export function addPoint(light, toward, color) {
+function addPoint(light, toward, color) {
   harmonicsOf(toward).forEach((value, k) => {
     for (let c = 0; c < 3; c++) light[3 * k + c] += value * color[c];
   });
@@ -192,12 +187,8 @@ export function addPoint(light, toward, color) {
 
 // The rotation (3×3, row by row) that best takes vertices to others (both 3·V), by weights (V): the
 // orthogonal factor of their weighted covariance (Higham's iteration).
-/**
- * @param {ArrayLike<number>} from
- * @param {ArrayLike<number>} to
- * @param {ArrayLike<number>} weights
- */
-export function rigidRotation(from, to, weights) {
+/** @type {(from: Values, to: Values, weights: Values) => number[]} */
+function rigidRotation(from, to, weights) {
   let m = covariance(from, to, weights);
   for (let k = 0; k < 30; k++) {
     const [r0, r1, r2] = [m.slice(0, 3), m.slice(3, 6), m.slice(6, 9)];
@@ -214,10 +205,7 @@ export function rigidRotation(from, to, weights) {
 }
 
 // Σ weight · to · fromᵀ about the weighted means, over its norm.
-/**
- * @type {(from: ArrayLike<number>, to: ArrayLike<number>, weights: ArrayLike<number>) =>
- *   number[]}
- */
+/** @type {(from: Values, to: Values, weights: Values) => number[]} */
 function covariance(from, to, weights) {
   const sums = { from: [0, 0, 0], to: [0, 0, 0], weight: 0 };
   const m = Array(9).fill(0);
@@ -235,11 +223,8 @@ function covariance(from, to, weights) {
 }
 
 // Irradiance (3·V) of light (harmonics in the head's axes) past the head itself.
-/**
- * @param {Values} transfer (9·V)
- * @param {Float64Array} light
- */
-export function received(transfer, light) {
+/** @param {Values} transfer (9·V) @param {Float64Array} light */
+function received(transfer, light) {
   const found = new Float64Array(transfer.length / 3);
   for (let v = 0; 9 * v < transfer.length; v++) {
     for (let c = 0; c < 3; c++) {
@@ -255,40 +240,28 @@ const CELL_M = 0.02;
 const SKIN = [0.5, 0.33, 0.25];
 const MIN_OPEN = 0.3; // share of the sky that a vertex must see to count as lit skin
 
-export class Bounce {
+class Bounce {
   // Neutral vertices (3·V), triangles (3·F) with their areas, and the share of the sky that
   // vertices see (V).
-  /**
-   * @param {Values} neutral
-   * @param {Values} faces
-   * @param {ArrayLike<number>} areas
-   * @param {ArrayLike<number>} occlusion
-   */
-  constructor(neutral, faces, areas, occlusion) {
+  /** @param {Values[]} arrays */
+  constructor([neutral, faces, areas, occlusion]) {
     this.occlusion = occlusion;
     this.weight = new Float64Array(occlusion.length);
     for (let c = 0; c < faces.length; c++) {
       if (occlusion[faces[c]] > MIN_OPEN) this.weight[faces[c]] += areas[Math.floor(c / 3)];
     }
-    this.cell = new Int32Array(occlusion.length);
-    this.cells = 0;
-    /** Cells between neighbors along x, y and z; the outermost cells are empty. */
-    this.strides = this.placeInCells(neutral);
-    this.sumOfWeights = this.around(this.weight);
-  }
-
-  /** @param {Values} neutral */
-  placeInCells(neutral) {
     const [low, high] = box(neutral);
     const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
       Math.floor((value - low[axis]) / CELL_M) + 1;
     const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
-    for (let v = 0; v < this.cell.length; v++) {
-      const [x, y, z] = [0, 1, 2].map(axis => place(neutral[3 * v + axis], axis));
-      this.cell[v] = (x * ny + y) * nz + z;
-    }
+    this.cell = Int32Array.from(occlusion, (_, v) => {
+      const [x, y, z] = vector(axis => place(neutral[3 * v + axis], axis));
+      return (x * ny + y) * nz + z;
+    });
     this.cells = nx * ny * nz;
-    return [ny * nz, nz, 1];
+    /** Cells between neighbors along x, y and z; the outermost cells are empty. */
+    this.strides = [ny * nz, nz, 1];
+    this.sumOfWeights = this.around(this.weight);
   }
 
   // Sum of values (V) in each vertex's cell and the 26 around it.
@@ -318,8 +291,8 @@ export class Bounce {
       for (let v = 0; v < weight.length; v++) channel[v] = weight[v] * arriving[3 * v + c];
       const near = this.around(channel);
       for (let v = 0; v < weight.length; v++) {
-        out[3 * v + c] +=
-          ((1 - occlusion[v]) * SKIN[c] * near[v]) / Math.max(sumOfWeights[v], 1e-12);
+        const mean = near[v] / Math.max(sumOfWeights[v], 1e-12);
+        out[3 * v + c] += (1 - occlusion[v]) * SKIN[c] * mean;
       }
     }
   }
@@ -331,7 +304,7 @@ const UNLIKE_LIGHT = 0.2;
 // Gain of red, green and blue, and share, by the light of the capture and the one that is shown (27
 // harmonics each, in the same axes; lamps as if they were far away).
 /** @type {(recorded: ArrayLike<number>, shown: ArrayLike<number>) => number[]} */
-export function keptColors(recorded, shown) {
+function keptColors(recorded, shown) {
   const gain = [0, 0, 0];
   const weight = (/** @type {number} */ k) => COSINE_LOBE[Math.floor(k / 3)] ** 2;
   const [product, square] = [new Float64Array(3), new Float64Array(3).fill(1e-12)];
@@ -348,4 +321,266 @@ export function keptColors(recorded, shown) {
   }
   const step = Math.min(1, Math.sqrt(off / whole) / UNLIKE_LIGHT);
   return [...gain, 1 - step * step * (3 - 2 * step)];
+}
+
+// Colors of the splats under the light of a scene: a texel a splat, computed again where pose,
+// light or eye have changed. What depends on the avatar alone is in the data file.
+
+// Of each harmonic in the mean radiance around the direction that skin mirrors (light/harmonics.py,
+// GLOSSY).
+const GLOSSY = [1, 0.85, 0.85, 0.85, 0.62, 0.62, 0.62, 0.62, 0.62];
+const MIN_RIGID = 1e-3; // weight of covered vertices where the turn of the head is found
+const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
+
+export class LightPass {
+  // For data of an avatar whose light is known.
+  /** @param {WebGL2RenderingContext} gl @param {Data} data */
+  constructor(gl, data) {
+    this.gl = gl;
+    const { arrays, header } = data;
+    const { convention } = header;
+    const light = (/** @type {string} */ name) => arrays[`light_${name}`].values;
+    this.faces = arrays.faces.values;
+    this.neutral = arrays.neutral.values;
+    this.transfer = light('transfer');
+    this.rigid = Float64Array.from(light('occlusion'), share => share + MIN_RIGID);
+    this.count = arrays.xyz.shape[0];
+    const frames = new FaceFrames({ faces: arrays.faces, neutral: arrays.neutral }, convention);
+    frames.placeFrames(Float64Array.from(this.neutral));
+    const areas = frames.neutralArea;
+    this.bounce = new Bounce([this.neutral, this.faces, areas, light('occlusion')]);
+    this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
+    this.lashCorners = light('lash_corners');
+    this.lashes = light('lash_face').length;
+    const lashFaces = Array.from(light('lash_face'), face => [
+      ...this.faces.subarray(3 * face, 3 * face + 3),
+    ]);
+    const lashes = { shape: [lashFaces.length, 3], values: Int32Array.from(lashFaces.flat()) };
+    this.lashFrames = new FaceFrames({ faces: lashes, neutral: arrays.neutral }, convention);
+    const vertices = this.neutral.length / 3;
+    this.vertexValues = new Float32Array(
+      paddedLength((vertices + 4 * this.lashes) * VERTEX_TEXELS),
+    );
+    this.vertexTexture = floatTexture(gl, gl.RGBA32F, this.vertexValues);
+    const cards = Array.from(
+      { length: 6 * this.lashes },
+      (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 0, 2, 3][k % 6],
+    );
+    this.casters = Uint32Array.from([...this.faces, ...cards.map(corner => vertices + corner)]);
+    this.shadows = makeTarget(gl, gl.DEPTH_COMPONENT32F, MAP_SIZE, MAP_SIZE, gl.DEPTH_ATTACHMENT);
+    this.vertexArray = gl.createVertexArray();
+    this.indexBuffer = gl.createBuffer();
+    gl.bindVertexArray(this.vertexArray);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indexBuffer);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.casters, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    const rows = Math.ceil(this.count / TEXTURE_WIDTH) || 1;
+    this.colors = makeTarget(gl, gl.RGBA32F, TEXTURE_WIDTH, rows);
+    const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
+    const colorShader = lightFragmentShader(harmonics, arrays.strain_color ? 3 : 0);
+    this.program = program(gl, OVER_VERTEX_SHADER, colorShader);
+    this.shadowProgram = program(gl, SHADOW_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER);
+    const { damping, recorded, typical } = /** @type {LightOfCapture} */ (header.light);
+    this.recorded = recorded;
+    this.typical = [...typical, damping];
+    this.light = litBy({}, header.up);
+    this.kept = [0, 0, 0, 0]; // gain of red, green and blue, share
+    this.view = sunView(this.neutral, [0, 1, 0]);
+  }
+
+  // Follow the posed vertices (3·V) and the light.
+  /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
+  update(vertices, sides, light) {
+    const { gl } = this;
+    this.light = light;
+    this.packVertices(vertices, sides, light);
+    updateTexture(gl, this.vertexTexture, this.vertexValues);
+    if (!light.sun) return;
+    this.view = sunView(vertices, light.sun.toward);
+    this.drawShadows();
+  }
+
+  /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
+  packVertices(vertices, sides, { world, sun }) {
+    const normals = vertexNormals(this.faces, sides, vertices.length);
+    const rotation = rigidRotation(vertices, this.neutral, this.rigid);
+    const around = Float64Array.from(world);
+    if (sun) addPoint(around, sun.toward, sun.color);
+    const arriving = received(this.transfer, rotatedLight(world, rotation));
+    const distant = rotatedLight(around, rotation);
+    this.kept = keptColors(this.recorded, distant);
+    this.bounce.add(received(this.transfer, distant), arriving);
+    for (let from = 0, to = 0; from < vertices.length; from += 3, to += 4 * VERTEX_TEXELS) {
+      for (let k = 0; k < 3; k++) {
+        this.vertexValues[to + k] = vertices[from + k];
+        this.vertexValues[to + 4 + k] = normals[from + k];
+        this.vertexValues[to + 8 + k] = arriving[from + k];
+      }
+    }
+    if (!sun) return;
+    this.lashFrames.placeFrames(vertices);
+    for (let corner = 0; corner < 4 * this.lashes; corner++) {
+      const point = placed(this.lashFrames.world, corner >> 2, this.lashCorners, corner);
+      this.vertexValues.set(point, (vertices.length / 3 + corner) * 4 * VERTEX_TEXELS);
+    }
+  }
+
+  drawShadows() {
+    const { gl, view } = this;
+    const { program, uniforms } = this.shadowProgram;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadows.framebuffer);
+    gl.viewport(0, 0, MAP_SIZE, MAP_SIZE);
+    gl.enable(gl.DEPTH_TEST);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.useProgram(program);
+    bindTexture(gl, 0, this.vertexTexture, uniforms.uVertices);
+    this.setSun(uniforms);
+    gl.bindVertexArray(this.vertexArray);
+    gl.drawElements(gl.TRIANGLES, this.casters.length, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  /** @param {Program['uniforms']} uniforms */
+  setSun(uniforms) {
+    this.gl.uniformMatrix3fv(uniforms.uToSun, true, this.view.axes);
+    this.gl.uniform3f(uniforms.uMiddle, ...this.view.middle);
+    this.gl.uniform1f(uniforms.uRadius, this.view.radius);
+  }
+
+  // Compute the colors seen from a camera (world to camera, row-major); returns their texture.
+  // Textures are the renderer's, and the framebuffer and viewport are others afterwards.
+  /**
+   * @type {(camera: Float64Array, splats: WebGLTexture, tail: WebGLTexture, frames: WebGLTexture)
+   *   => WebGLTexture}
+   */
+  draw(camera, splats, tail, frames) {
+    const { gl, colors, view, light } = this;
+    const { program, uniforms } = this.program;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, colors.framebuffer);
+    gl.viewport(0, 0, colors.width, colors.height);
+    gl.useProgram(program);
+    const { surfaceTexture, vertexTexture, shadows } = this;
+    const names = ['uSplats', 'uTail', 'uFaces', 'uSurface', 'uVertices', 'uShadows'];
+    const textures = [splats, tail, frames, surfaceTexture, vertexTexture, shadows.texture];
+    for (const [unit, bound] of textures.entries())
+      bindTexture(gl, unit, bound, uniforms[names[unit]]);
+    this.setSun(uniforms);
+    gl.uniform1f(uniforms.uTexel, view.texel);
+    const world = light.world.map((value, k) => GLOSSY[Math.floor(k / 3)] * value);
+    gl.uniform3fv(uniforms['uWorld[0]'], world);
+    gl.uniform3f(uniforms.uSunColor, ...(light.sun?.color ?? [0, 0, 0]));
+    gl.uniform1f(uniforms.uFactor, light.factor);
+    gl.uniform4fv(uniforms.uKept, this.kept);
+    gl.uniform4fv(uniforms.uTypical, this.typical);
+    const eye = vector(
+      k => -camera[k] * camera[3] - camera[4 + k] * camera[7] - camera[8 + k] * camera[11],
+    );
+    gl.uniform3f(uniforms.uEye, ...eye);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    return colors.texture;
+  }
+
+  dispose() {
+    const { gl } = this;
+    for (const item of [this.surfaceTexture, this.vertexTexture]) gl.deleteTexture(item);
+    gl.deleteBuffer(this.indexBuffer);
+    gl.deleteVertexArray(this.vertexArray);
+    for (const item of [this.program, this.shadowProgram]) gl.deleteProgram(item.program);
+    for (const target of [this.colors, this.shadows]) deleteTarget(gl, target);
+  }
+}
+
+// How a sun sees the head: rows across, up and along its rays; the middle and radius of what it
+// sees, and the width of a texel of its shadow map, in meters.
+/** @param {ArrayLike<number>} vertices @param {Vector} toward */
+function sunView(vertices, toward) {
+  const [middle, half] = bounds(vertices);
+  let square = 0;
+  for (let v = 0; v < vertices.length; v += 3) {
+    const x = vertices[v] - middle[0];
+    const y = vertices[v + 1] - middle[1];
+    const z = vertices[v + 2] - middle[2];
+    square = Math.max(square, x * x + y * y + z * z);
+  }
+  const forward = scaled(toward, -1);
+  const across = unit(crossed(forward, Math.abs(forward[1]) < 0.9 ? [0, 1, 0] : [1, 0, 0]));
+  const axes = [...across, ...crossed(forward, across), ...forward];
+  const radius = Math.sqrt(square) * 1.01 + 4 * LIFT_M;
+  return { middle, radius, texel: (2 * half) / MAP_SIZE, axes };
+}
+
+// Where the splats are on the neutral mesh, and what that receives: normal, roughness (0: skin) |
+// irradiance of the capture, occlusion | corners of the triangle | their weights.
+/** @param {Arrays} arrays @param {FaceFrames} frames of the neutral mesh */
+function surfaceTexels(arrays, frames) {
+  const { faces, neutral, splats_per_face, xyz } = arrays;
+  const names = ['face', 'irradiance', 'occlusion', 'roughness'];
+  const [face, irradiance, occlusion, roughness] = names.map(
+    name => arrays[`light_${name}`].values,
+  );
+  const normals = vertexNormals(faces.values, frames.sides, neutral.values.length);
+  const least = [0, 0, 0];
+  for (let k = 0; k < irradiance.length; k++)
+    least[k % 3] += (MIN_IRRADIANCE * 3 * irradiance[k]) / irradiance.length;
+  const values = new Float32Array(paddedLength(xyz.shape[0] * SURFACE_TEXELS));
+  for (let own = 0, splat = 0; own < splats_per_face.values.length; own++) {
+    for (const end = splat + splats_per_face.values[own]; splat < end; splat++) {
+      const from = 3 * ((own + face[splat]) % faces.shape[0]);
+      const corners = Array.from(faces.values.subarray(from, from + 3));
+      const [a, b, c] = corners.map(vertex => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
+      const weights = nearestWeights(a, b, c, placed(frames.world, own, xyz.values, splat));
+      const to = 4 * SURFACE_TEXELS * splat;
+      for (let k = 0; k < 3; k++) {
+        const [vertex, weight] = [corners[k], weights[k]];
+        for (let channel = 0; channel < 3; channel++) {
+          values[to + channel] += weight * normals[3 * vertex + channel];
+          values[to + 4 + channel] += weight * irradiance[3 * vertex + channel];
+        }
+        values[to + 3] += weight * roughness[vertex];
+        values[to + 7] += weight * occlusion[vertex];
+        values[to + 8 + k] = vertex;
+        values[to + 12 + k] = weight;
+      }
+      for (let k = 0; k < 3; k++) values[to + 4 + k] = Math.max(values[to + 4 + k], least[k]);
+    }
+  }
+  return values;
+}
+
+// The point of a splat (xyz in its triangle's frame) in space.
+/** @type {(world: Float64Array, face: number, xyz: Values, splat: number) => Vector} */
+function placed(world, face, xyz, splat) {
+  const [x, y, z] = xyz.subarray(3 * splat, 3 * splat + 3);
+  return vector(row => {
+    const at = 12 * face + 4 * row;
+    return world[at] * x + world[at + 1] * y + world[at + 2] * z + world[at + 3];
+  });
+}
+
+// Barycentric coordinates of a point in the plane of a triangle, clamped to it.
+/** @type {(a: Values, b: Values, c: Values, point: Vector) => number[]} */
+function nearestWeights(a, b, c, point) {
+  const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
+  const [uu, uv, pu] = [first, second, offset].map(each => dotProduct(each, first));
+  const [vv, pv] = [dotProduct(second, second), dotProduct(offset, second)];
+  const area = Math.max(uu * vv - uv * uv, 1e-30);
+  const [u, v] = [(vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area];
+  const clamped = [1 - u - v, u, v].map(weight => Math.max(0, Math.min(1, weight)));
+  const sum = clamped[0] + clamped[1] + clamped[2];
+  return clamped.map(weight => weight / sum);
+}
+
+// Unit normals (3·V) weighted by the area of triangles, by their sides; 0 where there are none.
+/** @type {(faces: Values, sides: Float64Array, size: number) => Float64Array<ArrayBuffer>} */
+function vertexNormals(faces, sides, size) {
+  const normals = new Float64Array(size);
+  for (let c = 0; c < faces.length; c++) {
+    const from = 9 * Math.floor(c / 3) + 6;
+    for (let k = 0; k < 3; k++) normals[3 * faces[c] + k] += sides[from + k];
+  }
+  for (let at = 0; at < size; at += 3) {
+    const length = Math.hypot(normals[at], normals[at + 1], normals[at + 2]);
+    for (let k = at; k < at + 3; k++) normals[k] /= Math.max(length, 1e-20);
+  }
+  return normals;
 }

@@ -5,13 +5,8 @@
 /** @import { Data, Performance } from './types.js' */
 
 import { DataError } from './data.js';
-import {
-  axisAngleOf,
-  matrixFromAxisAngle,
-  multiplied,
-  quaternionOf,
-  slerpAxisAngle,
-} from './vector.js';
+import { axisAngleOf, matrixFromAxisAngle, multiplied } from './vector.js';
+import { quaternionOf, slerpAxisAngle } from './vector.js';
 
 // Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded
 // one.
@@ -44,12 +39,13 @@ export class Motion {
   // way. Of a performance, the head as a whole stays where it is in the first recorded frame.
   /** @param {number} frame */
   sample(frame) {
-    const recorded = this.shapes.performance ? 0 : frame;
-    const first = Math.min(Math.max(Math.floor(recorded), 0), this.recordedFrames - 1);
-    const second = Math.min(first + 1, this.recordedFrames - 1);
-    const share = Math.min(Math.max(recorded - first, 0), 1);
-    blend(this.recorded.coefficients.values, first, second, share, this.coefficients);
-    blend(this.recorded.translation.values, first, second, share, this.translation);
+    const time = this.shapes.performance ? 0 : frame;
+    const [first, second, share] = neighbors(time, this.recordedFrames);
+    for (const name of /** @type {const} */ (['coefficients', 'translation'])) {
+      const [{ values }, out] = [this.recorded[name], this[name]];
+      for (let k = 0, at = first * out.length, to = second * out.length; k < out.length; k++)
+        out[k] = values[at + k] + share * (values[to + k] - values[at + k]);
+    }
     const [pose, size] = [this.recorded.pose.values, this.pose.length];
     for (let at = 0; at < size; at += 3) {
       const before = pose.subarray(first * size + at, first * size + at + 3);
@@ -64,20 +60,15 @@ export class Motion {
   release() {
     this.pinnedCoefficients.fill(NaN);
     this.pinnedPose.fill(NaN);
-    this.shapes.release();
+    this.shapes.pinned.fill(NaN);
   }
 }
 
-/**
- * @type {(values: ArrayLike<number>, first: number, second: number, share: number, out:
- *   Float64Array) => void}
- */
-function blend(values, first, second, share, out) {
-  const size = out.length;
-  for (let k = 0; k < size; k++) {
-    const before = values[first * size + k];
-    out[k] = before + share * (values[second * size + k] - before);
-  }
+// Rows before and after a time, and the share of the second.
+/** @type {(time: number, rows: number) => [number, number, number]} */
+function neighbors(time, rows) {
+  const first = Math.min(Math.max(Math.floor(time), 0), rows - 1);
+  return [first, Math.min(first + 1, rows - 1), Math.min(Math.max(time - first, 0), 1)];
 }
 
 /** @type {(values: Float64Array, pinned: Float64Array) => void} */
@@ -106,12 +97,8 @@ export class Rig {
   }
 
   // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
-  /**
-   * @param {ArrayLike<number>} coefficients
-   * @param {ArrayLike<number>} pose
-   * @param {ArrayLike<number>} translation
-   */
-  pose(coefficients, pose, translation) {
+  /** @param {Pick<Motion, 'coefficients' | 'pose' | 'translation'>} motion */
+  pose({ coefficients, pose, translation }) {
     this.shaped.set(this.base);
     this.joints.set(this.jointRest);
     addShapes(this.shaped, this.basis, coefficients);
@@ -122,8 +109,28 @@ export class Rig {
     const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
     if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
     this.chain();
-    this.skinVertices(translation);
-    return this.vertices;
+    const { shaped, weights, skin, vertices } = this;
+    const joints = this.parents.length;
+    for (let v = 0, at = 0; at < shaped.length; v++, at += 3) {
+      const x = shaped[at];
+      const y = shaped[at + 1];
+      const z = shaped[at + 2];
+      let px = translation[0];
+      let py = translation[1];
+      let pz = translation[2];
+      for (let j = 0; j < joints; j++) {
+        const w = weights[v * joints + j];
+        if (w === 0) continue;
+        const s = 12 * j;
+        px += w * (skin[s] * x + skin[s + 1] * y + skin[s + 2] * z + skin[s + 3]);
+        py += w * (skin[s + 4] * x + skin[s + 5] * y + skin[s + 6] * z + skin[s + 7]);
+        pz += w * (skin[s + 8] * x + skin[s + 9] * y + skin[s + 10] * z + skin[s + 11]);
+      }
+      vertices[at] = px;
+      vertices[at + 1] = py;
+      vertices[at + 2] = pz;
+    }
+    return vertices;
   }
 
   /** Rotation and offset of each joint in the world, from the root outwards. */
@@ -156,31 +163,6 @@ export class Rig {
           skin[to + 2] * joints[3 * j + 2];
         skin[to + 3] = placed[3 * j + row] - turned;
       }
-    }
-  }
-
-  /** @param {ArrayLike<number>} translation */
-  skinVertices(translation) {
-    const { shaped, weights, skin, vertices } = this;
-    const joints = this.parents.length;
-    for (let v = 0, at = 0; at < shaped.length; v++, at += 3) {
-      const x = shaped[at];
-      const y = shaped[at + 1];
-      const z = shaped[at + 2];
-      let px = translation[0];
-      let py = translation[1];
-      let pz = translation[2];
-      for (let j = 0; j < joints; j++) {
-        const w = weights[v * joints + j];
-        if (w === 0) continue;
-        const s = 12 * j;
-        px += w * (skin[s] * x + skin[s + 1] * y + skin[s + 2] * z + skin[s + 3]);
-        py += w * (skin[s + 4] * x + skin[s + 5] * y + skin[s + 6] * z + skin[s + 7]);
-        pz += w * (skin[s + 8] * x + skin[s + 9] * y + skin[s + 10] * z + skin[s + 11]);
-      }
-      vertices[at] = px;
-      vertices[at + 1] = py;
-      vertices[at + 2] = pz;
     }
   }
 }
@@ -251,10 +233,6 @@ export class Shapes {
     return this.performance !== null || this.pinned.some(value => !Number.isNaN(value));
   }
 
-  release() {
-    this.pinned.fill(NaN);
-  }
-
   // Replace expressions, jaw and eyes, and turn the neck as the performance does.
   /** @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void} */
   apply(frame, coefficients, pose) {
@@ -288,21 +266,14 @@ export class Shapes {
     weights.fill(0);
     let head = null;
     if (performance) {
-      const first = Math.min(Math.max(Math.floor(frame), 0), performance.rows.length - 1);
-      const second = Math.min(first + 1, performance.rows.length - 1);
-      const share = Math.min(Math.max(frame - first, 0), 1);
-      const [before, after] = [performance.rows[first], performance.rows[second]];
-      for (let k = 0; k < weights.length; k++) {
-        const column = performance.columns[k];
-        if (column >= 0) weights[k] = before[column] + share * (after[column] - before[column]);
-      }
-      if (performance.head.every(column => column >= 0)) {
-        head = performance.head.map(
-          column => before[column] + share * (after[column] - before[column]),
-        );
-      }
+      const { columns, rows } = performance;
+      const [first, second, share] = neighbors(frame, rows.length);
+      const value = (/** @type {number} */ column) =>
+        rows[first][column] + share * (rows[second][column] - rows[first][column]);
+      for (let k = 0; k < weights.length; k++) if (columns[k] >= 0) weights[k] = value(columns[k]);
+      if (performance.head.every(column => column >= 0)) head = performance.head.map(value);
     }
-    for (let k = 0; k < weights.length; k++) if (!Number.isNaN(pinned[k])) weights[k] = pinned[k];
+    replacePinned(weights, pinned);
     return head;
   }
 }

@@ -9,7 +9,7 @@
 import { DataError } from './data.js';
 import { ENVIRONMENTS } from './light.js';
 import { StgaAvatar, hexOf } from './stga-avatar.js';
-import { scaled } from './vector.js';
+import { scaled, vector } from './vector.js';
 
 const fixed = (/** @type {number} */ value) => value.toFixed(2);
 const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
@@ -28,10 +28,7 @@ const RANGES = {
 
 export class LightControls {
   // Fill and show `section` for an avatar whose light is known.
-  /**
-   * @param {HTMLElement} section
-   * @param {StgaAvatar} avatar
-   */
+  /** @param {HTMLElement} section @param {StgaAvatar} avatar */
   constructor(section, avatar) {
     this.avatar = avatar;
     /** @type {Kind} */
@@ -43,14 +40,10 @@ export class LightControls {
     this.color = /** @type {HTMLInputElement} */ (section.querySelector('input[type="color"]'));
     this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
     section.hidden = false;
-    const environments = Object.entries(ENVIRONMENTS).map(([name, { label }]) => [name, label]);
-    for (const [name, label] of [
-      ['recorded', 'As recorded'],
-      [DRAGGED, 'A light to drag'],
-      ...environments,
-    ]) {
+    this.select.add(new Option('As recorded', 'recorded'));
+    this.select.add(new Option('A light to drag', DRAGGED));
+    for (const [name, { label }] of Object.entries(ENVIRONMENTS))
       this.select.add(new Option(label, name));
-    }
     this.select.addEventListener('change', () => {
       this.kind = this.select.value;
       this.showKind();
@@ -71,11 +64,7 @@ export class LightControls {
     this.showKind();
   }
 
-  /**
-   * @param {HTMLElement} section
-   * @param {string} name
-   * @param {typeof RANGES['turn']} range
-   */
+  /** @param {HTMLElement} section @param {string} name @param {typeof RANGES['turn']} range */
   addRange(section, name, { label, kinds, low, high, value, format }) {
     const [row, output, input] = sliderRow(section, 'range', label, low, high);
     [input.value, input.name] = [String(value), name];
@@ -150,18 +139,16 @@ function fromPad(camera, x, y) {
   const angle = PAD_ANGLE * Math.min(1, reach);
   const side = reach > 0 ? Math.sin(angle) / reach : 0;
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const part = (/** @type {number} */ k) =>
-    m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle);
-  return [part(0), part(1), part(2)];
+  return vector(k => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle));
 }
 
 // The reverse, within the pad.
 /** @type {(camera: Camera | null, toward: Vector) => number[]} */
 function onPad(camera, toward) {
   const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const along = (/** @type {number} */ k) =>
-    m[k] * toward[0] + m[k + 1] * toward[1] + m[k + 2] * toward[2];
-  const [x, y, z] = [along(0), along(4), along(8)];
+  const [x, y, z] = vector(
+    k => m[4 * k] * toward[0] + m[4 * k + 1] * toward[1] + m[4 * k + 2] * toward[2],
+  );
   const side = Math.hypot(x, y);
   const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
   return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
@@ -170,23 +157,11 @@ function onPad(camera, toward) {
 // "#rrggbb" in linear light.
 /** @type {(hex: string) => Vector} */
 function linearColor(hex) {
-  const part = (/** @type {number} */ at) => {
-    const value = parseInt(hex.slice(at, at + 2), 16) / 255;
+  return vector(k => {
+    const value = parseInt(hex.slice(2 * k + 1, 2 * k + 3), 16) / 255;
     return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
-  };
-  return [part(1), part(3), part(5)];
+  });
 }
-
-/**
- * @typedef {object} SliderOptions
- * @property {string} id
- * @property {string} label
- * @property {number} low
- * @property {number} high
- * @property {() => number} read what plays
- * @property {(value: number | null) => void} write null: as recorded
- * @property {(value: number) => string} [format]
- */
 
 const SLIDERS_SHOWN = 8;
 // The last comes first.
@@ -210,14 +185,8 @@ const avatar = element('stga-avatar', StgaAvatar);
 /** @type {{ update: () => void, release: () => void }[]} */
 const sliders = [];
 
-/**
- * The first element that the selector finds. Throws where there is none of the class.
- * @template {Element} E
- * @param {string} selector
- * @param {new () => E} kind
- * @param {ParentNode} parent
- * @returns {E}
- */
+// The first element that the selector finds. Throws where there is none of the class.
+/** @type {<E extends Element>(selector: string, kind: new () => E, parent?: ParentNode) => E} */
 function element(selector, kind, parent = document) {
   const found = parent.querySelector(selector);
   if (!(found instanceof kind)) throw new Error(`The page has no ${selector}.`);
@@ -240,9 +209,8 @@ function setPressed(button, pressed) {
 
 /** @param {HTMLInputElement} input */
 function fillTrack(input) {
-  const [low, high] = [Number(input.min), Number(input.max)];
-  const share = (Number(input.value) - low) / (high - low || 1);
-  input.style.setProperty('--done', `${100 * share}%`);
+  const [low, high, value] = [input.min, input.max, input.value].map(Number);
+  input.style.setProperty('--done', `${(100 * (value - low)) / (high - low || 1)}%`);
 }
 
 // Playback
@@ -257,10 +225,7 @@ function updateTransport() {
   fillTrack(inputOf('scrub'));
 }
 
-function toggle() {
-  if (avatar.playing) avatar.pause();
-  else avatar.play();
-}
+const toggle = () => (avatar.playing ? avatar.pause() : avatar.play());
 
 function toggleLoop() {
   avatar.loop = !avatar.loop;
@@ -322,10 +287,11 @@ let background = null; // chosen by the viewer; null: the theme's
 /** @type {Map<HTMLElement, string | null>} */
 const swatches = new Map(); // button → color; null: the theme's
 
-function applyBackground() {
+/** @param {string | null} [chosen] null: the theme's; by default the one before */
+function applyBackground(chosen = background) {
+  background = chosen;
   const dark = document.documentElement.dataset.theme === 'dark';
-  const trained = hexOf(info().background);
-  avatar.background = background ?? (dark ? DARK_BACKGROUND : trained);
+  avatar.background = background ?? (dark ? DARK_BACKGROUND : hexOf(info().background));
   for (const [swatch, color] of swatches) setPressed(swatch, color === background);
 }
 
@@ -336,19 +302,13 @@ function addBackgrounds() {
     Object.assign(swatch, { className: 'swatch', title: name });
     swatches.set(swatch, color || null);
     swatch.style.setProperty('--color', color || 'linear-gradient(135deg, #fff 50%, #15171b 50%)');
-    swatch.addEventListener('click', () => chooseBackground(color || null));
+    swatch.addEventListener('click', () => applyBackground(color || null));
     row.append(swatch);
   }
   const custom = document.createElement('input');
   Object.assign(custom, { type: 'color', className: 'swatch', title: 'Any color' });
-  custom.addEventListener('input', () => chooseBackground(custom.value));
+  custom.addEventListener('input', () => applyBackground(custom.value));
   row.append(custom);
-  applyBackground();
-}
-
-/** @param {string | null} color */
-function chooseBackground(color) {
-  background = color;
   applyBackground();
 }
 
@@ -366,14 +326,10 @@ function toggleTheme() {
 
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
-// A row with a name, an `output` or a button that shows the value, and the slider itself.
+// A row with a name, an `output` or (kind "slider") a button that shows the value, and the slider.
 /**
- * @param {HTMLElement} parent
- * @param {'slider' | 'range'} kind the first has the button
- * @param {string} label
- * @param {number} low
- * @param {number} high
- * @returns {[HTMLLabelElement, HTMLElement, HTMLInputElement]}
+ * @type {(parent: HTMLElement, kind: string, label: string, low: number, high: number) =>
+ *   [HTMLLabelElement, HTMLElement, HTMLInputElement]}
  */
 function sliderRow(parent, kind, label, low, high) {
   const row = Object.assign(document.createElement('label'), { className: kind });
@@ -389,8 +345,13 @@ function sliderRow(parent, kind, label, low, high) {
   return [row, value, input];
 }
 
-/** @type {(parent: HTMLElement, options: SliderOptions) => HTMLLabelElement} */
-function addSlider(parent, { id, label, low, high, read, write, format = fixed }) {
+// A slider that shows what `read` says plays, and writes; null: as recorded.
+/**
+ * @type {(parent: HTMLElement, id: string, label: string, low: number, high: number,
+ *   read: () => number, write: (value: number | null) => void,
+ *   format?: (value: number) => string) => HTMLLabelElement}
+ */
+function addSlider(parent, id, label, low, high, read, write, format = fixed) {
   const [row, value, input] = sliderRow(parent, 'slider', label, low, high);
   row.dataset.name = id;
   let pinned = false;
@@ -420,26 +381,16 @@ function addSlider(parent, { id, label, low, high, read, write, format = fixed }
   return row;
 }
 
-// "Expression 3" for expr_003.
-/** @param {string} name */
-function expressionLabel(name) {
-  const number = /^expr_(\d+)$/.exec(name);
-  return number ? `Expression ${Number(number[1])}` : name;
-}
-
 function addExpressions() {
   const section = byId('expressions');
   const list = element('.sliders', HTMLElement, section);
-  const rows = info().sliders.map(({ name, reach }) =>
-    addSlider(list, {
-      id: name,
-      label: expressionLabel(name),
-      low: -reach,
-      high: reach,
-      read: () => avatar.getExpression(name),
-      write: value => avatar.setExpression(name, value),
-    }),
-  );
+  const rows = info().sliders.map(({ name, reach }) => {
+    const label = name.replace(/^expr_0*(\d+)$/, 'Expression $1');
+    const read = () => avatar.getExpression(name);
+    return addSlider(list, name, label, -reach, reach, read, value =>
+      avatar.setExpression(name, value),
+    );
+  });
   section.hidden = !rows.length;
   showFirst(rows, byId('more'));
 }
@@ -463,16 +414,10 @@ function addFaceShapes() {
   byId('shapes').hidden = !names.length;
   names.sort((one, other) => SHAPES_FIRST.indexOf(other) - SHAPES_FIRST.indexOf(one));
   const list = element('.sliders', HTMLElement, byId('shapes'));
-  const rows = names.map(name =>
-    addSlider(list, {
-      id: name,
-      label: name,
-      low: 0,
-      high: 1,
-      read: () => avatar.getShape(name),
-      write: value => avatar.setShape(name, value),
-    }),
-  );
+  const rows = names.map(name => {
+    const read = () => avatar.getShape(name);
+    return addSlider(list, name, name, 0, 1, read, value => avatar.setShape(name, value));
+  });
   showFirst(rows, byId('more-shapes'));
   const file = inputOf('performance');
   byId('open-performance').addEventListener('click', () => file.click());
@@ -510,28 +455,22 @@ function addPose() {
   );
   const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
-    addSlider(list, {
-      id: label,
-      label,
-      low,
-      high,
-      read: () => avatar.getPose(joints[0])[axis],
-      write: value => joints.forEach(joint => avatar.setPose(joint, replaced(joint, axis, value))),
-      format: value => degrees((180 / Math.PI) * value),
-    });
+    const read = () => avatar.getPose(joints[0])[axis];
+    const write = (/** @type {number | null} */ value) => {
+      for (const joint of joints) {
+        pinnedAngles[joint] ??= [null, null, null];
+        pinnedAngles[joint][axis] = value;
+        avatar.setPose(joint, pinnedAngles[joint]);
+      }
+    };
+    const format = (/** @type {number} */ value) => degrees((180 / Math.PI) * value);
+    addSlider(list, label, label, low, high, read, write, format);
   }
   byId('pose').hidden = !known.length;
 }
 
 /** @type {Record<string, (number | null)[]>} */
 const pinnedAngles = {}; // joint → three angles, null: as recorded
-
-/** @type {(joint: string, axis: number, value: number | null) => (number | null)[]} */
-function replaced(joint, axis, value) {
-  pinnedAngles[joint] ??= [null, null, null];
-  pinnedAngles[joint][axis] = value;
-  return pinnedAngles[joint];
-}
 
 function releaseAll() {
   for (const joint of Object.keys(pinnedAngles)) delete pinnedAngles[joint];

@@ -3,21 +3,14 @@
 // background.
 
 /**
- * @import { LightPass } from './light_pass.js'
+ * @import { LightPass } from './light.js'
  * @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js'
  */
 
 import { FACE_FLOATS } from './face_frames.js';
-import {
-  FACE_TEXELS,
-  OVER_FRAGMENT_SHADER,
-  OVER_VERTEX_SHADER,
-  SPLAT_FRAGMENT_SHADER,
-  SPLAT_TEXELS,
-  TEXTURE_WIDTH,
-  splatVertexShader,
-  tailTexels,
-} from './shaders.js';
+import { FACE_TEXELS, SPLAT_TEXELS, TEXTURE_WIDTH, tailTexels } from './shaders.js';
+import { OVER_FRAGMENT_SHADER, OVER_VERTEX_SHADER } from './shaders.js';
+import { SPLAT_FRAGMENT_SHADER, splatVertexShader } from './shaders.js';
 import { wholeQuaternion } from './vector.js';
 
 const SH_C0 = 0.28209479177387814;
@@ -32,15 +25,10 @@ export function paddedLength(texels) {
 /** @type {(gl: WebGL2RenderingContext, vertex: string, fragment: string) => Program} */
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
-  /** @type {[number, string][]} */
-  const stages = [
-    [gl.VERTEX_SHADER, vertex],
-    [gl.FRAGMENT_SHADER, fragment],
-  ];
-  for (const [kind, source] of stages) {
+  for (const kind of [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER]) {
     const shader = gl.createShader(kind);
     if (!shader) continue; // the context is lost
-    gl.shaderSource(shader, source);
+    gl.shaderSource(shader, kind === gl.VERTEX_SHADER ? vertex : fragment);
     gl.compileShader(shader);
     gl.attachShader(made, shader);
     gl.deleteShader(shader);
@@ -87,24 +75,18 @@ export function updateTexture(gl, texture, values) {
 }
 
 /**
- * @param {WebGL2RenderingContext} gl
- * @param {number} unit
- * @param {WebGLTexture} bound
- * @param {WebGLUniformLocation | null} [uniform]
+ * @type {(gl: WebGL2RenderingContext, unit: number, bound: WebGLTexture,
+ *   uniform: WebGLUniformLocation | null) => void}
  */
 export function bindTexture(gl, unit, bound, uniform) {
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, bound);
-  gl.uniform1i(uniform ?? null, unit);
+  gl.uniform1i(uniform, unit);
 }
 
 /**
- * @param {WebGL2RenderingContext} gl
- * @param {number} format
- * @param {number} width
- * @param {number} height
- * @param {number} [attachment]
- * @returns {Target}
+ * @type {(gl: WebGL2RenderingContext, format: number, width: number, height: number,
+ *   attachment?: number) => Target}
  */
 export function makeTarget(gl, format, width, height, attachment = gl.COLOR_ATTACHMENT0) {
   const made = gl.createTexture();
@@ -128,16 +110,10 @@ export function deleteTarget(gl, target) {
 export class Renderer {
   // Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw
   // them.
-  /**
-   * @param {WebGL2RenderingContext} gl
-   * @param {Data} data
-   */
+  /** @param {WebGL2RenderingContext} gl @param {Data} data */
   constructor(gl, data) {
-    if (!gl.getExtension('EXT_color_buffer_float')) {
-      throw new RendererError(
-        'This browser cannot draw to float textures, which the avatar needs.',
-      );
-    }
+    if (!gl.getExtension('EXT_color_buffer_float'))
+      throw new RendererError('This browser cannot draw to float textures, as the avatar needs.');
     this.gl = gl;
     const { arrays, header } = data;
     this.antialiased = header.antialiased;
@@ -152,11 +128,8 @@ export class Renderer {
     this.lightPass = null;
     this.overProgram = program(gl, OVER_VERTEX_SHADER, OVER_FRAGMENT_SHADER);
     this.splatTexture = floatTexture(gl, gl.RGBA32F, splatTexels(arrays));
-    this.tailTexture = floatTexture(
-      gl,
-      gl.RGBA16F,
-      tailValues(arrays, tailTexels(harmonics, strains)),
-    );
+    const tail = tailValues(arrays, tailTexels(harmonics, strains));
+    this.tailTexture = floatTexture(gl, gl.RGBA16F, tail);
     this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
     this.frameTexture = floatTexture(gl, gl.RGBA32F, this.frameValues);
     this.vertexArray = gl.createVertexArray();
@@ -172,85 +145,40 @@ export class Renderer {
     this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
-  // Draw `order` (back to front) of the splats on the frames in `frameValues`. camera: { size,
-  // focal, center, matrix }; background: red, green, blue, alpha; framebuffer: null for the canvas;
-  // format: of the target in which they are blended.
+  // Draw `order` (back to front) of the splats on the frames in `frameValues`. framebuffer: null
+  // for the canvas; format: of the target in which they are blended.
   /**
-   * @param {Uint32Array} order
-   * @param {Camera} camera
-   * @param {Color} background
-   * @param {boolean} showSelection
-   * @param {WebGLFramebuffer | null} [framebuffer]
-   * @param {number} [format]
+   * @type {(order: Uint32Array, camera: Camera, background: Color, showSelection: boolean,
+   *   framebuffer?: WebGLFramebuffer | null, format?: number) => void}
    */
   draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
     const gl = this.gl;
     const [width, height] = camera.size;
-    if (
-      this.target?.width !== width ||
-      this.target.height !== height ||
-      this.target.format !== format
-    ) {
-      if (this.target) deleteTarget(gl, this.target);
-      this.target = makeTarget(gl, format, width, height);
+    let { target } = this;
+    if (target?.width !== width || target.height !== height || target.format !== format) {
+      if (target) deleteTarget(gl, target);
+      target = this.target = makeTarget(gl, format, width, height);
     }
-    const { target } = this;
     updateTexture(gl, this.frameTexture, this.frameValues);
     gl.bindVertexArray(this.vertexArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
-    const colors = this.lightPass?.draw(
-      camera.matrix,
-      this.splatTexture,
-      this.tailTexture,
-      this.frameTexture,
-    );
+    const { splatTexture, tailTexture, frameTexture } = this;
+    const colors = this.lightPass?.draw(camera.matrix, splatTexture, tailTexture, frameTexture);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    this.drawSplats(camera, showSelection, colors);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-    gl.useProgram(this.overProgram.program);
-    bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
-    const [red, green, blue, alpha] = background;
-    gl.uniform4f(
-      this.overProgram.uniforms.uBackground,
-      red * alpha,
-      green * alpha,
-      blue * alpha,
-      alpha,
-    );
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
-  }
-
-  /**
-   * @param {Camera} camera
-   * @param {boolean} showSelection
-   * @param {WebGLTexture} [colors] of the light pass; else as recorded
-   */
-  drawSplats(camera, showSelection, colors) {
-    const gl = this.gl;
     if (colors)
       this.litProgram ??= program(gl, splatVertexShader(0, 0, true), SPLAT_FRAGMENT_SHADER);
     const { program: used, uniforms } = (colors && this.litProgram) || this.splatProgram;
     gl.useProgram(used);
-    bindTexture(gl, 0, this.frameTexture, uniforms.uFaces);
-    bindTexture(gl, 1, this.splatTexture, uniforms.uSplats);
-    bindTexture(gl, 2, colors ?? this.tailTexture, colors ? uniforms.uColors : uniforms.uTail);
-    const m = camera.matrix;
+    bindTexture(gl, 0, frameTexture, uniforms.uFaces);
+    bindTexture(gl, 1, splatTexture, uniforms.uSplats);
+    bindTexture(gl, 2, colors ?? tailTexture, colors ? uniforms.uColors : uniforms.uTail);
     // Rows of world to camera are columns of its transpose, camera to world.
-    gl.uniformMatrix3fv(uniforms.uToWorld, false, [
-      m[0],
-      m[1],
-      m[2],
-      m[4],
-      m[5],
-      m[6],
-      m[8],
-      m[9],
-      m[10],
-    ]);
+    const rows = camera.matrix.filter((_, k) => k < 12 && k % 4 < 3);
+    gl.uniformMatrix3fv(uniforms.uToWorld, false, rows);
     gl.uniform2f(uniforms.uFocal, ...camera.focal);
     gl.uniform2f(uniforms.uCenter, ...camera.center);
     gl.uniform2f(uniforms.uSize, ...camera.size);
@@ -260,15 +188,20 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.useProgram(this.overProgram.program);
+    bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
+    const [red, green, blue, alpha] = background;
+    const premultiplied = [red * alpha, green * alpha, blue * alpha, alpha];
+    gl.uniform4fv(this.overProgram.uniforms.uBackground, premultiplied);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   // The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied
   // with alpha.
   /**
-   * @param {Uint32Array} order
-   * @param {Camera} camera
-   * @param {Color} background
-   * @param {boolean} showSelection
+   * @type {(order: Uint32Array, camera: Camera, background: Color, showSelection: boolean) =>
+   *   Uint8ClampedArray<ArrayBuffer>}
    */
   read(order, camera, background, showSelection) {
     const gl = this.gl;
@@ -289,26 +222,20 @@ export class Renderer {
 
   dispose() {
     const gl = this.gl;
-    for (const item of [this.splatTexture, this.tailTexture, this.frameTexture])
-      gl.deleteTexture(item);
+    const { splatTexture, tailTexture, frameTexture } = this;
+    for (const item of [splatTexture, tailTexture, frameTexture]) gl.deleteTexture(item);
     gl.deleteBuffer(this.indexBuffer);
     gl.deleteVertexArray(this.vertexArray);
-    for (const item of [this.splatProgram, this.overProgram, this.litProgram])
+    const { splatProgram, overProgram, litProgram } = this;
+    for (const item of [splatProgram, overProgram, litProgram])
       gl.deleteProgram(item?.program ?? null);
     if (this.target) deleteTarget(gl, this.target);
   }
 }
 
 /** @param {Arrays} arrays */
-function splatTexels({
-  xyz,
-  splats_per_face,
-  rotation,
-  rotation_largest,
-  log_scale,
-  opacity,
-  color,
-}) {
+function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, ...arrays }) {
+  const { log_scale, opacity, color } = arrays;
   const values = new Float32Array(paddedLength(xyz.shape[0] * SPLAT_TEXELS));
   for (let face = 0, splat = 0; face < splats_per_face.values.length; face++) {
     for (const end = splat + splats_per_face.values[face]; splat < end; splat++) {
@@ -320,10 +247,8 @@ function splatTexels({
         values[to + 12 + k] = 0.5 + SH_C0 * color.values[from + k];
       }
       values[to + 3] = face; // a float holds whole numbers up to 2^24
-      values.set(
-        wholeQuaternion(rotation.values.subarray(from, from + 3), rotation_largest.values[splat]),
-        to + 4,
-      );
+      const smaller = rotation.values.subarray(from, from + 3);
+      values.set(wholeQuaternion(smaller, rotation_largest.values[splat]), to + 4);
       values[to + 11] = opacity.values[splat];
     }
   }
@@ -338,10 +263,8 @@ function tailValues({ xyz, sh, strain_color }, texels) {
     if (!array) continue;
     const size = array.shape[1];
     for (let splat = 0; splat < xyz.shape[0]; splat++) {
-      values.set(
-        array.values.subarray(size * splat, size * (splat + 1)),
-        4 * texels * splat + offset,
-      );
+      const own = array.values.subarray(size * splat, size * (splat + 1));
+      values.set(own, 4 * texels * splat + offset);
     }
     offset += size;
   }
@@ -356,10 +279,7 @@ const MAX_KEY = DIGITS * DIGITS - 1;
 
 export class DepthSort {
   // xyz (3·N) of splats sorted by triangle, and how many each triangle has.
-  /**
-   * @param {ArrayLike<number>} xyz
-   * @param {ArrayLike<number>} splatsPerFace
-   */
+  /** @param {ArrayLike<number>} xyz @param {ArrayLike<number>} splatsPerFace */
   constructor(xyz, splatsPerFace) {
     this.xyz = xyz;
     this.splatsPerFace = splatsPerFace;

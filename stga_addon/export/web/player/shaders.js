@@ -39,12 +39,7 @@ function tailTriple(k) {
 
 // Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
 // are slow on many GPUs.
-/**
- * @param {number} harmonics
- * @param {string} direction
- * @param {string} sum
- * @param {number[]} [factors] of degree 1 on
- */
+/** @type {(count: number, direction: string, sum: string, factors?: number[]) => string} */
 function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
   const terms = SH.slice(0, harmonics).map((term, k) => {
     const factor = factors[Math.floor(Math.sqrt(k + 1)) - 1];
@@ -60,8 +55,8 @@ function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
 // Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
 // to `byStrain`.
 /**
- * @type {(harmonics: number, strains: number, direction: string, byView?: string, byStrain?:
- *   string) => string}
+ * @type {(harmonics: number, strains: number, direction: string, byView?: string,
+ *   byStrain?: string) => string}
  */
 function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
@@ -75,12 +70,9 @@ function tailColor(harmonics, strains, direction, byView = 'color', byStrain = '
   return lines.join('\n  ');
 }
 
-// The limits and constants are those of the kernels that trained the splats (raster/cpu).
-/**
- * @param {number} harmonics
- * @param {number} strains
- * @param {boolean} [isLit] whether colors come from the light pass
- */
+// The limits and constants are those of the kernels that trained the splats (raster/cpu). isLit:
+// whether colors come from the light pass.
+/** @type {(harmonics: number, strains: number, isLit?: boolean) => string} */
 export function splatVertexShader(harmonics, strains, isLit = false) {
   return `${PREAMBLE}
 uniform sampler2D uFaces;
@@ -207,11 +199,8 @@ void main() {
 export const SHADOW_FRAGMENT_SHADER = `#version 300 es
 void main() {}`;
 
-// A texel a splat: its color in sRGB, not clipped.
-/**
- * @param {number} harmonics of splats whose color depends on the view
- * @param {number} strains 3 where it depends on strain
- */
+// A texel a splat: its color in sRGB, not clipped. strains: 3 where colors depend on strain.
+/** @type {(harmonics: number, strains: number) => string} */
 export function lightFragmentShader(harmonics, strains) {
   return `${PREAMBLE}
 uniform sampler2D uSplats, uTail, uFaces, uSurface, uVertices, uShadows;

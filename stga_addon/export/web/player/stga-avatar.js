@@ -2,17 +2,129 @@
 // <stga-avatar src="anna.stga" autoplay loop>: an animated head avatar as an HTML element
 // (docs/web.md).
 
-/** @import { Camera, Lighting } from './types.js' */
+/** @import { Camera, Color, Data, Lighting } from './types.js' */
 
-import { addControls, cameraOfView } from './camera.js';
+import { addControls, bounds, cameraOfView, fitted, frontCamera } from './camera.js';
 import { DataError, readData } from './data.js';
-import { RendererError } from './renderer.js';
-import { litBy } from './light.js';
-import { readPerformance } from './motion.js';
-import { Player } from './player.js';
+import { FaceFrames } from './face_frames.js';
+import { LightPass, litBy } from './light.js';
+import { Motion, Rig, readPerformance } from './motion.js';
+import { DepthSort, Renderer, RendererError } from './renderer.js';
+import { vector } from './vector.js';
 
 const MAX_PIXEL_RATIO = 2;
+const TIMING_SHARE = 0.1; // of the newest frame in the running mean
 const MAX_STEP_S = 0.25; // of playback time between two frames: a hidden tab resumes where it was
+
+// One avatar on one canvas: follows motion and camera, and draws when something has changed.
+export class Player {
+  // `data` of readData. Throws RendererError where the browser cannot draw it.
+  /** @param {HTMLCanvasElement} canvas @param {Data} data */
+  constructor(canvas, data) {
+    const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
+    const gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
+    const problem =
+      'This page needs WebGL 2, which this browser or graphics driver does not offer.';
+    if (!gl) throw new RendererError(problem);
+    this.gl = gl;
+    const { header, arrays } = data;
+    this.canvas = canvas;
+    this.data = data;
+    this.motion = new Motion(data);
+    this.rig = new Rig(data);
+    this.faceFrames = new FaceFrames(arrays, header.convention);
+    this.depthSort = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values);
+    this.renderer = new Renderer(this.gl, data);
+    /** @type {Color} */
+    this.background = [...header.background, 1];
+    this.showSelection = false;
+    /** @type {Lighting | null} null: as recorded */
+    this.lighting = null;
+    /** @type {LightPass | null} */
+    this.lightPass = null;
+    /** @type {Lighting | null} that the light pass holds, for the pose that it holds */
+    this.lit = null;
+    /** @type {number | null} */
+    this.posed = null; // frame that faceFrames hold
+    this.frame = 0;
+    this.milliseconds = 0;
+    this.pose();
+    this.middle = bounds(this.rig.vertices)[0];
+    const [view] = header.views;
+    this.home = view ? cameraOfView(view) : frontCamera(this.rig.vertices, header.up);
+    this.camera = this.home;
+    this.pivot = this.middle;
+  }
+
+  resetCamera() {
+    this.camera = this.home;
+    this.pivot = this.middle;
+  }
+
+  /** Draw the current frame on the canvas. */
+  draw() {
+    const begin = performance.now();
+    const camera = fitted(this.camera, this.canvas.width, this.canvas.height);
+    const order = this.prepare(camera);
+    this.renderer.draw(order, camera, this.background, this.showSelection);
+    const spent = performance.now() - begin;
+    this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
+  }
+
+  // Pixels of the current frame from `camera`, which has its own size (Renderer.read).
+  /** @param {Camera} camera */
+  read(camera) {
+    return this.renderer.read(this.prepare(camera), camera, this.background, this.showSelection);
+  }
+
+  /** Forget the pose, because pinned values have changed. */
+  invalidate() {
+    this.posed = null;
+  }
+
+  /** @param {Camera} camera */
+  prepare(camera) {
+    this.pose();
+    const values = this.renderer.frameValues;
+    this.faceFrames.compose(camera.matrix, values);
+    this.renderer.lightPass = this.lighting && this.litPass(this.lighting);
+    return this.depthSort.sort(values);
+  }
+
+  pose() {
+    if (this.posed === this.frame) return;
+    this.motion.sample(this.frame);
+    this.faceFrames.update(this.rig.pose(this.motion));
+    this.faceFrames.annotate(this.selectionBits(), this.renderer.frameValues);
+    this.posed = this.frame;
+    this.lit = null;
+  }
+
+  // The light pass for the current pose.
+  /** @param {Lighting} lighting */
+  litPass(lighting) {
+    this.lightPass ??= new LightPass(this.gl, this.data);
+    if (this.lit !== lighting) {
+      const light = litBy(lighting, this.data.header.up);
+      this.lightPass.update(this.rig.vertices, this.faceFrames.sides, light);
+    }
+    this.lit = lighting;
+    return this.lightPass;
+  }
+
+  selectionBits() {
+    const { selection } = this.data.arrays;
+    if (!selection || this.motion.shapes.performance) return null;
+    const [, bytes] = selection.shape;
+    const first = bytes * Math.min(Math.round(this.frame), this.motion.frames - 1);
+    return selection.values.subarray(first, first + bytes);
+  }
+
+  dispose() {
+    this.renderer.dispose();
+    this.lightPass?.dispose();
+  }
+}
 
 const STYLE = `
 :host { display: block; position: relative; overflow: hidden; contain: content; }
@@ -36,23 +148,16 @@ export class StgaAvatar extends HTMLElement {
   #loading = 0;
   #canvas = document.createElement('canvas');
   #message = document.createElement('p');
+  speed = 1;
+  loop = false;
 
   constructor() {
     super();
-    const root = this.attachShadow({ mode: 'open' });
-    const style = document.createElement('style');
-    style.textContent = STYLE;
-    this.#message.role = 'alert';
-    this.#message.hidden = true;
-    root.append(style, this.#canvas, this.#message);
-    this.speed = 1;
-    this.loop = false;
-    addControls(
-      this.#canvas,
-      () => this.#player,
-      () => this.#changed('camerachange'),
-      () => this.#changed('lightchange'),
-    );
+    const style = Object.assign(document.createElement('style'), { textContent: STYLE });
+    Object.assign(this.#message, { role: 'alert', hidden: true });
+    this.attachShadow({ mode: 'open' }).append(style, this.#canvas, this.#message);
+    const get = () => this.#player;
+    addControls(this.#canvas, get, event => this.#changed(event));
     this.#canvas.addEventListener('webglcontextlost', event => this.#lose(event));
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
@@ -93,7 +198,7 @@ export class StgaAvatar extends HTMLElement {
   }
 
   get frameCount() {
-    return this.#player?.frameCount ?? 0;
+    return this.#player?.motion.frames ?? 0;
   }
 
   /** Whole or fractional frame that is shown, from 0. */
@@ -207,19 +312,12 @@ export class StgaAvatar extends HTMLElement {
   /** @param {Camera | string} value */
   set camera(value) {
     const player = this.#loaded;
-    const { views } = player.data.header;
-    player.camera =
-      typeof value === 'string'
-        ? cameraOfView(
-            views[
-              this.#index(
-                views.map(view => view.name),
-                value,
-                'view',
-              )
-            ],
-          )
-        : value;
+    if (typeof value === 'string') {
+      const { views } = player.data.header;
+      const names = views.map(view => view.name);
+      value = cameraOfView(views[this.#index(names, value, 'view')]);
+    }
+    player.camera = value;
     player.pivot = player.middle;
     this.#changed('camerachange');
   }
@@ -239,9 +337,8 @@ export class StgaAvatar extends HTMLElement {
     const digits = /^#([0-9a-f]{6})$/i.exec(value)?.[1];
     if (!digits && value !== 'transparent')
       throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
-    const part = (/** @type {number} */ at) => parseInt((digits ?? '').slice(at, at + 2), 16) / 255;
-    if (this.#player)
-      this.#player.background = digits ? [part(0), part(2), part(4), 1] : [0, 0, 0, 0];
+    const part = (/** @type {number} */ k) => parseInt(value.slice(2 * k + 1, 2 * k + 3), 16) / 255;
+    if (this.#player) this.#player.background = digits ? [...vector(part), 1] : [0, 0, 0, 0];
     this.#request ||= requestAnimationFrame(now => this.#tick(now));
   }
 
@@ -319,9 +416,8 @@ export class StgaAvatar extends HTMLElement {
   /** @param {string | number} name of an expression, or its component */
   #component(name) {
     const { sliders } = this.#loaded.data.header;
-    const names = sliders.map(slider =>
-      typeof name === 'string' ? slider.name : slider.component,
-    );
+    const key = typeof name === 'string' ? 'name' : 'component';
+    const names = sliders.map(slider => slider[key]);
     return sliders[this.#index(names, name, 'expression')].component;
   }
 
@@ -393,44 +489,32 @@ export class StgaAvatar extends HTMLElement {
     this.#request = 0;
     const player = this.#player;
     if (!player || player.gl.isContextLost()) return;
-    if (this.#playing) this.#advance(now, player.motion.fps);
+    if (this.#playing) {
+      const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
+      this.#last = now;
+      this.#time += step * this.fps * this.speed;
+      if (this.loop) this.#time %= this.frameCount;
+      else if (this.#time >= this.frameCount - 1) this.pause();
+    }
     player.frame = this.#time;
     player.draw();
     if (this.#playing) this.#changed('frame');
   }
 
-  /** @type {(now: number, fps: number) => void} */
-  #advance(now, fps) {
-    const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
-    this.#last = now;
-    this.#time += step * fps * this.speed;
-    const end = this.loop ? this.frameCount : this.frameCount - 1;
-    if (this.#time < end) return;
-    if (this.loop) this.#time %= this.frameCount;
-    else this.pause();
-  }
-
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const [width, height] = [this.clientWidth, this.clientHeight].map(side =>
-      Math.max(1, Math.round(side * ratio)),
-    );
+    const width = Math.max(1, Math.round(this.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.clientHeight * ratio));
     if (this.#canvas.width === width && this.#canvas.height === height) return;
-    this.#canvas.width = width;
-    this.#canvas.height = height;
+    Object.assign(this.#canvas, { width, height });
     if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
   }
 }
 
 /** @param {number[]} color red, green, blue from 0 to 1 */
 export function hexOf(color) {
-  return `#${color
-    .map(part =>
-      Math.round(255 * part)
-        .toString(16)
-        .padStart(2, '0'),
-    )
-    .join('')}`;
+  const levels = color.map(part => (256 + Math.round(255 * part)).toString(16).slice(1));
+  return `#${levels.join('')}`;
 }
 
 /** @param {string} address */

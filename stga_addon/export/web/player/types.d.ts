@@ -28,6 +28,9 @@ export interface Slider {
   reach: number;
 }
 
+/** Light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
+export type LightOfCapture = { damping: number; recorded: number[]; typical: number[] };
+
 /** Header of a data file, checked. */
 export interface Header {
   title: string;
@@ -44,38 +47,12 @@ export interface Header {
    * only.
    */
   shapes?: { names: string[]; opens: string; limited: string };
-  /**
-   * Where it is known, the light of the capture (27 harmonics); how much albedo is drawn to its
-   * mean, 0 to 1, and that.
-   */
-  light?: { damping: number; recorded: number[]; typical: number[] };
+  light?: LightOfCapture;
   views: View[];
 }
 
-type NeededArrays =
-  | (
-      | 'xyz'
-      | 'rotation'
-      | 'rotation_largest'
-      | 'log_scale'
-      | 'opacity'
-      | 'color'
-      | 'splats_per_face'
-    )
-  | (
-      | 'faces'
-      | 'neutral'
-      | 'base'
-      | 'basis'
-      | 'correctives'
-      | 'weights'
-      | 'joint_rest'
-      | 'joint_basis'
-    )
-  | ('coefficients' | 'pose' | 'translation');
-
-/** Arrays of a data file, checked; what others there are, `checkData` (data.js) lists. */
-export type Arrays = Record<NeededArrays, DataArray> & { [name: string]: DataArray | undefined };
+/** Arrays of a data file, checked: those of `checkData` (data.js). */
+export type Arrays = { [name: string]: DataArray };
 
 export interface Data {
   header: Header;
@@ -115,13 +92,6 @@ export interface Lighting {
   sun?: Sun;
   /** Stops. */
   exposure?: number;
-}
-
-export interface Environment {
-  label: string;
-  even: Vector;
-  lobes: Sun[];
-  sun?: Sun;
 }
 
 /** Lighting as the player computes with it. */

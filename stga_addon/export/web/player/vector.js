@@ -6,6 +6,9 @@
 
 const SMALL_ANGLE = 1e-8;
 
+/** @type {(part: (k: number) => number) => Vector} */
+export const vector = part => [part(0), part(1), part(2)];
+
 /** @type {(a: ArrayLike<number>, b: ArrayLike<number>) => Vector} */
 export function crossed(a, b) {
   return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
