@@ -10,7 +10,7 @@ from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display import splat_nodes
 from ..stga_addon.scene.display.splat_object import get_input
-from ..stga_addon.scene.light.scene_light import throw_shadow, throws_shadow
+from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from . import ids
 from .common import file_path, flame_model_path, path_property, polled, reporting, scene_settings

@@ -3,7 +3,7 @@ context."""
 
 import bpy
 
-from ..stga_addon.scene.light import settings as lighting
+from ..stga_addon.scene import light as lighting
 from ..stga_addon.scene.render import engine, viewport_display
 from .common import preferences
 from .training_python import training_python

@@ -227,7 +227,7 @@ class _Recording:
         with bpy.context.temp_override(scene=self._scene, view_layer=self._view_layer):
             if frame != self._posed[0]:
                 self._scene.frame_set(frame)
-                self._cache.light.casters.forget()
+                self._cache.light.forget_casters()
                 self._layers = visible_layers(bpy.context.evaluated_depsgraph_get(), self._cache)
             given = None if self._cameras is None else self._cameras[self._recorded]
             camera = given or scene_camera(bpy.context.evaluated_depsgraph_get())

@@ -12,8 +12,7 @@ from ..operators.common import scene_settings
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display.splat_object import shows_nodes, stored_light
-from ..stga_addon.scene.light.scene_light import world_light
-from ..stga_addon.scene.light.settings import MODE_CHANGED, lighting_settings
+from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
 from ..stga_addon.scene.render import viewport_display
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from .request import draw_running

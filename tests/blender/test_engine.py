@@ -23,11 +23,11 @@ from stga_addon.light.values import Light, Lighting  # noqa: E402
 from stga_addon.raster.cpu.harmonics import basis as harmonics  # noqa: E402
 from stga_addon.render.render import render as render_splats  # noqa: E402
 from stga_addon.render.render import render_avatar  # noqa: E402
+from stga_addon.scene import light as light_settings  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
-from stga_addon.scene.light import settings as light_settings  # noqa: E402
 from stga_addon.scene.render import engine  # noqa: E402
 
 from .exr import read_exr  # noqa: E402

@@ -19,13 +19,13 @@ from light.scenes import lit_avatar  # noqa: E402
 
 from stga_addon.capture.mesh_geometry import vertex_normals  # noqa: E402
 from stga_addon.light.lamps import LIFT_M, Lamps, ShadowMap  # noqa: E402
+from stga_addon.scene import light as settings  # noqa: E402
 from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
 from stga_addon.scene.display.splat_nodes import PERCENTAGE  # noqa: E402
 from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar  # noqa: E402
 from stga_addon.scene.layers import Relit  # noqa: E402
-from stga_addon.scene.light import settings  # noqa: E402
-from stga_addon.scene.light.scene_light import throw_shadow, throws_shadow  # noqa: E402
+from stga_addon.scene.light import throw_shadow, throws_shadow  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
 from .exr import read_exr  # noqa: E402
@@ -372,7 +372,7 @@ def test_nothing_is_made_anew_while_nothing_moves():
     assert brighter.lighting.lights[0].color[0] == pytest.approx(31 / 1.3**2)
     assert brighter.casters is first.casters
     cube.location.x += 1
-    cache.light.casters.forget()
+    cache.light.forget_casters()
     assert np.abs(again().casters[0].vertices - first.casters[0].vertices).max() > 0.5
     head.data.vertices[0].co.x += 0.01
     head.data.update()

@@ -146,8 +146,8 @@ def test_images_of_recorded_light_say_so(
 def test_relit_color_of_a_frame(tmp_path: Path) -> None:
     """Catches relit colors that do not reach the nodes, or stay when taken back."""
     from stga_addon.light.relight import Relighter
+    from stga_addon.scene import light as settings
     from stga_addon.scene.display.display_modes import DISPLAY_COLOR
-    from stga_addon.scene.light import settings
     from stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 
     def node_colors() -> np.ndarray:

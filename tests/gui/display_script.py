@@ -27,12 +27,12 @@ sys.path.append(str(FOLDER / "packages"))
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene import light as lighting  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
 from stga_addon.scene.gpu.renderer import SplatRenderer, _pixels  # noqa: E402
-from stga_addon.scene.light import settings as lighting  # noqa: E402
 from stga_addon.scene.render import engine, viewport_display  # noqa: E402
 from stga_addon.scene.render.view_transform import inverse_view  # noqa: E402
 from stga_addon.scene.render.viewport_display import display, region_view  # noqa: E402

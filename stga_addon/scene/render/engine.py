@@ -30,7 +30,7 @@ from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer, has_gpu_context
 from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
-from ..light.settings import settings_values
+from ..light import settings_values
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import (
     combined,
@@ -259,7 +259,7 @@ class EngineViewport:
     def update(self, depsgraph: Any) -> None:
         """The scene has changed: pose the splats again, and read edited meshes again."""
         self._layers = None
-        self._cache.light.casters.forget()
+        self._cache.light.forget_casters()
         changed = (update.id for update in depsgraph.updates)
         self._cache.discard({each.original for each in changed if isinstance(each, bpy.types.Mesh)})
 

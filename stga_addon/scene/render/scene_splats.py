@@ -24,8 +24,7 @@ from ..display.splat_object import (
     stored_light,
 )
 from ..layers import SceneLayer
-from ..light.scene_light import SceneLight
-from ..light.settings import lighting_settings
+from ..light import SceneLight, lighting_settings
 from ..vertex_groups import frame_selection
 
 

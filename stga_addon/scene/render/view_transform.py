@@ -1,9 +1,5 @@
-"""Scene-linear colors of splats: the inverse of a scene's view transform, and what lies behind
-them.
-
-Blender's own color management converts a grid of scene-linear colors to a picture; that table is
-inverted.
-"""
+"""Scene-linear colors of splats: the inverse of a scene's view transform, for which Blender's own
+color management converts a grid of colors to a picture; and what lies behind splats."""
 
 import tempfile
 import threading
@@ -16,7 +12,8 @@ import bpy
 import numpy as np
 
 from ...capture.color import linear_to_srgb, srgb_to_linear
-from ..compat import REC709, choose_image_file, working_space, world_nodes
+from ..compat import REC709, choose_image_file, working_space
+from ..light import world_light
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
@@ -45,8 +42,20 @@ class InverseView:
     def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
         self._axis, self._shown = axis, shown
         nodes = np.linspace(0, 1, INVERSE_GRID) ** 2  # denser in the dark
-        grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
-        self._inverse = self._solve(grid).reshape(*(INVERSE_GRID,) * 3, 3)
+        target = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
+        # Places in samples that show `target` best, by damped Gauss-Newton steps.
+        last = len(axis) - 1
+        gray = np.maximum.accumulate(np.einsum("iiic->i", shown) / 3)
+        place = np.interp(target, gray, np.arange(last + 1))
+        slopes = np.stack(np.gradient(shown, axis=(0, 1, 2)), -1).reshape(*shown.shape[:3], 9)
+        for _ in range(INVERSE_STEPS):
+            rest = interpolate(shown, place) - target
+            jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
+            transposed = jacobian.transpose(0, 2, 1)
+            normal = transposed @ jacobian + DAMPING * np.eye(3)
+            step = np.linalg.solve(normal, transposed @ rest[..., None])[..., 0]
+            place = np.clip(place - np.clip(step, -MAX_STEP, MAX_STEP), 0, last)
+        self._inverse = place.reshape(*(INVERSE_GRID,) * 3, 3)
 
     def show(self, linear: np.ndarray) -> np.ndarray:
         """sRGB (…, 3) that the view transform shows of scene-linear colors."""
@@ -62,33 +71,16 @@ class InverseView:
             linear[begin : begin + CHUNK] = np.interp(place, np.arange(len(self._axis)), self._axis)
         return linear.reshape(srgb.shape)
 
-    def _solve(self, target: np.ndarray) -> np.ndarray:
-        """Places (M, 3), in samples, that show `target` best, by damped Gauss-Newton steps."""
-        last = len(self._axis) - 1
-        gray = np.maximum.accumulate(np.einsum("iiic->i", self._shown) / 3)
-        place = np.interp(target, gray, np.arange(last + 1))
-        slopes = np.stack(np.gradient(self._shown, axis=(0, 1, 2)), -1)
-        slopes = slopes.reshape(*self._shown.shape[:3], 9)
-        for _ in range(INVERSE_STEPS):
-            rest = interpolate(self._shown, place) - target
-            jacobian = interpolate(slopes, place).reshape(-1, 3, 3)
-            transposed = jacobian.transpose(0, 2, 1)
-            normal = transposed @ jacobian + DAMPING * np.eye(3)
-            step = np.linalg.solve(normal, transposed @ rest[..., None])[..., 0]
-            place = np.clip(place - np.clip(step, -MAX_STEP, MAX_STEP), 0, last)
-        return place
-
 
 def interpolate(table: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Values (M, C) of a table (G, G, G, C) at places (M, 3) in samples, trilinearly."""
     size = len(table)
     low = np.minimum(place.astype(np.int64), size - 2)
     part = place - low
-    flat, first = table.reshape(size**3, -1), (low[:, 0] * size + low[:, 1]) * size + low[:, 2]
-    values = np.zeros((len(place), flat.shape[1]))
+    values = np.zeros((len(place), table.shape[3]))
     for corner in product((0, 1), repeat=3):
         weight = np.prod(np.where(corner, part, 1 - part), axis=1)
-        values += weight[:, None] * flat[first + (corner[0] * size + corner[1]) * size + corner[2]]
+        values += weight[:, None] * table[tuple((low + corner).T)]
     return values
 
 
@@ -121,8 +113,7 @@ def measure(scene: Any) -> None:
     key = _settings(scene)
     if key in _measured:
         _keep(key, _measured[key])
-        return
-    if not needs_inverse(scene):
+    if key in _measured or not needs_inverse(scene):
         return
     measured = threading.Event()
 
@@ -214,16 +205,16 @@ def combined(
     return image
 
 
-def srgb_background(scene: Any) -> tuple[float, float, float] | None:
-    """Color behind the splats as in `scene_background`, in sRGB 0…1."""
-    linear = scene_background(scene)
-    return None if linear is None else srgb(linear)
-
-
 def srgb(linear: Any) -> tuple[float, float, float]:
     """sRGB 0…1 of a scene-linear color."""
     red, green, blue = linear_to_srgb(np.clip(np.array(linear, np.float64), 0, 1)).tolist()
     return red, green, blue
+
+
+def srgb_background(scene: Any) -> tuple[float, float, float] | None:
+    """Color behind the splats as in `scene_background`, in sRGB 0…1."""
+    linear = scene_background(scene)
+    return None if linear is None else srgb(linear)
 
 
 def scene_background(scene: Any) -> tuple[float, ...] | None:
@@ -240,16 +231,5 @@ def scene_background(scene: Any) -> tuple[float, ...] | None:
 
 def world_color(scene: Any) -> tuple[float, ...] | None:
     """Scene-linear color of the world; None where it is not one color; black without one."""
-    world = scene.world
-    if world is None:
-        return 0.0, 0.0, 0.0
-    tree = world_nodes(world)
-    output = tree.get_output_node("ALL") if tree else None
-    links = output.inputs["Surface"].links if output else ()
-    if not links:
-        return tuple(world.color)
-    if links[0].from_node.type == "BACKGROUND":
-        color, strength = (links[0].from_node.inputs[name] for name in ("Color", "Strength"))
-        if not color.is_linked and not strength.is_linked:
-            return tuple(channel * strength.default_value for channel in color.default_value[:3])
-    return None
+    light = world_light(scene.world)
+    return None if light is None or light.image is not None else light.color

@@ -65,7 +65,7 @@ class GpuDisplay:
 
     def scene_changed(self) -> None:
         """Read what throws shadows onto heads again."""
-        self.cache.light.casters.forget()
+        self.cache.light.forget_casters()
 
     def _before(self) -> None:
         """Keep the framebuffer of the scene's colors, before that of the overlays is bound."""
