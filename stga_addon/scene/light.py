@@ -285,15 +285,15 @@ class SceneLight:
         red, green, blue = (white / white.mean()).tolist()
         names = "mode", "mix", "exposure", "roughness", "specular", "shadows"
         chosen = {name: getattr(settings, name) for name in names}
-        world, suns = no_world(), ()  # also for nodes that are not understood
-        light = world_light(depsgraph.scene_eval.world) if settings.world else None
-        if light is not None and light.image is None:
-            world = uniform(light.color)
-        elif light is not None:
-            light = light._replace(image=light.image.original)
-            if light not in self._worlds:
-                self._worlds = {light: _split_world(light)}
-            world, suns = self._worlds[light]
+        world = no_world()  # also for nodes that are not understood
+        outside = world_light(depsgraph.scene_eval.world) if settings.world else None
+        if outside is not None and outside.image is None:
+            world = uniform(outside.color)
+        elif outside is not None:
+            outside = outside._replace(image=outside.image.original)
+            if outside not in self._worlds:
+                self._worlds = {outside: _split_world(outside)}
+            world, suns = self._worlds[outside]
             u, _, v = np.linalg.svd(to_world[:3, :3])
             world = rotated(world, (u @ v).T)
             lights += [in_avatar_space(sun, to_world) for sun in suns]
