@@ -54,8 +54,8 @@ class ConvertMotion:
         "capture whose identity a performance moves (default: average)", None, metavar="CAPTURE"
     )
     avatar: Path | None = option(
-        "run of the performer's avatar: it tracks footage more exactly than the face networks, "
-        "which do where the footage shows somebody else", None, metavar="RUN",
+        "run of the performer's avatar, which tracks the footage; where that shows somebody else, "
+        "the face networks do", None, metavar="RUN",
     )  # fmt: skip
     fps: float | None = option("of the result (default: as recorded)", None, above=0)
     options: MotionOptions = motion_options_field()

@@ -329,12 +329,18 @@ def test_render_region(crop, tmp_path):
     )
 
 
-def test_world_color_is_the_background(tmp_path):
-    """Catches a background blended in linear light: splats were trained in sRGB."""
+@pytest.mark.parametrize("is_linked", [True, False])
+def test_world_color_is_the_background(tmp_path, is_linked):
+    """Catches a background blended in linear light: splats were trained in sRGB; and one of a world
+    whose output has no shader, which Cycles renders black."""
     scene = bpy.context.scene
     scene.render.film_transparent = False
     scene.world = bpy.data.worlds.new("world")
-    background = enable_nodes(scene.world).nodes["Background"].inputs
+    scene.world.color = 0.6, 0.3, 0.1
+    tree = enable_nodes(scene.world)
+    background = tree.nodes["Background"].inputs
+    if not is_linked:
+        tree.links.clear()
     background["Color"].default_value, background["Strength"].default_value = (
         (0.4, 0.1, 0.2, 1),
         0.5,
@@ -342,7 +348,7 @@ def test_world_color_is_the_background(tmp_path):
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
     camera = expected_camera(camera_at(), shown)
-    behind = 1.055 * np.array([0.2, 0.05, 0.1]) ** (1 / 2.4) - 0.055
+    behind = (1.055 * np.array([0.2, 0.05, 0.1]) ** (1 / 2.4) - 0.055) * is_linked
     expected = render_avatar(avatar, evaluated_vertices(head), camera, tuple(behind))
     passes = render(tmp_path)
     assert passes["A"].min() == 1

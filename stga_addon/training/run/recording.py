@@ -74,12 +74,12 @@ def track_recording(
     timesteps = open_capture(root, read_run(run).flame).timesteps
     report(0, len(timesteps))
     factor = _fit_scale(run, root, helpers, lambda: report(0, len(timesteps)))
-    of = run, (run / AVATAR).stat().st_mtime_ns, root, factor
-    avatar, settings, capture = _open(*of)
+    source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
+    avatar, settings, capture = _open(*source)
     assert capture.flame is not None
     rows = _exposure(avatar, settings, capture)
     parts = [
-        (*of, rows, timesteps[first : first + PART_TIMESTEPS], False)
+        (*source, rows, timesteps[first : first + PART_TIMESTEPS], False)
         for first in range(0, len(timesteps), PART_TIMESTEPS)
     ]
     found = helpers.map(
@@ -129,14 +129,14 @@ def _track_part(
 def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], None]) -> float:
     """Scale the capture's world such that the head is as large as the avatar's; landmarks alone are
     off by some percent. One camera does not see scale. Returns the factor."""
-    of = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0
-    avatar, settings, capture = _open(*of)
+    source = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0
+    avatar, settings, capture = _open(*source)
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     if len(cameras) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     rows = _exposure(avatar, settings, capture)
-    parts = [(*of, rows, [timestep], True) for timestep in chosen]
+    parts = [(*source, rows, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
     scale_capture(root, read_run(run).flame, factor)
