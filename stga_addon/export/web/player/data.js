@@ -48,7 +48,13 @@ async function inflate(bytes) {
   } catch (error) {
     throw error instanceof DataError ? error : new DataError('The avatar data is damaged.');
   }
-  return new Uint8Array(await new Blob(chunks).arrayBuffer());
+  const raw = new Uint8Array(size);
+  let at = 0;
+  for (const chunk of chunks) {
+    raw.set(chunk, at);
+    at += chunk.length;
+  }
+  return raw;
 }
 
 /** @type {(bytes: Uint8Array) => any} */
