@@ -30,7 +30,7 @@ LACKS = (
     "edition of the add-on, or choose a Python that has them in its preferences or by STGA_PYTHON"
 )
 BUTTONS = {
-    LACKS: "Choose a Python in Preferences",
+    LACKS: "Choose a Python",
     "run folder: //run is relative to the .blend file, which has not been saved yet": "Save the "
     "File",
     "/captures/anna: was tracked with FLAME and needs a FLAME model": "Choose It",
