@@ -502,6 +502,17 @@ def _adopt(scene: Any) -> None:
         settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
 
+@persistent
+def _after_update(scene: Any, *_: Any) -> None:
+    """Let the panel work on no head, and no splats, that were deleted: its pointers keep these in
+    the file."""
+    settings = getattr(scene, ids.SETTINGS)
+    for name in ("head", "splats"):
+        thing = getattr(settings, name)
+        if thing is not None and thing.name not in scene.objects and not thing.users_collection:
+            setattr(settings, name, None)
+
+
 def show_panel() -> None:
     """Open the sidebar at the add-on's tab, where there is a window."""
     if has_timer():
@@ -524,6 +535,7 @@ HANDLERS = (
     (bpy.app.handlers.load_post, _after_load),
     (bpy.app.handlers.save_pre, _before_save),
     (bpy.app.handlers.save_post, _after_save),
+    (bpy.app.handlers.depsgraph_update_post, _after_update),
 )
 
 

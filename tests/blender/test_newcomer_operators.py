@@ -174,3 +174,10 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     lighting.mode = "recorded"
     lighting.mode = "scene"
     assert lighting.exposure == 1.5
+
+
+def test_a_deleted_head_is_forgotten(head):
+    """Catches a panel that works on a head that is no longer in the scene."""
+    bpy.data.collections.remove(head.users_collection[0])
+    bpy.context.view_layer.update()
+    assert bpy.context.scene.stga.head is None

@@ -289,7 +289,7 @@ def drive(head: str) -> Iterator[Any]:
     handle = space.draw_handler_add(count, ("draws",), "WINDOW", "POST_PIXEL")
     threading.Thread(target=send, daemon=True).start()
     begin = time.monotonic()
-    yield DRIVEN_S
+    yield lambda: counted["poses"] > 2 and time.monotonic() - begin > DRIVEN_S
     rates = [number / (time.monotonic() - begin) for number in counted.values()]
     moved = float(np.abs(corners() - resting).max())
     space.draw_handler_remove(handle, "WINDOW")
@@ -445,7 +445,7 @@ def delete() -> Iterator[Any]:
             select_only(thing)
             bpy.ops.ed.undo_push(message="before")
         click(f"Delete {what}", bpy.ops.object.delete, "EXEC_DEFAULT", True)
-        yield 0.2
+        yield lambda what=what: getattr(chosen(), what) is None
         yield from panels_unfolded(f"without {what}")
     with in_viewport():
         bpy.ops.ed.undo()
