@@ -176,8 +176,15 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     assert lighting.exposure == 1.5
 
 
-def test_a_deleted_head_is_forgotten(head):
-    """Catches a panel that works on a head that is no longer in the scene."""
-    bpy.data.collections.remove(head.users_collection[0])
+def test_appended_and_deleted_heads(head, tmp_path):
+    """Catches a panel that does not know an appended head, or works on one that is deleted."""
+    file, name = str(tmp_path / "head.blend"), head.name
+    bpy.ops.wm.save_as_mainfile(filepath=file)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.append(directory=f"{file}/Object/", filename=name)
+    scene = bpy.context.scene
+    assert scene.stga.head == bpy.data.objects[name]
+    for collection in scene.stga.head.users_collection:
+        collection.objects.unlink(scene.stga.head)
     bpy.context.view_layer.update()
-    assert bpy.context.scene.stga.head is None
+    assert scene.stga.head is None

@@ -63,7 +63,8 @@ def click(name: str, action: Callable[..., Any], *how: Any, **options: Any) -> A
 
 
 def opened(file: Path) -> float:
-    bpy.ops.wm.open_mainfile(filepath=str(file))
+    """Open it in the window as it is; seconds to wait."""
+    bpy.ops.wm.open_mainfile(filepath=str(file), load_ui=False)
     return 0.3
 
 
@@ -83,6 +84,9 @@ def show_only(root: str = "") -> None:
 
 def panels_unfolded(state: str) -> Iterator[Any]:
     """A picture of each panel, and the texts that do not fit."""
+    open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
+    show_only()
+    yield lambda: open_sidebar("STGA", [viewport()[0].screen])
     for panel in module("ui.panel").CLASSES:
         if hasattr(panel, "bl_category") and not hasattr(panel, "bl_parent_id"):
             show_only(panel.bl_idname)
@@ -200,9 +204,6 @@ def stop_workers() -> Iterator[Any]:
 
 def fresh() -> Iterator[Any]:
     """Every panel and every button in a file without a head."""
-    open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
-    show_only()
-    yield lambda: open_sidebar("STGA", [viewport()[0].screen])
     yield from panels_unfolded("fresh")
     yield from press("fresh")
 
@@ -430,7 +431,7 @@ def append() -> Iterator[Any]:
     bpy.ops.wm.read_homefile(app_template="")
     yield 0.2
     click("Append", bpy.ops.wm.append, directory=f"{FIRST}/Object/", filename=name)
-    seen["appended"] = name in bpy.data.objects
+    seen["appended"] = chosen().splats == bpy.data.objects[name]
     yield 0.3
     shot("appended")
     yield from panels_unfolded("appended")
