@@ -38,7 +38,7 @@ def asked(extension, take, out):
     """Ask for the tracking of the take, without a worker."""
     jobs = extension.stga_addon.jobs
     wanted = jobs.track.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
-    jobs.folder.write_request(jobs.folder.request_folder(out), wanted)
+    jobs.perform.write_request(jobs.perform.request_folder(out), wanted)
 
 
 def mesh_at(frame):

@@ -17,7 +17,7 @@ from ...capture.camera import Camera
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
-from ...cli.carry_out import carry_out
+from ...cli.commands import carry_out
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
