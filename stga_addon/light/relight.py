@@ -89,9 +89,8 @@ class Relighter:
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
-            raise StgaError(
-                "the avatar does not know the light of its capture; `stga relight RUN` estimates it"
-            )
+            problem = "the avatar does not know the light of its capture"
+            raise StgaError(f"{problem}; `stga relight RUN` estimates it")
         self.avatar, self.light = avatar, avatar.light
         self.face, self.weights = surface_points(avatar)
         self.corners = np.ascontiguousarray(avatar.faces[self.face])
