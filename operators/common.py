@@ -27,15 +27,21 @@ PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
     """Decorator of `execute`: a StgaError becomes the operator's error report, without a
-    traceback."""
+    traceback; the pointer says that Blender is busy."""
 
     def guarded(self: Any, context: Any) -> set[str]:
         setattr(context.window_manager, ids.MESSAGE, "")
+        window = context.window
+        if window is not None:
+            window.cursor_modal_set("WAIT")
         try:
             return execute(self, context)
         except StgaError as error:
             tell(self, "ERROR", str(error))
             return {"CANCELLED"}
+        finally:
+            if window is not None:
+                window.cursor_modal_restore()
 
     return guarded
 

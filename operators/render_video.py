@@ -89,6 +89,8 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
     filename_ext = ""
     filter_glob: file_filter(".mp4")
 
+    _recording: Any = None
+
     @classmethod
     def poll(cls, context: Any) -> bool:
         if not polled(cls, scene_settings(context).splats is not None, "Show an avatar first"):
@@ -160,9 +162,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             raise
 
     def cancel(self, context: Any) -> None:
-        """End the recording, also when Blender quits or loads another file meanwhile."""
-        context.window_manager.event_timer_remove(self._timer)
-        self._recording.discard()
+        """End the recording, also when Blender quits or loads another file meanwhile; the file
+        dialog that is left has none."""
+        if self._recording is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._recording.discard()
 
     def _frames(self, context: Any) -> list[int]:
         scene = context.scene

@@ -9,6 +9,7 @@ import numpy as np
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
 NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
+APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
 REC709 = "Linear Rec.709"
 """The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
