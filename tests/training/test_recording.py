@@ -54,7 +54,8 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
         )
         darker = np.where(mask[..., None] > 0, image * GAIN + OFFSET, image)
         Image.fromarray(darker.astype(np.uint8)).save(path)
-    write_json(root / "tracking.json", {"image_misfit": {}, "meters_per_unit": 1.0})
+    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": False}
+    write_json(root / "tracking.json", report)
     scale_capture(root, root / "model.npz", SCALE)
     write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
     return run, root
