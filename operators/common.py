@@ -16,8 +16,8 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.rig.arkit import shape_key_names
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.keyframes import shape_key_names
 from . import ids
 
 MAX_REPORT_CHARACTERS = 90

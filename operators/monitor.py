@@ -21,7 +21,6 @@ from bpy.app.handlers import persistent
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
-from ..stga_addon.jobs.folder import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.jobs.monitor_state import (
     CHECK_INTERVAL_S,
     SLICE_INTERVAL_S,
@@ -29,6 +28,7 @@ from ..stga_addon.jobs.monitor_state import (
     RunFiles,
     transition,
 )
+from ..stga_addon.jobs.perform import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image

@@ -19,10 +19,10 @@ from ..stga_addon.jobs.render import Render
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
-from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
+from ..stga_addon.scene.objects import frames_per_second
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.render.view_transform import srgb_background

@@ -8,7 +8,7 @@ from ..operators import ids
 from ..operators.common import is_head, scene_settings
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import has_heat_map, shows_residuals
+from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
 from .sidebar import SidebarPanel
 
 

@@ -16,7 +16,7 @@ from light.scenes import lit_avatar  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 from stga_addon.training.effect_catalog import EFFECTS  # noqa: E402

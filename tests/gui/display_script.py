@@ -31,7 +31,7 @@ from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import light as lighting  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
 from stga_addon.scene.gpu.renderer import SplatRenderer, _pixels  # noqa: E402
 from stga_addon.scene.render import engine, viewport_display  # noqa: E402
