@@ -251,7 +251,7 @@ def write_blend(
     """
     from ..export.playback import playback_fps
     from ..scene.avatar_scene import set_up_head, show_on_head, show_world
-    from ..scene.blend_file import empty_file, save_file
+    from ..scene.objects import empty_file, save_file
     from ..tracking.folder import is_flame
 
     inputs, run = read_inputs(out), out / RUN_FOLDER

@@ -202,6 +202,12 @@ def open_run(
     return OpenedRun(run, opened, tuple(takes))
 
 
+def avatar_version(run: Path) -> list[str]:
+    """A run's avatar, and when it was written; of a run that has one."""
+    file = (run / AVATAR).resolve()
+    return [str(file), str(file.stat().st_mtime_ns)]
+
+
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
     """The capture of a run, with the FLAME parameters that the run refined. Errors as of
     `open_run`."""
