@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..training.effect_decisions import EffectDecision
+from ..training.effect_catalog import EffectDecision
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ world.ply       what stands still behind the person, in world space; only where 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequen
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_lock, lock_owner
-from ..effect_decisions import EffectDecision
+from ..effect_catalog import EffectDecision
 from ..settings import TrainingSettings
 from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
 
@@ -331,8 +331,15 @@ def read_residuals(folder: Path, faces: int) -> np.ndarray:
     """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another
     mesh."""
     path = folder / RESIDUALS
-    residual = read_npz(path).get("residual")
-    if residual is None or residual.dtype != np.float32 or residual.shape != (faces,):
-        found = "no such array" if residual is None else f"{residual.dtype} {residual.shape}"
-        raise StgaError(f"{path}: expected 'residual', float32 ({faces},), found {found}")
-    return residual
+    return float_array(path, read_npz(path), "residual", (faces,))
+
+
+def float_array(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
+) -> np.ndarray:
+    """A float32 array of this shape among those of a file. Raises StgaError where it is not."""
+    array = arrays.get(name)
+    if array is None or array.dtype != np.float32 or array.shape != shape:
+        found = "no such array" if array is None else f"{array.dtype} {array.shape}"
+        raise StgaError(f"{path}: expected '{name}', float32 {shape}, found {found}")
+    return array
