@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
 from ..avatar.embedding import face_frames, to_local, to_world
 from ..avatar.splats import SH_C0, Splats, joined
@@ -80,12 +81,8 @@ class CleanPlate:
 
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
-    """The plate of each camera that has masks, of the training views.
-
-    correct: the exposure of images. Raises StgaError where a file cannot be read.
-    """
-    from scipy.ndimage import binary_dilation
-
+    """The plate of each camera that has masks, of the training views; correct: their exposure.
+    Raises StgaError where a file cannot be read."""
     by_camera: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         if view.mask is not None:
@@ -112,13 +109,8 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
 
 
 def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool.
-
-    Push and pull: pixels without a color get that of the image at half the size, whose pixels are
-    the means of those that have one.
-    """
-    from scipy.ndimage import zoom
-
+    """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool: those of
+    the image at half the size, whose pixels are means of those that have one (push and pull)."""
     if seen.all() or not seen.any():
         return image
     height, width = seen.shape
@@ -176,8 +168,6 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
     """Meters from the person's center (3,) to the shell on which plates of different cameras look
     most alike."""
-    from scipy.ndimage import gaussian_filter
-
     details = []  # without coarse colors, which light and exposure change, and without noise
     for plate in plates:
         sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]

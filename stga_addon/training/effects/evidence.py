@@ -34,16 +34,15 @@ RIDGE_WEIGHT = 1.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Root mean square errors, in levels of 255, of colors that a model was not fitted to: without
-    it and with it."""
+    """Root mean square errors, in levels of 255, without and with a model, of other colors than it
+    was fitted to."""
 
     before: float
     after: float
 
     @property
     def gain(self) -> float:
-        """Root mean square, in levels of 255, of the error that the model removes; 0 where it adds
-        error."""
+        """Root mean square, in levels of 255, of the error that it removes, or 0."""
         return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
@@ -115,10 +114,7 @@ def _agreement(before: np.ndarray, after: np.ndarray) -> Evidence:
 
 def stable_colors(color: np.ndarray) -> np.ndarray:
     """color (S, K, 3) of the half of the triangles with the least relative change of color, NaN for
-    the others.
-
-    Lids, lips and whatever the mesh does not follow change ten times as much as cameras differ.
-    """
+    the others: lids and lips change ten times as much as cameras differ."""
     mean = _mean(color)
     change = ((color - mean) / (mean + RELATIVE_CHANGE_BIAS_LEVELS)) ** 2
     seen = ~np.isnan(color[..., 0])
@@ -171,12 +167,8 @@ def scattered_folds(group: np.ndarray) -> list[Fold]:
 
 
 def consecutive_folds(timestep: np.ndarray) -> list[Fold]:
-    """FOLDS folds of consecutive timesteps (S,); a model is not fitted to the timesteps directly
-    beside them either.
-
-    What changes slowly is alike in neighboring timesteps, so that they say nothing of unseen ones.
-    A fold that leaves nothing to fit is left out.
-    """
+    """FOLDS folds of consecutive timesteps (S,), without those that leave nothing to fit. A model
+    is not fitted to the timesteps beside them either, in which slow changes are alike."""
     timesteps, order = np.unique(timestep, return_inverse=True)
     count, folds = min(FOLDS, len(timesteps)), []
     for fold in range(count):

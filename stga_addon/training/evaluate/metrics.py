@@ -115,10 +115,8 @@ def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarra
 
 
 def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:
-    """Exposure of the training cameras' views.
-
-    rows: `TrainingSettings.exposure`. A camera that they do not list was trained as it is.
-    """
+    """Exposure of the training cameras' views by the rows of `TrainingSettings.exposure`; a camera
+    that they do not list was trained as it is."""
     trained, listed = {view.camera_index for view in training_views}, view_exposure(rows)
 
     def exposure(view: View) -> np.ndarray | None:
@@ -240,10 +238,8 @@ def evaluate_avatar(
     perceptual: bool = False,
     matched: bool | None = None,
 ) -> Quality:
-    """Quality of an avatar on all views of a split, of which one at a time is held in memory.
-
-    matched: whether to apply the exposure of each view; None: where the avatar was trained so.
-    """
+    """Quality of an avatar on all views of a split, read one at a time; matched: whether to apply
+    the exposure of each view, None: where the avatar was trained so."""
     rows, exposure = avatar.settings.get("exposure") or (), None
     backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
@@ -259,10 +255,7 @@ def evaluate_avatar(
 
 def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
     """Mean PSNR in dB of the avatar in front of its world, in all views of a split, against images
-    as recorded.
-
-    Renderings are given the exposure of their camera where the run knows one; none is fitted.
-    """
+    as recorded: with the exposure of their camera where the run knows one; none is fitted."""
     known = known_exposure(avatar.settings.get("exposure") or (), capture.views.get("train", ()))
     found = []
     for view in capture.views[split]:
@@ -299,12 +292,8 @@ def peak_memory_mb() -> float | None:
 def _scores(
     image: np.ndarray, target: np.ndarray, perceptual: bool, where: np.ndarray | None = None
 ) -> tuple[float, float, float]:
-    """PSNR, SSIM and LPIPS (NaN if not measured) of the whole image or of the region `where` (H,
-    W).
-
-    For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is
-    scaled to a mean over the region.
-    """
+    """PSNR, SSIM and LPIPS (NaN if not measured) of the image, or of the region `where` (H, W): the
+    pixels outside are replaced by the target's, and SSIM is scaled to a mean over the region."""
     psnr_db, shown = psnr(image, target, where), target.transpose(2, 0, 1).astype(np.float32) / 255
     share = 1.0 if where is None else float(where.mean())
     if where is not None:

@@ -136,8 +136,7 @@ def voxel_size(mesh: np.ndarray) -> float:
 def _nearest_triangle(
     points: np.ndarray, mesh: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh and nearest triangle (N,), approximated by samples of every
-    triangle."""
+    """Distance (N,) to the mesh and nearest triangle (N,), by samples of every triangle."""
     samples = _mesh_samples(mesh, faces)
     distance, nearest = cKDTree(samples).query(points)
     return distance, nearest // (len(samples) // len(faces))

@@ -155,11 +155,8 @@ def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
 
 
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
-    """The correction that inverts the settings' `exposure`; None if there is none.
-
-    It applies to the foreground only, because the background is constant whatever the camera.
-    Images of cameras that the settings do not list stay unchanged.
-    """
+    """The correction that inverts the settings' `exposure`, of the foreground only, in images of
+    the cameras that it lists; None if there is none."""
     if not settings.exposure:
         return None
     exposure = view_exposure(settings.exposure)

@@ -148,10 +148,8 @@ def next_folder(run: Path) -> Path:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder for one process, and clear away what a killed one left half written.
-
-    Raises StgaError while another process holds the folder.
-    """
+    """Hold the folder for one process, and clear away what a killed one left half written. Raises
+    StgaError while another process holds it."""
     path = folder / "run.lock"
     with ExitStack() as lock:
         try:
@@ -250,12 +248,9 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
 
 
 def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
-    """The device to continue a run on, and why: its own, unless `requested` names another
-    (`choose_device`).
-
-    A run of a GPU that this machine lacks continues on the first one.
-    Raises StgaError where that device does not work or cannot train this run.
-    """
+    """The device to continue a run on, and why: its own, or the first GPU where this machine lacks
+    that one, unless `requested` names another (`choose_device`). Raises StgaError where it does not
+    work or cannot train this run."""
     trained_on, has_adapter = run.device, False
     with suppress(StgaError):  # where there is no GPU at all
         named = trained_on.removeprefix(GPU)
@@ -291,12 +286,9 @@ def write_tracking(
 
 
 def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined
-    none.
-
-    A timestep is replaced only if the capture's tracked parameters are those that the run started
-    from, so that another capture stays unchanged. Raises StgaError if the run's file is damaged.
-    """
+    """The capture with the parameters that the run in `folder` refined, in the timesteps whose
+    tracked parameters are those that the run started from: another capture stays unchanged. Raises
+    StgaError if the run's file is damaged."""
     path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
@@ -322,8 +314,7 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
 
 
 def write_residuals(folder: Path, mean: np.ndarray) -> None:
-    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where
-    that is unknown."""
+    """Write mean (F,): mean absolute error (0…1) by triangle, NaN where that is unknown."""
     write_npz(folder / RESIDUALS, {"residual": mean.astype(np.float32)}, compressed=True)
 
 

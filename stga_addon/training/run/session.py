@@ -531,10 +531,8 @@ def _asked_interval_s() -> float | None:
 
 @contextmanager
 def interrupt_requests() -> Iterator[list[int]]:
-    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt.
-
-    Without effect off the main thread and in Blender, which handles Ctrl-C itself.
-    """
+    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt. Without
+    effect off the main thread and in Blender, which handles Ctrl-C itself."""
     requests: list[int] = []
 
     def request(number: int, _frame: object) -> None:
