@@ -12,9 +12,7 @@ from ..errors import StgaError
 from ..options import duration, option
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
-from .backdrop import BACKDROPS
-from .effect_catalog import EFFECTS
-from .effect_decisions import CHOICES, parse_choice
+from .effect_catalog import CHOICES, EFFECTS, parse_choice
 
 STRATEGIES = {
     "global": "every iteration trains all splats; most accurate on the captures measured so far",
@@ -24,6 +22,10 @@ STRATEGIES = {
 CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
 SCHEDULES = ("default", "paper")
+BACKDROPS = ("plain", "masked", "mesh")
+"""plain: one color, that of the settings' background; masked: anything, replaced by that color
+outside the masks; mesh: the same, and images without a mask have the tracked mesh's silhouette for
+one."""
 GLOBAL_UNITS = ("iteration", "frame")
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
@@ -133,7 +135,7 @@ class TrainingSettings:
     random_background  where there are masks, put a random color behind the head in every iteration,
                        so that splats
                    of the background's color cannot hide in it and alpha is learned
-    backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for
+    backdrop       what is behind the head in the images, one of BACKDROPS: but for
                    "plain", training and evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
                           first `coarse_share` of the budget half of that

@@ -10,11 +10,7 @@ from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import VIEW, split_rows
-from stga_addon.raster.gpu.optimizer import (
-    OptimizerTables,
-    optimize,
-    upload_step,
-)
+from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
 
 pytestmark = pytest.mark.needs("adapter")

@@ -87,28 +87,6 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         )
 
 
-def test_frozen_rows_keep_every_bit() -> None:
-    """Catches anything at all happening to rows that are not listed, also where their gradients are
-    large or NaN."""
-    state = random_state(40, 7)
-    state.gradients.xyz[3] = np.nan
-    state.parameters.xyz[5] = [np.nan, -0.0, 1e-42]
-    before = bits(state)
-    listed = np.array([0, 7, 21, 39], np.int32)
-    for _ in range(5):
-        adam.step(state, listed, RATES)
-    after = bits(state)
-    frozen = np.setdiff1d(np.arange(40), listed)
-    for name in before:
-        np.testing.assert_array_equal(after[name][frozen], before[name][frozen], err_msg=name)
-    moved = [
-        name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()
-    ]
-    parts = ("parameters", "average", "first", "second")
-    trained = [f"{part}/{name}" for part in parts for name in state.parameters._fields]
-    assert set(trained) | {"steps"} == set(moved)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
     """Catches one NaN from a degenerate view spreading into parameters or moments, where it would

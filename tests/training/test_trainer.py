@@ -291,17 +291,6 @@ def test_render_shows_the_average(toy: Capture) -> None:
     assert trainer.render(view).min() == 1
 
 
-def test_render_returns_a_copy(toy: Capture) -> None:
-    """Catches pictures that change when the next one is rendered, because buffers are reused."""
-    trainer = make_trainer(toy)
-    view = view_of(toy, 1)
-    picture = trainer.render(view)
-    kept = picture.copy()
-    disturb(trainer)
-    assert not np.array_equal(trainer.render(view), kept)
-    np.testing.assert_array_equal(picture, kept)
-
-
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy: Capture, convention: str) -> None:
     """Catches bound and unbound limits that are mixed up, and hull points limited in triangles

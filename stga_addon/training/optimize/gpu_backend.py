@@ -13,9 +13,8 @@ from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.gpu import optimizer
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
-from ...raster.gpu.image_loss import image_loss, upload_target
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
-from ...raster.gpu.optimizer import OffsetTables, OptimizerTables
+from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
 from ...raster.gpu.rasterize import (
     Rasterizer,
     SplatTable,

@@ -16,10 +16,9 @@ from .cpu_backend import CpuBackend
 from .density import MAX_SPLIT_SHARE, control_density, reset_strays
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .outlines import Outline, prune_outside, read_outlines
+from .post_step import Outline, UnseenSides, prune_outside, read_outlines, unseen_sides
 from .state import Batch, TrainState, new_state, with_offsets
 from .strategies import Strategy
-from .unseen_sides import UnseenSides, unseen_sides
 
 if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend

@@ -16,7 +16,7 @@ world.ply       what stands still behind the person, in world space; only where 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequen
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_folder
-from ..effect_decisions import EffectDecision
+from ..effect_catalog import EffectDecision
 from ..settings import TrainingSettings
 from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
 
@@ -148,10 +148,8 @@ def next_folder(run: Path) -> Path:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder for one process, and clear away what a killed one left half written.
-
-    Raises StgaError while another process holds the folder.
-    """
+    """Hold the folder for one process, and clear away what a killed one left half written. Raises
+    StgaError while another process holds it."""
     with hold_folder(folder, "run.lock", "run is working in this folder"):
         remove_leftovers(folder)
         yield
@@ -247,12 +245,9 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
 
 
 def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
-    """The device to continue a run on, and why: its own, unless `requested` names another
-    (`choose_device`).
-
-    A run of a GPU that this machine lacks continues on the first one.
-    Raises StgaError where that device does not work or cannot train this run.
-    """
+    """The device to continue a run on, and why: its own, or the first GPU where this machine lacks
+    that one, unless `requested` names another (`choose_device`). Raises StgaError where it does not
+    work or cannot train this run."""
     trained_on, has_adapter = run.device, False
     with suppress(StgaError):  # where there is no GPU at all
         named = trained_on.removeprefix(GPU)
@@ -288,12 +283,9 @@ def write_tracking(
 
 
 def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined
-    none.
-
-    A timestep is replaced only if the capture's tracked parameters are those that the run started
-    from, so that another capture stays unchanged. Raises StgaError if the run's file is damaged.
-    """
+    """The capture with the parameters that the run in `folder` refined, in the timesteps whose
+    tracked parameters are those that the run started from: another capture stays unchanged. Raises
+    StgaError if the run's file is damaged."""
     path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
@@ -319,8 +311,7 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
 
 
 def write_residuals(folder: Path, mean: np.ndarray) -> None:
-    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where
-    that is unknown."""
+    """Write mean (F,): mean absolute error (0…1) by triangle, NaN where that is unknown."""
     write_npz(folder / RESIDUALS, {"residual": mean.astype(np.float32)}, compressed=True)
 
 
@@ -328,8 +319,15 @@ def read_residuals(folder: Path, faces: int) -> np.ndarray:
     """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another
     mesh."""
     path = folder / RESIDUALS
-    residual = read_npz(path).get("residual")
-    if residual is None or residual.dtype != np.float32 or residual.shape != (faces,):
-        found = "no such array" if residual is None else f"{residual.dtype} {residual.shape}"
-        raise StgaError(f"{path}: expected 'residual', float32 ({faces},), found {found}")
-    return residual
+    return float_array(path, read_npz(path), "residual", (faces,))
+
+
+def float_array(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
+) -> np.ndarray:
+    """A float32 array of this shape among those of a file. Raises StgaError where it is not."""
+    array = arrays.get(name)
+    if array is None or array.dtype != np.float32 or array.shape != shape:
+        found = "no such array" if array is None else f"{array.dtype} {array.shape}"
+        raise StgaError(f"{path}: expected '{name}', float32 {shape}, found {found}")
+    return array
