@@ -349,10 +349,13 @@ def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
 
 
 def test_gradients_are_overwritten():
-    """Catches stale gradients: coefficients above the degree in use must be overwritten, too."""
+    """Catches stale gradients, and time spent on coefficients above the degree in use."""
     scene = SCENES["lower degree than stored"]
     _, fresh, rows, _ = raw_gradients(scene)
     _, overwritten, _, _ = raw_gradients(scene, fill=5.0)
+    used = (scene.degree + 1) ** 2
+    assert (overwritten.sh[:, used:] == 5.0).all()
+    overwritten.sh[:, used:] = 0.0
     for name in NAMES:
         np.testing.assert_array_equal(
             getattr(overwritten, name)[rows], getattr(fresh, name)[rows], err_msg=name

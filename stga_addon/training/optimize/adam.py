@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ...avatar.offsets import OFFSETS
+from ...avatar.splats import MAX_SH_DEGREE
 from ...capture.camera import Camera
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from .state import OffsetState, TrainState
@@ -24,6 +25,7 @@ def step(
     rates: Mapping[str, float],
     ema_share: float = 1.0,
     epsilon: np.float32 = EPSILON,
+    sh_degree: int = MAX_SH_DEGREE,
 ) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
@@ -31,15 +33,18 @@ def step(
     ema_share  least share of the stepped row in its exponential moving average; with 1, the average
                is the row
     epsilon    added to the root of the second moment; `image_epsilon` in training
+    sh_degree  in use: coefficients of higher ones have no gradient, and memory is left alone
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    for name, table in state.tables.items():
+    tables = dict(state.tables)
+    for name, table in tables.items():
         table.rates[:] = rates[name]
-        if name == "sh":
-            table.rates[3:] = rates["sh_rest"]
+    sh_rates = tables["sh"].rates
+    sh_rates[3:] = rates["sh_rest"]
+    tables["sh"] = tables["sh"]._replace(rates=sh_rates[: 3 * (sh_degree + 1) ** 2])
     options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
-    adam_rows(rows, state.steps, tuple(state.tables.values()), options)
+    adam_rows(rows, state.steps, tuple(tables.values()), options)
 
 
 def step_offsets(

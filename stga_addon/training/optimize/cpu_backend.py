@@ -74,7 +74,7 @@ class CpuBackend:
             limit = np.float32(settings.distance_limit) * self._frames.units
             xyz, weight = state.parameters.xyz, settings.distance_weight
             distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
-        adam.step(state, rows, batch.rates, settings.ema_share, epsilon)
+        adam.step(state, rows, batch.rates, settings.ema_share, epsilon, batch.sh_degree)
         if batch.accumulate:
             add_screen_gradients(rows, screen, state.screen_gradient, state.gradient_count)
         return loss
