@@ -114,6 +114,8 @@ class TrainingSettings:
                          points
     unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points
                    that few cameras see fade, unless nothing else explains what these cameras see
+    adam_beta2     decay of Adam's second moment: at 0.999 it is an average over more iterations
+                   than a detail takes to be learned
     adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
                    that hardly show in an image, and whose gradients are below it, hardly move
     ema_share      share of the latest step in each splat's exponential moving average, which the
@@ -187,6 +189,7 @@ class TrainingSettings:
     unseen_opacity_weight: float = setting(0.06, 0, MAX_WEIGHT)
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
+    adam_beta2: float = setting(0.99, 0.5, 0.9999)
     adam_epsilon: float = setting(0.003, maximum=1.0, above=0)
     ema_share: float = setting(0.015, 0, 1)
     stray_reset_interval: int = setting(200, 0, MAX_COUNT)
@@ -264,7 +267,7 @@ class TrainingSettings:
                 raise StgaError(f"--effect cannot be combined with --{name} {value}")
 
 
-INRIA_ADAM_EPSILON = 1e-9
+INRIA_ADAM_BETA2, INRIA_ADAM_EPSILON = 0.999, 1e-9
 """3D Gaussian Splatting's ε of 1e-15, at an image of 600 by 550."""
 PAPER_SETTINGS = {
     "views_per_visit": 0,
@@ -274,6 +277,7 @@ PAPER_SETTINGS = {
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,
+    "adam_beta2": INRIA_ADAM_BETA2,
     "adam_epsilon": INRIA_ADAM_EPSILON,
     "ema_share": 1.0,
     "lattice": 4,
@@ -291,6 +295,7 @@ GAUSSIAN_AVATARS_SETTINGS = {
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_reset_interval": 0,
+    "adam_beta2": INRIA_ADAM_BETA2,
     "adam_epsilon": INRIA_ADAM_EPSILON,
     "ema_share": 1.0,
     "hull_points": False,
