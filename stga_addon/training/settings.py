@@ -78,9 +78,9 @@ class Preset:
 
 
 PRESETS = {
-    "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
-    "standard": Preset("everyday work", 3000, 2.0, {}),
-    "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
+    "draft": Preset("a first look", 500, 0.3, {"lattice": 1}),
+    "standard": Preset("everyday work", 1900, 1.3, {}),
+    "final": Preset("the best quality of the three", 5600, 3.8, {"growth": 0.6}),
 }
 """Fewer splats are ahead in the first seconds, more of them in the end."""
 
@@ -130,6 +130,7 @@ class TrainingSettings:
     hull_points    add hull points for what the mesh does not cover
     density_interval  iterations between density control, 0 never; it works during `density_span` of
                       the budget
+    split_share    largest share of the splats that one round of density control splits
     growth         most splats that density control may add, as a share of the initial number
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration,
@@ -198,14 +199,15 @@ class TrainingSettings:
     sh_degree: int = setting(3, 0, MAX_SH_DEGREE)
     sh_steps: tuple[float, ...] = setting((0.3, 0.5, 0.7), 0)
     hull_points: bool = True
-    density_interval: int = setting(200, 0, MAX_COUNT)
+    density_interval: int = setting(100, 0, MAX_COUNT)
     density_span: tuple[float, float] = setting((0.1, 0.6), 0)
+    split_share: float = setting(0.2, 0, 1)
     growth: float = setting(0.25, 0, MAX_GROWTH)
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     random_background: bool = True
     backdrop: str = setting("plain", choices=BACKDROPS)
     scale: float = setting(1.0, 0.05, 1)
-    coarse_share: float = setting(0.0, 0, 1)
+    coarse_share: float = setting(0.35, 0, 1)
     target_psnr: float | None = option(
         "stop when the held-out views reach it", None, maximum=200, above=0, metavar="DB"
     )
@@ -267,9 +269,18 @@ class TrainingSettings:
                 raise StgaError(f"--effect cannot be combined with --{name} {value}")
 
 
-INRIA_ADAM_BETA2, INRIA_ADAM_EPSILON = 0.999, 1e-9
-"""3D Gaussian Splatting's ε of 1e-15, at an image of 600 by 550."""
+_PUBLISHED = {
+    "adam_beta2": 0.999,
+    "adam_epsilon": 1e-9,  # 3D Gaussian Splatting's 1e-15, at an image of 600 by 550
+    "ema_share": 1.0,
+    "hull_points": False,
+    "random_background": False,
+    "density_interval": 200,
+    "split_share": 0.02,
+    "coarse_share": 0.0,
+}
 PAPER_SETTINGS = {
+    **_PUBLISHED,
     "views_per_visit": 0,
     "global_interval": 20,
     "warm_up_share": 0.0,
@@ -277,29 +288,20 @@ PAPER_SETTINGS = {
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,
-    "adam_beta2": INRIA_ADAM_BETA2,
-    "adam_epsilon": INRIA_ADAM_EPSILON,
-    "ema_share": 1.0,
     "lattice": 4,
-    "hull_points": False,
-    "random_background": False,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
 """The paper's settings where they differ from the defaults, which measured best
 (docs/results.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
+    **_PUBLISHED,
     "convention": "gaussian_avatars",
     "lattice": 0,
     "rates": Rates(5e-3, 1e-3, 1.7e-2, 5e-2, 2.5e-3, 1.25e-4, position_end=0.01, end=1.0),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_reset_interval": 0,
-    "adam_beta2": INRIA_ADAM_BETA2,
-    "adam_epsilon": INRIA_ADAM_EPSILON,
-    "ema_share": 1.0,
-    "hull_points": False,
-    "random_background": False,
     "growth": 8.0,
 }
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and

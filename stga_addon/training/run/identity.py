@@ -18,7 +18,10 @@ QUANTUM = 1e-6 * 0.5**0.5
 """Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines
 compute other last bits. It is irrational, so that neither decimals nor binary fractions lie at the
 edge between two multiples."""
-LATER_SETTINGS: dict[int, dict[str, Any]] = {5: {"torso": False}, 6: {"adam_beta2": 0.999}}
+LATER_SETTINGS: dict[int, dict[str, Any]] = {
+    5: {"torso": False},
+    6: {"adam_beta2": 0.999, "split_share": 0.02},
+}
 """Format version of runs -> settings that earlier ones do not have, with what these were trained
 with."""
 
