@@ -95,7 +95,7 @@ def test_the_step_is_adam_in_float64() -> None:
         adam.step_offsets(
             {"strain_position": state}, rows, face, gradient,
             {"strain_position": smoothed}.__getitem__, rate,
-            ema_share, epsilon,
+            0.999, ema_share, epsilon,
         )  # fmt: skip
         for f in np.unique(face[rows]):
             steps[f] += 1

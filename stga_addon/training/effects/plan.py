@@ -100,7 +100,7 @@ def exposure(facts: CaptureFacts) -> Verdict:
 
 def antialiasing(facts: CaptureFacts) -> Verdict:
     settings, widest = facts.settings, facts.pixel_range
-    if settings.scale < 1 or settings.coarse_share > 0:
+    if settings.scale < 1:
         return Verdict(True, "images are trained at a smaller size than they are rendered at")
     if widest > MAX_PIXEL_WIDTH_RATIO:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")

@@ -13,7 +13,7 @@ from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
 from .cpu_backend import CpuBackend
-from .density import MAX_SPLIT_SHARE, control_density, reset_strays
+from .density import control_density, reset_strays
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .post_step import Outline, UnseenSides, prune_outside, read_outlines, unseen_sides
@@ -151,7 +151,7 @@ class Trainer:
             reset_strays(state, limit, settings.stray_reset_share)
         if splits:
             budget = round(self.initial_count * (1 + settings.growth)) - len(state)
-            share = MAX_SPLIT_SHARE if region is None else MAX_REGION_SPLIT_SHARE
+            share = settings.split_share if region is None else MAX_REGION_SPLIT_SHARE
             rng = np.random.default_rng([settings.seed, count])
             state = control_density(state, budget, rng, share, region)
         if prunes:

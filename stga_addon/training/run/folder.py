@@ -35,10 +35,17 @@ from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_folder
 from ..effect_catalog import EffectDecision
 from ..settings import TrainingSettings
-from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
+from .identity import (
+    LATER_SETTINGS,
+    RunIdentity,
+    difference,
+    earlier_identity,
+    identity_of,
+    settings_since,
+)
 
-FORMAT, VERSION = "stga-run", 5
-OLDEST_VERSION = 4
+FORMAT, VERSION = "stga-run", max(LATER_SETTINGS)
+VERSIONS = range(min(LATER_SETTINGS) - 1, VERSION + 1)
 """Read as well: LATER_SETTINGS are all that it lacks."""
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
 WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
@@ -120,13 +127,12 @@ def read_run(folder: Path) -> Run:
     if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
     version = values.pop("version", None)
-    if version not in (OLDEST_VERSION, VERSION):
-        reads = f"{OLDEST_VERSION} and {VERSION}"
+    if version not in VERSIONS:
+        reads = f"{VERSIONS[0]} to {VERSION}"
         found = f"has run format version {shorten(version)}"
         raise StgaError(f"{path}: {found}, this add-on reads {reads}")
-    if version == OLDEST_VERSION and isinstance(values.get("settings"), dict):
-        later = {name: getattr(TrainingSettings, name) for name in LATER_SETTINGS}
-        values["settings"].update(later)
+    if isinstance(values.get("settings"), dict):
+        values["settings"].update(settings_since(version))
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:
@@ -227,7 +233,7 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     trained = stored.identity
     if trained is None or trained == given:  # None: the run was prepared, but has not begun
         return given
-    if trained == version_4_identity(given, run.settings):
+    if trained in (earlier_identity(given, run.settings, version) for version in VERSIONS):
         return trained
     changed = difference(trained, given)
     if trained.principal_point != given.principal_point:
