@@ -95,8 +95,8 @@ def only_drive_panel() -> None:
     """Leave the sidebar's tab with the Drive panel open, for pictures."""
     ui = sys.modules[f"{extension}.ui.panel"]
     kept = [
-        sys.modules[f"{extension}.ui.motion"].MotionPanel,
-        sys.modules[f"{extension}.ui.drive"].DrivePanel,
+        sys.modules[f"{extension}.ui.motion_panel"].MotionPanel,
+        sys.modules[f"{extension}.ui.motion_panel"].DrivePanel,
     ]
     for panel in reversed(ui.CLASSES):
         bpy.utils.unregister_class(panel)

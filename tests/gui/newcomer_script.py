@@ -30,7 +30,6 @@ NECK_ANGLE, MOUTH, VIDEO_S = 0.3, 0.6, 2.0
 STARTED = time.monotonic()
 seen: dict[str, Any] = {"version": bpy.app.version_string}
 extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-ids = sys.modules[f"{extension}.operators.ids"]
 monitor = sys.modules[f"{extension}.operators.monitor"]
 bpy.context.preferences.view.show_splash = False
 
@@ -194,9 +193,8 @@ def press() -> Iterator[Callable[[], bool]]:
     """Call every operator that can be called here as its button does, and undo it."""
     bpy.ops.wm.open_mainfile(filepath=str(FOLDER / "first.blend"))
     seen["pressed"], seen["messages"] = [], {}
-    names = {name for name in vars(ids).values() if str(name).startswith("stga.")}
-    for name in sorted(names - {f"stga.{each}" for each in WORKERS}):
-        operator = getattr(bpy.ops.stga, name.removeprefix("stga."))
+    for name in sorted({*dir(bpy.ops.stga)} - {*WORKERS}):
+        operator = getattr(bpy.ops.stga, name)
         with viewport():
             bpy.ops.ed.undo_push(message="before")
             if not operator.poll():
