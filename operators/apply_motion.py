@@ -90,8 +90,6 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     """Animate this head with the expressions and pose of another person; its earlier animation is
     kept"""
 
-    bl_idname = "stga.apply_motion"
-    bl_label = "Apply Motion"
     needs = (needs_rig_or_shapes,)
 
     filepath: options.path(
@@ -172,7 +170,6 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         default=True,
         options=ONCE,
     )
-    filename_ext = ".npz"
     filter_glob: options.file_filter(".npz", ".csv", ".json", ".txt")
 
     @classmethod

@@ -36,7 +36,6 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
     """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What
     was begun with the same video is continued"""
 
-    bl_idname = "stga.avatar_from_video"
     bl_label = "Avatar from Video"
     needs = (idle(*TRAINS),)
 

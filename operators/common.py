@@ -46,11 +46,18 @@ def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, 
 
 
 class Action:
-    """Mixin of operators that `run(context)` where every poll of `needs` holds."""
+    """Mixin of operators that `run(context)` where every poll of `needs` holds. Identifier and, if
+    it has no other, label are the name of the class: `SolveAgain` is "stga.solve_again"."""
 
     bl_options = frozenset({"REGISTER"})
     needs: tuple[Poll, ...] = ()
     run: Any
+
+    def __init_subclass__(cls) -> None:
+        words = re.findall("[A-Z][a-z]*", cls.__name__)
+        cls.bl_idname = f"stga.{'_'.join(words).lower()}"
+        if "bl_label" not in vars(cls):
+            cls.bl_label = " ".join(words)
 
     @classmethod
     def poll(cls, context: Any) -> bool:

@@ -86,7 +86,6 @@ class MeasureRange(Edit, bpy.types.Operator):
     """Measure the range of expression, jaw and eyes in the recording that the head was trained
     on"""
 
-    bl_idname = "stga.measure_range"
     bl_label = "Measure Trained Range"
     needs = (needs_rig,)
 
@@ -102,8 +101,6 @@ class DriveLive(Action, bpy.types.Operator):
     """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made
     by Record"""
 
-    bl_idname = "stga.drive_live"
-    bl_label = "Drive Live"
     needs = (needs_rig_or_shapes,)
 
     def run(self, context: Any) -> None:
@@ -157,7 +154,6 @@ class _OfSession(Action):
 class StopLive(_OfSession, bpy.types.Operator):
     """Stop listening; the head goes back to its own animation, and a recording is kept"""
 
-    bl_idname = "stga.stop_live"
     bl_label = "Stop"
 
     def act(self, context: Any, running: LiveSession) -> None:
@@ -169,7 +165,6 @@ class CalibrateLive(_OfSession, bpy.types.Operator):
     """Take the performer's face and head of this moment as the resting ones, which do not move the
     head"""
 
-    bl_idname = "stga.calibrate_live"
     bl_label = "Set Neutral"
 
     def act(self, context: Any, running: LiveSession) -> None:
@@ -180,7 +175,6 @@ class RecordLive(_OfSession, Edit, bpy.types.Operator):
     """Record what is received; again: write the take as CSV and apply it to the head as a new
     action"""
 
-    bl_idname = "stga.record_live"
     bl_label = "Record"
 
     def act(self, context: Any, running: LiveSession) -> None:
@@ -194,7 +188,6 @@ class RecordLive(_OfSession, Edit, bpy.types.Operator):
 class FollowLive(_OfSession, bpy.types.Operator):
     """Follow this sender instead of the other"""
 
-    bl_idname = "stga.follow_live"
     bl_label = "Follow"
 
     address: options.text("Address", "IP address of the sender")
@@ -228,14 +221,12 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
     """Find the motion of the face in a video, write it as a file into the takes, and apply it to
     the head"""
 
-    bl_idname = "stga.drive_video"
     bl_label = "Drive from Video"
     needs = (idle(Kind.PERFORMANCE), needs_rig_or_shapes)
 
     avatar: options.field(
         ConvertMotion, "avatar", "Track with Avatar", subtype="DIR_PATH", options=ONCE
     )
-    filename_ext = ".mp4"
     filter_glob: options.file_filter(*VIDEO_SUFFIXES)
 
     def invoke(self, context: Any, event: Any) -> set[str]:

@@ -2,6 +2,7 @@
 Gaussian splats."""
 
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ class OpenNpz(Edit, bpy.types.Operator):
     """Open an .npz file by its content: show an avatar, apply a FLAME motion to the head, or import
     it as a new one"""
 
-    bl_idname = "stga.open_npz"
     bl_label = "Open Avatar or Motion"
     bl_options = Edit.bl_options | {"INTERNAL"}
 
@@ -64,38 +64,18 @@ class _ViewportDrop:
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
-class VideoDrop(_ViewportDrop, bpy.types.FileHandler):
-    bl_idname = "STGA_FH_video"
-    bl_label = "Avatar from Video (STGA)"
-    bl_import_operator = "stga.avatar_from_video"
-    bl_file_extensions = ";".join(VIDEO_SUFFIXES)
+def _handler(name: str, label: str, operator: str, suffixes: Iterable[str]) -> type:
+    """A file handler that gives dropped files to an operator."""
+    about = {"bl_idname": f"STGA_FH_{name}", "bl_label": f"{label} (STGA)"}
+    about |= {"bl_import_operator": operator, "bl_file_extensions": ";".join(suffixes)}
+    kinds = (_ViewportDrop, bpy.types.FileHandler)
+    return type(f"{name.title()}Drop", kinds, about | {"__module__": __name__})
 
 
-class CaptureDrop(_ViewportDrop, bpy.types.FileHandler):
-    bl_idname = "STGA_FH_capture"
-    bl_label = "Head Capture (STGA)"
-    bl_import_operator = "stga.import_capture"
-    bl_file_extensions = ".json"
-
-
-class AvatarDrop(_ViewportDrop, bpy.types.FileHandler):
-    bl_idname = "STGA_FH_npz"
-    bl_label = "Avatar or FLAME Motion (STGA)"
-    bl_import_operator = "stga.open_npz"
-    bl_file_extensions = ".npz"
-
-
-class PlyDrop(_ViewportDrop, bpy.types.FileHandler):
-    bl_idname = "STGA_FH_ply"
-    bl_label = "Gaussian Splats (STGA)"
-    bl_import_operator = "stga.import_ply"
-    bl_file_extensions = ".ply"
-
-
-class PerformanceDrop(_ViewportDrop, bpy.types.FileHandler):
-    """Blender asks which handler to use for .json files, which captures have too."""
-
-    bl_idname = "STGA_FH_performance"
-    bl_label = "Face Performance (STGA)"
-    bl_import_operator = "stga.apply_motion"
-    bl_file_extensions = ".csv;.json;.txt"
+VideoDrop = _handler("video", "Avatar from Video", "stga.avatar_from_video", VIDEO_SUFFIXES)
+CaptureDrop = _handler("capture", "Head Capture", "stga.import_capture", [".json"])
+NpzDrop = _handler("npz", "Avatar or FLAME Motion", "stga.open_npz", [".npz"])
+PlyDrop = _handler("ply", "Gaussian Splats", "stga.import_ply", [".ply"])
+# Blender asks which handler to use for .json files, which captures have too.
+PERFORMANCES = (".csv", ".json", ".txt")
+PerformanceDrop = _handler("performance", "Face Performance", "stga.apply_motion", PERFORMANCES)

@@ -64,8 +64,6 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
     """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian
     splats"""
 
-    bl_idname = "stga.export_avatar"
-    bl_label = "Export Avatar"
     needs = (needs_head,)
 
     filepath: options.path(
@@ -315,7 +313,6 @@ class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
     """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of
     ARKit's 52 shapes"""
 
-    bl_idname = "stga.export_performance"
     bl_label = "Export ARKit Curves"
     needs = (needs_rig,)
 
@@ -336,9 +333,6 @@ class ExportCameras(Action, bpy.types.Operator, ExportHelper):
     """Export cameras at the current frame as calibration of footage: each has a folder, video or
     image of its name"""
 
-    bl_idname = "stga.export_cameras"
-    bl_label = "Export Cameras"
-
     filename_ext = ".json"
     filepath: options.path("File", "transforms.json in the folder of the footage", options=ONCE)
     filter_glob: options.file_filter(".json")
@@ -357,9 +351,6 @@ class ExportCameras(Action, bpy.types.Operator, ExportHelper):
 class ExportHeadModel(Action, bpy.types.Operator, ExportHelper):
     """Export the active object's shape keys as a head model for tracking; keys named identity… make
     other persons"""
-
-    bl_idname = "stga.export_head_model"
-    bl_label = "Export Head Model"
 
     filename_ext = ".npz"
     filter_glob: options.file_filter(".npz")

@@ -35,9 +35,6 @@ class ImportCapture(Edit, bpy.types.Operator, FileImport):
     """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with
     images"""
 
-    bl_idname = "stga.import_capture"
-    bl_label = "Import Capture"
-
     filepath: options.path("File", "Folder of the capture, or any file in it", options=ONCE)
     directory: options.path(
         "Capture",
@@ -83,10 +80,8 @@ class ImportMotion(Edit, bpy.types.Operator, FileImport):
     """Import FLAME parameters (VHAP, GaussianAvatars, plain expression and pose) as a rigged,
     animated head"""
 
-    bl_idname = "stga.import_motion"
     bl_label = "Import FLAME Motion"
 
-    filename_ext = ".npz"
     flame: options.flame()
     filter_glob: options.file_filter(".npz")
 
@@ -101,7 +96,6 @@ class ImportMotion(Edit, bpy.types.Operator, FileImport):
 class ImportMeshes(Edit, bpy.types.Operator, FileImport):
     """Import a folder of meshes with the same triangles, one for each frame, as an animated head"""
 
-    bl_idname = "stga.import_meshes"
     bl_label = "Import Mesh Sequence"
 
     filepath: options.path(
@@ -117,7 +111,6 @@ class ImportMeshes(Edit, bpy.types.Operator, FileImport):
 class OpenDemo(Edit, bpy.types.Operator):
     """Open a small capture of a generated person, to try training in a minute"""
 
-    bl_idname = "stga.open_demo"
     bl_label = "Open Demo Capture"
 
     needs = (need(lambda _: DEMO.is_dir(), "Only the complete edition brings the demo capture"),)

@@ -27,7 +27,6 @@ class PoseHead(Edit, bpy.types.Operator):
     """Show the bones and select one in Pose mode; again: back to Object mode. R turns a bone, I
     keeps its pose"""
 
-    bl_idname = "stga.pose_head"
     bl_label = "Pose the Head"
     needs = (needs_rig,)
 
@@ -83,7 +82,6 @@ def is_posing(context: Any, rig: Any) -> bool:
 class AddArkitControls(Edit, bpy.types.Operator):
     """Add 52 sliders named as ARKit's blend shapes: jawOpen, mouthSmileLeft, …"""
 
-    bl_idname = "stga.add_arkit_controls"
     bl_label = "Add Face Sliders"
 
     @classmethod

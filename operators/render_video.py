@@ -54,8 +54,6 @@ class RenderVideo(Action, bpy.types.Operator, ExportHelper):
     """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working
     meanwhile"""
 
-    bl_idname = "stga.render_video"
-    bl_label = "Render Video"
     needs = (
         need(lambda context: context.scene.stga.splats, "Show an avatar first"),
         idle(Kind.VIDEO),

@@ -133,9 +133,6 @@ def _kind_property(kinds: Any) -> Any:
 class Cancel(Action, bpy.types.Operator):
     """Stop a request that is running"""
 
-    bl_idname = "stga.cancel"
-    bl_label = "Cancel"
-
     request: _kind_property(Kind)
 
     @classmethod
@@ -155,9 +152,6 @@ class Dismiss(Action, bpy.types.Operator):
     """Remove status and log of a request that has ended; what it made stays, such as a run with its
     checkpoints"""
 
-    bl_idname = "stga.dismiss"
-    bl_label = "Dismiss"
-
     request: _kind_property(DISMISSIBLE)
 
     needs = (
@@ -173,9 +167,6 @@ class Dismiss(Action, bpy.types.Operator):
 
 class CopyReport(Action, bpy.types.Operator):
     """Copy the error message, traceback and log of a worker to the clipboard"""
-
-    bl_idname = "stga.copy_report"
-    bl_label = "Copy Report"
 
     directory: options.text(
         "Folder",

@@ -39,7 +39,6 @@ class Select(Edit, bpy.types.Operator):
     """Select the triangles that move from the neutral face in each frame, as one vertex group for
     each frame"""
 
-    bl_idname = "stga.select"
     bl_label = "Select Moving Triangles"
     needs = (needs_own_head,)
 
@@ -77,7 +76,6 @@ class Select(Edit, bpy.types.Operator):
 class ToggleRegion(Edit, bpy.types.Operator):
     """Select this region as a whole, or triangle by triangle, when triangles are selected next"""
 
-    bl_idname = "stga.toggle_region"
     bl_label = "Key Region"
     bl_options = Edit.bl_options | {"INTERNAL"}
     needs = (needs_own_head,)
@@ -97,7 +95,6 @@ class CountSelected(Edit, bpy.types.Operator):
     """Update the number of triangles and splats that each frame trains, after painting vertex
     groups"""
 
-    bl_idname = "stga.count_selected"
     bl_label = "Update Counts"
     needs = (needs_head,)
 
@@ -109,8 +106,6 @@ class HeatMap(Edit, bpy.types.Operator):
     """Color the head's triangles, in the viewport and in renders: by how often each is selected, or
     by the error of the trained avatar there"""
 
-    bl_idname = "stga.heat_map"
-    bl_label = "Heat Map"
     needs = (needs_own_head,)
 
     show: options.boolean("Show", "Off: restore the head's own colors", default=True, options=ONCE)

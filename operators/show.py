@@ -54,11 +54,8 @@ UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
 class ShowAvatar(Edit, bpy.types.Operator, FileImport):
     """Show a trained avatar: splats that follow the animated head"""
 
-    bl_idname = "stga.show_avatar"
-    bl_label = "Show Avatar"
     needs = (needs_head,)
 
-    filename_ext = ".npz"
     hide_head: options.boolean(
         "Hide Head",
         "Hide the head's mesh, which covers the splats; it still deforms them",
@@ -85,10 +82,8 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
 class ImportPly(Edit, bpy.types.Operator, FileImport):
     """Import a 3D Gaussian Splatting PLY file"""
 
-    bl_idname = "stga.import_ply"
     bl_label = "Import Gaussian Splats"
 
-    filename_ext = ".ply"
     filter_glob: options.file_filter(".ply")
     up: options.choice(
         "Up",
@@ -117,7 +112,6 @@ def _has_own_splats(context: Any) -> bool:
 class ChooseDisplay(Edit, bpy.types.Operator):
     """Choose how the splats are displayed, in a shading that shows their colors"""
 
-    bl_idname = "stga.choose_display"
     bl_label = "Display"
     needs = (need(_has_own_splats, "Show an avatar first"),)
 
@@ -144,7 +138,6 @@ class PreviewImages(Edit, bpy.types.Operator):
     """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads
     that face it, without one as points"""
 
-    bl_idname = "stga.preview_images"
     bl_label = "Preview for EEVEE/Cycles"
 
     needs = (need(_own_as_trained, "No splats are displayed as trained"),)
@@ -169,7 +162,6 @@ class PreviewImages(Edit, bpy.types.Operator):
 class StandardView(Edit, bpy.types.Operator):
     """Show colors as trained: set the scene's view transform to Standard"""
 
-    bl_idname = "stga.standard_view"
     bl_label = "Use Standard View Transform"
 
     def run(self, context: Any) -> None:
@@ -194,8 +186,6 @@ class EstimateLight(Action, bpy.types.Operator):
     """Find out the light of the capture that the avatar was trained on, so that the scene can light
     the avatar"""
 
-    bl_idname = "stga.estimate_light"
-    bl_label = "Estimate Light"
     needs = (idle(Kind.LIGHT), _needs_splats)
 
     directory: options.path("Run Folder", "Folder of the avatar's run", "DIR_PATH")
@@ -210,7 +200,6 @@ class RelightFrame(Edit, bpy.types.Operator):
     """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
     frames keep them"""
 
-    bl_idname = "stga.relight_frame"
     bl_label = "Relight Frame for EEVEE and Cycles"
     needs = (_needs_splats,)
 
@@ -228,7 +217,6 @@ class HeadShadow(Edit, bpy.types.Operator):
     """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
     again: hide it"""
 
-    bl_idname = "stga.head_shadow"
     bl_label = "Shadow onto the Scene"
     needs = (_needs_splats,)
 

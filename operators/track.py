@@ -66,8 +66,6 @@ class TrackFootage(Action, bpy.types.Operator, TrackOptions):
     """Track the head that the footage shows, in a process that continues when Blender is closed,
     and import it"""
 
-    bl_idname = "stga.track_footage"
-    bl_label = "Track Footage"
     needs = (idle(Kind.TRACKING),)
 
     landmarks: options.field(Track, "landmarks", subtype="DIR_PATH", options=ONCE)
@@ -87,7 +85,6 @@ class ViewFootage(Edit, bpy.types.Operator):
     """Look through the capture's cameras, at their images behind the see-through head; again: back
     to the free view"""
 
-    bl_idname = "stga.view_footage"
     bl_label = "Look Through Camera"
 
     step: options.integer(
@@ -122,7 +119,6 @@ class MarkKey(Edit, bpy.types.Operator):
     """Keep the pose and expression of this frame, set by hand, as a key for Solve Again; on a key:
     no longer"""
 
-    bl_idname = "stga.mark_key"
     bl_label = "Mark as Key"
 
     @classmethod
@@ -147,9 +143,6 @@ class MarkKey(Edit, bpy.types.Operator):
 class SolveAgain(Action, bpy.types.Operator):
     """Solve the tracked capture again around the keys, in a process beside Blender, and import
     it"""
-
-    bl_idname = "stga.solve_again"
-    bl_label = "Solve Again"
 
     @classmethod
     def poll(cls, context: Any) -> bool:

@@ -36,8 +36,6 @@ class AnalyzeCapture(Action, bpy.types.Operator):
     """Find out which effects the capture calls for, and how long each preset takes on this
     machine"""
 
-    bl_idname = "stga.analyze_capture"
-    bl_label = "Analyze Capture"
     needs = (idle(Kind.ANALYSIS), needs_head)
 
     def run(self, context: Any) -> None:
@@ -154,7 +152,6 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     """Train the avatar on the capture's images, in a process that continues when Blender is
     closed"""
 
-    bl_idname = "stga.train"
     bl_label = "Train Avatar"
 
     directory: options.path("Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH")
@@ -224,9 +221,6 @@ class Refine(ContinueOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
     """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the
     region is the selected triangles, otherwise a vertex group"""
 
-    bl_idname = "stga.refine"
-    bl_label = "Refine"
-
     directory: options.path("Run Folder", "Folder of the run to refine", "DIR_PATH")
     region: options.text(
         "Region",
@@ -248,7 +242,6 @@ class Refine(ContinueOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
 class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator):
     """Train a further take of the same head into the avatar, which keeps what it has learned"""
 
-    bl_idname = "stga.extend"
     bl_label = "Extend with Take"
 
     directory: options.path("Run Folder", "Folder of the run to extend", "DIR_PATH")
@@ -283,7 +276,6 @@ class SelectExtension(Action, bpy.types.Operator):
     """Select the triangles that extending the run by this head's take would train in each frame:
     those that move, and those that look different than in the run's images"""
 
-    bl_idname = "stga.select_extension"
     bl_label = "Select What Extend Trains"
     needs = (idle(Kind.SELECTION), needs_own_head)
 

@@ -99,7 +99,6 @@ class TestPython(Action, bpy.types.Operator):
     """Start the Python that tracks and trains, and report its versions of torch and numba and its
     device, or what it lacks"""
 
-    bl_idname = "stga.test_python"
     bl_label = "Test"
     needs = (need(lambda _: not test.is_running, "A test is running"),)
 

@@ -21,7 +21,6 @@ SILENT_S = 1.0
 
 
 class MotionPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_motion"
     bl_label = "5 Motion"
 
     def draw(self, context: Any) -> None:
@@ -34,7 +33,6 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
 
 
 class FacePanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_face"
     bl_label = "Face"
     bl_parent_id = MotionPanel.bl_idname
 
@@ -63,7 +61,6 @@ def _draw_keys(layout: Any, keys: list[Any]) -> None:
 class TrainedPanel(ClosedPanel, bpy.types.Panel):
     """Meters of how far outside the trained range the head is posed in this frame."""
 
-    bl_idname = "STGA_PT_trained"
     bl_label = "Trained Range"
     bl_parent_id = MotionPanel.bl_idname
 
@@ -82,7 +79,6 @@ class TrainedPanel(ClosedPanel, bpy.types.Panel):
 class CoefficientsPanel(ClosedPanel, bpy.types.Panel):
     """Sliders of a FLAME head without names: of expression, and of other persons."""
 
-    bl_idname = "STGA_PT_coefficients"
     bl_label = "Coefficients"
     bl_parent_id = MotionPanel.bl_idname
 
@@ -105,7 +101,6 @@ def _coefficients(head: Any) -> list[list[Any]]:
 
 
 class DrivePanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_drive"
     bl_label = "Drive"
     bl_parent_id = MotionPanel.bl_idname
 

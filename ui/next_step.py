@@ -26,7 +26,6 @@ GO_ON = "Go on working, save, or quit Blender"
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_next_step"
     bl_label = "Next Step"
 
     def draw(self, context: Any) -> None:

@@ -17,7 +17,6 @@ LAYERS = ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DAT
 
 
 class CapturePanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_capture"
     bl_label = "1 Capture"
 
     def draw(self, context: Any) -> None:
@@ -53,7 +52,6 @@ class SelectedFrames(bpy.types.UIList):
 
 
 class SelectPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_select"
     bl_label = "2 Select"
 
     def draw(self, context: Any) -> None:

@@ -44,7 +44,6 @@ _is_told = False
 
 
 class ShowPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_show"
     bl_label = "4 Show"
 
     def draw(self, context: Any) -> None:
@@ -93,7 +92,6 @@ def draw_input(layout: Any, modifier: Any, name: str, **how: Any) -> None:
 
 
 class LightingPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_lighting"
     bl_parent_id = ShowPanel.bl_idname
     bl_label = "Lighting"
 

@@ -1,6 +1,7 @@
 """What the panels of the sidebar tab share: their base, wrapped text, options of buttons, and how a
 request is drawn: progress with Cancel, end with Dismiss, failure with the end of the log."""
 
+import re
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,16 @@ _shown: dict[Path, monitor.Curve] = {}
 
 
 class SidebarPanel:
+    """Mixin of panels, whose identifier is the name of the class: `TrainPanel` is
+    "STGA_PT_train"."""
+
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = TAB
+
+    def __init_subclass__(cls) -> None:
+        words = re.findall("[A-Z][a-z]*", cls.__name__.removesuffix("Panel"))
+        cls.bl_idname = f"STGA_PT_{'_'.join(words).lower()}"
 
 
 class ClosedPanel(SidebarPanel):

@@ -16,7 +16,6 @@ from .train_panel import draw_missing_python
 
 
 class TrackPanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_track"
     bl_label = "Track Footage"
 
     def draw(self, context: Any) -> None:
@@ -38,7 +37,6 @@ class TrackPanel(ClosedPanel, bpy.types.Panel):
 
 
 class TrackOptionsPanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_track_options"
     bl_label = "Options"
     bl_parent_id = TrackPanel.bl_idname
 
@@ -50,7 +48,6 @@ class TrackOptionsPanel(ClosedPanel, bpy.types.Panel):
 
 
 class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_track_check"
     bl_label = "Check and Correct"
     bl_parent_id = TrackPanel.bl_idname
 

@@ -36,7 +36,6 @@ from .sidebar import (
 
 
 class TrainPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_train"
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
@@ -96,7 +95,6 @@ def draw_preferences(layout: Any, text: str) -> None:
 
 
 class TrainOptionsPanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_train_options"
     bl_label = "Options"
     bl_parent_id = TrainPanel.bl_idname
 
@@ -108,7 +106,6 @@ class TrainOptionsPanel(ClosedPanel, bpy.types.Panel):
 
 
 class ContinuePanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_continue"
     bl_label = "Refine and Extend"
     bl_parent_id = TrainPanel.bl_idname
 
@@ -157,7 +154,6 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
 
 
 class EffectsPanel(ClosedPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_effects"
     bl_label = "Effects"
     bl_parent_id = TrainPanel.bl_idname
 

@@ -6,15 +6,13 @@ import sys
 import time
 from pathlib import Path
 
+import bpy
 import pytest
+from capture.factory import write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import write_mesh_capture  # noqa: E402
-
-from stga_addon.jobs.table import Kind  # noqa: E402
-from stga_addon.training.run.folder import read_run  # noqa: E402
-from stga_addon.training.settings import PRESETS  # noqa: E402
+from stga_addon.jobs.table import Kind
+from stga_addon.training.run.folder import read_run
+from stga_addon.training.settings import PRESETS
 
 
 @pytest.fixture

@@ -3,25 +3,23 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import ball, flame_parameters, write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import Avatar
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.display.splat_object import evaluated_splats
+from stga_addon.scene.rig.flame_rig import rig_of
+from stga_addon.training.optimize.avatar_tracking import RefinedTracking
+from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
-from capture.factory import ball, flame_parameters, write_flame_capture, write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.embedding import to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar  # noqa: E402
-from stga_addon.capture.model import Capture  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
-from stga_addon.training.optimize.avatar_tracking import RefinedTracking  # noqa: E402
-from stga_addon.training.run.folder import with_refined_tracking, write_tracking  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6

@@ -4,16 +4,16 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
 pytest.importorskip("av")
 pytest.importorskip("cv2")
 
-from tracking.head_video import write_head_video  # noqa: E402
+from tracking.head_video import write_head_video
 
-from stga_addon.scene import tags  # noqa: E402
+from stga_addon.scene import tags
 
 
 @pytest.fixture

@@ -4,21 +4,19 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.capture.open import open_capture
+from stga_addon.export.ply import read_ply
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.vertex_groups import read_selection
 
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.embedding import to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, read_avatar  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.export.ply import read_ply  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 
 @pytest.fixture

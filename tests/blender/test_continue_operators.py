@@ -3,22 +3,20 @@ stays in place."""
 
 import tempfile
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.file import read_avatar
+from stga_addon.jobs.monitor_state import RequestState
+from stga_addon.jobs.table import Kind
+from stga_addon.scene import tags
+from stga_addon.training.run.folder import read_run
 
-from capture.factory import write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.file import read_avatar  # noqa: E402
-from stga_addon.jobs.monitor_state import RequestState  # noqa: E402
-from stga_addon.jobs.table import Kind  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.training.run.folder import read_run  # noqa: E402
-
-from .test_analyze_operator import error_of, tick_until_done, write_interpreter  # noqa: E402
-from .test_operators import write_ball_avatar  # noqa: E402
-from .test_train_operators import ask_only  # noqa: E402
+from .test_analyze_operator import error_of, tick_until_done, write_interpreter
+from .test_operators import write_ball_avatar
+from .test_train_operators import ask_only
 
 
 @pytest.fixture

@@ -6,22 +6,20 @@ import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
+import bpy
 import numpy as np
 import pytest
+from driving.live import wire
+from flame.small_head import small_head, write_flame
 
-bpy = pytest.importorskip("bpy")
-
-from driving.live import wire  # noqa: E402
-from flame.small_head import small_head, write_flame  # noqa: E402
-
-from stga_addon.driving.head_map import head_map  # noqa: E402
-from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral  # noqa: E402
-from stga_addon.driving.performance import ARKIT_SHAPES, Performance  # noqa: E402
-from stga_addon.driving.read_performance import read_performance  # noqa: E402
-from stga_addon.flame.forward import flame_forward  # noqa: E402
-from stga_addon.flame.sequence import FlameSequence, read_motion  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.driving.head_map import head_map
+from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
+from stga_addon.driving.performance import ARKIT_SHAPES, Performance
+from stga_addon.driving.read_performance import read_performance
+from stga_addon.flame.forward import flame_forward
+from stga_addon.flame.sequence import FlameSequence, read_motion
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.rig.flame_rig import rig_of
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 2e-5

@@ -2,15 +2,13 @@
 
 from types import SimpleNamespace
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-
-from .test_import_operators import write_motion  # noqa: E402
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_import_operators import write_motion
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 

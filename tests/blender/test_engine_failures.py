@@ -2,20 +2,20 @@
 
 import threading
 
+import bpy
 import pytest
 
-bpy = pytest.importorskip("bpy")
 pytest.importorskip("numba")
 
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.splat_object import set_input  # noqa: E402
-from stga_addon.scene.render import engine  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+from stga_addon.errors import StgaError
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.splat_object import set_input
+from stga_addon.scene.render import engine
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from .exr import read_exr  # noqa: E402
-from .test_engine import HEIGHT, WIDTH, _engine, camera_at, multilayer, no_python, show  # noqa: E402, F401
-from .test_splat_object import avatar_of  # noqa: E402
+from .exr import read_exr
+from .test_engine import HEIGHT, WIDTH, _engine, camera_at, multilayer, no_python, show  # noqa: F401
+from .test_splat_object import avatar_of
 
 
 @pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])

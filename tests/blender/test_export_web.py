@@ -2,22 +2,20 @@
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture
+from export.web.web_data import posed_mesh, read_web_data
+from flame.small_head import small_head, write_flame
 
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import write_flame_capture  # noqa: E402
-from export.web.web_data import posed_mesh, read_web_data  # noqa: E402
-from flame.small_head import small_head, write_flame  # noqa: E402
-
-from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
-from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
-from stga_addon.flame.model import JOINTS  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.open import open_capture
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.model import JOINTS
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.rig.flame_rig import rig_of
 
 BLENDER_TOLERANCE_M = 1e-5
 """Float32 skinning in Blender, steps of the file's blend shapes and weights."""

@@ -1,24 +1,22 @@
 """What an imported capture looks like: framed viewports, bones that are posed by one button."""
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
+from mathutils import Vector
 from PIL import Image
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.development.demo.capture import unpack_capture
+from stga_addon.export.ply import write_ply
+from stga_addon.scene import tags
+from stga_addon.scene.avatar_scene import frame_head
+from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS
+from stga_addon.scene.display.splat_nodes import DISPLAY
+from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
+from stga_addon.scene.objects import layers_of
 
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-from mathutils import Vector  # noqa: E402
-
-from stga_addon.development.demo.capture import unpack_capture  # noqa: E402
-from stga_addon.export.ply import write_ply  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.avatar_scene import frame_head  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS  # noqa: E402
-from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
-from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
-from stga_addon.scene.objects import layers_of  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 
 @pytest.fixture

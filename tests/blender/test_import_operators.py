@@ -3,12 +3,10 @@
 from functools import partial
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
-
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import (  # noqa: E402
+from capture.factory import (
     ball,
     flame_parameters,
     moved,
@@ -18,11 +16,11 @@ from capture.factory import (  # noqa: E402
     write_mesh_capture,
 )
 
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
+from stga_addon.capture.open import open_capture
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.display.splat_object import evaluated_splats
 
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
 for package in ("torch", "numba", "PIL"):
     pytest.importorskip(package)
 

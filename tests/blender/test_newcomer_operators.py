@@ -5,24 +5,22 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
+from light.scenes import lit_avatar
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import triangle_mesh
+from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display.display_modes import POINTS
+from stga_addon.scene.display.splat_object import display_mode, show_avatar
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.training.effect_catalog import EFFECTS
 
-from capture.factory import write_mesh_capture  # noqa: E402
-from light.scenes import lit_avatar  # noqa: E402
-
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
-from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
-from stga_addon.training.effect_catalog import EFFECTS  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
-from .test_panel import draw  # noqa: E402
+from .test_operators import write_ball_avatar
+from .test_panel import draw
 
 LACKS = (
     "/opt/blender/5.2/python/bin/python3.13 (Python 3.13.2) lacks torch, numba, scipy, pillow. "

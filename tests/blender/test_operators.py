@@ -7,31 +7,29 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import ball, write_flame_capture, write_mesh_capture
+from export.web.web_data import read_web_data
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.model import Capture
+from stga_addon.capture.open import open_capture
+from stga_addon.export.formats import export_avatar
+from stga_addon.export.ply import read_ply, write_ply
+from stga_addon.jobs.track import Track
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.display_modes import POINTS
+from stga_addon.scene.display.splat_object import evaluated_splats, set_input
+from stga_addon.scene.vertex_groups import read_selection
+from stga_addon.selection import SelectionOptions, select_capture
 
-from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
-from export.web.web_data import read_web_data  # noqa: E402
-
-from stga_addon.avatar.embedding import to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
-from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.avatar.splats import Splats  # noqa: E402
-from stga_addon.capture.model import Capture  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.export.formats import export_avatar  # noqa: E402
-from stga_addon.export.ply import read_ply, write_ply  # noqa: E402
-from stga_addon.jobs.track import Track  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
-from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
-
-from .captures import closure  # noqa: E402
+from .captures import closure
 
 pytestmark = pytest.mark.usefixtures("extension")
 

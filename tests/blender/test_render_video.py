@@ -8,11 +8,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 from PIL import Image
 
-bpy = pytest.importorskip("bpy")
 av = pytest.importorskip("av")
 
 from capture.factory import write_mesh_capture  # noqa: E402

@@ -2,20 +2,18 @@
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.capture.open import open_capture
+from stga_addon.scene.display.heat_map import HEAT, SHARE
+from stga_addon.scene.vertex_groups import read_selection
+from stga_addon.selection import SelectionOptions, select_capture
 
-from capture.factory import write_mesh_capture  # noqa: E402
-
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.display.heat_map import HEAT, SHARE  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
-from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
-
-from .captures import closure  # noqa: E402
-from .test_operators import write_ball_avatar  # noqa: E402
+from .captures import closure
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 

@@ -4,20 +4,18 @@ solved again."""
 import sys
 from math import radians
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture
+from flame.small_head import small_head
+from mathutils import Quaternion
+from tracking.test_head_model import blender_head
 
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import write_flame_capture  # noqa: E402
-from flame.small_head import small_head  # noqa: E402
-from mathutils import Quaternion  # noqa: E402
-from tracking.test_head_model import blender_head  # noqa: E402
-
-from stga_addon.jobs.perform import perform_in_folder  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.tracking.head_model import HeadModel, read_head_model  # noqa: E402
+from stga_addon.jobs.perform import perform_in_folder
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.tracking.head_model import HeadModel, read_head_model
 
 HEAD = HeadModel(small_head(0), "flame")
 

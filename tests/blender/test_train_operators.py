@@ -8,19 +8,17 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.files import write_json
+from stga_addon.jobs.table import Kind
+from stga_addon.scene.display.splat_object import evaluated_splats
 
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.file import read_avatar, write_avatar  # noqa: E402
-from stga_addon.files import write_json  # noqa: E402
-from stga_addon.jobs.table import Kind  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
@@ -151,8 +149,8 @@ def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypat
     monkeypatch.setattr(extension.operators.request, "missing_packages", lambda: ["torch"])
     expected = r"^Error: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
-        bpy.ops.stga.train(directory=run, minutes=0.1)
-    assert not (tmp_path / "run").exists()
+        bpy.ops.stga.train(directory=str(tmp_path / "new"), minutes=0.1)
+    assert not (tmp_path / "new").exists()
     assert bpy.ops.stga.train.poll()
     (tmp_path / "capture").rename(tmp_path / "elsewhere")
     with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
@@ -186,13 +184,17 @@ def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     assert not bpy.ops.stga.dismiss.poll()
 
 
-def test_dismiss_removes_a_requests_files_only(extension, worker, tmp_path):
-    """Catches a Dismiss that deletes what a user put into the request's folder, or, for a path
-    stored in a .blend file from elsewhere, files that no training wrote."""
+def test_dismiss_removes_a_requests_files_only(worker):
+    """Catches a Dismiss that deletes what a user put into the request's folder."""
     (worker.folder / "notes.txt").write_text("mine")
     worker.leave()
     bpy.ops.stga.dismiss(request="training")
     assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
+
+
+def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
+    """Catches a .blend file from elsewhere whose stored path makes Dismiss delete files that no
+    training wrote."""
     folder = tmp_path / "documents/job"
     folder.mkdir(parents=True)
     names = ["preview.npz", "result.json", "selection.npz", "status.json", "worker.log"]
