@@ -2,12 +2,12 @@
 head model for tracking."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from queue import Empty, Queue
-from threading import Thread
 from typing import Any
 
 import bpy
@@ -207,9 +207,9 @@ class RangeExport:
         self._head, self._frames = head, iterate_frames(frames)
         self._queue: Queue[Any] = Queue(MAX_WAITING_MESHES)
         self._is_fed = False
-        self._error: Exception | None = None
-        self._thread = Thread(target=self._run, args=(write,), name="stga export", daemon=True)
-        self._thread.start()
+        pool = ThreadPoolExecutor(1, "stga export")
+        self._written = pool.submit(write, self._meshes())
+        pool.shutdown(wait=False)
 
     def step(self) -> bool:
         """Pose the next frame if the thread has room for it; whether the thread is still at
@@ -219,7 +219,7 @@ class RangeExport:
             self._is_fed = frame is None
             self._queue.put(None if frame is None else (frame, evaluated_vertices(self._head)))
             self.done += frame is not None
-        return self._thread.is_alive()
+        return not self._written.done()
 
     def finish(self) -> bool:
         """End the export, restore the scene's frame; whether it is whole. Raises what the thread
@@ -230,16 +230,10 @@ class RangeExport:
                 while True:
                     self._queue.get_nowait()
             self._queue.put(Cancelled())
-        self._thread.join()
-        if self._error is not None and not isinstance(self._error, Cancelled):
-            raise self._error
-        return self._error is None
-
-    def _run(self, write: Callable[[Meshes], Any]) -> None:
-        try:
-            write(self._meshes())
-        except Exception as error:
-            self._error = error
+        with suppress(Cancelled):
+            self._written.result()
+            return True
+        return False
 
     def _meshes(self) -> Meshes:
         while (item := self._queue.get()) is not None:
