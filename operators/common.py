@@ -16,8 +16,8 @@ from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.rig.arkit import shape_key_names
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.keyframes import shape_key_names
 from ..stga_addon.schema import alternatives, type_hints
 from . import options
 from .options import ONCE
@@ -32,15 +32,21 @@ Poll = Callable[[Any, Any], bool]
 
 def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, Any], set[str]]:
     """Decorator: a StgaError becomes the operator's error report, without a traceback, and nothing
-    that is returned becomes FINISHED."""
+    that is returned becomes FINISHED; the pointer says that Blender is busy."""
 
     def guarded(self: Any, context: Any) -> set[str]:
         context.window_manager.stga_message = ""
+        window = context.window
+        if window is not None:
+            window.cursor_modal_set("WAIT")
         try:
             return execute(self, context) or {"FINISHED"}
         except StgaError as error:
             self.tell("ERROR", str(error))
             return {"CANCELLED"}
+        finally:
+            if window is not None:
+                window.cursor_modal_restore()
 
     return guarded
 

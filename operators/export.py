@@ -32,10 +32,9 @@ from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.blend_file import frames_per_second, iterate_frames
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_object import check_head
-from ..stga_addon.scene.objects import Warn
+from ..stga_addon.scene.objects import Warn, frames_per_second, iterate_frames
 from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection

@@ -13,9 +13,14 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import leave_edit_mode, show_kind
-from ..stga_addon.scene.rig.arkit import add_shapes, has_shapes, head_shapes
-from ..stga_addon.scene.rig.flame_rig import rig_of
-from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES, posing_bone
+from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.keyframes import (
+    EXPRESSION_NAMES,
+    add_shapes,
+    has_shapes,
+    head_shapes,
+    posing_bone,
+)
 from . import monitor
 from .common import Edit, capture_source, flame_motion, head_of, needs_rig, polled, rig_or_none
 

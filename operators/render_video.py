@@ -20,10 +20,10 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
-from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
+from ..stga_addon.scene.objects import frames_per_second
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
@@ -91,6 +91,7 @@ class RenderVideo(Action, bpy.types.Operator, ExportHelper):
     seconds: options.field(Render, "seconds", min=0.1, soft_max=60.0)
     filename_ext = ""
     filter_glob: options.file_filter(".mp4")
+    _recording: Any = None
 
     def check(self, context: Any) -> bool:
         """Keep the path's extension in step with the format; whether it changed."""
@@ -149,9 +150,11 @@ class RenderVideo(Action, bpy.types.Operator, ExportHelper):
             raise
 
     def cancel(self, context: Any) -> None:
-        """End the recording, also when Blender quits or loads another file meanwhile."""
-        context.window_manager.event_timer_remove(self._timer)
-        self._recording.discard()
+        """End the recording, also when Blender quits or loads another file meanwhile; the file
+        dialog that is left has none."""
+        if self._recording is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._recording.discard()
 
     def _frames(self, scene: Any) -> list[int]:
         frames = list(scene_frames(scene))

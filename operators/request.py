@@ -13,7 +13,13 @@ import bpy
 
 from ..stga_addon import __version__
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.folder import check_request, request_folder, worker_arguments, write_request
+from ..stga_addon.jobs.perform import (
+    check_request,
+    perform_in_folder,
+    request_folder,
+    worker_arguments,
+    write_request,
+)
 from ..stga_addon.jobs.table import (
     DISMISSIBLE,
     JOBS,
@@ -80,8 +86,6 @@ def start(
 
 def _perform_here(folder: Path) -> None:
     """Carry out the request in Blender's own Python, with Blender's progress at the pointer."""
-    from ..stga_addon.jobs.perform import perform_in_folder
-
     manager = bpy.context.window_manager
 
     def show(progress: Any) -> bool:

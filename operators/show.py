@@ -14,7 +14,7 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.compat import NATIVE_SPLATS
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
 from ..stga_addon.scene.display.splat_object import (
     get_input,
     hide_object,
@@ -162,7 +162,7 @@ class PreviewImages(Edit, bpy.types.Operator):
 class StandardView(Edit, bpy.types.Operator):
     """Show colors as trained: set the scene's view transform to Standard"""
 
-    bl_label = "Use Standard View Transform"
+    bl_label = "Use Standard View"
 
     def run(self, context: Any) -> None:
         context.scene.view_settings.view_transform = "Standard"
@@ -200,7 +200,6 @@ class RelightFrame(Edit, bpy.types.Operator):
     """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
     frames keep them"""
 
-    bl_label = "Relight Frame for EEVEE and Cycles"
     needs = (_needs_splats,)
 
     clear: options.boolean("Clear", "Show recorded colors again", options=ONCE)
@@ -217,7 +216,6 @@ class HeadShadow(Edit, bpy.types.Operator):
     """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
     again: hide it"""
 
-    bl_label = "Shadow onto the Scene"
     needs = (_needs_splats,)
 
     def run(self, context: Any) -> None:

@@ -276,7 +276,7 @@ class SelectExtension(Action, bpy.types.Operator):
     """Select the triangles that extending the run by this head's take would train in each frame:
     those that move, and those that look different than in the run's images"""
 
-    bl_label = "Select What Extend Trains"
+    bl_label = "Select for Extend"
     needs = (idle(Kind.SELECTION), needs_own_head)
 
     directory: options.path("Run Folder", "Folder of the run to extend", "DIR_PATH")

@@ -19,7 +19,7 @@ from . import monitor, options
 from .common import Action, need, package, preferences
 
 POLL_INTERVAL_S = 0.3
-PREPARATION = "stga_addon.jobs.preparation"
+PREPARATION = "stga_addon.jobs.perform"
 START_DELAY_S = 1.0
 """After the extension was enabled: neither enabling nor Blender's start waits for a process."""
 

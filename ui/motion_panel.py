@@ -25,7 +25,7 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, context.scene.stga
-        layout.operator("stga.apply_motion", text="Apply Motion from File", icon="IMPORT")
+        layout.operator("stga.apply_motion", text="Apply Motion…", icon="IMPORT")
         row, other = layout.row(align=True), settings.motion_source
         row.prop(settings, "motion_source")
         if other is not None:
@@ -126,7 +126,7 @@ class DrivePanel(ClosedPanel, bpy.types.Panel):
         row.prop(settings, "exchange_mouth", text="Swap Mouth", toggle=True)
         layout.prop(settings, "takes")
         if not draw_running(layout, context, Kind.PERFORMANCE):
-            layout.operator("stga.drive_video", text="From a Video of a Face", icon="FILE_MOVIE")
+            layout.operator("stga.drive_video", text="Drive from Video…", icon="FILE_MOVIE")
 
 
 def _draw_source(layout: Any, context: Any, settings: Any) -> None:

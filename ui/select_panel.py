@@ -8,8 +8,8 @@ import bpy
 from ..operators.common import is_head
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import has_heat_map, shows_residuals
 from ..stga_addon.scene.objects import layers_of
+from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
 from .sidebar import SidebarPanel
 
 LAYERS = ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA"))
@@ -86,7 +86,7 @@ def _draw_regions(layout: Any, head: Any) -> None:
     possible, ticked = possible_regions(head), key_regions(head)
     if not possible:
         return
-    layout.label(text="Selected as a Whole")
+    layout.label(text="Whole Regions")
     grid = layout.grid_flow(columns=2, align=True, row_major=True)
     for name in possible:
         is_on = name in ticked

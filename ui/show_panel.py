@@ -15,7 +15,7 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
 from ..stga_addon.scene.display.splat_object import (
     display_mode,
     input_identifier,
@@ -118,7 +118,7 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
             text = f"The capture's light was hard: albedo is evened out by {light.damping:.0%}"
             draw_text(layout, context, text, "INFO")
         row = layout.row(align=True)
-        row.operator("stga.relight_frame", text="Relight Frame (EEVEE, Cycles)")
+        row.operator("stga.relight_frame")
         row.operator("stga.relight_frame", text="", icon="X").clear = True
         layout.operator("stga.head_shadow")
 

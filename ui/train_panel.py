@@ -19,7 +19,7 @@ from ..stga_addon.format import describe_figures, format_duration
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import shows_residuals
+from ..stga_addon.scene.vertex_groups import shows_residuals
 from ..stga_addon.training.effect_catalog import EFFECTS
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.status import WorkerState
@@ -85,7 +85,7 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
 def draw_missing_python(layout: Any, context: Any) -> None:
     """Where no Python here can track and train, say where one is chosen."""
     if not has_training_python(context):
-        draw_preferences(layout, "Choose a Python in Preferences")
+        draw_preferences(layout, "Choose a Python")
 
 
 def draw_preferences(layout: Any, text: str) -> None:

@@ -234,6 +234,7 @@ def track(
             "median_reprojection_px": round(result.median_px, 3),
             "meters_per_unit": result.scale,
             "interpolated": list(result.interpolated),
+            "in_order": fit.ordered,
             "warnings": list(result.warnings),
             "reprojection_px": _rounded(result.reprojection_px),
             "image_misfit": _rounded(result.image_misfit),

@@ -15,7 +15,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display.splat_object import evaluated_splats
-from stga_addon.scene.rig.flame_rig import rig_of
+from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 

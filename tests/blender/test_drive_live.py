@@ -19,7 +19,7 @@ from stga_addon.driving.read_performance import read_performance
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.sequence import FlameSequence, read_motion
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.rig.flame_rig import rig_of
+from stga_addon.scene.rig.head import rig_of
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 2e-5

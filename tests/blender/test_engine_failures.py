@@ -2,20 +2,20 @@
 
 import threading
 
-import bpy
 import pytest
 
+bpy = pytest.importorskip("bpy")
 pytest.importorskip("numba")
 
-from stga_addon.errors import StgaError
-from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_object import set_input
-from stga_addon.scene.render import engine
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.scene.display import splat_nodes  # noqa: E402
+from stga_addon.scene.display.splat_object import set_input  # noqa: E402
+from stga_addon.scene.render import engine  # noqa: E402
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 
-from .exr import read_exr
-from .test_engine import HEIGHT, WIDTH, _engine, camera_at, multilayer, no_python, show  # noqa: F401
-from .test_splat_object import avatar_of
+from .exr import read_exr  # noqa: E402
+from .test_engine import HEIGHT, WIDTH, _engine, camera_at, multilayer, no_python, show  # noqa: E402, F401
+from .test_splat_object import avatar_of  # noqa: E402
 
 
 @pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
@@ -23,8 +23,8 @@ def test_unsupported_cameras_are_refused(kind):
     """Catches a perspective image from a camera of another type."""
     if kind is not None:
         camera_at(type=kind)
-    expected = "no camera" if kind is None else "camera: is not a perspective camera"
-    with pytest.raises(RuntimeError, match=expected):
+    message = "no camera" if kind is None else "camera: is not a perspective camera"
+    with pytest.raises(RuntimeError, match=message):
         bpy.ops.render.render()
 
 
@@ -45,28 +45,16 @@ def test_a_head_in_edit_mode_is_named():
     _, head = show(avatar_of("stga", 10))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    sentence = "head: is in Edit Mode; head splats is drawn again when you leave it"
-    with pytest.raises(StgaError, match=sentence):
+    message = "head: is in Edit Mode; head splats is drawn again when you leave it"
+    with pytest.raises(StgaError, match=message):
         visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
 
 
-@pytest.mark.parametrize(
-    ("stage", "raised", "message"),
-    [
-        ("visible_layers", StgaError("is broken"), "^Error: is broken$"),
-        (
-            "visible_layers",
-            ValueError("of bones"),
-            r"Unexpected error \(ValueError: of bones\); see",
-        ),
-        ("combined", MemoryError("of rgb"), r"Unexpected error \(MemoryError: of rgb\); see the"),
-    ],
-)
-def test_failed_render_is_an_error_and_an_empty_image(
-    stage, raised, message, tmp_path, monkeypatch
-):
+@pytest.mark.parametrize("stage", ["visible_layers", "combined"])
+@pytest.mark.parametrize("raised", [StgaError("head: is broken"), MemoryError("of pixels")])
+def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, monkeypatch):
     """Catches an image without passes, and a failure saved as an image."""
 
     def fail(*_: object) -> None:
@@ -76,6 +64,9 @@ def test_failed_render_is_an_error_and_an_empty_image(
     scene.render.filepath = str(tmp_path / "failed.png")
     camera_at()
     monkeypatch.setattr(engine, stage, fail)
+    message = "^Error: head: is broken$"
+    if isinstance(raised, MemoryError):
+        message = r"Unexpected error \(MemoryError: of pixels\); see the console"
     with pytest.raises(RuntimeError, match=message) as reported:
         bpy.ops.render.render(write_still=True)
     assert str(reported.value).count(str(raised)) == 1
@@ -95,6 +86,7 @@ def test_panels_drop_the_engine_on_unregister():
         every = bpy.types.Panel.__subclasses__()
         return [each for each in every if engine.ENGINE in getattr(each, "COMPAT_ENGINES", ())]
 
+    assert panels()
     engine.unregister()
     assert not panels()
     engine.register(no_python)

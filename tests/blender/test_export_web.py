@@ -15,7 +15,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.model import JOINTS
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.rig.flame_rig import rig_of
+from stga_addon.scene.rig.head import rig_of
 
 BLENDER_TOLERANCE_M = 1e-5
 """Float32 skinning in Blender, steps of the file's blend shapes and weights."""

@@ -11,8 +11,7 @@ from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.export.ply import write_ply
 from stga_addon.scene import tags
 from stga_addon.scene.avatar_scene import frame_head
-from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS
-from stga_addon.scene.display.splat_nodes import DISPLAY
+from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, POINTS, QUADS
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
 from stga_addon.scene.objects import layers_of
 

@@ -24,7 +24,7 @@ from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.jobs.track import Track
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.display_modes import POINTS
+from stga_addon.scene.display.splat_nodes import POINTS
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input
 from stga_addon.scene.vertex_groups import read_selection
 from stga_addon.selection import SelectionOptions, select_capture
@@ -235,6 +235,7 @@ def range_export(extension, write, frames: range, stop_after: int | None = None)
     context = SimpleNamespace(
         window_manager=SimpleNamespace(event_timer_remove=said.append, stga_message=""),
         workspace=SimpleNamespace(status_text_set=said.append),
+        window=None,
     )
     job = module.RangeExport(bpy.context.scene.stga.head, frames, write)
     dialog = SimpleNamespace(_range=job, _timer="timer", filepath="", inform=said.append)

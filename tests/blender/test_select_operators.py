@@ -8,8 +8,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.capture.open import open_capture
-from stga_addon.scene.display.heat_map import HEAT, SHARE
-from stga_addon.scene.vertex_groups import read_selection
+from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
 from .captures import closure
