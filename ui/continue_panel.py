@@ -52,9 +52,9 @@ def _draw_refine(layout: Any, settings: Any) -> None:
     frames.active = not options.all_frames
     frames.prop(options, "first", text="")
     frames.prop(options, "last", text="")
-    row = column.row(align=True)
-    row.prop(options, "seconds")
-    row.prop(options, "growth")
+    fields = column.column(align=True)
+    fields.prop(options, "seconds")
+    fields.prop(options, "growth")
     refine = column.operator(
         ids.REFINE,
         text="Refine Selected Faces" if editing else "Refine Vertex Group",
