@@ -22,7 +22,7 @@ PATH_OPTIONS = (
 
 def action_curves(owner: Any) -> Any:
     """The f-curve collection that animates the data-block `owner`; makes its action (and slot)
-    where it has none. Call `.new(data_path, index=…)` on it, or `animation.write_curve`."""
+    where it has none. Call `.new(data_path, index=…)` on it, or `arrays.write_curves`."""
     animation = owner.animation_data or owner.animation_data_create()
     if animation.action is None:
         animation.action = bpy.data.actions.new(f"{owner.name} action")

@@ -87,8 +87,11 @@ def light_irradiance(found: Relit) -> np.ndarray:
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + arriving)[:BALL]
 
 
-def whiten(head) -> None:
-    """Let the head's mesh be seen in images, white and diffuse."""
+def baked_irradiance(shown, head) -> np.ndarray:
+    """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
+    shown.hide_render = True  # splats shine themselves
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
     head.hide_set(False)
     head.hide_render = False
     material = bpy.data.materials.new("white")
@@ -98,14 +101,6 @@ def whiten(head) -> None:
     white.inputs[0].default_value = (1, 1, 1, 1)
     material.node_tree.links.new(white.outputs[0], out.inputs[0])
     head.data.materials.append(material)
-
-
-def baked_irradiance(shown, head) -> np.ndarray:
-    """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
-    shown.hide_render = True  # splats shine themselves
-    scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
-    whiten(head)
     baked = head.data.color_attributes.new("baked", "FLOAT_COLOR", "POINT")
     head.data.attributes.active_color = baked
     for each in bpy.context.selected_objects:
