@@ -168,6 +168,7 @@ def press(state: str) -> Iterator[Any]:
             if name == "stga.drive_live":
                 click(f"{state}, Stop", bpy.ops.stga.stop_live)
             with in_viewport():
+                bpy.ops.screen.animation_cancel()
                 if "UNDO" not in operator.bl_options:
                     bpy.ops.ed.undo_push(message="after")
                 bpy.ops.ed.undo()
@@ -205,7 +206,6 @@ def misunderstand() -> Iterator[Any]:
     """Train into a folder that a file never saved does not have."""
     click("Train without a folder", bpy.ops.stga.train, directory="//run")
     seen["error in the panel"] = bpy.context.window_manager.stga_message
-    yield 0.2
     shot("error")
 
 
@@ -317,7 +317,6 @@ def export() -> Iterator[Any]:
     click("Import PLY", bpy.ops.stga.import_ply, filepath=file)
     shown = bpy.context.view_layer.objects.active
     seen["opened again"] = [count, len(shown.data.vertices)]
-    yield 0.2
     shot("opened again")
     bpy.data.objects.remove(shown)
     click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
@@ -353,7 +352,7 @@ def reopen() -> Iterator[Any]:
     """Save and open again."""
     run = Path(chosen().run_folder)
     click("Save", bpy.ops.wm.save_as_mainfile, filepath=str(FIRST))
-    click("Open", bpy.ops.wm.open_mainfile, filepath=str(FIRST))
+    bpy.ops.wm.open_mainfile(filepath=str(FIRST))
     yield 0.3
     seen["run found"] = Path(bpy.path.abspath(chosen().run_folder)) == run
     shot("reopened")
@@ -486,7 +485,6 @@ def drop() -> Iterator[Any]:
     yield 0.3
     shot("dropped video")
     subprocess.run(["xdotool", "key", "Escape"], check=True)
-    yield 0.3
 
 
 STEPS = """fresh open_demo misunderstand train pose live display select export reopen
