@@ -315,7 +315,7 @@ def export() -> Iterator[Any]:
         yield 0.1
     count, file = len(chosen().splats.data.vertices), str(FOLDER / "avatar_ply.ply")
     click("Import PLY", bpy.ops.stga.import_ply, filepath=file)
-    shown = bpy.context.view_layer.objects.active
+    shown = chosen().splats
     seen["opened again"] = [count, len(shown.data.vertices)]
     shot("opened again")
     bpy.data.objects.remove(shown)
