@@ -450,6 +450,7 @@ def render() -> Iterator[Any]:
     settings.resolution_x = IMAGE_PX
     scene.frame_end = scene.frame_start + 1
     scene.cycles.samples = scene.eevee.taa_render_samples = SAMPLES
+    scene.cycles.use_denoising = False  # which not every build can
     complete: list[str] = []
     note = lambda *_: complete.append("")  # noqa: E731
     bpy.app.handlers.render_complete.append(note)
