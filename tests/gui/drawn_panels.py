@@ -62,8 +62,9 @@ class Leaf:
             group, name = arguments[0].split(".")
             self.text = getattr(getattr(bpy.ops, group), name).get_rna_type().name
         elif kind in ("prop", "prop_search") and hasattr(arguments[0], "bl_rna"):
-            field = arguments[0].bl_rna.properties[arguments[1]]
-            self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
+            field = arguments[0].bl_rna.properties.get(arguments[1])
+            if field is not None:  # no custom property
+                self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
         self.text = options.get("text", self.text)
 
     @property

@@ -6,6 +6,7 @@ import sys
 import time
 import traceback
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,8 @@ def play(steps: Iterator[Any], result: Path, patience_s: float = 600.0) -> None:
             pass
         except Exception:
             seen["traceback"] = traceback.format_exc()
-            picture(result.with_name("failed.png"))
+            with suppress(RuntimeError):
+                picture(result.with_name("failed.png"))
         result.write_text(json.dumps(seen, indent=1))
         bpy.ops.wm.quit_blender()
         return None
