@@ -11,8 +11,7 @@ from bpy.app.handlers import persistent
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving.head_map import HeadMap, head_map
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.rig.arkit import add_shapes, has_shapes, head_shapes
-from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES
+from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES, add_shapes, has_shapes, head_shapes
 from . import ids, monitor
 from .common import (
     capture_source,

@@ -10,7 +10,7 @@ from ..operators.common import is_head, scene_settings
 from ..operators.continue_run import ExtendOptions, RefineOptions
 from ..operators.train import DeviceOptions
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.scene.display.heat_map import shows_residuals
+from ..stga_addon.scene.vertex_groups import shows_residuals
 from .options import set_options
 from .request import draw_running
 from .sidebar import SidebarPanel

@@ -325,17 +325,15 @@ def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, floa
         record = read_record(job)
         if record is not None and record.seconds:
             taken.setdefault(type(job.request), []).append((record.seconds, stated[job.name]))
-    found = {
-        job.name: _corrected(stated[job.name], taken.get(type(job.request), ())) for job in jobs
-    }
-    return {name: seconds for name, seconds in found.items() if seconds is not None}
-
-
-def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]) -> float | None:
-    if stated is None:
-        return median(seconds for seconds, _ in taken) if taken else None
-    factors = [seconds / expected for seconds, expected in taken if expected]
-    return stated * median(factors) if factors else stated
+    found: dict[str, float] = {}
+    for job in jobs:
+        alike, expected = taken.get(type(job.request), []), stated[job.name]
+        factors = [seconds / before for seconds, before in alike if before]
+        if expected is not None:
+            found[job.name] = expected * median(factors) if factors else expected
+        elif alike:
+            found[job.name] = median(seconds for seconds, _ in alike)
+    return found
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:

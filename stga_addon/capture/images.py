@@ -105,46 +105,13 @@ def read_view(
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area,
-    rounded.
-
-    An integral image, read at the new pixels' edges and differenced, down and then across, a band
-    of rows at a time.
-    """
+    """Shrink (H, W) or (H, W, C) uint8 to height x width: mean over each new pixel's area,
+    rounded."""
     if pixels.shape[:2] == (height, width):
         return pixels
-    small = np.empty((height, width, *pixels.shape[2:]), np.uint8)
-    whole, part = _edges(len(pixels), height)
-    above = np.zeros((1, *pixels.shape[1:]))  # sum of the rows above the band
-    step = max(1, BAND_PIXELS // pixels.shape[1] * height // len(pixels))
-    for start in range(0, height, step):
-        edges = slice(start, min(start + step, height) + 1)
-        rows = whole[edges] - whole[edges][0]
-        lines = pixels[whole[edges][0] : whole[edges][-1] + 1].astype(np.float64)
-        integral = np.concatenate([above, lines]).cumsum(axis=0)
-        mean = _differences(integral, lines, rows, part[edges]) * (height / len(pixels))
-        columns = mean.swapaxes(0, 1)
-        integral_across = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
-        mean = _differences(integral_across, columns, *_edges(len(columns), width))
-        mean = mean * (width / len(columns))
-        small[edges.start : edges.stop - 1] = mean.swapaxes(0, 1) + 0.5
-        above = integral[rows[-1]][None]
-    return small
+    import cv2
 
-
-def _edges(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Whole and fractional part (new + 1,) of the new pixels' edges, in old pixels."""
-    edges = np.linspace(0, old, new + 1)
-    whole = np.minimum(edges.astype(int), old - 1)
-    return whole, edges - whole
-
-
-def _differences(
-    integral: np.ndarray, lines: np.ndarray, whole: np.ndarray, part: np.ndarray
-) -> np.ndarray:
-    """Sums of `lines` between consecutive edges, from their integral."""
-    at_edges = integral[whole] + part.reshape(-1, *[1] * (lines.ndim - 1)) * lines[whole]
-    return np.diff(at_edges, axis=0)
+    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _in_bands(

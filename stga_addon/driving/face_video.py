@@ -10,7 +10,7 @@ from ..progress import Cancelled, Progress, Report
 from ..tracking.face_networks import FaceNetworks
 from ..tracking.footage.video import VideoFrames, read_video
 from .inverse import head_angles
-from .performance import COLUMN, COUNT, Performance, arkit_name
+from .performance import ARKIT_SHAPES, Performance, arkit_name
 from .shapes import face_shapes
 
 CAMERA_FIELD_OF_VIEW_DEG = 63.0
@@ -27,9 +27,8 @@ def watched_performance(path: Path, report: Report) -> Performance:
     video = read_video(path)
     if not video.fps > 0:
         raise StgaError(f"{path}: states no frame rate")
-    frames = VideoFrames(
-        video, dict(zip(video.timesteps, range(len(video.timesteps)), strict=True))
-    )
+    numbers = {timestep: number for number, timestep in enumerate(video.timesteps)}
+    frames = VideoFrames(video, numbers)
     networks = FaceNetworks()
     times, rows, rotations = [], [], []
     for number, timestep in enumerate(frames.timesteps):
@@ -42,8 +41,7 @@ def watched_performance(path: Path, report: Report) -> Performance:
             times.append(timestep / video.fps)
             # The network's names have `_neutral` and lack tongueOut.
             named = {arkit_name(name): score for name, score in found.weights.items()}
-            scores = {COLUMN[name]: score for name, score in named.items() if name is not None}
-            rows.append([scores.get(column, 0.0) for column in range(COUNT)])
+            rows.append([named.get(name, 0.0) for name in ARKIT_SHAPES])
             rotations.append(head_rotation(found.points, (image.shape[0], image.shape[1])))
     if not rows:
         raise StgaError(f"{path}: no face was found in any of its {len(frames.timesteps)} frames")

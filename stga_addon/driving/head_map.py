@@ -15,7 +15,7 @@ from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints, SurfacePoints
 from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
-from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
+from .shapes import EYE_JOINTS, JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
 
 JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
 """Those that turn the jaw; jawForward, which a rotation cannot do, is left to the expressions."""
@@ -69,10 +69,9 @@ class HeadMap:
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
         values, zero = self.parameters(performance.weights), np.zeros(3)
-        count = self.expressions.shape[1]
-        turns = (
-            np.zeros((len(values), 3)) if performance.head is None else head_turns(performance.head)
-        )
+        count, turns = self.expressions.shape[1], np.zeros((len(values), 3))
+        if performance.head is not None:
+            turns = head_turns(performance.head)
         return [
             FlameFrame(row[:count], zero, turn, row[count : count + 3], zero, row[count + 3 :])
             for row, turn in zip(values, turns, strict=True)
@@ -82,9 +81,7 @@ class HeadMap:
 def features(weights: np.ndarray) -> np.ndarray:
     """(T, FEATURES): `effective_weights` of (T, 52), then jawOpen times PRODUCT_SHAPES."""
     effective = effective_weights(weights)
-    return np.concatenate(
-        [effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]], axis=1
-    )
+    return np.hstack([effective, effective[:, JAW_OPEN, None] * effective[:, PRODUCTS]])
 
 
 def head_turns(angles: np.ndarray) -> np.ndarray:
@@ -116,9 +113,8 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
 def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
     """A sequence without timesteps of the person whose neutral mesh (V, 3) this is."""
     no_frames: dict[int, FlameFrame] = {}
-    return FlameSequence(
-        model, np.zeros(model.n_identity), neutral - model.v_template, (), no_frames.__getitem__
-    )
+    offset = neutral - model.v_template
+    return FlameSequence(model, np.zeros(model.n_identity), offset, (), no_frames.__getitem__)
 
 
 def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
@@ -133,9 +129,8 @@ def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadM
     columns = [COLUMN[name] for name in person.expression_names]
     targets = np.zeros((COUNT, used.sum(), 3))
     expressions = np.zeros((FEATURES, person.n_expression))
-    targets[columns] = [
-        points.on(shape, person.faces) for shape in np.moveaxis(person.shapedirs, 2, 0)
-    ]
+    shapes = np.moveaxis(person.shapedirs, 2, 0)
+    targets[columns] = [points.on(shape, person.faces) for shape in shapes]
     expressions[columns, range(person.n_expression)] = 1
     reach = np.isin(np.arange(COUNT), columns).astype(np.float64)
     return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), _gaze(), reach)
@@ -179,9 +174,8 @@ class _Fit:
             wanted = self.neutral + np.tensordot(effective_weights(weights), self.targets, 1)
             rows.append(features(weights))
             solutions.append(self.coefficients(jaw @ self.jaw, wanted))
-        return np.asarray(
-            np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
-        )
+        found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
+        return np.asarray(found)
 
     def _jaw(self) -> np.ndarray:
         """(52, 3) axis-angle of the shapes that turn the jaw, fitted together with expressions."""
@@ -191,9 +185,8 @@ class _Fit:
         for name in JAW_SHAPES:
             wanted, values = self.neutral + self.targets[COLUMN[name]], np.zeros(len(columns))
             for _ in range(JAW_STEPS):
-                start, slopes = self.posed.linearized(
-                    values[: self.count], self.rigid(values[self.count :])
-                )
+                expressions, jaw = np.split(values, [self.count])
+                start, slopes = self.posed.linearized(expressions, self.rigid(jaw))
                 matrix = slopes[..., columns].reshape(-1, len(columns))
                 prior = np.diag([self.ridge] * self.count + [self.ridge * 1e-3] * 3)
                 step = matrix.T @ (wanted - start).ravel() - prior @ values
@@ -238,13 +231,9 @@ def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
     )
     done = moved - fit.neutral
     done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]
-    size, missed = (
-        np.sqrt((each**2).sum(axis=(1, 2))) for each in (found.targets, found.targets - done)
-    )
+    size, missed = np.linalg.norm([found.targets, found.targets - done], axis=(2, 3))
     reach = np.clip(1 - missed / np.maximum(size, 1e-12), 0, 1) * (size > 0)
-    eyeballs = (
-        person.weights[:, [JOINTS.index("left_eye"), JOINTS.index("right_eye")]] > 0.5
-    ).any()
+    eyeballs = (person.weights[:, EYE_JOINTS] > 0.5).any()
     looks = np.array([name.startswith("eyeLook") for name in ARKIT_SHAPES])
     return np.where(looks & eyeballs, 1.0, reach)
 
@@ -260,6 +249,4 @@ def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:
     products = np.zeros((COUNT, found.expressions.shape[1]))
     products[PRODUCTS] = found.expressions[COUNT:]
     linear = np.concatenate([found.expressions[:COUNT], found.jaw, found.eyes], axis=1)
-    return ShapeControls(
-        ARKIT_SHAPES, linear, products, ARKIT_SHAPES[JAW_OPEN], ARKIT_SHAPES[MOUTH_CLOSE]
-    )
+    return ShapeControls(ARKIT_SHAPES, linear, products, "jawOpen", "mouthClose")

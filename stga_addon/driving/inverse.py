@@ -20,9 +20,8 @@ NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256  # Rows whose matrices are held at once
 RIDGE = 1e-9  # Share of the mean squared displacement, for weights that a head cannot tell apart
 TIMECODE_BASE = 60
-EXTRA_COLUMNS = tuple(
-    f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in ("Yaw", "Pitch", "Roll")
-)
+TURNS = "Yaw", "Pitch", "Roll"
+EXTRA_COLUMNS = [f"{part}{turn}" for part in ("Head", "LeftEye", "RightEye") for turn in TURNS]
 
 
 def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Performance:
@@ -36,9 +35,8 @@ def captured_performance(sequence: FlameSequence, name: str, fps: float) -> Perf
     weights = arkit_weights(frames, head_map(sequence, name), sequence)
     first = sequence.timesteps[0]
     times = (np.array(sequence.timesteps) - first) / fps
-    return Performance(
-        times, weights, head_angles(np.stack([frame.neck_pose for frame in frames])), fps
-    )
+    head = head_angles(np.stack([frame.neck_pose for frame in frames]))
+    return Performance(times, weights, head, fps)
 
 
 def arkit_weights(
@@ -53,9 +51,8 @@ def arkit_weights(
     """
     weights = np.zeros((len(frames), COUNT))
     if names := sequence.model.expression_names:
-        weights[:, [COLUMN[name] for name in names]] = np.clip(
-            [frame.expr for frame in frames], 0, 1
-        )
+        columns = [COLUMN[name] for name in names]
+        weights[:, columns] = np.clip([frame.expr for frame in frames], 0, 1)
         return weights
     jaw_columns = [COLUMN[name] for name in JAW_SHAPES]
     jaw = np.stack([frame.jaw_pose for frame in frames])
@@ -73,10 +70,9 @@ def arkit_weights(
     wanted = np.stack([frame.expr for frame in frames]) - known
     # The length of coefficients times the metric is how far they move the face's points.
     person = with_identity(sequence).model
-    _, slopes = PosedPoints(person, found.points).linearized(
-        np.zeros(person.n_expression), np.zeros(RIGID_SIZE)
-    )
-    moves = slopes[..., : person.n_expression].reshape(-1, person.n_expression)
+    count, posed = person.n_expression, PosedPoints(person, found.points)
+    _, slopes = posed.linearized(np.zeros(count), np.zeros(RIGID_SIZE))
+    moves = slopes[..., :count].reshape(-1, count)
     values, vectors = np.linalg.eigh(moves.T @ moves)
     metric = vectors * np.sqrt(np.maximum(values, 0))
     first, second, wanted = linear[free] @ metric, by_jaw[free] @ metric, wanted @ metric
@@ -107,9 +103,8 @@ def _descended(
             curvature = row[:, column] + ridge
             slope = right[:, column] - (row * weights).sum(axis=1) - ridge * weights[:, column]
             old = weights[:, column].copy()
-            weights[:, column] = np.clip(
-                old + slope / np.maximum(curvature, 1e-30), 0, limits[:, column]
-            )
+            moved = old + slope / np.maximum(curvature, 1e-30)
+            weights[:, column] = np.clip(moved, 0, limits[:, column])
             largest = max(largest, float(np.abs(weights[:, column] - old).max(initial=0)))
         if largest < CONVERGED:
             break
@@ -155,15 +150,12 @@ def write_performance(path: Path, performance: Performance) -> None:
     header = ["Timecode", "BlendShapeCount", *names, *EXTRA_COLUMNS]
     head = np.zeros((len(performance.times), 3)) if performance.head is None else performance.head
     lines = [",".join(header)]
-    for time, weights, turn in zip(
-        performance.times.tolist(), performance.weights, head, strict=True
-    ):
-        cells = [*weights.tolist(), *turn.tolist(), *[0.0] * (len(EXTRA_COLUMNS) - 3)]
+    eyes = np.zeros((len(head), len(EXTRA_COLUMNS) - 3))
+    rows = np.hstack([performance.weights, head, eyes]).tolist()
+    for time, cells in zip(performance.times.tolist(), rows, strict=True):
         count, sub = divmod(round(time * TIMECODE_BASE * 1000), 1000)
         whole, frame = divmod(count, TIMECODE_BASE)
         code = f"{whole // 3600:02d}:{whole // 60 % 60:02d}:{whole % 60:02d}:{frame:02d}.{sub:03d}"
-        lines.append(
-            ",".join([code, str(COUNT + len(EXTRA_COLUMNS)), *(f"{cell:.6f}" for cell in cells)])
-        )
+        lines.append(",".join([code, str(len(cells)), *(f"{cell:.6f}" for cell in cells)]))
     with replacing(path) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -59,11 +59,16 @@ class TrainedRange:
         return self.first if choice == "first" else self.quiet
 
 
+def _by_part(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
+    """Part -> its parameters (T, K) in all frames."""
+    fields = PART_FIELDS.items()
+    return {part: np.stack([getattr(frame, name) for frame in frames]) for part, name in fields}
+
+
 def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
     """The range of the frames that an avatar was trained on."""
     middle, width = {}, {}
-    for part, name in PART_FIELDS.items():
-        values = np.stack([getattr(frame, name) for frame in frames])
+    for part, values in _by_part(frames).items():
         low, high = np.quantile(values, [OUTER_QUANTILE, 1 - OUTER_QUANTILE], axis=0)
         middle[part], width[part] = (low + high) / 2, np.maximum((high - low) / 2, MIN_WIDTH[part])
     return TrainedRange(middle, width, quiet_neutral(frames), quiet_neutral(frames[:1]))
@@ -72,11 +77,7 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
     """Part -> the median of its parameters over the frames that are most alike, in whatever order:
     a face keeps returning to rest."""
-    frames = evenly_spread(frames, MAX_COMPARED_FRAMES)
-    parts = {
-        part: np.stack([getattr(frame, name) for frame in frames])
-        for part, name in PART_FIELDS.items()
-    }
+    parts = _by_part(evenly_spread(frames, MAX_COMPARED_FRAMES))
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
     squares = (face**2).sum(axis=1)
     apart = squares[:, None] + squares - 2 * face @ face.T
@@ -89,15 +90,14 @@ def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
 def quiet_weights(performance: Performance) -> np.ndarray:
     """(52,) median of the weights over the rows in which their sum is least."""
     order = np.argsort(performance.weights.sum(axis=1), kind="stable")
-    return np.asarray(
-        np.median(performance.weights[order[: max(1, round(QUIET_SHARE * len(order)))]], axis=0)
-    )
+    quiet = order[: max(1, round(QUIET_SHARE * len(order)))]
+    return np.asarray(np.median(performance.weights[quiet], axis=0))
 
 
 def exchanged_neutral(
     frames: Sequence[FlameFrame],
-    theirs: dict[str, np.ndarray] | None = None,
-    own: dict[str, np.ndarray] | None = None,
+    theirs: Mapping[str, np.ndarray | float] | None = None,
+    own: Mapping[str, np.ndarray | float] | None = None,
 ) -> list[FlameFrame]:
     """The frames with this head's neutral in place of the other person's, part by part; None: a
     neutral of zeros.
@@ -105,10 +105,8 @@ def exchanged_neutral(
     Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by
     small angles.
     """
-    change = {
-        name: (0.0 if own is None else own[part]) - (0.0 if theirs is None else theirs[part])
-        for part, name in PART_FIELDS.items()
-    }
+    own, theirs = own or dict.fromkeys(PART_FIELDS, 0.0), theirs or dict.fromkeys(PART_FIELDS, 0.0)
+    change = {name: own[part] - theirs[part] for part, name in PART_FIELDS.items()}
     return [
         replace(f, **{name: getattr(f, name) + value for name, value in change.items()})
         for f in frames
@@ -119,8 +117,7 @@ def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> dict[str, np
     """Part -> (T,) how far outside the trained range each frame is: 0 inside, 1 where it is twice
     as far from the middle as the range reaches, for the parameter that is farthest."""
     found = {}
-    for part, name in PART_FIELDS.items():
-        values = np.stack([getattr(frame, name) for frame in frames])
+    for part, values in _by_part(frames).items():
         reach = np.abs(values - trained.middle[part]) / trained.width[part]
         found[part] = np.maximum(reach.max(axis=1, initial=0) - 1, 0)
     return found
@@ -256,12 +253,10 @@ def open_motion(
         raise StgaError(f"{path}: {problem}")
     _check_faces(path, capture.flame.model, faces)
     sequence = transferred_motion(capture.flame, neutral)
-    frames, beyond = adapted(
-        [sequence.frame(timestep) for timestep in sequence.timesteps], options, trained
-    )
-    return Motion(
-        _with_frames(sequence, sequence.timesteps, frames), playback_fps(capture), 0, beyond
-    )
+    own = [sequence.frame(timestep) for timestep in sequence.timesteps]
+    frames, beyond = adapted(own, options, trained)
+    moved = _with_frames(sequence, sequence.timesteps, frames)
+    return Motion(moved, playback_fps(capture), 0, beyond)
 
 
 def performed(
@@ -298,15 +293,13 @@ def prepared_performance(
     if performance.times[-1] * rate > MAX_ROWS:
         length = f"{performance.times[-1]:.0f} s at {rate:g} frames per second"
         raise StgaError(f"a performance of {length} is too long")
-    rest = None
+    weights, rest = performance.weights[0], None
+    if options.neutral == "quiet":
+        weights = quiet_weights(performance)
     if options.neutral in ("quiet", "first"):
-        weights = (
-            quiet_weights(performance) if options.neutral == "quiet" else performance.weights[0]
-        )
         rest = replace(performance, weights=weights[None], head=None)
-    return at_strength(
-        smoothed(corrected(resampled(performance, fps), options, rest), options.smoothing), options
-    )
+    changed = corrected(resampled(performance, fps), options, rest)
+    return at_strength(smoothed(changed, options.smoothing), options)
 
 
 def corrected(
@@ -347,9 +340,9 @@ def _finished(
     if trained is None or options.stay_trained is None:
         return frames, {}
     beyond = outside(frames, trained)
-    return (
-        led_back(frames, trained, options.stay_trained) if options.stay_trained else frames
-    ), beyond
+    if options.stay_trained:
+        frames = led_back(frames, trained, options.stay_trained)
+    return frames, beyond
 
 
 def _with_frames(

@@ -28,6 +28,7 @@ OPTIONAL = ("tongueOut",)  # Shapes that sources of 51 lack; they stay zero
 PARTS = ("face", "jaw", "eyes")
 MAX_NAMED = 8  # Names that an error lists
 _KEYS = {name.lower(): name for name in ARKIT_SHAPES}
+_LIKE_A_SHAPE = re.compile("(eye|jaw|mouth|brow|cheek|nose|tongue)(?!yaw|pitch|roll)")
 
 
 def arkit_name(name: str) -> str | None:
@@ -49,44 +50,27 @@ def part_of(name: str) -> str:
 
 def mirrored_name(name: str) -> str:
     """The shape of the other side; shapes without a side are their own."""
-    if name.endswith("Left"):
-        return name.removesuffix("Left") + "Right"
-    return name.removesuffix("Right") + "Left" if name.endswith("Right") else name
+    return re.sub("(Left|Right)$", lambda side: "Left" if side[0] == "Right" else "Right", name)
 
 
 def columns_of(where: str, names: Iterable[str]) -> dict[int, int]:
     """Column of the 52 -> first index in `names`. Raises StgaError, beginning with `where`, with
     the shapes that are missing, but for those of `OPTIONAL`."""
     listed = list(names)
-    found: dict[int, int] = {}
-    for index, name in enumerate(listed):
-        spelled = arkit_name(name)
-        if spelled is not None:
-            found.setdefault(COLUMN[spelled], index)
+    spelled = [arkit_name(name) for name in listed]
+    found = {COLUMN[name]: spelled.index(name) for name in spelled if name is not None}
     missing = [name for name in ARKIT_SHAPES if COLUMN[name] not in found and name not in OPTIONAL]
-    if not missing:
-        return found
     if len(missing) > COUNT // 2:
         problem = f"names {len(found)} of ARKit's {COUNT} blend shapes, expected all but tongueOut"
         raise StgaError(f"{where}: {problem}")
-    more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
-    raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{_unknown(listed)}")
-
-
-def _unknown(names: list[str]) -> str:
-    """What stands there instead of the missing names: mistyped names, most likely."""
-    prefixes = ("eye", "jaw", "mouth", "brow", "cheek", "nose", "tongue")
-    rotations = re.compile(
-        r"(left|right)?(eye|head)(yaw|pitch|roll)|(left|right)eye(yaw|pitch|roll)"
-    )
-    strange = [
-        name
-        for name in names
-        if arkit_name(name) is None
-        and name.rsplit(".", 1)[-1].lower().startswith(prefixes)
-        and not rotations.fullmatch(name.lower())
-    ]
-    return f"; it has {', '.join(shorten(name) for name in strange[:MAX_NAMED])}" if strange else ""
+    if missing:
+        more = f" and {len(missing) - MAX_NAMED} more" if len(missing) > MAX_NAMED else ""
+        # What stands there instead: mistyped names, most likely.
+        unknown = [name for name, known in zip(listed, spelled, strict=True) if known is None]
+        strange = [shorten(n) for n in unknown if _LIKE_A_SHAPE.match(n.rsplit(".", 1)[-1].lower())]
+        instead = f"; it has {', '.join(strange[:MAX_NAMED])}" if strange else ""
+        raise StgaError(f"{where}: lacks {', '.join(missing[:MAX_NAMED])}{more}{instead}")
+    return found
 
 
 MIRROR = np.array([COLUMN[mirrored_name(name)] for name in ARKIT_SHAPES])
@@ -124,9 +108,8 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
     times = np.arange(count) / rate
 
     def interpolated(values: np.ndarray) -> np.ndarray:
-        return np.stack(
-            [np.interp(times, performance.times, column) for column in values.T], axis=1
-        )
+        columns = [np.interp(times, performance.times, column) for column in values.T]
+        return np.stack(columns, axis=1)
 
     head = None if performance.head is None else interpolated(performance.head)
     return Performance(times, interpolated(performance.weights), head, rate)
@@ -183,9 +166,7 @@ def relative_to(performance: Performance, rest: Performance) -> Performance:
 
 def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:
     """The performance with the weights of other parts at zero."""
-    return amplified(
-        performance, {part: 1.0 if part in parts else 0.0 for part in (*PARTS, "head")}
-    )
+    return amplified(performance, {part: float(part in parts) for part in (*PARTS, "head")})
 
 
 @dataclass(frozen=True)

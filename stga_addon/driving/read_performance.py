@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import file_size, read_json
+from ..files import read_bytes, read_json
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
@@ -28,10 +28,8 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
         if found is None:
             problem = f"row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
             raise StgaError(f"{where}: {problem}")
-        hours, minutes, whole = (int(found[group]) for group in (1, 2, 3))
-        fields.append(
-            (hours, minutes, whole, int(found[5]), float(f"0.{found[6] or 0}"), found[4] == ";")
-        )
+        *clock, separator, frame, part = found.groups()
+        fields.append((*map(int, clock), int(frame), float(f"0.{part or 0}"), separator == ";"))
     hours, minutes, whole, frames, parts, dropping = np.array(fields, np.float64).T
     second = 3600 * hours + 60 * minutes + whole
     base = _base(second, frames + parts)
@@ -99,29 +97,27 @@ def _head(text: str) -> tuple[float, float, float] | None:
     return (yaw, pitch, roll) if all(map(math.isfinite, (yaw, pitch, roll))) else None
 
 
-SUFFIXES = (".csv", ".json", ".txt")
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 MIN_FPS, MAX_FPS = 1.0, 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
-COUNT_COLUMN = "blendshapecount"
-TIMECODE_COLUMNS = ("timecode",)
-SECONDS_COLUMNS = ("time", "timestamp", "seconds")
+COUNT_COLUMN, TIMECODE_COLUMN = "blendshapecount", "timecode"
+SECONDS_COLUMNS = (TIMECODE_COLUMN, "time", "timestamp", "seconds")
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
 FRAME_KEYS = ("frames", "weightMat", "weights")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
-CATEGORY_KEYS = (("categoryName", "category_name", "name"), ("score", "value", "weight"))
+NAMED, SCORED = ("categoryName", "category_name", "name"), ("score", "value", "weight")
 
 
 def is_performance(path: Path) -> bool:
-    """Whether a path is one of `SUFFIXES`, or the folder of a Live Link Face take."""
+    """Whether a path has a suffix of `READERS`, or is the folder of a Live Link Face take."""
     if path.is_dir():
         is_capture = (path / "flame_param").is_dir() or any(path.glob("transforms*.json"))
         return not is_capture and bool(_take_files(path))
-    return path.suffix.lower() in SUFFIXES
+    return path.suffix.lower() in READERS
 
 
 def read_performance(path: Path) -> Performance:
@@ -139,97 +135,73 @@ def read_performance(path: Path) -> Performance:
             names = ", ".join(path.name for path in own[:4]) or "none"
             raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
         path = own[0]
-    suffix = path.suffix.lower()
-    if suffix == ".json":
-        return _read_json(path)
-    if suffix == ".csv":
-        return _read_csv(path)
-    if suffix == ".txt":
-        return _read_packets(path)
-    problem = f"is no performance; expected {', '.join(SUFFIXES)} or the folder of a take"
-    raise StgaError(f"{path}: {problem}")
+    if path.suffix.lower() not in READERS:
+        problem = f"is no performance; expected {', '.join(READERS)} or the folder of a take"
+        raise StgaError(f"{path}: {problem}")
+    return READERS[path.suffix.lower()](path)
 
 
 def _take_files(folder: Path) -> list[Path]:
-    return sorted(
-        path for path in folder.iterdir() if path.suffix.lower() == ".csv" and path.is_file()
-    )
+    return sorted(path for path in folder.glob("*.[cC][sS][vV]") if path.is_file())
 
 
-def _text(path: Path) -> str:
-    if file_size(path) > MAX_TEXT_BYTES:
-        raise StgaError(f"{path}: has more than the {MAX_TEXT_BYTES} bytes allowed")
+def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise StgaError(f"{path}: is not UTF-8 text") from error
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def _read_csv(path: Path) -> Performance:
     try:
-        rows = [
-            row for row in csv.reader(_text(path).splitlines()) if any(cell.strip() for cell in row)
-        ]
+        rows = [row for row in csv.reader(_lines(path)) if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise StgaError(f"{path}: is not valid CSV ({error})") from error
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
-    header, body = [cell.strip() for cell in rows[0]], rows[1:]
+    header = [cell.strip() for cell in rows[0]]
     columns = columns_of(str(path), header)
     plain = {
-        name.rsplit(".", 1)[-1].lower(): index for index, name in reversed(list(enumerate(header)))
+        name.rsplit(".", 1)[-1].lower(): index for index, name in reversed([*enumerate(header)])
     }
     count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
     body = [
-        row
-        for row in body
+        [*row, *[""] * (len(header) - len(row))]
+        for row in rows[1:]
         if count is None or (len(row) > count + 1 and row[count].strip() not in ("", "0"))
     ]
     if not body:
         raise StgaError(f"{path}: has no row with a face")
+
+    def values(index: int) -> np.ndarray:
+        """(T,) of a column."""
+        found = np.empty(len(body))
+        for number, row in enumerate(body):
+            try:
+                found[number] = float(row[index])
+            except ValueError:
+                problem = f"{shorten(header[index])} is {shorten(row[index])}, expected a number"
+                raise StgaError(f"{path}: row {number + 1}: {problem}") from None
+        return found
+
     weights = np.zeros((len(body), COUNT))
     for column, index in columns.items():
-        weights[:, column] = [
-            _number(path, row, number, index, header) for number, row in enumerate(body)
-        ]
+        weights[:, column] = values(index)
     head = None
     if all(name in plain for name in HEAD_COLUMNS):
-        cells = [
-            [_number(path, row, n, plain[name], header) for name in HEAD_COLUMNS]
-            for n, row in enumerate(body)
-        ]
-        head = np.array(cells) if np.any(cells) else None
-    return _performance(path, _csv_times(path, body, plain, header), weights, head)
-
-
-def _csv_times(
-    path: Path, body: list[list[str]], plain: dict[str, int], header: list[str]
-) -> np.ndarray | None:
-    code = next((plain[name] for name in TIMECODE_COLUMNS if name in plain), None)
-    codes = [] if code is None else [row[code] if code < len(row) else "" for row in body]
-    if any(":" in text for text in codes):
-        return seconds_of(str(path), codes)
+        head = np.stack([values(plain[name]) for name in HEAD_COLUMNS], axis=1)
     at = next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
-    at = at if code is None else code
-    if at is None:
-        return None
-    return np.array([_number(path, row, number, at, header) for number, row in enumerate(body)])
-
-
-def _number(path: Path, row: list[str], number: int, index: int, header: list[str]) -> float:
-    text = row[index] if index < len(row) else ""
-    try:
-        return float(text)
-    except ValueError:
-        problem = f"{shorten(header[index])} is {shorten(text)}, expected a number"
-        raise StgaError(f"{path}: row {number + 1}: {problem}") from None
+    codes = [row[plain[TIMECODE_COLUMN]] for row in body] if TIMECODE_COLUMN in plain else []
+    times: np.ndarray | None = None
+    if any(":" in code for code in codes):
+        times = seconds_of(str(path), codes)
+    elif at is not None:
+        times = values(at)
+    return _performance(path, times, weights, None if head is None or not head.any() else head)
 
 
 def _read_packets(path: Path) -> Performance:
-    lines = [line for line in _text(path).splitlines() if line.strip()]
-    packets = [parse_packet(line.encode()) for line in lines]
+    packets = [parse_packet(line.encode()) for line in _lines(path)]
     known = [packet for packet in packets if packet is not None]
     if not known:
         problem = "such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
@@ -269,9 +241,7 @@ def _json_rate(path: Path, outer: dict[str, Any]) -> float | None:
     for source in (outer, inner if isinstance(inner, dict) else {}):
         for key in ("exportFps", "fps"):
             if key in source:
-                if not _is_number(source[key]):
-                    raise StgaError(f"{path}: {key} is {shorten(source[key])}, expected a number")
-                return float(source[key])
+                return _number(f"{path}: {key}", source[key])
     return None
 
 
@@ -279,14 +249,9 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
     """Name -> weight of one frame in any of the forms that `read_performance` takes."""
     where, found = f"{path}: frame {number + 1}", frame
     if isinstance(frame, dict):
-        found = next((frame[key] for key in WEIGHT_KEYS if key in frame), frame)
+        found = _first(frame, WEIGHT_KEYS, frame)
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
-        names_of, values_of = (
-            [[e[k] for k in keys if k in e] for e in found] for keys in CATEGORY_KEYS
-        )
-        found = {
-            str((n or [None])[0]): (v or [0])[0] for n, v in zip(names_of, values_of, strict=True)
-        }
+        found = {str(_first(entry, NAMED, None)): _first(entry, SCORED, 0) for entry in found}
     if isinstance(found, list):
         if names is None or len(names) != len(found):
             known = "none" if names is None else str(len(names))
@@ -294,15 +259,22 @@ def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) 
         found = {str(name): value for name, value in zip(names, found, strict=True)}
     if not isinstance(found, dict):
         raise StgaError(f"{where}: is {shorten(frame)}, expected named weights")
-    weights = {
-        str(name): value
+    return {
+        str(name): _number(f"{where}: {shorten(str(name))}", value)
         for name, value in found.items()
         if arkit_name(str(name)) or _is_number(value)
     }
-    for name, value in weights.items():
-        if not _is_number(value):
-            raise StgaError(f"{where}: {shorten(name)} is {shorten(value)}, expected a number")
-    return {name: float(value) for name, value in weights.items()}
+
+
+def _first(entry: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
+    """The value of the first of the keys that is there."""
+    return next((entry[key] for key in keys if key in entry), default)
+
+
+def _number(what: str, value: Any) -> float:
+    if not _is_number(value):
+        raise StgaError(f"{what} is {shorten(value)}, expected a number")
+    return float(value)
 
 
 def _is_number(value: Any) -> bool:
@@ -336,3 +308,7 @@ def _performance(
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     return Performance(times, weights[first], None if head is None else head[first], rate)
+
+
+READERS = {".csv": _read_csv, ".json": _read_json, ".txt": _read_packets}
+"""By the suffixes of performances."""

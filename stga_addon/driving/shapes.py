@@ -5,10 +5,8 @@ on a FLAME head.
 Institute for Creative Technologies), made by `development/arkit_shapes.py`.
 
 ICT-FaceKit's points are moved onto the head: first by an affine map and ICT-FaceKit's own
-identities, iterating nearest
-points (point to plane, as Chen and Medioni 1992), then by a smooth warp (radial basis functions)
-with less and less smoothing. No detector and no table of landmarks is needed; a head must look
-along +z with y up.
+identities, iterating nearest points (point to plane, as Chen and Medioni 1992), then by a smooth
+warp (radial basis functions) with less and less smoothing. A head must look along +z with y up.
 """
 
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ from ..errors import StgaError
 from ..files import read_npz
 from ..flame.forward import joint_positions
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from ..tracking.posed_points import SurfacePoints
+from ..tracking.posed_points import SurfacePoints, unit
 from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
@@ -54,18 +52,15 @@ def face_shapes() -> FaceShapes:
     arrays = read_npz(SHAPES_FILE)
     shapes = np.zeros((COUNT, *arrays["points"].shape))
     shapes[[COLUMN[name] for name in ARKIT_SHAPES if name not in OPTIONAL]] = arrays["shapes"]
-    points, normals, identity = (
-        arrays[name].astype(np.float64) for name in ("points", "normals", "identity")
-    )
-    return FaceShapes(points, normals, arrays["reliable"], shapes, identity)
+    rest = {name: arrays[name].astype(np.float64) for name in ("points", "normals", "identity")}
+    return FaceShapes(reliable=arrays["reliable"], shapes=shapes, **rest)
 
 
 def effective_weights(weights: np.ndarray) -> np.ndarray:
     """Weights (..., 52) with mouthClose at most jawOpen: it closes the lips of an open jaw."""
     limited = weights.copy()
-    limited[..., MOUTH_CLOSE] = np.minimum(
-        weights[..., MOUTH_CLOSE], np.maximum(weights[..., JAW_OPEN], 0)
-    )
+    opened = np.maximum(weights[..., JAW_OPEN], 0)
+    limited[..., MOUTH_CLOSE] = np.minimum(weights[..., MOUTH_CLOSE], opened)
     return limited
 
 
@@ -119,10 +114,8 @@ class _Surface:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.corners = vertices[faces]
         self.centers = self.corners.mean(axis=1)
-        normals = np.cross(
-            self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0]
-        )
-        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+        first, second = (self.corners[:, k] - self.corners[:, 0] for k in (1, 2))
+        self.normals = unit(np.cross(first, second), 1e-20)
 
     def nearest(
         self, points: np.ndarray, normals: np.ndarray
@@ -137,11 +130,8 @@ class _Surface:
         distance = np.linalg.norm(positions - points[:, None], axis=2)
         turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
         best = (distance + FAR_M * turned).argmin(axis=1)
-        rows = np.arange(len(points))
-        first, second, third, fourth = (
-            values[rows, best] for values in (near, barycentric, positions, distance)
-        )
-        return first, second, third, fourth
+        at = np.arange(len(points)), best
+        return near[at], barycentric[at], positions[at], distance[at]
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -163,21 +153,14 @@ def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     inside = (second >= 0) & (third >= 0) & (second + third <= 1)
     on_ab, on_ac, on_bc = along(ab, from_a), along(ac, from_a), along(c - b, from_b)
     zero = np.zeros_like(on_ab)
-    options = np.stack(
-        [
-            np.stack([1 - second - third, second, third], -1),
-            np.stack([1 - on_ab, on_ab, zero], -1),
-            np.stack([1 - on_ac, zero, on_ac], -1),
-            np.stack([zero, 1 - on_bc, on_bc], -1),
-        ]
-    )
-    distance = np.linalg.norm(
-        np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None], axis=-1
-    )
+    second = np.stack([second, on_ab, zero, 1 - on_bc])
+    third = np.stack([third, zero, on_ac, on_bc])
+    options = np.stack([1 - second - third, second, third], axis=-1)
+    offset = np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None]
+    distance = np.linalg.norm(offset, axis=-1)
     distance[0] = np.where(inside, distance[0], np.inf)
-    return np.asarray(
-        np.take_along_axis(options, distance.argmin(axis=0)[None, ..., None], axis=0)[0]
-    )
+    nearest = distance.argmin(axis=0)[None, ..., None]
+    return np.asarray(np.take_along_axis(options, nearest, axis=0)[0])
 
 
 def _aligned(
@@ -190,19 +173,15 @@ def _aligned(
     points = source.points @ linear + pupils.mean(axis=0) - own.mean(axis=0) @ linear
     normals = source.normals
     count = len(source.identity)
-    basis = np.einsum(
-        "ac,nb->nacb", np.eye(3), np.pad(source.points, ((0, 0), (0, 1)), constant_values=1.0)
-    )
-    basis = np.concatenate(
-        [basis.reshape(-1, 3, 12), source.identity.transpose(1, 2, 0) * linear[0, 0]], axis=2
-    )
+    affine = np.einsum("ac,nb->nacb", np.eye(3), _homogeneous(source.points)).reshape(-1, 3, 12)
+    identities = source.identity.transpose(1, 2, 0) * linear[0, 0]
+    basis = np.concatenate([affine, identities], axis=2)
     entries = [0, 1, 2, 4, 5, 6, 8, 9, 10]  # of the affine map without its translation
     anchors = PUPIL_WEIGHT * basis[list(PUPILS)].reshape(6, -1)
     prior = np.zeros((9 + count, 12 + count))
     prior[np.arange(9), entries] = AFFINE_WEIGHT
-    prior[9 + np.arange(count), 12 + np.arange(count)] = IDENTITY_DEVIATION_M * np.sqrt(
-        skin.sum() / count
-    )
+    deviation = IDENTITY_DEVIATION_M * np.sqrt(skin.sum() / count)
+    prior[9 + np.arange(count), 12 + np.arange(count)] = deviation
     for _ in range(ITERATIONS):
         face, _, target, distance = surface.nearest(points[skin], normals[skin])
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
@@ -216,8 +195,7 @@ def _aligned(
         found = np.linalg.lstsq(rows, np.concatenate([*wanted, np.zeros(count)]), rcond=None)[0]
         linear = found[entries].reshape(3, 3)
         points = basis @ found
-        normals = source.normals @ np.linalg.inv(linear)
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = unit(source.normals @ np.linalg.inv(linear))
     return points, normals
 
 
@@ -231,13 +209,17 @@ def _warped(
         kept = distance < MAX_WARP_MATCH_M
         fixed = np.concatenate([points[skin][kept], points[list(PUPILS)]])
         moved = np.concatenate([target[kept], pupils]) - fixed
-        plain = np.pad(fixed, ((0, 0), (0, 1)), constant_values=1.0)
+        plain = _homogeneous(fixed)
         kernel = smoothing * np.eye(len(fixed)) - _distances(fixed, fixed)
         system = np.block([[kernel, plain], [plain.T, np.zeros((4, 4))]])
         weights = np.linalg.solve(system, np.concatenate([moved, np.zeros((4, 3))]))
-        everywhere = np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
-        warped = points + np.concatenate([-_distances(points, fixed), everywhere], axis=1) @ weights
+        terms = np.hstack([-_distances(points, fixed), _homogeneous(points)])
+        warped = points + terms @ weights
     return np.asarray(warped)
+
+
+def _homogeneous(points: np.ndarray) -> np.ndarray:
+    return np.pad(points, ((0, 0), (0, 1)), constant_values=1.0)
 
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -77,8 +77,8 @@ def is_ply(path: Path) -> bool:
 def read_ply(path: Path) -> Splats:
     """Read world-space splats from a 3D Gaussian Splatting PLY of SH degree 0 to 3.
 
-    Properties may stand in any order; those that are not the layout's are ignored.
-    Raises StgaError naming the file and the property that is missing, not finite or truncated.
+    Properties may stand in any order, beside others. Raises StgaError naming the file and the
+    property that is missing, not finite or truncated.
     """
     vertices = read_vertices(path)
     rest = sum(1 for name in vertices.dtype.names or () if name.startswith("f_rest_"))
@@ -162,8 +162,8 @@ def read_vertices(path: Path) -> np.ndarray:
         raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
     except ValueError as error:
         raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
-    if table.shape != (count, len(names)):
-        expected = count, len(names)
+    expected = count, len(names)
+    if table.shape != expected:
         raise StgaError(f"{path}: has vertices of shape {table.shape}, expected {expected}")
     return np.asarray(unstructured_to_structured(table, dtype))
 
@@ -201,10 +201,8 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
         if number < 0 or not order or not properties:
             break
         if "list" in properties.values():
-            raise StgaError(
-                f"{path}: PLY element {name!r} has a list property before the vertices end, "
-                "not supported"
-            )
+            problem = f"PLY element {name!r} has a list property before the vertices end"
+            raise StgaError(f"{path}: {problem}, not supported")
         dtype = np.dtype(list(properties.items()))
         if name == "vertex":
             return is_ascii, newline + 1, skipped, number, dtype
@@ -212,9 +210,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
     raise StgaError(f"{path}: PLY header describes no vertices")
 
 
-PLY_NAME = "point_cloud.ply"
-MOTION_NAME = "flame_param.npz"
-BINDING = "binding_0"
+PLY_NAME, MOTION_NAME, BINDING = "point_cloud.ply", "flame_param.npz", "binding_0"
 
 
 def write_gaussian_avatars(
@@ -231,10 +227,9 @@ def write_gaussian_avatars(
     if sequence is None:
         raise StgaError(f"{folder}: GaussianAvatars needs the FLAME parameters of a FLAME capture")
     if not np.array_equal(sequence.model.faces, avatar.faces):
-        raise StgaError(
-            f"{folder}: the avatar's mesh ({len(avatar.faces)} triangles) is not the FLAME model's "
-            f"({len(sequence.model.faces)}), expected an avatar trained on this model's meshes"
-        )
+        counts = f"{len(avatar.faces)} and {len(sequence.model.faces)} triangles"
+        problem = f"the avatar's mesh is not the FLAME model's ({counts})"
+        raise StgaError(f"{folder}: {problem}, expected an avatar trained on this model's meshes")
     splats = in_convention(avatar, "gaussian_avatars")
     columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
     with replacing_together() as new_file:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..avatar.splats import Splats
 from ..files import replacing
+from ..flame.quaternions import normalized
 
 MAGIC, VERSION = b"NGSP", 3
 """The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
@@ -34,13 +35,20 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     whole = np.clip(np.round(world.xyz * 2.0**bits), -limit, limit - 1).astype("<i4")
     flags = ANTIALIASED if antialiased else 0
     header = MAGIC + struct.pack("<IIBBBB", VERSION, len(world), world.sh_degree, bits, flags, 0)
+    # Of a unit quaternion xyzw the index of the largest part; of the others a sign bit, and nine
+    # bits of magnitude in units of sqrt(½) / 511.
+    index, others = smallest_three(world.unit_rotations()[:, [1, 2, 3, 0]])
+    magnitude = np.clip(np.round(np.abs(others) * (511 * math.sqrt(2))), 0, 511)
+    rotations = index.astype("<u4")
+    for part in (magnitude + 512 * (others < 0)).T:
+        rotations = (rotations << 10) | part.astype("<u4")
     columns = (
         # two's complement, least significant byte first
         whole.view(np.uint8).reshape(-1, 3, 4)[..., :3],
         _byte(world.opacities() * 255),
         _byte((world.sh[:, 0] * COLOR_SCALE + 0.5) * 255),
         _byte((world.log_scale + 10) * 16),
-        _smallest_three(world.unit_rotations()[:, [1, 2, 3, 0]]),
+        rotations,
         _byte(world.sh[:, 1:] * 128 + 128),
     )
     packed = gzip.compress(header + b"".join(column.tobytes() for column in columns), mtime=0)
@@ -52,18 +60,12 @@ def _byte(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.clip(np.round(values), 0, 255), np.uint8)
 
 
-def _smallest_three(rotation: np.ndarray) -> np.ndarray:
-    """(N,) uint32 of unit quaternions xyzw (N, 4): the index of the largest component, then the
-    others.
-
-    Each of them has a sign bit and nine bits of magnitude, in units of sqrt(½) / 511.
-    """
-    rows = np.arange(len(rotation))
-    largest = np.abs(rotation).argmax(axis=1)
-    positive = rotation * np.where(rotation[rows, largest] < 0, -1, 1)[:, None]
-    magnitude = np.clip(np.round(np.abs(positive) * (511 * math.sqrt(2))), 0, 511).astype("<u4")
-    component = magnitude | ((positive < 0).astype("<u4") << 9)
-    packed = largest.astype("<u4")
-    for axis in range(4):
-        packed = np.where(axis == largest, packed, (packed << 10) | component[:, axis])
-    return np.asarray(packed, "<u4")
+def smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in
+    order, of the unit quaternion whose largest part is positive. A zero quaternion counts as the
+    identity."""
+    q = normalized(rotation)
+    largest = np.abs(q).argmax(1)
+    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
+    others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]
+    return largest.astype(np.uint8), np.take_along_axis(q, others, 1)

@@ -15,7 +15,7 @@ from ..export.ply import read_ply
 from ..files import write_json
 from ..light.environment import harmonics_of, read_hdr
 from ..options import like, option
-from ..progress import Progress, Report, Say, ignore
+from ..progress import Progress, Report, Say, Written, ignore
 from ..training.run.folder import (
     AVATAR,
     WORLD_FILE,
@@ -24,7 +24,6 @@ from ..training.run.folder import (
     open_run,
     with_refined_tracking,
 )
-from .results import Written
 
 if TYPE_CHECKING:
     from ..light.estimate import Known

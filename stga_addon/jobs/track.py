@@ -15,12 +15,11 @@ from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
 from ..options import option, usable_path
-from ..progress import Cancelled, Progress, Report, Say, TimeLeft
+from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, REPORT_FILE, SHEET_FILE, is_flame, is_written
 from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
-from .results import Written
 from .train import Train, resumed, train
 
 WORLDS = {

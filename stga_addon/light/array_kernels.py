@@ -38,26 +38,20 @@ def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None
     size, u, v = len(depth), corners[1] - corners[0], corners[2] - corners[0]
     across, down = _crossed(u, v, 2, 1) / area, _crossed(u, v, 0, 2) / area
     plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
-    high, middle, low = np.take_along_axis(
-        corners, np.argsort(corners[:, 1], axis=0)[:, None], axis=0
-    )
+    order = np.argsort(corners[:, 1], axis=0)[:, None]
+    high, middle, low = np.take_along_axis(corners, order, axis=0)
     rows = np.ceil(high[1] - 0.5) - 1, np.floor(middle[1] - 0.5), np.floor(low[1] - 0.5)
     limits = [np.clip(row, -1, size - 1).astype(np.int64) for row in rows]
     long = _line(high, low)
-    for before, last, short in (
-        (*limits[:2], _line(high, middle)),
-        (*limits[1:], _line(middle, low)),
-    ):
+    lines = _line(high, middle), _line(middle, low)
+    for before, last, short in zip(limits, limits[1:], lines, strict=False):
         count = last - before
         row = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count - before - 1, count)
         y = row + 0.5
-        a, b = (
-            np.repeat(slope, count) * y + np.repeat(begin, count) for slope, begin in (long, short)
-        )
-        begin = np.ceil(np.maximum(np.minimum(a, b), 0) - 0.5).clip(0)
-        texels = np.maximum(
-            np.floor(np.minimum(np.maximum(a, b), size) - 0.5) - begin + 1, 0
-        ).astype(np.int64)
+        edges = [np.repeat(slope, count) * y + np.repeat(b, count) for slope, b in (long, short)]
+        begin = np.ceil(np.maximum(np.minimum(*edges), 0) - 0.5).clip(0)
+        end = np.floor(np.minimum(np.maximum(*edges), size) - 0.5)
+        texels = np.maximum(end - begin + 1, 0).astype(np.int64)
         steepness, down, z = (np.repeat(values, count) for values in plane)
         z += steepness * (begin + 0.5) + down * y
         along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)

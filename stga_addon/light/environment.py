@@ -93,13 +93,13 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def split_environment(
-    image: np.ndarray, rotation: np.ndarray = UPRIGHT
+    image: np.ndarray, rotation: np.ndarray = UPRIGHT, max_suns: int = MAX_SUNS
 ) -> tuple[np.ndarray, tuple[Light, ...]]:
     """Harmonics (9, 3) of an environment, and its brightest parts as suns, which throw shadows.
 
     image: (H, W, 3) linear radiance, equirectangular as `pixel_directions`. rotation: (3, 3) from
     Blender's axes to those of the result. Suns are what is brighter than SUN_CONTRAST times the
-    mean, at most MAX_SUNS; harmonics hold the rest, so that both together have the environment's
+    mean, at most `max_suns`; harmonics hold the rest, so that both together have the environment's
     irradiance.
     """
     image = smaller(np.asarray(image, np.float64))
@@ -108,7 +108,7 @@ def split_environment(
     rest, level = image.copy(), image.sum(2)
     limit = SUN_CONTRAST * (level * angle).sum() / (angle.sum() * image.shape[1])
     suns: list[Light] = []
-    while len(suns) < MAX_SUNS and level.max() > limit:
+    while len(suns) < max_suns and level.max() > limit:
         brightest = vectors.reshape(-1, 3)[level.argmax()]
         near = (vectors @ brightest > np.cos(SUN_RADIUS)) & (level > limit)
         arriving = np.where(near[..., None], rest, 0) * angle[..., None]
@@ -123,11 +123,7 @@ def split_environment(
 
 def harmonics_of(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> np.ndarray:
     """(9, 3) of a whole environment, see `split_environment`."""
-    image = smaller(np.asarray(image, np.float64))
-    vectors, angle = pixel_directions(*image.shape[:2])
-    return np.asarray(
-        basis((vectors @ rotation.T).reshape(-1, 3)).T @ (image * angle[..., None]).reshape(-1, 3)
-    )
+    return split_environment(image, rotation, max_suns=0)[0]
 
 
 def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
@@ -136,13 +132,11 @@ def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
     rows, columns = image.shape[0] // step * step, image.shape[1] // step * step
     if step == 1:
         return image
-    return np.asarray(
-        image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1).mean((1, 3))
-    )
+    squares = image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1)
+    return np.asarray(squares.mean((1, 3)))
 
 
-MAX_LIGHTS = 64
-MAX_NUMBER = 1e6
+MAX_LIGHTS, MAX_NUMBER = 64, 1e6
 
 
 @dataclass(frozen=True)
@@ -192,8 +186,8 @@ def read_lighting(path: Path) -> Lighting:
         world, suns = split_environment(read_hdr(path))
         return Lighting(world, suns)
     if suffix != ".toml":
-        problem = "expected light as an environment (.hdr) or a list of lights (.toml)"
-        raise StgaError(f"{path}: {problem}")
+        expected = "expected light as an environment (.hdr) or a list of lights (.toml)"
+        raise StgaError(f"{path}: {expected}")
     values = read_toml(path)
     try:
         entries = values.get("lights", [])
@@ -204,12 +198,10 @@ def read_lighting(path: Path) -> Lighting:
         raise StgaError(f"{path}: {error}") from error
     lights = []
     for entry in found.lights:
-        own = {
-            name: value for name, value in vars(entry).items() if name not in ("strength", "color")
-        }
-        lights.append(Light(color=entry.strength * np.array(entry.color), **own))
-    rest = {name: value for name, value in vars(found).items() if name not in ("world", "lights")}
-    return Lighting(uniform(found.world), tuple(lights), **rest)
+        own = {**vars(entry), "color": entry.strength * np.array(entry.color)}
+        del own["strength"]
+        lights.append(Light(**own))
+    return Lighting(**{**vars(found), "world": uniform(found.world), "lights": tuple(lights)})
 
 
 def _completed(kind: type, values: Any) -> Any:

@@ -81,11 +81,9 @@ def _view_colors(
     total, count = np.zeros((len(facing), 3)), np.zeros((len(facing), 1))
     for weights in POINTS:
         pixels, _ = view.camera.project(np.einsum("k,fkc->fc", weights, corners))
-        column, row = np.floor(pixels).astype(np.int64).T
-        inside = (
-            facing & (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
-        )
-        column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+        places = np.floor(pixels).astype(np.int64)
+        inside = facing & ((places >= 0) & (places < level.shape[::-1])).all(1)
+        column, row = np.where(inside[:, None], places, 0).T
         inside &= usable[row, column]
         color = np.clip((image[row, column] - offset) / gain, 0, 255)
         total += np.where(inside[:, None], srgb_to_linear(color / 255), 0)
@@ -98,9 +96,8 @@ def _inner(mask: np.ndarray) -> np.ndarray:
     padded = np.pad(mask, 2)
     height, width = mask.shape
     around = (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)
-    return np.asarray(
-        np.logical_and.reduce([padded[y : y + height, x : x + width] for y, x in around])
-    )
+    shifted = [padded[y : y + height, x : x + width] for y, x in around]
+    return np.asarray(np.logical_and.reduce(shifted))
 
 
 ITERATIONS = 40
@@ -185,9 +182,8 @@ def recorded_irradiance(
     cameras (T, F) see the vertex: teeth in an open mouth."""
     total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
     for arriving, seen in zip(direct, cameras, strict=True):
-        weight = (
-            np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))[:, None] + UNSEEN_WEIGHT
-        )
+        views = np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))
+        weight = views[:, None] + UNSEEN_WEIGHT
         total += weight * (arriving + bounce.light(arriving))
         count += weight
     return np.asarray(total / count)
@@ -255,9 +251,8 @@ def _solve(
         matrix = rows.T @ rows
         ridge = RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
         ridge[np.diag_indices(COUNT)] += DARK**2  # a channel that shows nothing
-        found[:, k] = np.linalg.solve(
-            matrix + ridge, rows.T @ (color[:, k] * np.sqrt(weight[:, k]))
-        )
+        wanted = color[:, k] * np.sqrt(weight[:, k])
+        found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ wanted)
     return found
 
 
@@ -265,12 +260,11 @@ def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) float32: EYE_ROUGHNESS on eyeballs, parts of their own that are nearly spheres of an
     eye's size, 0 elsewhere."""
     part = connected_parts(len(neutral), faces)
-    found = np.zeros(len(neutral), np.float32)
-    used = np.zeros(len(neutral), bool)
+    found, used = np.zeros(len(neutral), np.float32), np.zeros(len(neutral), bool)
     used[faces] = True
     for label in np.unique(part[used]):
-        members = np.flatnonzero((part == label) & used)
-        if len(members) >= MIN_VERTICES and _is_eyeball(neutral[members].astype(np.float64)):
+        members = used & (part == label)
+        if members.sum() >= MIN_VERTICES and _is_eyeball(neutral[members].astype(np.float64)):
             found[members] = EYE_ROUGHNESS
     return found
 

@@ -11,7 +11,7 @@ import numpy as np
 from . import array_kernels
 from .array_kernels import toward_light
 from .harmonics import COUNT, basis
-from .values import Caster, Light, Lighting
+from .values import KINDS, Caster, Light, Lighting
 
 MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
 LIFT_M = 0.001  # Points are lifted off the surface by it, so that it does not shade itself
@@ -19,9 +19,6 @@ BIAS_M, MAX_BIAS_M = 0.001, 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
 taps, at most MAX_BIAS_M."""
 TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
-Projection = Callable[[np.ndarray], np.ndarray]
-"""Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where a light
-cannot see them."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +66,15 @@ def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightV
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    return LightView(
-        axes, center if light.kind == "sun" else light.position, scale, light.kind == "sun", size
-    )
+    is_sun = light.kind == "sun"
+    return LightView(axes, center if is_sun else light.position, scale, is_sun, size)
 
 
-def light_projection(vertices: np.ndarray, light: Light, size: int = MAP_SIZE) -> Projection:
-    """What `light_view` sees, as a function of points."""
+def light_projection(
+    vertices: np.ndarray, light: Light, size: int = MAP_SIZE
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Points (N, 3) in meters -> (N, 3) float32: x and y in texels of what `light_view` sees, depth
+    in meters; NaN where a light cannot see them."""
     view = light_view(head_bounds(vertices), light, size)
     axes, shift = view.axes.astype(np.float32), (view.origin @ view.axes).astype(np.float32)
 
@@ -195,14 +194,12 @@ class Lamps:
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
     """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
     places, width = _places(light, center)
-    intensity = {"sun": 1.0, "point": 1 / (4 * np.pi), "spot": 1 / (4 * np.pi), "area": 1 / np.pi}[
-        light.kind
-    ]
+    kind = KINDS.index(light.kind)
+    intensity = (1.0, 1 / (4 * np.pi), 1 / (4 * np.pi), 1 / np.pi)[kind]
     edge = np.cos(light.cone / 2)
     fade = max((1 - edge) * light.blend, MIN_FADE)
     color = light.color * intensity / len(places)
     rest = (*light.direction, *color, edge, fade, shadow_map, light.diffuse, light.specular, width)
-    kind = ("sun", "point", "spot", "area").index(light.kind)
     return np.array([(kind, *place, *rest) for place in places], np.float32)
 
 

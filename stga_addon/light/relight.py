@@ -1,8 +1,9 @@
 """Colors of splats under a scene's light, and how much of the recorded ones that light keeps."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
 from .harmonics import COUNT, GLOSSY, LAMBERT, basis, rotated
 from .lamps import LIFT_M, Lamps, distant_light
-from .surface import Bounce, Lashes, at_splats, find_lashes, surface_points
+from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
@@ -23,8 +24,7 @@ from which on nothing, as a share: other objects' shadows."""
 RIDGE = 1e-6  # Of the mean of a diagonal, added to it: meshes without light in some harmonics
 
 
-@dataclass(frozen=True)
-class Kept:
+class Kept(NamedTuple):
     """Colors are share · gain · recorded + (1 − share) · relit, all linear.
 
     share  0…1, of splats at which about as much arrives as in the capture (`kept_shares`)
@@ -52,23 +52,18 @@ def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
     direction, each channel but for a factor."""
     old, new = (LAMBERT[:COUNT, None] * light for light in (recorded, distant))
     gain = np.maximum((old * new).sum(0) / np.maximum((old * old).sum(0), 1e-12), 0)
-    difference = float(
-        np.linalg.norm(new - gain * old) / max(float(np.linalg.norm(gain * old)), 1e-12)
-    )
-    return Kept(1 - float(_smooth_step(np.array(difference / UNLIKE_LIGHT))), gain)
+    same = gain * old
+    difference = np.linalg.norm(new - same) / max(float(np.linalg.norm(same)), 1e-12)
+    return Kept(1 - float(_smooth_step(np.asarray(difference / UNLIKE_LIGHT))), gain)
 
 
 def kept_shares(kept: Kept, arriving: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
     """(N,) float32 of what arrives at splats now, and of what arrived in the capture (N, 3)."""
     same = np.asarray(kept.gain, np.float32) * irradiance
-    off = arriving - same
-    square = np.einsum("nk,nk->n", off, off) / np.maximum(
-        np.einsum("nk,nk->n", same, same), np.float32(1e-12)
-    )
-    share = 1 - _smooth_step(
-        (np.sqrt(square) - ALIKE_AT_SPLAT) / (UNLIKE_AT_SPLAT - ALIKE_AT_SPLAT)
-    )
-    return np.asarray(kept.share * share, np.float32)
+    square = row_dot(arriving - same, arriving - same)
+    unlike = np.sqrt(square / np.maximum(row_dot(same, same), np.float32(1e-12)))
+    step = _smooth_step((unlike - ALIKE_AT_SPLAT) / (UNLIKE_AT_SPLAT - ALIKE_AT_SPLAT))
+    return np.asarray(kept.share * (1 - step), np.float32)
 
 
 def _smooth_step(values: np.ndarray) -> np.ndarray:
@@ -94,9 +89,8 @@ class Relighter:
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
-            raise StgaError(
-                "the avatar does not know the light of its capture; `stga relight RUN` estimates it"
-            )
+            problem = "the avatar does not know the light of its capture"
+            raise StgaError(f"{problem}; `stga relight RUN` estimates it")
         self.avatar, self.light = avatar, avatar.light
         self.face, self.weights = surface_points(avatar)
         self.corners = np.ascontiguousarray(avatar.faces[self.face])
@@ -137,10 +131,9 @@ class Relighter:
         """(N, 3) recorded sRGB, mean over directions from which a splat is seen."""
         sh = self.avatar.splats.sh
         means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
-        normals = self._at_splats(
-            vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces)
-        )
-        return sh_color(means * sh, -self._unit(normals)).astype(np.float32)
+        normals = vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces)
+        inward = -self._unit(self._at_splats(normals))
+        return sh_color(means * sh, inward).astype(np.float32)
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
@@ -160,11 +153,9 @@ class Relighter:
     def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
         """(9, 3) of the world in the neutral mesh's axes, for a posed `mesh` (V, 3)."""
         # Open vertices, which the jaw moves least, say how the head is turned.
-        weights = np.asarray(self.light.occlusion, np.float64) + 1e-3
-        rotation, _ = weighted_procrustes(
-            np.asarray(mesh, np.float64), self.avatar.neutral, weights
-        )
-        return rotated(world, rotation)
+        weights = self.light.occlusion + np.float64(1e-3)
+        mesh = np.asarray(mesh, np.float64)
+        return rotated(world, weighted_procrustes(mesh, self.avatar.neutral, weights)[0])
 
     def colors(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
@@ -180,9 +171,8 @@ class Relighter:
         share = {"recorded": 0.0, "mix": lighting.mix, "scene": 1.0}[lighting.mode]
         if not share:
             return self._recorded(mesh, eye)
-        lit = self._lit(
-            np.asarray(mesh, np.float64), np.asarray(eye, np.float64), lighting, casters
-        )
+        mesh, eye = (np.asarray(points, np.float64) for points in (mesh, eye))
+        lit = self._lit(mesh, eye, lighting, casters)
         lit *= np.float32(2**lighting.exposure) / np.asarray(lighting.white, np.float32)
         return lit if share == 1 else share * lit + (1 - share) * self._recorded(mesh, eye)
 
@@ -190,52 +180,44 @@ class Relighter:
         """(9, 6) of the world, and of it with lamps far away, in the neutral mesh's axes for a
         posed `mesh`; and what is kept."""
         center = (mesh.max(0) + mesh.min(0)) / 2
-        distant = lighting.world + sum(
-            (distant_light(light, center) for light in lighting.lights), np.zeros((9, 3))
-        )
+        lamps = [distant_light(light, center) for light in lighting.lights]
+        distant = lighting.world + sum(lamps, np.zeros((9, 3)))
         # Both at once: turning them into the head's axes takes longer than the rest.
         both = self.world_in_head(mesh, np.concatenate([lighting.world, distant], axis=1))
         found = kept(self.recorded_light, both[:, 3:])
         # Other highlights than the capture's are asked for.
-        same = max(0.0, 1 - abs(lighting.specular - 1)) * max(
-            0.0, 1 - abs(lighting.roughness / SKIN_ROUGHNESS - 1)
-        )
-        return both.astype(np.float32), replace(found, share=found.share * same)
+        for factor in (lighting.specular, lighting.roughness / SKIN_ROUGHNESS):
+            found = found._replace(share=found.share * max(0.0, 1 - abs(factor - 1)))
+        return both.astype(np.float32), found
 
     def _lit(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster]
     ) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
         distant, likeness = self.distant_in_head(mesh, lighting)
-        world = distant[:, :3]
-        lamps = Lamps(
-            lighting, mesh, self.avatar.faces, (*casters, *self.lash_casters(mesh, lighting))
-        )
+        world, casters = distant[:, :3], (*casters, *self.lash_casters(mesh, lighting))
+        lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
         at_vertices = np.maximum(self.light.transfer @ world, 0)
         at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
         # All at once, because the places of the vertices in memory are what takes time.
-        at_splats = self._at_splats(
-            np.concatenate([mesh, vertex_normal, self.bounce.light(at_vertices)], axis=1)
-        )
+        bounced = self.bounce.light(at_vertices)
+        at_splats = self._at_splats(np.concatenate([mesh, vertex_normal, bounced], axis=1))
         points, normals = np.ascontiguousarray(at_splats[:, :3]), self._unit(at_splats[:, 3:6])
-        roughness = np.where(
-            self.roughness > 0, self.roughness, np.float32(max(lighting.roughness, 0.05))
-        )
-        arriving, highlight = lamps.shade(
-            points + LIFT_M * normals, normals, eye, roughness, REFLECTANCE
-        )
+        skin = np.float32(max(lighting.roughness, 0.05))
+        roughness = np.where(self.roughness > 0, self.roughness, skin)
+        lifted = points + LIFT_M * normals
+        arriving, highlight = lamps.shade(lifted, normals, eye, roughness, REFLECTANCE)
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
         albedo = self.albedo
         if self._strained:
             albedo = self._albedo(self.diffuse_color + self._strain_color(mesh))
-        lit = np.asarray(
-            albedo * arriving * np.float32(1 / np.pi) + np.float32(lighting.specular) * highlight
-        )
+        lit = albedo * arriving * np.float32(1 / np.pi)
+        lit += np.float32(lighting.specular) * highlight
         if likeness.share > 0:
             same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
             lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
-        return lit
+        return np.asarray(lit)
 
     def _sky_highlight(
         self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray,
@@ -245,7 +227,7 @@ class Relighter:
         if not np.any(world):
             return np.zeros_like(points)
         view = self._unit(eye.astype(np.float32) - points)
-        cosine = np.maximum(np.einsum("nk,nk->n", normals, view), np.float32(0.02))
+        cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
         glossy = (GLOSSY[:, None] * world).astype(np.float32)
         seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
         x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
@@ -257,13 +239,10 @@ class Relighter:
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        share = np.where(
-            self.roughness > 0, np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE)
-        )
-        highlight = share[:, None] * self.irradiance / np.pi
-        albedo = (
-            np.pi * np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear) / self.irradiance
-        )
+        wet, skin = np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE)
+        highlight = np.where(self.roughness > 0, wet, skin)[:, None] * self.irradiance / np.pi
+        diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear)
+        albedo = np.pi * diffuse / self.irradiance
         damping = self.light.damping
         if damping:
             albedo = np.maximum(albedo, 1e-4)
@@ -299,8 +278,8 @@ class Relighter:
     @staticmethod
     def _unit(vectors: np.ndarray) -> np.ndarray:
         # np.linalg.norm is slow where the last axis is short
-        square = np.einsum("nk,nk->n", vectors, vectors)
-        return np.asarray(vectors / np.maximum(np.sqrt(square), np.float32(1e-12))[:, None])
+        length = np.sqrt(row_dot(vectors, vectors))
+        return np.asarray(vectors / np.maximum(length, np.float32(1e-12))[:, None])
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:

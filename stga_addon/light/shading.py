@@ -2,28 +2,20 @@
 
 from pathlib import Path
 
-from .lamps import BIAS_M, LIFT_M, MAP_SIZE, MAX_BIAS_M, TAP_STEP
-from .relight import (
-    ALIKE_AT_SPLAT,
-    HIGHLIGHT_SHARE,
-    MIN_DIFFUSE_SHARE,
-    REFLECTANCE,
-    UNLIKE_AT_SPLAT,
-    WET_HIGHLIGHT_SHARE,
-)
+from . import lamps, relight
 
 SHADING_DEFINES = f"""
-#define MAP_SIZE {MAP_SIZE}
-#define LIFT {LIFT_M!r}
-#define BIAS {BIAS_M!r}
-#define MAX_BIAS {MAX_BIAS_M!r}
-#define TAP_STEP {TAP_STEP!r}
-#define REFLECTANCE {REFLECTANCE!r}
-#define HIGHLIGHT_SHARE {HIGHLIGHT_SHARE!r}
-#define WET_HIGHLIGHT_SHARE {WET_HIGHLIGHT_SHARE!r}
-#define MIN_DIFFUSE_SHARE {MIN_DIFFUSE_SHARE!r}
-#define ALIKE_AT_SPLAT {ALIKE_AT_SPLAT!r}
-#define UNLIKE_AT_SPLAT {UNLIKE_AT_SPLAT!r}
+#define MAP_SIZE {lamps.MAP_SIZE}
+#define LIFT {lamps.LIFT_M!r}
+#define BIAS {lamps.BIAS_M!r}
+#define MAX_BIAS {lamps.MAX_BIAS_M!r}
+#define TAP_STEP {lamps.TAP_STEP!r}
+#define REFLECTANCE {relight.REFLECTANCE!r}
+#define HIGHLIGHT_SHARE {relight.HIGHLIGHT_SHARE!r}
+#define WET_HIGHLIGHT_SHARE {relight.WET_HIGHLIGHT_SHARE!r}
+#define MIN_DIFFUSE_SHARE {relight.MIN_DIFFUSE_SHARE!r}
+#define ALIKE_AT_SPLAT {relight.ALIKE_AT_SPLAT!r}
+#define UNLIKE_AT_SPLAT {relight.UNLIKE_AT_SPLAT!r}
 #define PI 3.14159265358979
 """
 SRGB_FUNCTIONS = """

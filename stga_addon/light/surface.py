@@ -36,9 +36,8 @@ def transfer_of(
     open_sky, whole_sky = np.zeros((2, len(vertices)))
     for direction, harmonic in zip(sky, harmonics, strict=True):
         cosine = np.maximum(normals @ direction, 0)
-        depths = ShadowMap(
-            vertices, faces, Light("sun", np.ones(3), direction=-direction), size=MAP_SIZE
-        )
+        sun = Light("sun", np.ones(3), direction=-direction)
+        depths = ShadowMap(vertices, faces, sun, size=MAP_SIZE)
         reached = cosine * depths.lit(points, BIAS_M, step=0)
         transfer += reached[:, None] * harmonic
         open_sky += reached
@@ -66,18 +65,15 @@ class Bounce:
 
     def light(self, irradiance: np.ndarray) -> np.ndarray:
         """(V, 3) irradiance from skin around a vertex, by what arrives at vertices (V, 3)."""
-        near = np.stack(
-            [self._around(self._weight * channel) for channel in np.asarray(irradiance).T], axis=-1
-        )
+        columns = np.asarray(irradiance).T
+        near = np.stack([self._around(self._weight * column) for column in columns], axis=-1)
         return np.asarray(self._blocked * near / np.maximum(self._sum_of_weights, 1e-12)[:, None])
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """(V,): sum of values (V,) in each vertex's cell and those around it."""
         total = np.bincount(self._cell, values, int(np.prod(self._shape))).reshape(self._shape)
-        for axis in range(3):
-            # the outermost cells are empty
-            ahead, behind = np.roll(total, 1, axis), np.roll(total, -1, axis)
-            total = total + ahead + behind
+        for axis in range(3):  # the outermost cells are empty
+            total = total + np.roll(total, 1, axis) + np.roll(total, -1, axis)
         return np.asarray(total.ravel()[self._cell])
 
 
@@ -95,9 +91,7 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     face = avatar.splats.face.astype(np.int64)
     points = points_to_world(avatar.splats.xyz, frames, face)
-    edges = np.sort(
-        avatar.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2).astype(np.int64), axis=1
-    )
+    edges = np.sort(avatar.faces[:, [[1, 2], [2, 0], [0, 1]]].astype(np.int64)).reshape(-1, 2)
     key = edges[:, 0] * (int(avatar.faces.max(initial=0)) + 1) + edges[:, 1]
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(key[order][1:] == key[order][:-1])
@@ -122,18 +116,18 @@ def _nearest(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.nd
     """Barycentric coordinates (N, 3) in triangles' planes, clamped, and squared distance (N,)."""
     a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     offset = points - a
-    uu, uv, vv = _dot(first, first), _dot(first, second), _dot(second, second)
-    pu, pv = _dot(offset, first), _dot(offset, second)
+    uu, uv, vv = row_dot(first, first), row_dot(first, second), row_dot(second, second)
+    pu, pv = row_dot(offset, first), row_dot(offset, second)
     area = np.maximum(uu * vv - uv * uv, 1e-30)
     u, v = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
     inside = np.stack([1 - u - v, u, v], axis=-1)
     weights = np.clip(inside, 0, 1)
     weights /= weights.sum(1, keepdims=True)
     away = points - np.einsum("nk,nkc->nc", weights, corners)
-    return inside, weights, _dot(away, away)
+    return inside, weights, row_dot(away, away)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("nk,nk->n", a, b))
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
+from stga_addon.batch import ray as ray_engine
 from stga_addon.batch.engines import make_engine
-from stga_addon.batch.engines import ray as ray_engine
 from stga_addon.errors import StgaError
 
 from .conftest import TrainedHere

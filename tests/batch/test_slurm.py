@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from stga_addon.batch.engines import make_engine, slurm
-from stga_addon.batch.engines.slurm import SlurmEngine
+from stga_addon.batch import slurm
+from stga_addon.batch.engines import make_engine
 from stga_addon.batch.run import JobState
+from stga_addon.batch.slurm import SlurmEngine
 from stga_addon.errors import StgaError
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE, StatusWriter, WorkerState
@@ -96,20 +97,6 @@ def test_jobs_of_a_dead_node_resume_elsewhere(on_cluster, tmp_path, trained_here
         assert splats_of(there, f"train-seed{seed}") == splats_of(
             trained_here(), f"train-seed{seed}"
         )
-
-
-@pytest.mark.needs("slurm")
-def test_a_failed_job_of_an_array_fails_alone(on_cluster: Cluster, tmp_path: Path) -> None:
-    """Catches an array that one failed job takes down, and jobs after it that count as failed
-    themselves."""
-    plan = tiny_plan(tmp_path, iterations=3)
-    name = "train-seed1"
-    (plan.out / name).mkdir(parents=True)
-    (plan.out / name / "run.json").write_text("{}")
-    batch, _ = carry_out(plan, SlurmEngine())
-    states = {name: entry.state for name, entry in batch.entries.items()}
-    assert states["train-seed0"] == states["evaluate-seed0"] == JobState.FINISHED
-    assert (states[name], states["evaluate-seed1"]) == (JobState.FAILED, JobState.BLOCKED)
 
 
 @pytest.mark.nightly
@@ -214,7 +201,6 @@ def test_without_slurm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slurm.shutil, "which", lambda name: None)
     with pytest.raises(StgaError, match="--engine slurm: the program sbatch was not found"):
         make_engine("slurm")
-    with pytest.raises(
-        StgaError, match="--address: is that of a Ray cluster; expected --engine ray, got slurm"
-    ):
+    sentence = "--address: is that of a Ray cluster; expected --engine ray, got slurm"
+    with pytest.raises(StgaError, match=sentence):
         make_engine("slurm", "host:1")

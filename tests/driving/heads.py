@@ -6,20 +6,23 @@ from pathlib import Path
 import numpy as np
 from flame.mouths import open_flame
 
+from stga_addon.capture.mesh_geometry import connected_parts
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT
 from stga_addon.driving.shapes import face_points, face_shapes
 from stga_addon.flame.model import FlameModel
 
 KERNEL_M, REACH_M = 0.006, 0.012
 RIGID = tuple(name for name in ARKIT_SHAPES if name.startswith("jaw"))
+LOOKS = [
+    ("Up", "Down", "Left"),
+    ("Up", "Down", "Right"),
+    ("In", "Out", "Left"),
+    ("In", "Out", "Right"),
+]
 OPPOSITES = (
     ("jawLeft", "jawRight"),
     ("mouthLeft", "mouthRight"),
-    *(
-        (f"eyeLook{a}{side}", f"eyeLook{b}{side}")
-        for a, b in (("Up", "Down"), ("In", "Out"))
-        for side in ("Left", "Right")
-    ),
+    *((f"eyeLook{one}{side}", f"eyeLook{other}{side}") for one, other, side in LOOKS),
 )
 SAMPLES = 400
 
@@ -43,25 +46,20 @@ def with_expressions(model: FlameModel, components: int) -> FlameModel:
     distance = np.linalg.norm(model.v_template[:, None] - points, axis=2)
     spread = np.exp(-0.5 * (distance / KERNEL_M) ** 2)
     spread /= np.maximum(spread.sum(axis=1, keepdims=True), 1e-9)
-    spread *= np.exp(-((np.maximum(distance.min(axis=1), REACH_M) - REACH_M) ** 2) / REACH_M**2)[
-        :, None
-    ]
+    beyond = np.maximum(distance.min(axis=1, keepdims=True), REACH_M) - REACH_M
+    spread *= np.exp(-((beyond / REACH_M) ** 2))
     spread[model.weights[:, 3:].any(axis=1)] = 0
     kept = [column for column, name in enumerate(ARKIT_SHAPES) if name not in RIGID]
-    moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used]).reshape(
-        len(kept), -1
-    )
+    moved = np.einsum("vp,spc->svc", spread, face_shapes().shapes[kept][:, used])
+    moved = moved.reshape(len(kept), -1)
     weights = random_poses(SAMPLES, np.random.default_rng(0))[:, kept]
     # Principal components of weights @ moved, from the small matrix of the shapes' products.
     values, vectors = np.linalg.eigh(moved @ moved.T)
     root = vectors * np.sqrt(np.maximum(values, 0))
     _, sizes, axes = np.linalg.svd((weights - weights.mean(axis=0)) @ root, full_matrices=False)
-    axes = (
-        axes[:components] @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T @ moved
-    )
-    expressions = (sizes[:components, None] * axes / np.sqrt(SAMPLES)).T.reshape(
-        -1, 3, min(components, len(kept))
-    )
+    inverse = vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    axes = sizes[:components, None] * axes[:components] @ inverse.T @ moved / np.sqrt(SAMPLES)
+    expressions = axes.T.reshape(-1, 3, len(axes))
     return replace(model, shapedirs=np.concatenate([identity, expressions], axis=2))
 
 
@@ -75,23 +73,15 @@ def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
             weights[:, COLUMN[name]] *= chosen == number
     closed = rng.random(count) < 1 / 3
     weights[closed, COLUMN["jawOpen"]] = rng.random(int(closed.sum()))
-    weights[:, COLUMN["mouthClose"]] = np.where(
-        closed, weights[:, COLUMN["jawOpen"]] * rng.random(count), 0
-    )
+    opened = weights[:, COLUMN["jawOpen"]]
+    weights[:, COLUMN["mouthClose"]] = np.where(closed, opened * rng.random(count), 0)
     weights[:, COLUMN["tongueOut"]] = 0
     return np.asarray(weights)
 
 
 def _with_eyes(model: FlameModel) -> FlameModel:
     """The model whose eyeballs, the smaller parts of the mesh, follow their joints."""
-    label = np.arange(len(model.v_template))
-    while True:
-        merged = label.copy()
-        for corner in range(3):
-            np.minimum.at(merged, model.faces[:, corner], label[model.faces].min(axis=1))
-        if (merged == label).all():
-            break
-        label = merged
+    label = connected_parts(len(model.v_template), model.faces)
     weights, regressor = model.weights.copy(), model.j_regressor.copy()
     for part in np.unique(label)[1:]:
         inside = label == part

@@ -16,7 +16,6 @@ from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
@@ -40,13 +39,10 @@ def files(tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("drive")
     model = small_head(0)
     write_flame(model, folder / "flame.npz")
-    neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model)).astype(
-        np.float32
-    )
-    write_avatar(
-        folder / "a.npz",
-        Avatar(lattice_splats(neutral, model.faces, order=0), "stga", neutral, model.faces),
-    )
+    neutral = flame_forward(model, np.full(model.n_identity, 0.5), neutral_frame(model))
+    neutral = neutral.astype(np.float32)
+    splats = lattice_splats(neutral, model.faces, order=0)
+    write_avatar(folder / "a.npz", Avatar(splats, "stga", neutral, model.faces))
     weights = np.zeros((10, 52))
     weights[:, COLUMN["jawOpen"]] = np.linspace(0, 0.9, 10)
     weights[:, COLUMN["jawLeft"]] = np.linspace(0, 0.5, 10)
@@ -65,34 +61,26 @@ def files(tmp_path_factory) -> dict[str, Path]:
 def test_convert_there_and_back(files, tmp_path, capsys):
     """Catches a motion that `read_motion` refuses, another rate, a mirror that does not exchange
     sides, and a strength that changes no CSV, or a motion twice."""
-    out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
-    assert (
-        stga("drive", files["take.csv"], "--flame", files["flame.npz"], "--fps", 60, "--out", out)
-        == 0
-    )
+    out, back, flame = tmp_path / "motion.npz", tmp_path / "back.csv", files["flame.npz"]
+    assert stga("drive", files["take.csv"], "--flame", flame, "--fps", 60, "--out", out) == 0
     model = small_head(0)
     motion = read_motion(out, model)
     assert len(motion.timesteps) == 19
     drop = sequence_mesh(motion, 18) - sequence_mesh(motion, 0)
     assert drop[:, 1].min() < -0.008
-    arguments = [out, "--flame", files["flame.npz"], "--mirror", "--out", back]
-    assert main(["drive", *map(str, arguments)]) == 0
+    assert stga("drive", out, "--flame", flame, "--mirror", "--out", back) == 0
     weights = read_performance(back).weights
     np.testing.assert_allclose(weights[-1, COLUMN["jawOpen"]], 0.9, atol=0.01)
     np.testing.assert_allclose(weights[-1, COLUMN["jawRight"]], 0.5, atol=0.01)
-    weak = ["--flame", files["flame.npz"], "--strength", 0.5, "--out"]
-    for source, output in (
-        ("take.csv", "weak.csv"),
-        ("take.csv", "weak.npz"),
-        ("weak.npz", "weaker.csv"),
-    ):
-        source = files.get(source, tmp_path / source)
-        assert main(["drive", *map(str, (source, *weak, tmp_path / output))]) == 0
+    weak = ["--flame", flame, "--strength", 0.5, "--out"]
+    assert stga("drive", files["take.csv"], *weak, tmp_path / "weak.csv") == 0
+    assert stga("drive", files["take.csv"], *weak, tmp_path / "weak.npz") == 0
+    assert stga("drive", tmp_path / "weak.npz", *weak, tmp_path / "weaker.csv") == 0
     for output, share in (("weak.csv", 0.5), ("weaker.csv", 0.25)):
         found = read_performance(tmp_path / output)
         np.testing.assert_allclose(found.weights[-1, COLUMN["jawOpen"]], 0.9 * share, atol=0.01)
         np.testing.assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
-    assert main(["drive", str(out), "--out", str(tmp_path / "x.npz")]) == 2
+    assert stga("drive", out, "--out", tmp_path / "x.npz") == 2
     assert "holds FLAME parameters already" in capsys.readouterr().err
 
 
@@ -100,8 +88,8 @@ def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
     """Catches a performance that asks for a FLAME file, a motion that does not know whose it is,
     and weights that are fitted although they are the head's own coefficients."""
     out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
-    assert main(["drive", str(files["take.csv"]), "--out", str(out)]) == 0
-    assert main(["drive", str(out), "--out", str(back)]) == 0
+    assert stga("drive", files["take.csv"], "--out", out) == 0
+    assert stga("drive", out, "--out", back) == 0
     given, found = read_performance(files["take.csv"]), read_performance(back)
     np.testing.assert_allclose(found.weights, given.weights, atol=1e-6)
     np.testing.assert_allclose(found.head, given.head, atol=1e-5)
@@ -109,12 +97,11 @@ def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
 
 def test_render_and_export_a_performance(files, tmp_path, capsys):
     """Catches a command that takes FLAME motions alone, or options that change nothing."""
-    base = [
-        "render", files["a.npz"], "--cameras", files["cameras.json"], "--motion", files["take.csv"],
-    ]  # fmt: skip
-    base += ["--flame", files["flame.npz"], "--gain", "head=0", "--device", "cpu", "--out"]
-    assert main([str(a) for a in [*base, tmp_path / "full"]]) == 0
-    assert main([str(a) for a in [*base, tmp_path / "less", "--gain", "jaw=0.2"]]) == 0
+    motion = ["--motion", files["take.csv"], "--flame", files["flame.npz"]]
+    base = ["render", files["a.npz"], "--cameras", files["cameras.json"], *motion]
+    base += ["--gain", "head=0", "--device", "cpu", "--out"]
+    assert stga(*base, tmp_path / "full") == 0
+    assert stga(*base, tmp_path / "less", "--gain", "jaw=0.2") == 0
     full, less = (
         [np.asarray(Image.open(path)).astype(int) for path in sorted((tmp_path / name).iterdir())]
         for name in ("full", "less")
@@ -122,16 +109,12 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     assert len(full) == len(less) == 10
     assert np.abs(full[0] - less[0]).max() <= 1
     assert np.abs(full[9] - full[0]).sum() > 2 * np.abs(less[9] - less[0]).sum() > 0
-    ply = [
-        files["a.npz"], "--format", "ply", "--timestep", 9, "--motion", files["take.csv"],
-        "--flame",
-    ]  # fmt: skip
-    assert main(["export", *map(str, [*ply, files["flame.npz"], "--out", tmp_path / "a.ply"])]) == 0
+    ply = ["export", files["a.npz"], "--format", "ply"]
+    assert stga(*ply, "--timestep", 9, *motion, "--out", tmp_path / "a.ply") == 0
     assert (tmp_path / "a.ply").stat().st_size > 1000
-    assert main([str(a) for a in [*base, tmp_path / "x", "--stay-trained"]]) == 2
+    assert stga(*base, tmp_path / "x", "--stay-trained") == 2
     assert "is no run with a FLAME capture" in capsys.readouterr().err
-    ply = ["export", files["a.npz"], "--format", "ply", "--mirror", "--out", tmp_path / "b.ply"]
-    assert main([str(a) for a in ply]) == 2
+    assert stga(*ply, "--mirror", "--out", tmp_path / "b.ply") == 2
     assert "--mirror: has no effect without --motion" in capsys.readouterr().err
 
 

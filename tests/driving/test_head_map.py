@@ -30,9 +30,8 @@ MOUTH_LEFT, MOUTH_RIGHT = 291, 61
 
 
 def sequence_of(model, shape=None) -> FlameSequence:
-    return FlameSequence(
-        model, np.zeros(model.n_identity) if shape is None else shape, None, (), {}.__getitem__
-    )
+    shape = np.zeros(model.n_identity) if shape is None else shape
+    return FlameSequence(model, shape, None, (), {}.__getitem__)
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +55,8 @@ def posed(sequence, found, weights) -> np.ndarray:
     row = found.parameters(weights[None])[0]
     count, zero = sequence.model.n_expression, np.zeros(3)
     frame = FlameFrame(row[:count], zero, zero, row[count : count + 3], zero, row[count + 3 :])
-    return found.points.on(
-        flame_forward(sequence.model, sequence.shape, frame), sequence.model.faces
-    )
+    mesh = flame_forward(sequence.model, sequence.shape, frame)
+    return found.points.on(mesh, sequence.model.faces)
 
 
 def weights_of(**values: float) -> np.ndarray:
@@ -76,10 +74,9 @@ def test_points_lie_where_the_masks_are(demo):
     assert used.sum() > 440
     for point, mask in ((NOSE_TIP, "nose"), (UPPER_LIP, "lips"), (LOWER_LIP, "lips")):
         assert np.isin(corners[point], model.masks[mask]).any(), mask
-    near_eyes = [np.linalg.norm(at[p] - model.v_template[model.masks[m]], axis=1).min()
-                 for p, m in ((LEFT_EYE, "left_eye_region"),
-                     (RIGHT_EYE, "right_eye_region"))]  # fmt: skip
-    assert max(near_eyes) < 0.006
+    for point, mask in ((LEFT_EYE, "left_eye_region"), (RIGHT_EYE, "right_eye_region")):
+        away = np.linalg.norm(at[point] - model.v_template[model.masks[mask]], axis=1)
+        assert away.min() < 0.006, mask
     assert at[LEFT_EYE, 0] > 0.02 and at[RIGHT_EYE, 0] < -0.02  # noqa: PT018
     assert at[CHIN, 1] < at[LOWER_LIP, 1] < at[NOSE_TIP, 1]
 
@@ -115,19 +112,13 @@ def test_directions(demo):
     assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
     np.testing.assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
     assert found.reach[COLUMN["tongueOut"]] == 0
-    for name, axis, sign in (
-        ("eyeLookUpLeft", 1, 1),
-        ("eyeLookOutLeft", 0, 1),
-        ("eyeLookInLeft", 0, -1),
-    ):
-        row_ = found.parameters(weights_of(**{name: 1.0})[None])[0]
-        zero = np.zeros(3)
-        frame = FlameFrame(
-            np.zeros(model.n_expression), zero, zero, zero, zero, row_[model.n_expression + 3 :]
-        )
-        ball = model.weights[:, 3] > 0.9
-        before = model.v_template[ball]
-        pupil = before[:, 2].argmax()
+    zero, ball = np.zeros(3), model.weights[:, 3] > 0.9
+    before = model.v_template[ball]
+    pupil = before[:, 2].argmax()
+    for name, axis, sign in (("Up", 1, 1), ("Out", 0, 1), ("In", 0, -1)):
+        values = found.parameters(weights_of(**{f"eyeLook{name}Left": 1.0})[None])[0]
+        eyes, rest_face = values[model.n_expression + 3 :], np.zeros(model.n_expression)
+        frame = FlameFrame(rest_face, zero, zero, zero, zero, eyes)
         moved = flame_forward(model, sequence.shape, frame)[ball][pupil] - before[pupil]
         assert sign * moved[axis] > 0.003, name
 
@@ -146,12 +137,10 @@ def test_combinations_against_a_free_fit(rich):
             frame = FlameFrame(values[:count], zero, zero, values[count:], zero, np.zeros(6))
             return found.points.on(flame_forward(sequence.model, sequence.shape, frame), faces)
 
-        start = found.parameters(row[None])[0, : count + 3]
-        free = least_squares(
-            lambda values: (points(values) - wanted).ravel() * 1000,  # noqa: B023
-            start,
-            max_nfev=6,
-        )
+        def error(values):
+            return (points(values) - wanted).ravel() * 1000  # noqa: B023
+
+        free = least_squares(error, found.parameters(row[None])[0, : count + 3], max_nfev=6)
         missed.append(np.linalg.norm(posed(sequence, found, row) - wanted, axis=1).mean())
         best.append(np.linalg.norm(points(free.x) - wanted, axis=1).mean())
     assert np.mean(missed) < 1.2 * np.mean(best)  # 1.16; of FLAME 1.06 (benchmarks/driving.py)
@@ -174,15 +163,9 @@ def test_there_and_back(rich, tmp_path):
     np.testing.assert_allclose(again.times, take.times, atol=1e-4)
     np.testing.assert_allclose(again.head, head, atol=1e-5)
     error = np.abs(again.weights - effective_weights(weights)).max(axis=0)
-    sure = [
-        COLUMN[name]
-        for name in ARKIT_SHAPES
-        if name.startswith(("eyeLook", "jawOpen", "jawLeft", "jawRight"))
-    ]
+    sure = [name.startswith(("eyeLook", "jawO", "jawL", "jawR")) for name in ARKIT_SHAPES]
     assert error[sure].max() < 0.01
-    assert (error < 0.01).sum() >= 30, {
-        name: round(float(e), 3) for name, e in zip(ARKIT_SHAPES, error, strict=True)
-    }
+    assert (error < 0.01).sum() >= 30, dict(zip(ARKIT_SHAPES, error.round(3), strict=True))
     # What cannot be told apart still looks the same.
     frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
     for number, row in enumerate(arkit_weights(frames, found, sequence)[:5]):

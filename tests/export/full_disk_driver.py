@@ -37,19 +37,10 @@ def main(disk: Path) -> list[dict[str, object]]:
                     message = str(error)
                 except Exception as error:
                     message = f"not a StgaError: {error!r}"
-                left = [
-                    str(item.relative_to(disk)) for item in disk.rglob("*") if item.name != "filler"
-                ]
-                found.append(
-                    {
-                        "format": format,
-                        "path": str(path),
-                        "share": share,
-                        "message": message,
-                        "left": left,
-                    }
-                )
                 (disk / "filler").unlink()
+                left = [str(item.relative_to(disk)) for item in disk.rglob("*")]
+                case = {"format": format, "path": str(path), "share": share}
+                found.append({**case, "message": message, "left": left})
                 empty(path.parent)
     return found
 

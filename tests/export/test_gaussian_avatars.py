@@ -18,18 +18,14 @@ from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, sequence_mesh
 
 VERTICES, IDENTITY, EXPRESSION = 20, 6, 4
-PLY_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex 50\n"
-    + "".join(
-        f"property float {name}\n"
-        for name in ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
-    )
-    + "".join(f"property float f_rest_{i}\n" for i in range(45))
-    + "property float opacity\n"
-    + "".join(f"property float scale_{i}\n" for i in range(3))
-    + "".join(f"property float rot_{i}\n" for i in range(4))
-    + "property float binding_0\nend_header\n"
-)
+HEADER = ["ply", "format binary_little_endian 1.0", "element vertex 50"]
+PROPERTIES = [
+    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+    *(f"f_rest_{i}" for i in range(45)),
+    *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "binding_0"),
+]
+LINES = [*HEADER, *(f"property float {name}" for name in PROPERTIES), "end_header", ""]
+PLY_HEADER = "\n".join(LINES).encode()
 
 
 @pytest.fixture
@@ -51,16 +47,11 @@ def sequence() -> FlameSequence:
     def float32(*shape: int) -> np.ndarray:
         return rng.normal(size=shape).astype(np.float32).astype(np.float64) * 0.25
 
-    frames = {
-        timestep: FlameFrame(
-            float32(EXPRESSION), float32(3), float32(3), float32(3), float32(3), float32(6)
-        )
-        for timestep in (0, 2, 5)
-    }
+    sizes = (EXPRESSION, 3, 3, 3, 3, 6)
+    frames = {timestep: FlameFrame(*map(float32, sizes)) for timestep in (0, 2, 5)}
     frames[2] = replace(frames[2], dynamic_offset=float32(VERTICES, 3))
-    return FlameSequence(
-        model, float32(IDENTITY), float32(VERTICES, 3), (0, 2, 5), frames.__getitem__
-    )
+    offset = float32(VERTICES, 3)
+    return FlameSequence(model, float32(IDENTITY), offset, (0, 2, 5), frames.__getitem__)
 
 
 def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
@@ -74,7 +65,7 @@ def test_ply_has_exactly_the_layouts_properties(tmp_path, sequence):
     avatar = avatar_on(sequence, "gaussian_avatars")
     write_gaussian_avatars(tmp_path / "out", avatar, sequence)
     content = (tmp_path / "out" / "point_cloud.ply").read_bytes()
-    assert content.startswith(PLY_HEADER.encode())
+    assert content.startswith(PLY_HEADER)
     rows = np.frombuffer(content[len(PLY_HEADER) :], "<f4").reshape(50, 63)
     np.testing.assert_array_equal(rows[:, 62], avatar.splats.face)
     np.testing.assert_array_equal(rows[:, :3], avatar.splats.xyz)
@@ -83,7 +74,8 @@ def test_ply_has_exactly_the_layouts_properties(tmp_path, sequence):
 
 
 def test_motion_holds_every_array_the_viewer_asks_for(tmp_path, sequence):
-    """Catches a missing dynamic offset, float64, or timesteps out of order."""
+    """Catches a missing dynamic offset, float64, timesteps out of order, or None turned into an
+    object array."""
     write_gaussian_avatars(tmp_path, avatar_on(sequence, "stga"), sequence)
     with np.load(tmp_path / "flame_param.npz", allow_pickle=False) as data:
         arrays = dict(data)
@@ -99,10 +91,6 @@ def test_motion_holds_every_array_the_viewer_asks_for(tmp_path, sequence):
     np.testing.assert_array_equal(arrays["jaw_pose"][2], sequence.frame(5).jaw_pose)
     np.testing.assert_array_equal(arrays["dynamic_offset"][1], sequence.frame(2).dynamic_offset)
     assert not arrays["dynamic_offset"][[0, 2]].any()
-
-
-def test_sequence_without_offsets_writes_zeros(tmp_path, sequence):
-    """Catches None turned into an object array."""
     bare = replace(sequence, static_offset=None)
     write_gaussian_avatars(tmp_path, avatar_on(bare, "stga"), bare)
     with np.load(tmp_path / "flame_param.npz", allow_pickle=False) as data:
@@ -116,24 +104,26 @@ def bound_splats(path: Path) -> Splats:
 
 
 def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
-    """Catches a motion or binding changed on the way: world splats are the same."""
+    """Catches a motion or binding changed on the way: world splats are the same; and an extra
+    property that confuses ordinary readers."""
     avatar = avatar_on(sequence, "gaussian_avatars")
     write_gaussian_avatars(tmp_path, avatar, sequence)
     splats = bound_splats(tmp_path / "point_cloud.ply")
     motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
-        np.testing.assert_array_equal(
-            getattr(splats, name), getattr(avatar.splats, name), err_msg=name
-        )
-        assert getattr(splats, name).dtype == getattr(avatar.splats, name).dtype
+        found, expected = getattr(splats, name), getattr(avatar.splats, name)
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+        assert found.dtype == expected.dtype
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
-        np.testing.assert_allclose(
-            sequence_mesh(motion, mine), sequence_mesh(sequence, timestep), atol=1e-12
-        )
+        expected = sequence_mesh(sequence, timestep)
+        np.testing.assert_allclose(sequence_mesh(motion, mine), expected, atol=1e-12)
+    plain = read_ply(tmp_path / "point_cloud.ply")  # of readers that ignore the binding
+    np.testing.assert_array_equal(plain.xyz, avatar.splats.xyz)
+    assert not plain.face.any()
 
 
-def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and covariance (3, 3) of a splat on its triangle, by definition."""
+def viewer_world(row: Splats, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) and covariance (3, 3) of one splat on its triangle, by definition."""
     p, q, r = corners
     first = (q - p) / np.linalg.norm(q - p)
     normal = np.cross(q - p, r - p)
@@ -141,9 +131,9 @@ def viewer_world(row: dict[str, np.ndarray], corners: np.ndarray) -> tuple[np.nd
     third = np.cross(first, normal)
     size = (np.linalg.norm(q - p) + abs(third @ (r - p))) / 2
     turn = np.column_stack([first, normal, third])
-    local = Rotation.from_quat(row["rotation"][[1, 2, 3, 0]]).as_matrix() * np.exp(row["log_scale"])
-    axes = size * turn @ local
-    return turn @ row["xyz"] * size + (p + q + r) / 3, axes @ axes.T
+    own = Rotation.from_quat(row.rotation[0].astype(np.float64), scalar_first=True).as_matrix()
+    axes = size * turn @ own * np.exp(row.log_scale[0].astype(np.float64))
+    return turn @ row.xyz[0].astype(np.float64) * size + (p + q + r) / 3, axes @ axes.T
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -151,12 +141,10 @@ def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
     """Catches a pair without strain color at rest, whose least compression is not 0."""
     avatar = avatar_on(sequence, convention)
     strain_color = np.random.default_rng(1).normal(0, 0.2, (50, 3, 3)).astype(np.float32)
-    limits = np.broadcast_to(
-        np.array([[-1, -1, -1], [-0.2, -0.2, 1]], np.float32), (len(avatar.faces), 2, 3)
-    ).copy()
-    avatar = replace(
-        avatar, splats=replace(avatar.splats, strain_color=strain_color), strain_range=limits
-    )
+    limits = np.array([[[-1, -1, -1], [-0.2, -0.2, 1]]], np.float32)
+    limits = np.repeat(limits, len(avatar.faces), axis=0)
+    splats = replace(avatar.splats, strain_color=strain_color)
+    avatar = replace(avatar, splats=splats, strain_range=limits)
     write_gaussian_avatars(tmp_path, avatar, sequence)
     written = bound_splats(tmp_path / "point_cloud.ply").sh
     added = -0.2 * (strain_color[:, 0] + strain_color[:, 1]) / 0.28209479177387814
@@ -173,26 +161,21 @@ def test_avatar_of_the_other_convention_stands_where_it_stood(tmp_path, sequence
     world = to_world(avatar.splats, face_frames(neutral, avatar.faces, neutral, "stga"))
     np.testing.assert_array_equal(splats.face, avatar.splats.face)
     np.testing.assert_array_equal(splats.sh, avatar.splats.sh)
+    turns = Rotation.from_quat(world.rotation, scalar_first=True).as_matrix()
+    axes = turns * np.exp(world.log_scale)[:, None]
     for i, face in enumerate(splats.face):
-        row = {
-            name: getattr(splats, name)[i].astype(np.float64)
-            for name in ("xyz", "rotation", "log_scale")
-        }
-        position, covariance = viewer_world(row, neutral[avatar.faces[face]])
-        axes = Rotation.from_quat(world.rotation[i, [1, 2, 3, 0]]).as_matrix() * np.exp(
-            world.log_scale[i]
-        )
+        position, covariance = viewer_world(splats.rows([i]), neutral[avatar.faces[face]])
+        expected = axes[i] @ axes[i].T
         np.testing.assert_allclose(position, world.xyz[i], atol=2e-6)
-        np.testing.assert_allclose(covariance, axes @ axes.T, atol=5e-6 * np.abs(covariance).max())
+        np.testing.assert_allclose(covariance, expected, atol=5e-6 * np.abs(covariance).max())
 
 
 def test_conversion_there_and_back_keeps_precision_far_from_the_origin(sequence):
     """Catches a detour through world coordinates, which costs digits far away."""
     avatar = avatar_on(sequence, "stga")
     far = replace(avatar, neutral=avatar.neutral + np.float32(64))
-    there = replace(
-        far, splats=in_convention(far, "gaussian_avatars"), convention="gaussian_avatars"
-    )
+    splats = in_convention(far, "gaussian_avatars")
+    there = replace(far, splats=splats, convention="gaussian_avatars")
     back = in_convention(there, "stga")
     np.testing.assert_allclose(back.xyz, avatar.splats.xyz, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(back.log_scale, avatar.splats.log_scale, atol=1e-5)
@@ -206,12 +189,3 @@ def test_another_mesh_is_refused_before_anything_is_written(tmp_path, sequence):
     with pytest.raises(StgaError, match="triangles"):
         write_gaussian_avatars(tmp_path / "out", other, sequence)
     assert not (tmp_path / "out").exists()
-
-
-def test_plain_reader_ignores_the_binding(tmp_path, sequence):
-    """Catches an extra property that confuses ordinary 3DGS readers."""
-    avatar = avatar_on(sequence, "gaussian_avatars")
-    write_gaussian_avatars(tmp_path, avatar, sequence)
-    plain = read_ply(tmp_path / "point_cloud.ply")
-    np.testing.assert_array_equal(plain.xyz, avatar.splats.xyz)
-    assert not plain.face.any()

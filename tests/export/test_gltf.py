@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from avatar.conftest import random_splats, rendered
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.splats import SH_C0, Splats
@@ -35,9 +36,8 @@ def parsed(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     assert binary_size == document["buffers"][0]["byteLength"] == len(data) - 28 - size
     binary = data[28 + size :]
     primitive = document["meshes"][0]["primitives"][0]
-    return document, {
-        name: column(document, binary, i) for name, i in primitive["attributes"].items()
-    }
+    attributes = primitive["attributes"].items()
+    return document, {name: column(document, binary, index) for name, index in attributes}
 
 
 def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
@@ -47,9 +47,12 @@ def column(document: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
     dtype = np.dtype({FLOAT: "<f4", UNSIGNED_BYTE: "u1"}[accessor["componentType"]])
     assert view["byteOffset"] % 4 == 0
     assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
-    return np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"]).reshape(
-        -1, width
-    )
+    flat = np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"])
+    return flat.reshape(-1, width)
+
+
+def harmonic_names(degree: int) -> list[str]:
+    return [f"SH_DEGREE_{n}_COEF_{i}" for n in range(degree + 1) for i in range(2 * n + 1)]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -72,9 +75,7 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
-    coefficients = {
-        f"SH_DEGREE_{n}_COEF_{i}": "VEC3" for n in range(degree + 1) for i in range(2 * n + 1)
-    }
+    coefficients = dict.fromkeys(harmonic_names(degree), "VEC3")
     expected = {PREFIX + name: kind for name, kind in (SHAPES | coefficients).items()}
     assert set(attributes) == {"POSITION", "COLOR_0", *expected}
     for name, kind in expected.items():
@@ -83,9 +84,8 @@ def test_keeps_the_specification(avatar, tmp_path, degree):
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_array_equal(position["min"], attributes["POSITION"].min(axis=0))
     np.testing.assert_array_equal(position["max"], attributes["POSITION"].max(axis=0))
-    np.testing.assert_allclose(
-        np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1), 1, atol=1e-6
-    )
+    lengths = np.linalg.norm(attributes[PREFIX + "ROTATION"], axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-6)
     assert attributes[PREFIX + "SCALE"].min() >= 0
     assert 0 <= attributes[PREFIX + "OPACITY"].min() <= attributes[PREFIX + "OPACITY"].max() <= 1
 
@@ -95,13 +95,12 @@ def test_renders_equal(avatar, tmp_path):
     export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
     _, found = parsed(tmp_path / "a.glb")
     opacity = found[PREFIX + "OPACITY"][:, 0].astype(np.float64)
-    names = [f"{PREFIX}SH_DEGREE_{n}_COEF_{i}" for n in range(4) for i in range(2 * n + 1)]
     again = Splats(
         xyz=found["POSITION"],
         rotation=found[PREFIX + "ROTATION"][:, [3, 0, 1, 2]],
         log_scale=np.log(found[PREFIX + "SCALE"]),
         opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh=np.stack([found[name] for name in names], axis=1),
+        sh=np.stack([found[PREFIX + name] for name in harmonic_names(3)], axis=1),
         face=np.zeros(50, np.int32),
         unbound=np.zeros(50, bool),
     )
@@ -163,24 +162,10 @@ def test_three_reads_it(avatar, tmp_path):
     world = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert found["extension"]["kernel"] == "ellipse"
     np.testing.assert_allclose(np.reshape(found["position"], (-1, 3)), world.xyz)
-    axes = quaternion_to_matrix(world.unit_rotations()) * world.scales()[:, None]
-    covariance = axes @ axes.transpose(0, 2, 1)
-    rows, columns = np.triu_indices(3)
-    np.testing.assert_allclose(
-        np.reshape(found["covariance"], (-1, 6)), covariance[:, rows, columns], atol=1e-7
-    )
-    np.testing.assert_allclose(
-        np.reshape(found["color"], (-1, 4))[:, 3], world.opacities() * 255, atol=0.51
-    )
+    rotations = Rotation.from_quat(world.unit_rotations(), scalar_first=True).as_matrix()
+    axes = rotations * world.scales()[:, None]
+    covariance = (axes @ axes.transpose(0, 2, 1))[:, *np.triu_indices(3)]
+    np.testing.assert_allclose(np.reshape(found["covariance"], (-1, 6)), covariance, atol=1e-7)
+    alpha = np.reshape(found["color"], (-1, 4))[:, 3]
+    np.testing.assert_allclose(alpha, world.opacities() * 255, atol=0.51)
     assert "sphericalHarmonics3" in found
-
-
-def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) of unit quaternions wxyz (N, 4)."""
-    w, x, y, z = q.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.array(rows).transpose(2, 0, 1)

@@ -56,10 +56,13 @@ def quaternion(row: np.ndarray) -> list[float]:
     return [xyzw[3], *xyzw[:3]]
 
 
-def faint(avatar: Avatar) -> Avatar:
-    """With coefficients and sizes of a trained head's magnitude, which the format can hold."""
-    sh = avatar.splats.sh * np.float32(0.2)
-    return replace(avatar, splats=replace(avatar.splats, sh=sh))
+def written(avatar: Avatar, path: Path) -> tuple[Splats, Splats, int]:
+    """What is in a file of the avatar, with coefficients of a trained head's magnitude, which the
+    format can hold; what was to be in it; and flags."""
+    splats = replace(avatar.splats, sh=avatar.splats.sh * np.float32(0.2))
+    export_avatar(path, replace(avatar, splats=splats), "spz", [(0, avatar.neutral)])
+    found, flags = read(path)
+    return found, to_world(splats, avatar.frames(avatar.neutral)), flags
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -67,10 +70,7 @@ def faint(avatar: Avatar) -> Avatar:
 def test_reads_back(avatar, tmp_path, degree, antialiased):
     """Catches wrong orders, signs and scales, and a flag of antialiasing that is lost."""
     avatar = replace(avatar, splats=random_splats(4, 300, 30, degree), antialiased=antialiased)
-    avatar = faint(avatar)
-    export_avatar(tmp_path / "a.spz", avatar, "spz", [(0, avatar.neutral)])
-    found, flags = read(tmp_path / "a.spz")
-    world = to_world(avatar.splats, avatar.frames(avatar.neutral))
+    found, world, flags = written(avatar, tmp_path / "a.spz")
     assert flags == antialiased
     np.testing.assert_allclose(found.xyz, world.xyz, atol=2**-17)
     np.testing.assert_allclose(found.log_scale, world.log_scale, atol=1 / 32 + 1e-6)
@@ -83,11 +83,8 @@ def test_reads_back(avatar, tmp_path, degree, antialiased):
 
 def test_renders_nearly_equal(avatar, tmp_path):
     """Catches an error of quantization that can be seen."""
-    avatar = faint(avatar)
-    export_avatar(tmp_path / "a.spz", avatar, "spz", [(0, avatar.neutral)])
-    difference = rendered(read(tmp_path / "a.spz")[0]) - rendered(
-        to_world(avatar.splats, avatar.frames(avatar.neutral))
-    )
+    found, world, _ = written(avatar, tmp_path / "a.spz")
+    difference = rendered(found) - rendered(world)
     assert -10 * np.log10(np.mean(difference**2)) > 40
 
 
@@ -115,15 +112,11 @@ def test_far_and_extreme_splats(tmp_path):
 def test_gsply_reads_it(avatar, tmp_path):
     """Catches a file that another implementation understands otherwise."""
     gsply = pytest.importorskip("gsply", reason="the package gsply is not installed")
-    avatar = faint(avatar)
-    export_avatar(tmp_path / "a.spz", avatar, "spz", [(0, avatar.neutral)])
-    theirs, (ours, _) = gsply.read_spz(tmp_path / "a.spz"), read(tmp_path / "a.spz")
-    for name, mine in (
-        ("means", ours.xyz),
-        ("scales", ours.log_scale),
-        ("quats", ours.rotation),
-        ("sh0", ours.sh[:, 0]),
-    ):
-        np.testing.assert_allclose(getattr(theirs, name), mine, atol=1e-5)
+    ours, _, _ = written(avatar, tmp_path / "a.spz")
+    theirs = gsply.read_spz(tmp_path / "a.spz")
+    np.testing.assert_allclose(theirs.means, ours.xyz, atol=1e-5)
+    np.testing.assert_allclose(theirs.scales, ours.log_scale, atol=1e-5)
+    np.testing.assert_allclose(theirs.quats, ours.rotation, atol=1e-5)
+    np.testing.assert_allclose(theirs.sh0, ours.sh[:, 0], atol=1e-5)
     np.testing.assert_allclose(theirs.shN, ours.sh[:, 1:], atol=1e-6)
     np.testing.assert_allclose(theirs.opacities, ours.opacity, atol=1e-3)

@@ -17,9 +17,8 @@ def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) meters and triangles (F, 3) of a ball of 10 cm, and a plate 6 cm above a part
     of it."""
     ball = trimesh.creation.icosphere(subdivisions, RADIUS)
-    plate = trimesh.creation.box(
-        (0.12, 0.01, 0.12), trimesh.transformations.translation_matrix((0.05, 0.16, 0.0))
-    )
+    place = trimesh.transformations.translation_matrix((0.05, 0.16, 0.0))
+    plate = trimesh.creation.box((0.12, 0.01, 0.12), place)
     both = trimesh.util.concatenate([ball, plate])
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
@@ -43,6 +42,20 @@ def blocked(points, direction, vertices, faces):
     return found
 
 
+def middle_splats(face: np.ndarray, log_scale: float, coefficients: int = 1) -> Splats:
+    """A gray splat in the middle of each of the triangles."""
+    zeros, turn = np.zeros((len(face), 3), np.float32), np.float32([1, 0, 0, 0])
+    return Splats(
+        xyz=zeros,
+        rotation=np.tile(turn, (len(face), 1)),
+        log_scale=zeros + np.float32(log_scale),
+        opacity=zeros[:, 0] + 3,
+        sh=np.zeros((len(face), coefficients, 3), np.float32),
+        face=face.astype(np.int32),
+        unbound=np.zeros(len(face), bool),
+    )
+
+
 def lit_avatar(albedo=(0.5, 0.3, 0.2), radiance=0.5, degree=0):
     """The ball and plate as an avatar: a splat in the middle of each triangle, recorded in even
     light; its colors are those of a surface of this albedo without highlights."""
@@ -51,18 +64,9 @@ def lit_avatar(albedo=(0.5, 0.3, 0.2), radiance=0.5, degree=0):
     light = uniform(np.full(3, radiance))
     arriving = transfer @ light
     arriving = arriving + Bounce(vertices, faces, occlusion).light(arriving)
-    skin = np.zeros(len(vertices), np.float32)
-    avatar_light = AvatarLight(
-        light.astype(np.float32), transfer, occlusion, arriving.astype(np.float32), skin, 0.0
-    )
-    count = len(faces)
+    skin, recorded = np.zeros(len(vertices), np.float32), arriving.astype(np.float32)
+    avatar_light = AvatarLight(light.astype(np.float32), transfer, occlusion, recorded, skin, 0.0)
+    splats = middle_splats(np.arange(len(faces)), -6, (degree + 1) ** 2)
     color = linear_to_srgb(arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_SHARE))
-    sh = np.zeros((count, (degree + 1) ** 2, 3), np.float32)
-    sh[:, 0] = (color - 0.5) / SH_C0
-    splats = Splats(
-        xyz=np.zeros((count, 3), np.float32),
-        rotation=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scale=np.full((count, 3), -6, np.float32), opacity=np.full(count, 3, np.float32), sh=sh,
-        face=np.arange(count, dtype=np.int32), unbound=np.zeros(count, bool),
-    )  # fmt: skip
+    splats.sh[:, 0] = (color - 0.5) / SH_C0
     return Avatar(splats, "stga", vertices.astype(np.float32), faces, light=avatar_light)

@@ -33,9 +33,8 @@ def test_lights():
     points = rng.normal(0, 0.1, (500, 3)).astype(np.float32)
     normals = rng.normal(0, 1, points.shape)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    table = np.concatenate(
-        [light_rows(light, np.zeros(3), n - 1) for n, light in enumerate(LIGHTS)]
-    )
+    rows = [light_rows(light, np.zeros(3), n - 1) for n, light in enumerate(LIGHTS)]
+    table = np.concatenate(rows)
     lit = rng.random((3, 500), np.float32)
     roughness = rng.choice(np.float32([0, 0.2, 0.45]), 500)
     rest = np.float32([0.1, 0.2, 0.7]), roughness, np.full(500, 0.04, np.float32), table, lit
@@ -58,9 +57,8 @@ def test_shadow_maps(light):
     assert (np.isfinite(depth[0]) != np.isfinite(depth[1])).mean() < 1e-3
     both = np.isfinite(depth[0]) & np.isfinite(depth[1])
     assert np.abs(depth[0][both] - depth[1][both]).mean() < 1e-6
-    places = np.concatenate([points, [[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]]]).astype(
-        np.float32
-    )
+    outside = np.float32([[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]])
+    places = np.concatenate([points, outside])
     bias = np.random.default_rng(0).uniform(0, 0.006, len(places)).astype(np.float32)
     for step in (0.0, 2.0):
         lit = [np.empty(len(places), np.float32) for _ in range(2)]

@@ -44,9 +44,8 @@ def run(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
-    assert (
-        stga("render", run, "--cameras", root / "transforms_val.json", "--out", out, *options) == 0
-    )
+    cameras = root / "transforms_val.json"
+    assert stga("render", run, "--cameras", cameras, "--out", out, *options) == 0
     with Image.open(sorted(out.iterdir())[0]) as image:
         return np.asarray(image).astype(int)
 
@@ -76,33 +75,18 @@ def test_a_training_that_is_to_leave_light_as_it_is(root, tmp_path, capsys):
     assert read_avatar(tmp_path / "run/avatar.npz").light is None
 
 
-def test_a_gray_card_sets_the_level(run: Path, tmp_path: Path, root: Path) -> None:
-    """Catches a card that is ignored: twice the light is half the albedo."""
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    found = []
-    for level in (0.5, 0.25):
-        value = str(1.055 * level ** (1 / 2.4) - 0.055)
-        assert main(["relight", str(copy), "--gray-card", f"{value},{value},{value}"]) == 0
-        light = read_avatar(copy / "avatar.npz").light
-        assert light is not None
-        assert light.source == "gray_card"
-        found.append(light.irradiance.mean(0))
-    # the ball of this capture has no red
-    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
-
-
-def test_a_running_trainings_avatar_is_kept(run, tmp_path, monkeypatch, capsys):
-    """Catches a light that is written into an older avatar than the one which a training saved
-    meanwhile."""
+def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
+    run, tmp_path, monkeypatch, capsys
+):
+    """Catches a card that is ignored: twice the light is half the albedo; and a light that is
+    written into an older avatar than the one which a training saved meanwhile."""
     copy = tmp_path / "run"
     shutil.copytree(run, copy)
     before = (copy / "avatar.npz").read_bytes()
     with locked(copy):  # as a training has it
         assert main(["relight", str(copy)]) == 2
-    assert (
-        f"another run is working in this folder (process {os.getpid()})" in capsys.readouterr().err
-    )
+    problem = f"another run is working in this folder (process {os.getpid()})"
+    assert problem in capsys.readouterr().err
     assert (copy / "avatar.npz").read_bytes() == before
 
     def estimate(*given: object) -> object:
@@ -111,10 +95,15 @@ def test_a_running_trainings_avatar_is_kept(run, tmp_path, monkeypatch, capsys):
         return estimate_light(*given)
 
     monkeypatch.setattr("stga_addon.light.estimate.estimate_light", estimate)
-    assert main(["relight", str(copy), "--gray-card", "0.5,0.5,0.5"]) == 0
-    light = read_avatar(copy / "avatar.npz").light
-    assert light is not None
-    assert light.source == "gray_card"
+    found = []
+    for level in (0.5, 0.25):
+        value = str(1.055 * level ** (1 / 2.4) - 0.055)
+        assert main(["relight", str(copy), "--gray-card", f"{value},{value},{value}"]) == 0
+        light = read_avatar(copy / "avatar.npz").light
+        assert light.source == "gray_card"
+        found.append(light.irradiance.mean(0))
+    # the ball of this capture has no red
+    np.testing.assert_allclose(found[0][1:], 2 * found[1][1:], rtol=2e-3)
 
 
 def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
@@ -165,16 +154,13 @@ def test_render_refuses(run, root, tmp_path, capsys):
     lights = tmp_path / "lights.toml"
     lights.write_text(LIGHTS)
     cameras = ["--cameras", str(root / "transforms_val.json"), "--out", str(tmp_path / "p")]
-    for arguments, message in (
-        (
-            [str(plain), "--capture", str(root), *cameras, "--light", str(lights)],
-            "stga relight RUN",
-        ),
-        ([str(run), *cameras, "--light-turn", "90"], "--light-turn: has no effect"),
-        ([str(run), *cameras, "--light", str(tmp_path / "none.hdr")], "none.hdr"),
+    for source, option, value, message in (
+        ([plain, "--capture", root], "--light", lights, "stga relight RUN"),
+        ([run], "--light-turn", 90, "--light-turn: has no effect"),
+        ([run], "--light", tmp_path / "none.hdr", "none.hdr"),
     ):
         capsys.readouterr()
-        assert main(["render", *arguments]) == 2
+        assert main(["render", *map(str, source), *cameras, option, str(value)]) == 2
         assert message in capsys.readouterr().err
 
 

@@ -35,17 +35,14 @@ def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
             continue
         data += struct.pack(">BBH", 2, 2, width)
         for channel in row.T:
+            rest = channel
             if len(set(channel)) == 1:
-                data += bytes(b for n in [min(127, width)] for b in (128 + n, channel[0]))
-                rest = channel[127:]
-            else:
-                rest = channel
+                data, rest = data + bytes([255, channel[0]]), channel[127:]
             for start in range(0, len(rest), 100):
                 part = rest[start : start + 100]
                 data += bytes([len(part)]) + part.tobytes()
-    path.write_bytes(
-        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n-Y %d +X %d\n" % (height, width) + data
-    )
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=1\n\n"
+    path.write_bytes(header + b"-Y %d +X %d\n" % (height, width) + data)
     return path
 
 
@@ -82,24 +79,20 @@ def test_an_environment_keeps_its_irradiance():
     assert 0.1 < suns[0].angle < 0.2
     for normal in (toward, np.array([1.0, 0, 0]), np.array([0, 0, -1.0])):
         truth = (image * angle[..., None] * np.maximum(vectors @ normal, 0)[..., None]).sum((0, 1))
-        sh = (basis(normal[None]) * LAMBERT @ world)[0] + suns[0].color * max(
-            -suns[0].direction @ normal, 0
-        )
-        np.testing.assert_allclose(sh, truth, rtol=0.02, atol=0.05)
-    np.testing.assert_allclose(
-        harmonics_of(image, np.eye(3))[0], world[0] + suns[0].color * 0.28209, rtol=1e-3
-    )
+        found = (basis(normal[None]) * LAMBERT @ world)[0]
+        found += suns[0].color * max(-suns[0].direction @ normal, 0)
+        np.testing.assert_allclose(found, truth, rtol=0.02, atol=0.05)
+    whole = harmonics_of(image, np.eye(3))
+    np.testing.assert_allclose(whole[0], world[0] + suns[0].color * 0.28209, rtol=1e-3)
 
 
 def test_lights_of_a_text_file(tmp_path):
     """Catches defaults, strength and color that are lost, and mistakes without a sentence."""
     path = tmp_path / "lights.toml"
-    path.write_text(
-        'world = [0.1, 0.2, 0.3]\nexposure = 1.5\n[[lights]]\nkind = "sun"\nstrength = 3\ncolor = '
-        "[1, 0.5, 0.25]\n"
-        'direction = [0, -2, 0]\n[[lights]]\nkind = "area"\nstrength = 10\nposition = [1, 1, '
-        "1]\nsize = [0.2, 0.4]\n"
-    )
+    sun = 'kind = "sun"\nstrength = 3\ncolor = [1, 0.5, 0.25]\ndirection = [0, -2, 0]'
+    area = 'kind = "area"\nstrength = 10\nposition = [1, 1, 1]\nsize = [0.2, 0.4]'
+    rest = "world = [0.1, 0.2, 0.3]\nexposure = 1.5"
+    path.write_text(f"{rest}\n[[lights]]\n{sun}\n[[lights]]\n{area}\n")
     lighting = read_lighting(path)
     np.testing.assert_allclose(lighting.lights[0].color, [3, 1.5, 0.75])
     np.testing.assert_allclose(lighting.lights[0].direction, [0, -1, 0])
@@ -109,10 +102,12 @@ def test_lights_of_a_text_file(tmp_path):
     np.testing.assert_allclose(around.lights[1].position, [1, 1, -1], atol=1e-9)
     for text, message in (
         ("lights = 3", "lights"),
-        ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"), ("sky = 1", "sky"),
-         ("world = ", "TOML"),
-        ('[[lights]]\nkind = "sun"\nstrength = -1', "strength"), ("roughness = 0", "roughness"),
-    ):  # fmt: skip
+        ('[[lights]]\nkind = "laser"\nstrength = 1', "kind"),
+        ('[[lights]]\nkind = "sun"\nstrength = -1', "strength"),
+        ("sky = 1", "sky"),
+        ("world = ", "TOML"),
+        ("roughness = 0", "roughness"),
+    ):
         path.write_text(text)
         with pytest.raises(StgaError, match=message):
             read_lighting(path)

@@ -1,8 +1,10 @@
 """Irradiance of lights against closed forms and Blender's path tracer, shadows against cast
 rays."""
 
+import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +44,8 @@ def test_units_are_blenders():
     """Catches a wrong factor of π, and a cosine or distance that is left out."""
     assert irradiance(CASES["sun"]) == pytest.approx(3 * np.sqrt(0.5), rel=1e-5)
     square = 0.25 + 0.25 + 4
-    assert irradiance(CASES["point"]) == pytest.approx(
-        100 / (4 * np.pi) / square * 2 / np.sqrt(square), rel=1e-5
-    )
+    expected = 100 / (4 * np.pi) / square * 2 / np.sqrt(square)
+    assert irradiance(CASES["point"]) == pytest.approx(expected, rel=1e-5)
     small = Light("area", np.ones(3) * 100, (0, 0, 2), size=(0.01, 0.01))
     assert irradiance(small) == pytest.approx(100 / np.pi / 4, rel=1e-4)
 
@@ -109,44 +110,30 @@ def blender_light(light: Light) -> dict:
         settings |= {"spot_size": light.cone, "spot_blend": light.blend, "shadow_soft_size": 0.0}
     if light.kind == "point":
         settings |= {"shadow_soft_size": 0.0}
-    vectors = {
-        "direction": light.direction.tolist(),
-        "position": light.position.tolist(),
-        "tangent": across.tolist(),
-    }
-    return {"kind": light.kind, "settings": settings, **vectors}
+    vectors = {"direction": light.direction, "position": light.position, "tangent": across}
+    lists = {name: vector.tolist() for name, vector in vectors.items()}
+    return {"kind": light.kind, "settings": settings, **lists}
 
 
 @pytest.mark.nightly
 def test_irradiance_is_the_path_tracers(tmp_path):
     """Catches a light whose fall-off, cone or area differs from what Cycles shows, beyond 2 %."""
     pytest.importorskip("bpy")
-    import json
-    from dataclasses import replace
-
-    cases = {
-        n: replace(v, tangent=np.cross(v.direction, (0.0, 1.0, 0.0))) for n, v in CASES.items()
-    }
-    wanted = json.dumps({name: blender_light(light) for name, light in cases.items()})
+    wanted = json.dumps({name: blender_light(light) for name, light in CASES.items()})
     command = [sys.executable, "-c", PATH_TRACER, wanted, str(tmp_path / "x.exr")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parent)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.split("FOUND")[1].splitlines()[0])
-    for name, light in cases.items():
-        assert irradiance(light) == pytest.approx(found[name], rel=0.02), name
+    for name, light in CASES.items():
+        turned = replace(light, tangent=np.cross(light.direction, (0.0, 1.0, 0.0)))
+        assert irradiance(turned) == pytest.approx(found[name], rel=0.02), name
 
 
-@pytest.mark.parametrize(
-    "light",
-    [
-        Light("sun", np.ones(3), direction=(-0.3, -1, 0.1)),
-        Light("point", np.ones(3), (0.3, 0.8, 0.2)),
-    ],
-    ids=["sun", "point"],
-)
-def test_shadows_are_those_of_cast_rays(light):
+@pytest.mark.parametrize("kind", ["sun", "point"])
+def test_shadows_are_those_of_cast_rays(kind):
     """Catches shadow maps in which the surface shades itself, that miss the plate, or put its
     shadow elsewhere."""
+    light = Light(kind, np.ones(3), (0.3, 0.8, 0.2), direction=(-0.3, -1, 0.1))
     vertices, faces = ball_and_plate(3)
     normals = vertex_normals(vertices, faces)
     points = vertices + LIFT_M * normals
@@ -155,19 +142,15 @@ def test_shadows_are_those_of_cast_rays(light):
         to_light = light.position - points
         to_light = to_light / np.linalg.norm(to_light, axis=1, keepdims=True)
     facing = (normals * to_light).sum(1) > 0.1
-    expected = np.array(
-        [not blocked(p[None], d, vertices, faces)[0] for p, d in zip(points, to_light, strict=True)]
-    )
-    assert 0.02 < (facing & ~expected).mean() < 0.5
-    with_shadow = Lamps(Lighting(lights=(light,)), vertices, faces).irradiance(points, normals)[
-        :, 0
-    ]
-    without = Lamps(Lighting(lights=(light,), shadows=False), vertices, faces).irradiance(
-        points, normals
-    )[:, 0]
-    lit = with_shadow[facing] / without[facing]
-    assert (np.abs(lit - expected[facing]) > 0.5).mean() < 0.02
-    assert np.abs(lit - expected[facing]).mean() < 0.04
+    rays = zip(points, to_light, strict=True)
+    expected = np.array([not blocked(p[None], d, vertices, faces)[0] for p, d in rays])[facing]
+    assert 0.02 < (~expected).sum() / len(facing) < 0.5
+    lights = Lighting(lights=(light,)), Lighting(lights=(light,), shadows=False)
+    lamps = [Lamps(lighting, vertices, faces) for lighting in lights]
+    found, without = (each.irradiance(points, normals)[facing, 0] for each in lamps)
+    lit = found / without
+    assert (np.abs(lit - expected) > 0.5).mean() < 0.02
+    assert np.abs(lit - expected).mean() < 0.04
 
 
 def test_another_object_throws_its_shadow():
@@ -178,25 +161,23 @@ def test_another_object_throws_its_shadow():
     top = np.array([[0.0, 0.1 + LIFT_M, 0.0]])
     up = np.array([[0.0, 1.0, 0.0]])
     wall = Caster(np.array([[-1.0, 1, -1], [1, 1, -1], [0, 1, 1]]), np.array([[0, 1, 2]]))
-    assert Lamps(sun, vertices[:162], ball).irradiance(top, up)[0, 0] == pytest.approx(1, abs=1e-3)
-    assert Lamps(sun, vertices[:162], ball, [wall]).irradiance(top, up)[0, 0] == pytest.approx(
-        0, abs=1e-3
-    )
+    for casters, expected in (([], 1), ([wall], 0)):
+        found = Lamps(sun, vertices[:162], ball, casters).irradiance(top, up)[0, 0]
+        assert found == pytest.approx(expected, abs=1e-3)
 
 
 def test_depth_of_a_large_triangle():
     """Catches a wall from near a lamp to the head whose depth is that of its corners' mean and not
     of its plane."""
     lamp = Light("point", np.ones(3), (0, 0, 1))
-    wall = Caster(
-        np.array([[0.0, 0.4, 0.9], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]]), np.array([[0, 1, 2]])
-    )
+    corners = np.array([[0.0, 0.4, 0.9], [-0.3, -0.2, 0.1], [0.3, -0.2, 0.1]])
+    wall = Caster(corners, np.array([[0, 1, 2]]))
     found = ShadowMap(AROUND, NO_FACES, lamp, [wall]).depth
     view = light_view(head_bounds(AROUND), lamp)
     y, x = (np.indices(found.shape) + 0.5 - view.size / 2) / view.scale
     rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ view.axes.T
-    normal = np.cross(*(wall.vertices[1:] - wall.vertices[0]))
-    expected = (wall.vertices[0] - lamp.position) @ normal / (rays @ normal)
+    normal = np.cross(*(corners[1:] - corners[0]))
+    expected = (corners[0] - lamp.position) @ normal / (rays @ normal)
     drawn = np.isfinite(found)
     assert drawn.mean() > 0.1
     assert np.ptp(expected[drawn]) > 0.1

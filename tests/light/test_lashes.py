@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from light.scenes import blocked, lit_avatar
+from light.scenes import blocked, lit_avatar, middle_splats
 from stga_addon.avatar.file import Avatar, AvatarLight
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
@@ -24,9 +24,8 @@ SUN = Light("sun", np.full(3, 3.0), direction=(0, -1, 0))
 def eye_below_a_lid() -> tuple[np.ndarray, np.ndarray]:
     """An eyeball around the origin, and behind it a small plate at LID_HEIGHT whose normal is y."""
     ball = trimesh.creation.icosphere(4, EYE_RADIUS)
-    lid = trimesh.creation.box(
-        (0.02, 0.002, 0.01), trimesh.transformations.translation_matrix((0, 0.015, -0.004))
-    )
+    place = trimesh.transformations.translation_matrix((0, 0.015, -0.004))
+    lid = trimesh.creation.box((0.02, 0.002, 0.01), place)
     both = trimesh.util.concatenate([ball, lid.subdivide().subdivide()])
     return np.array(both.vertices), np.array(both.faces, np.int32)
 
@@ -37,26 +36,14 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
     transfer, occlusion = transfer_of(vertices, faces, 64)
     irradiance = np.full((len(vertices), 3), np.pi, np.float32)
     wet = np.where(np.linalg.norm(vertices, axis=1) < 0.0121, 0.2, 0).astype(np.float32)
-    light = AvatarLight(
-        uniform(np.ones(3)).astype(np.float32), transfer, occlusion, irradiance, wet, 0.0
-    )
-    count = len(faces) + 1
+    radiance = uniform(np.ones(3)).astype(np.float32)
+    light = AvatarLight(radiance, transfer, occlusion, irradiance, wet, 0.0)
     top = np.flatnonzero(vertices[faces][:, :, 1].min(1) > LID_HEIGHT - 1e-6)
-    splats = Splats(
-        xyz=np.zeros((count, 3), np.float32),
-        rotation=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-        log_scale=np.full((count, 3), -9, np.float32),
-        opacity=np.full(count, 3, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-        face=np.append(np.arange(len(faces)), top[0]).astype(np.int32),
-        unbound=np.zeros(count, bool),
-    )
+    splats = middle_splats(np.append(np.arange(len(faces)), top[0]), -9)
     avatar = Avatar(splats, "stga", vertices.astype(np.float32), faces, light=light)
     frames = avatar.frames(vertices)
-    splats.xyz[-1] = frames.rotation[top[0]].T @ (
-        np.array([0, LID_HEIGHT, 0]) + offset - frames.origin[top[0]]
-    )
-    splats.log_scale[-1] = np.log([0.0002, 0.0002, 0.0002])
+    place = np.array([0, LID_HEIGHT, 0]) + offset - frames.origin[top[0]]
+    splats.xyz[-1] = frames.rotation[top[0]].T @ place
     # The axes of the card are x and z of the world: turned about the lid's normal from the
     # triangle's.
     axes = np.eye(4)
@@ -87,15 +74,13 @@ def test_a_lash_shades_the_eye_as_cast_rays_say():
     faces = np.concatenate([avatar.faces, len(vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
     up = normals[:, 1] > 0.5
     eye = np.flatnonzero(up & (np.linalg.norm(points, axis=1) < EYE_RADIUS))
-    dark = blocked(points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), with_lid, faces)
-    alone = blocked(
-        points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0]), vertices, avatar.faces
-    )
+    lifted, sunward = points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0])
+    dark = blocked(lifted, sunward, with_lid, faces)
+    alone = blocked(lifted, sunward, vertices, avatar.faces)
     assert 20 < (dark & ~alone).sum() < (~alone).sum() - 20
-    lit = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0))[eye, 1]
-    open_ = relighter.radiance(vertices, EYE, Lighting(lights=(SUN,), specular=0, shadows=False))[
-        eye, 1
-    ]
+    lighting = Lighting(lights=(SUN,), specular=0)
+    lit = relighter.radiance(vertices, EYE, lighting)[eye, 1]
+    open_ = relighter.radiance(vertices, EYE, replace(lighting, shadows=False))[eye, 1]
     assert ((lit < 0.5 * open_) == dark).mean() > 0.9  # but for the soft edge
     assert (lit[dark & ~alone] < 0.5 * open_[dark & ~alone]).mean() > 0.9
 
@@ -115,18 +100,16 @@ def test_the_viewport_draws_lashes_into_its_shadow_maps():
 
 def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
     """Catches shadows of bright skin, of splats on the mesh, and of hair far from the eyes."""
-    relighters = {
-        "bright": Relighter(avatar_with((0, 0.003, 0.006), color=0.7)),
-        "on the mesh": Relighter(avatar_with((0, 0.001, 0.0))),
-        "far": Relighter(avatar_with((0, 0.03, 0.0))),
-    }
     avatar = avatar_with((0, 0.003, 0.006))
-    assert avatar.light is not None
     dry = replace(avatar.light, roughness=np.zeros_like(avatar.light.roughness))
-    relighters["no eyes"] = Relighter(replace(avatar, light=dry))
-    assert {name: len(each.lashes.face) for name, each in relighters.items()} == dict.fromkeys(
-        relighters, 0
-    )
+    others = {
+        "bright": avatar_with((0, 0.003, 0.006), color=0.7),
+        "on the mesh": avatar_with((0, 0.001, 0.0)),
+        "far": avatar_with((0, 0.03, 0.0)),
+        "no eyes": replace(avatar, light=dry),
+    }
+    for name, other in others.items():
+        assert not len(Relighter(other).lashes.face), name
 
 
 def test_splats_are_at_the_nearest_point_of_the_mesh():
@@ -137,9 +120,7 @@ def test_splats_are_at_the_nearest_point_of_the_mesh():
     ball = avatar.faces[np.linalg.norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]
     ball = ball[avatar.neutral[ball].mean(1)[:, 2] > -0.07]  # with a border
     xyz = (rng.normal(0, 1, (len(ball), 3)) * [1.0, 1.0, 0.1]).astype(np.float32)
-    splats = replace(
-        avatar.splats.rows(np.arange(len(ball))), xyz=xyz, face=np.arange(len(ball), dtype=np.int32)
-    )
+    splats = replace(middle_splats(np.arange(len(ball)), -6), xyz=xyz)
     avatar = replace(avatar, splats=splats, faces=ball)
     frames = avatar.frames(avatar.neutral)
     points = frames.origin + frames.scale[:, None] * np.einsum("nij,nj->ni", frames.rotation, xyz)

@@ -1,22 +1,24 @@
-"""Relit colors of an avatar whose truth is known: a ball of one albedo under a plate."""
+"""Relit colors of an avatar whose truth is known, a ball of one albedo under a plate; and what a
+scene's light keeps of recorded colors."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from light.scenes import lit_avatar
 from stga_addon.avatar.splats import sh_color
 from stga_addon.capture.color import srgb_to_linear
 from stga_addon.capture.mesh_geometry import vertex_normals
-from stga_addon.errors import StgaError
 from stga_addon.light import relight
-from stga_addon.light.harmonics import even_directions, rotated, uniform
-from stga_addon.light.relight import Relighter
+from stga_addon.light.harmonics import basis, even_directions, rotated, uniform
+from stga_addon.light.relight import Relighter, kept, kept_shares
 from stga_addon.light.values import Light, Lighting
 
 EYE = np.array([0.0, 0.0, 1.0])
 ALBEDO = (0.5, 0.3, 0.2)
+TINT = np.array([1.4, 1.0, 0.6])
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +28,7 @@ def relighter() -> Relighter:
 
 def turned(mesh: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """The mesh turned about y and moved; and the rotation."""
-    a = np.radians(degrees)
-    rotation = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    rotation = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
     return mesh @ rotation.T + [0.3, 0.1, -0.2], rotation
 
 
@@ -39,9 +40,9 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
 
 def normals_of(relighter):
     """(N, 3) the neutral mesh's smooth normals at the splats."""
-    normals = relighter._at_splats(
-        vertex_normals(relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces)
-    )
+    mesh, faces = relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces
+    normals = vertex_normals(mesh, faces)[relighter.corners]
+    normals = np.einsum("nk,nkc->nc", relighter.weights, normals)
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
@@ -51,9 +52,8 @@ def test_a_sun_gives_lamberts_cosine(relighter):
     sun = Light("sun", np.array([2.0, 2.0, 2.0]), direction=(0, 1, 0))
     lit = relighter.radiance(relighter.avatar.neutral, EYE, Lighting(lights=(sun,), specular=0))
     normals = normals_of(relighter)
-    down = (normals[:, 1] < -0.3) & (
-        np.linalg.norm(relighter.avatar.neutral[relighter.corners[:, 0]], axis=1) < 0.101
-    )
+    radius = np.linalg.norm(relighter.avatar.neutral[relighter.corners[:, 0]], axis=1)
+    down = (normals[:, 1] < -0.3) & (radius < 0.101)
     assert down.sum() > 100
     expected = np.array(ALBEDO) * 2 * -normals[down, 1:2] / np.pi
     np.testing.assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
@@ -77,11 +77,8 @@ def test_light_that_turns_with_the_head_changes_nothing(relighter):
 
 def test_a_still_head_under_still_light_does_not_flicker(relighter):
     """Catches anything random, or a state that one frame leaves to the next."""
-    mesh, lamp = (
-        relighter.avatar.neutral,
-        Light("spot", np.ones(3) * 40, (0.2, 0.3, 0.8), direction=(-0.2, -0.3, -0.8)),
-    )
-    lighting = Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
+    lamp = Light("spot", np.ones(3) * 40, (0.2, 0.3, 0.8), direction=(-0.2, -0.3, -0.8))
+    mesh, lighting = relighter.avatar.neutral, Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
     first = relighter.colors(mesh, EYE, lighting)
     relighter.colors(turned(mesh, 20)[0], EYE, Lighting(uniform((1, 1, 1))))
     np.testing.assert_array_equal(relighter.colors(mesh, EYE, lighting), first)
@@ -96,13 +93,9 @@ def test_recorded_and_mix(relighter):
     recorded = relighter.colors(mesh, EYE, replace(lighting, mode="recorded"))
     np.testing.assert_allclose(recorded, sh_color(sh, np.tile(EYE, (len(sh), 1))), atol=1e-5)
     scene = relighter.colors(mesh, EYE, lighting)
-    half = relighter.colors(mesh, EYE, replace(lighting, mode="mix", mix=0.25))
-    np.testing.assert_allclose(
-        srgb_to_linear(half),
-        0.25 * srgb_to_linear(scene) + 0.75 * srgb_to_linear(recorded),
-        rtol=1e-3,
-        atol=1e-4,
-    )
+    mixed = relighter.colors(mesh, EYE, replace(lighting, mode="mix", mix=0.25))
+    expected = 0.25 * srgb_to_linear(scene) + 0.75 * srgb_to_linear(recorded)
+    np.testing.assert_allclose(srgb_to_linear(mixed), expected, rtol=1e-3, atol=1e-4)
 
 
 def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
@@ -110,53 +103,94 @@ def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypa
     white; also where nothing of the recorded colors is kept."""
     monkeypatch.setattr(relight, "UNLIKE_LIGHT", 1e-12)
     own = Lighting(relighter.light.radiance)
-    lit = relighter.radiance(relighter.avatar.neutral, EYE, own)
-    recorded = relighter.radiance(relighter.avatar.neutral, EYE, replace(own, mode="recorded"))
+    mesh = relighter.avatar.neutral
+    lit = relighter.radiance(mesh, EYE, own)
+    recorded = relighter.radiance(mesh, EYE, replace(own, mode="recorded"))
     open_ = relighter.light.occlusion[relighter.corners].min(1) > 0.5
-    facing = normals_of(relighter)
-    seen = open_ & (facing[:, 2] > 0.8)
+    seen = open_ & (normals_of(relighter)[:, 2] > 0.8)
     np.testing.assert_allclose(lit[seen], recorded[seen], rtol=0.06)
-    bright = relighter.radiance(
-        relighter.avatar.neutral, EYE, replace(own, exposure=1.0, white=(1.0, 2.0, 0.5))
-    )
+    bright = relighter.radiance(mesh, EYE, replace(own, exposure=1.0, white=(1.0, 2.0, 0.5)))
     np.testing.assert_allclose(bright, lit * np.float32([2, 1, 4]), rtol=1e-5)
 
 
-def test_color_that_depends_on_the_view_is_no_albedo():
-    """Catches highlights that were baked into harmonics and would stay where the recorded light put
-    them."""
-    plain, glossy = lit_avatar(ALBEDO), lit_avatar(ALBEDO, degree=1)
-    normals = Relighter(plain).avatar.frames(plain.neutral).rotation[:, :, 2]
-    sh = glossy.splats.sh.copy()
-    straight_on = np.stack([normals[:, 1], -normals[:, 2], normals[:, 0]], axis=1)
-    sh[:, 1:] = 0.2 * straight_on[..., None]
-    glossy = replace(glossy, splats=replace(glossy.splats, sh=sh))
-    seen_straight = sh_color(sh, -normals) - sh_color(plain.splats.sh, -normals)
-    mean = Relighter(glossy).diffuse_color - Relighter(plain).diffuse_color
-    assert seen_straight.mean() > 0.05
-    assert np.std(mean) < 0.3 * seen_straight.mean()
-    assert (mean < seen_straight).all()
-
-
 def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
-    """Catches a factor of a degree, or a direction, that is not that of the mean: against sampled
-    directions."""
+    """Catches highlights that were baked into harmonics and count as albedo, a factor of a degree,
+    or a direction, that is not that of the mean: against sampled directions."""
     avatar = lit_avatar(ALBEDO, degree=3)
     sh = np.random.default_rng(0).normal(0, 0.1, avatar.splats.sh.shape).astype(np.float32)
     relighter = Relighter(replace(avatar, splats=replace(avatar.splats, sh=sh)))
-    mesh = avatar.neutral.astype(np.float64)
-    normals = np.einsum(
-        "nk,nkc->nc", relighter.weights, vertex_normals(mesh, avatar.faces)[relighter.corners]
-    )[:40]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     directions = even_directions(4000)
-    for normal, coefficients, found in zip(normals, sh, relighter.diffuse_color, strict=False):
+    rows = zip(normals_of(relighter)[:40], sh, relighter.diffuse_color, strict=False)
+    for normal, coefficients, found in rows:
         seen = directions[directions @ normal > 0.3]
         colors = sh_color(np.broadcast_to(coefficients, (len(seen), *coefficients.shape)), -seen)
         np.testing.assert_allclose(found, colors.mean(0), atol=1e-3)
 
 
-def test_an_avatar_without_light_says_so():
-    """Catches a traceback where the light was never estimated."""
-    with pytest.raises(StgaError, match="stga relight"):
-        Relighter(replace(lit_avatar(ALBEDO), light=None))
+def studio() -> np.ndarray:
+    """(9, 3) harmonics that are brighter from the front and above."""
+    light = uniform((0.5, 0.45, 0.4))
+    light[1:3] = [[0.3] * 3, [0.5, 0.4, 0.4]]
+    return light
+
+
+def relighter_of(light: np.ndarray) -> Relighter:
+    """Of the ball as it would have been recorded in a light (9, 3)."""
+    avatar = lit_avatar(degree=1)
+    assert avatar.light is not None
+    relighter = Relighter(avatar)
+    arriving = avatar.light.transfer @ light
+    arriving = (arriving + relighter.bounce.light(arriving)).astype(np.float32)
+    avatar.splats.sh[:, 1:] = 0.05
+    return Relighter(replace(avatar, light=replace(avatar.light, irradiance=arriving)))
+
+
+def test_the_captures_light_is_found_in_the_heads_axes():
+    """Catches light between skin and skin that is taken for the studio's, and channels that are
+    exchanged."""
+    np.testing.assert_allclose(relighter_of(studio()).recorded_light, studio(), atol=0.01)
+
+
+def test_the_captures_own_light_keeps_all_that_was_recorded():
+    """Catches highlights of the studio that are lost under it, a tint or level that is not that of
+    the light, and a head that turns away from its studio or takes the studio along."""
+    relighter = relighter_of(studio())
+    mesh = relighter.avatar.neutral.astype(np.float64)
+    recorded = relighter.radiance(mesh, EYE, Lighting(mode="recorded"))
+    tinted = relighter.radiance(mesh, EYE, Lighting(studio() * TINT))
+    np.testing.assert_allclose(tinted, recorded * TINT, rtol=0.03)
+    aside, turn = turned(mesh, 90)
+    along = Lighting(rotated(studio(), turn))
+    there = relighter.radiance(aside, EYE, replace(along, mode="recorded"))
+    np.testing.assert_allclose(relighter.radiance(aside, EYE, along), there, rtol=0.03)
+    assert share_kept(relighter, studio()) > 0.99
+    assert relighter.distant_in_head(aside, Lighting(studio()))[1].share < 0.1
+
+
+def share_kept(relighter: Relighter, world: np.ndarray, *lights: Light, **options: float) -> float:
+    lighting = Lighting(world, lights, **options)
+    return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].share
+
+
+def test_another_light_and_other_highlights_keep_nothing():
+    """Catches recorded shades that shine through under a light from elsewhere, a share that jumps
+    while the light moves away, and highlights of the capture that stay although others, or none,
+    are asked for."""
+    relighter = relighter_of(studio())
+    lamps = [Light("sun", np.full(3, x), direction=(1, 0.2, 0)) for x in np.linspace(0, 3, 61)]
+    shares = [share_kept(relighter, studio(), lamp) for lamp in lamps]
+    steps = -np.diff(shares)
+    assert shares[0] > 0.99
+    assert shares[-1] == 0
+    assert (steps >= 0).all()
+    assert steps.max() < 0.1
+    assert share_kept(relighter, studio(), specular=0.0) == 0
+    assert share_kept(relighter, studio(), roughness=0.9) == 0
+
+
+def test_shadows_of_other_objects_stay():
+    """Catches a shadow that vanishes because the light as a whole is the capture's."""
+    same = kept(studio(), 2 * studio())
+    irradiance = np.maximum(basis(np.eye(3)) @ studio(), 0.1).astype(np.float32)
+    arriving = irradiance * np.float32([[2], [1.9], [0.3]])
+    np.testing.assert_allclose(kept_shares(same, arriving, irradiance), [1, 1, 0], atol=1e-6)

@@ -155,8 +155,7 @@ def test_the_server_renders_on_the_wanted_device(
     np.testing.assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
     assert subprocess.Popen.poll(first) is not None
     device[0] = "gpu:Voodoo 2"
-    with pytest.raises(
-        StgaError, match=r"could not render the image \(--device gpu:Voodoo 2: no adapter"
-    ):
+    sentence = r"could not render the image \(--device gpu:Voodoo 2: no adapter"
+    with pytest.raises(StgaError, match=sentence):
         remote.compose(layers, CAMERA)
     remote.close()

@@ -12,12 +12,11 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
 from stga_addon.jobs.blender import RenderRecording
-from stga_addon.jobs.folder import write_request
-from stga_addon.jobs.perform import perform_in_folder
+from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
 from stga_addon.render.server import pack_layers, unpack_layers
-from stga_addon.render.video import Recorder, check_output, finished
+from stga_addon.render.video import Recorder, finished
 from stga_addon.worker.status import inspect_worker, request_cancel
 
 IMAGES = "recording.bin"
@@ -131,12 +130,3 @@ def test_a_full_disk_while_recording(tmp_path: Path) -> None:
     with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
         recorder.close()
     recorder.close()
-
-
-@pytest.mark.parametrize("output", ["file/video.mp4", "folder.mp4", "file"])
-def test_an_output_that_cannot_be_written(tmp_path: Path, output: str) -> None:
-    """Catches a path that is refused only after everything was rendered."""
-    (tmp_path / "file").write_text("")
-    (tmp_path / "folder.mp4").mkdir()
-    with pytest.raises(StgaError, match="cannot be written"):
-        check_output(tmp_path / output)

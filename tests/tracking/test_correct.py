@@ -12,7 +12,7 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward, frame_of
-from stga_addon.jobs.folder import write_request
+from stga_addon.jobs.perform import write_request
 from stga_addon.jobs.track import SolveAgain
 from stga_addon.tracking.correct import SOLVED_FILE, correct_capture, corrected
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, REPORT_FILE

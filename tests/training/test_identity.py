@@ -20,8 +20,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
-from stga_addon.jobs.folder import request_folder, write_request
-from stga_addon.jobs.perform import perform
+from stga_addon.jobs.perform import perform, request_folder, write_request
 from stga_addon.jobs.train import Resume
 from stga_addon.progress import Progress
 from stga_addon.render import device as device_choice

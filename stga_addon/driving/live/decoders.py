@@ -1,6 +1,7 @@
 """Datagrams of Live Link Face and of the Virtual Motion Capture protocol (OSC) as ARKit weights."""
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -12,22 +13,20 @@ from ..performance import (
     ARKIT_SHAPES,
     COLUMN,
     COUNT,
-    EXCHANGEABLE,
     MAX_WEIGHT,
     OPTIONAL,
     FacePacket,
     arkit_name,
+    mirrored_name,
 )
 
 VERSION = 6
 MAX_TEXT_BYTES = 512
 ROTATIONS = 9  # Yaw, pitch and roll of the head and of both eyes, after the shapes
-_EXCHANGED = {
-    f"{pair}{side}": f"{pair}{other}"
-    for pair in EXCHANGEABLE
-    for side, other in (("Left", "Right"), ("Right", "Left"))
-}
-PACKET_SHAPES = tuple(_EXCHANGED.get(name, name) for name in ARKIT_SHAPES)
+PACKET_SHAPES = tuple(
+    mirrored_name(name) if re.fullmatch("(jaw|mouth)(Left|Right)", name) else name
+    for name in ARKIT_SHAPES
+)
 """In the order of the packets, which have the left of jaw and mouth first, unlike the app's CSV
 files."""
 

@@ -43,12 +43,7 @@ class Source:
 
 def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, Any], Decoded | None]:
     """A decoder of datagrams that are frames by themselves."""
-
-    def decoded(data: bytes, _: Any) -> Decoded | None:
-        packet = decode(data)
-        return None if packet is None else (packet, None)
-
-    return decoded
+    return lambda data, _: None if (packet := decode(data)) is None else (packet, None)
 
 
 SOURCES = {
@@ -95,10 +90,8 @@ class Receiver:
         except OSError as error:
             self._socket.close()
             problem = f"port {self.port} of {where} cannot be opened ({error.strerror or error})"
-            raise StgaError(
-                f"{source.label}: {problem}; another program may be listening on it, or this "
-                "computer has no such address"
-            ) from error
+            reason = "another program may be listening on it, or this computer has no such address"
+            raise StgaError(f"{source.label}: {problem}; {reason}") from error
         self.port = self._socket.getsockname()[1]
 
     def read(self) -> list[tuple[str, bytes]]:

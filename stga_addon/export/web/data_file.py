@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,10 +15,11 @@ from ...avatar.splats import Splats
 from ...capture.mesh_geometry import weighted_procrustes
 from ...flame.forward import joint_positions
 from ...flame.model import JOINTS
-from ...flame.quaternions import from_matrices, normalized, to_axis_angle
+from ...flame.quaternions import from_matrices, to_axis_angle
 from ...flame.sequence import FlameSequence, with_identity
 from ...light.relight import Relighter
 from ..playback import Playback
+from ..spz import smallest_three
 
 MAGIC = b"STGA"
 FORMAT, VERSION = "stga-web", 2
@@ -42,16 +44,12 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint
     Integers are stored exactly. Equal contents give equal bytes. Raises ValueError where a value is
     not finite, or too many steps from zero.
     """
-    entries: dict[str, Any] = {}
-    blocks = []
-    for name, array in arrays.items():
-        entries[name], block = _entry(name, array)
-        blocks.append(block)
+    packed = {name: _entry(name, array) for name, array in arrays.items()}
+    entries = {name: entry for name, (entry, _) in packed.items()}
     complete = {"format": FORMAT, "version": VERSION, **header, "arrays": entries}
     text = json.dumps(complete, ensure_ascii=False, allow_nan=False).encode("utf-8")
-    raw = b"".join(
-        (MAGIC, VERSION.to_bytes(4, "little"), len(text).to_bytes(4, "little"), text, *blocks)
-    )
+    begin = MAGIC + struct.pack("<II", VERSION, len(text))
+    raw = b"".join((begin, text, *(block for _, block in packed.values())))
     return gzip.compress(raw, GZIP_LEVEL, mtime=0)
 
 
@@ -60,9 +58,8 @@ def _entry(name: str, array: np.ndarray | FixedPoint) -> tuple[dict[str, Any], b
     if isinstance(array, FixedPoint):
         steps = np.rint(np.asarray(array.values, np.float64) / array.step)
         if not (np.abs(steps) < MAX_STEPS).all():
-            raise ValueError(
-                f"{name} holds a value that is not finite, or beyond {MAX_STEPS * array.step:g}"
-            )
+            limit = MAX_STEPS * array.step
+            raise ValueError(f"{name} holds a value that is not finite, or beyond {limit:g}")
         integers, entry = steps.astype(np.int64), {"type": "fixed", "step": array.step}
     elif array.dtype.kind in "iub":
         integers, entry = array.astype(np.int64), {"type": "integer"}
@@ -129,9 +126,8 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
     offsets = [frame.dynamic_offset for frame in frames]
     if any(offset is not None for offset in offsets):
         zero = np.zeros_like(model.v_template)
-        shapes, factors = principal_shapes(
-            np.stack([zero if offset is None else offset for offset in offsets])
-        )
+        moved = np.stack([zero if offset is None else offset for offset in offsets])
+        shapes, factors = principal_shapes(moved)
         expressions = np.concatenate([expressions, shapes])
         coefficients = np.concatenate([coefficients, factors], axis=1)
     return WebRig(
@@ -184,22 +180,18 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
 
 def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shapes (R, V, 3) and coefficients (T, R) in −1…1 with products near offsets (T, V, 3)."""
-    frames, vertices = offsets.shape[:2]
-    flat = offsets.reshape(frames, -1)
+    flat = offsets.reshape(len(offsets), -1)
     _, directions = np.linalg.eigh(flat @ flat.T)
     directions = directions[:, ::-1]  # largest first
     shapes, rest = [], flat.copy()
     for column in directions.T:
-        if (
-            not frames
-            or np.linalg.norm(rest.reshape(frames, vertices, 3), axis=2).max() <= BAKE_TOLERANCE_M
-        ):
+        if np.linalg.norm(rest.reshape(-1, 3), axis=1).max() <= BAKE_TOLERANCE_M:
             break
         shapes.append(column @ flat)
         rest -= np.outer(column, shapes[-1])
     coefficients = directions[:, : len(shapes)]
     largest = np.abs(coefficients).max(0) if shapes else np.ones(0)
-    basis = np.array(shapes).reshape(-1, vertices, 3) * largest[:, None, None]
+    basis = np.array(shapes).reshape(-1, *offsets.shape[1:]) * largest[:, None, None]
     return basis, coefficients / largest
 
 
@@ -312,10 +304,9 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     if exact:
-        arrays = {
-            name: a.values.astype(np.float32) if isinstance(a, FixedPoint) else a
-            for name, a in arrays.items()
-        }
+        for name, array in arrays.items():
+            if isinstance(array, FixedPoint):
+                arrays[name] = array.values.astype(np.float32)
     return pack(header, arrays)
 
 
@@ -332,7 +323,7 @@ def _sliders(rig: WebRig) -> list[dict[str, Any]]:
 
 
 def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
-    largest, smaller = _smallest_three(splats.rotation)
+    largest, smaller = smallest_three(splats.rotation)
     arrays: Arrays = {
         "xyz": FixedPoint(splats.xyz, POSITION_STEP_M / local_unit),
         "rotation": FixedPoint(smaller, ROTATION_STEP),
@@ -349,21 +340,10 @@ def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
     return arrays
 
 
-def _smallest_three(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index (N,) of the part of largest magnitude of quaternions (N, 4), and the others (N, 3) in
-    order, of the unit quaternion whose largest part is positive. A zero quaternion counts as the
-    identity."""
-    q = normalized(rotation)
-    largest = np.abs(q).argmax(1)
-    q *= np.where(np.take_along_axis(q, largest[:, None], 1) < 0, -1, 1)
-    others = np.array([[k for k in range(4) if k != left_out] for left_out in range(4)])[largest]
-    return largest.astype(np.uint8), np.take_along_axis(q, others, 1)
-
-
 def _light_arrays(relighter: Relighter, order: np.ndarray, local_unit: float) -> Arrays:
     """How vertices receive light, and did in the capture; triangles of splats; lashes."""
     light, lashes, faces = relighter.light, relighter.lashes, len(relighter.avatar.faces)
-    largest = float(light.irradiance.max(initial=1e-6))
+    largest, corner_step = float(light.irradiance.max(initial=1e-6)), POSITION_STEP_M / local_unit
     return {
         "light_transfer": FixedPoint(light.transfer, TRANSFER_STEP),
         "light_occlusion": FixedPoint(light.occlusion, SHARE_STEP),
@@ -372,7 +352,5 @@ def _light_arrays(relighter: Relighter, order: np.ndarray, local_unit: float) ->
         # of most splats 0: their own
         "light_face": ((relighter.face - relighter.avatar.splats.face) % faces)[order],
         "light_lash_face": lashes.face,
-        "light_lash_corners": FixedPoint(
-            lashes.corners.reshape(-1, 12), POSITION_STEP_M / local_unit
-        ),
+        "light_lash_corners": FixedPoint(lashes.corners.reshape(-1, 12), corner_step),
     }

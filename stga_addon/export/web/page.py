@@ -79,19 +79,19 @@ MESH_NOTICE = f"Contains the triangles and the posed meshes of a FLAME head{FLAM
 
 
 def write_web(
-    path: Path, avatar: Avatar, playback: Playback, meshes: Iterable[np.ndarray] = (),
+    path: Path, avatar: Avatar, playback: Playback, meshes: Iterable[tuple[int, np.ndarray]] = (),
     sequence: FlameSequence | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
     the files.
 
     sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else
-              the posed `meshes` (V, 3) meters are baked, of which there is one at least
+              the numbered posed `meshes` are baked, of which there is one at least
     Raises StgaError where there is no pose, or a file cannot be written.
     """
     motion = None if playback.motion_only else sequence
     try:
-        rig = baked_rig(list(meshes)) if motion is None else flame_rig(motion)
+        rig = baked_rig([mesh for _, mesh in meshes]) if motion is None else flame_rig(motion)
         data = data_file(avatar, rig, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error

@@ -17,7 +17,7 @@ world.ply       what stands still behind the person, in world space; only where 
 
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from ...flame.forward import FlameFrame, frame_of
 from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
-from ...worker.lock import hold_lock, lock_owner
+from ...worker.lock import hold_folder
 from ..effect_decisions import EffectDecision
 from ..settings import TrainingSettings
 from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
@@ -152,16 +152,7 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises StgaError while another process holds the folder.
     """
-    path = folder / "run.lock"
-    with ExitStack() as lock:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(hold_lock(path))
-        except BlockingIOError as error:
-            text = f"another run is working in this folder (process {lock_owner(path)})"
-            raise StgaError(f"{folder}: {text}") from error
-        except OSError as error:
-            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    with hold_folder(folder, "run.lock", "run is working in this folder"):
         remove_leftovers(folder)
         yield
 

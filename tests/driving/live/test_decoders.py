@@ -11,12 +11,8 @@ from hypothesis import strategies as st
 
 from stga_addon.driving import read_performance
 from stga_addon.driving.head_map import head_turns
-from stga_addon.driving.live.decoders import (
-    Received,
-    decode_live_link_face,
-    decode_vmc,
-    osc_messages,
-)
+from stga_addon.driving.live import decoders
+from stga_addon.driving.live.decoders import Received, decode_live_link_face, decode_vmc
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN
 
 from . import wire
@@ -46,9 +42,8 @@ def test_live_link_face_with_other_counts():
     assert as_dict(packet.weights) == pytest.approx({**weights, "tongueOut": 0.0})
     assert packet.head is None
     assert "tongueOut" not in packet.names
-    assert as_dict(
-        decode_live_link_face(wire.live_link_face(weights, count=52)).weights
-    ) == pytest.approx(weights)
+    packet = decode_live_link_face(wire.live_link_face(weights, count=52))
+    assert as_dict(packet.weights) == pytest.approx(weights)
     for absent in (wire.live_link_face({}, count=0), wire.live_link_face({}, count=0) + b"\0"):
         packet = decode_live_link_face(absent)
         assert packet is not None
@@ -64,11 +59,7 @@ def test_packets_of_pylivelinkface():
     name = b"Python_LiveLinkFace"
     values = np.linspace(0, 1, 61)
     data = struct.pack("<I", 6) + device.encode() + struct.pack("!i", len(name)) + name
-    data += (
-        struct.pack("!II", 600, 1056060032)
-        + struct.pack("!II", 60, 1)
-        + struct.pack("!B61f", 61, *values)
-    )
+    data += struct.pack("!IIIIB61f", 600, 1056060032, 60, 1, 61, *values)
     packet = decode_live_link_face(data)
     assert packet.subject == name.decode()
     assert packet.time == pytest.approx((600 + 0.47295) / 60, abs=1e-5)
@@ -83,9 +74,8 @@ def test_facial_mocap():
         packet = read_performance.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
         assert as_dict(packet.weights) == pytest.approx(weights)
         assert packet.head == pytest.approx(np.radians([20, 10, 30]))
-    assert read_performance.parse_packet(b"mouthSmile_L&-5|jawOpen&12|").weights[
-        COLUMN["mouthSmileLeft"]
-    ] == pytest.approx(-0.05)
+    packet = read_performance.parse_packet(b"mouthSmile_L&-5|jawOpen&12|")
+    assert packet.weights[COLUMN["mouthSmileLeft"]] == pytest.approx(-0.05)
 
 
 def osc_text(text: str) -> bytes:
@@ -93,20 +83,15 @@ def osc_text(text: str) -> bytes:
 
 
 def blend(name: str, value: float) -> bytes:
-    return (
-        osc_text("/VMC/Ext/Blend/Val") + osc_text(",sf") + osc_text(name) + struct.pack(">f", value)
-    )
+    return b"".join(map(osc_text, ("/VMC/Ext/Blend/Val", ",sf", name))) + struct.pack(">f", value)
 
 
 APPLY = osc_text("/VMC/Ext/Blend/Apply") + osc_text(",")
 
 
 def bundle(*messages: bytes) -> bytes:
-    return (
-        osc_text("#bundle")
-        + struct.pack(">Q", 1)
-        + b"".join(struct.pack(">i", len(m)) + m for m in messages)
-    )
+    parts = b"".join(struct.pack(">i", len(message)) + message for message in messages)
+    return osc_text("#bundle") + struct.pack(">Q", 1) + parts
 
 
 def test_vmc_by_hand():
@@ -114,18 +99,15 @@ def test_vmc_by_hand():
     VRM's own expressions, whose A is no shape of ARKit."""
     packet, known = decode_vmc(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), Received())
     assert packet is None
-    packet, known = decode_vmc(
-        bundle(blend("MouthSmile_L", 0.25), bundle(blend("cheekPuff", 0.75), APPLY)), known
-    )
+    inner = bundle(blend("cheekPuff", 0.75), APPLY)
+    packet, known = decode_vmc(bundle(blend("MouthSmile_L", 0.25), inner), known)
     expected = {"jawOpen": 0.5, "mouthSmileLeft": 0.25, "cheekPuff": 0.75}
     assert {name: value for name, value in as_dict(packet.weights).items() if value} == expected
     assert set(packet.names) == set(expected)
     packet, _ = decode_vmc(bundle(blend("jawOpen", 0.0), APPLY), known)
     assert as_dict(packet.weights)["cheekPuff"] == 0.75
-    assert (
-        decode_vmc(osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1), Received())
-        is None
-    )
+    other = osc_text("/avatar/x") + osc_text(",f") + struct.pack(">f", 1)
+    assert decode_vmc(other, Received()) is None
 
 
 def test_vmc_with_python_osc():
@@ -150,7 +132,7 @@ def test_vmc_with_python_osc():
     assert as_dict(packet.weights) == pytest.approx(weights)
     assert packet.time == 12.5
     mixed = written("/x/y", 1, 2.5, "text", b"blob", True, False)
-    assert osc_messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
+    assert decoders.osc_messages(mixed.dgram) == [("/x/y", (1, 2.5, "text", b"blob", True, False))]
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -160,9 +142,8 @@ def test_vmc_head(axis):
     angle = 0.3
     quaternion = np.array([0.0, 0.0, 0.0, math.cos(angle / 2)])
     quaternion[axis] = math.sin(angle / 2)
-    where = osc_text("/VMC/Ext/Bone/Pos") + osc_text(",sfffffff") + osc_text("Head") + struct.pack(
-        ">7f", 0, 1, 0, *quaternion
-    )  # fmt: skip
+    where = b"".join(map(osc_text, ("/VMC/Ext/Bone/Pos", ",sfffffff", "Head")))
+    where += struct.pack(">7f", 0, 1, 0, *quaternion)
     packet, _ = decode_vmc(bundle(where, blend("jawOpen", 0), APPLY), Received())
     turn = head_turns(np.array([packet.head]))[0]
     expected = np.zeros(3)
@@ -194,13 +175,8 @@ def test_ten_thousand_malformed_packets():
     known = Received()
     for _ in range(10_000):
         data = malformed(rng)
-        decoded = decode_vmc(data, known)
-        known = known if decoded is None else decoded[1]
-        for packet in (
-            decode_live_link_face(data),
-            read_performance.parse_packet(data),
-            decoded and decoded[0],
-        ):
+        vmc, known = decode_vmc(data, known) or (None, known)
+        for packet in decode_live_link_face(data), read_performance.parse_packet(data), vmc:
             if packet is not None and packet.weights is not None:
                 assert np.isfinite(packet.weights).all()
                 assert packet.time is None or math.isfinite(packet.time)
@@ -214,4 +190,4 @@ def test_any_bytes(data):
     decode_live_link_face(b"\x06" + data)
     read_performance.parse_packet(data)
     decode_vmc(data, Received())
-    osc_messages(b"#bundle\0" + data)
+    decoders.osc_messages(b"#bundle\0" + data)

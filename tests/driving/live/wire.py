@@ -1,5 +1,6 @@
 """Packets written by hand from the layouts of the protocols."""
 
+import re
 import struct
 
 import numpy as np
@@ -19,9 +20,8 @@ def live_link_face(
     """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate,
     denominator; the values."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
-    names = b"".join(
-        struct.pack(">i", len(text.encode())) + text.encode() for text in (device, subject)
-    )
+    texts = device.encode(), subject.encode()
+    names = b"".join(struct.pack(">i", len(text)) + text for text in texts)
     time = struct.pack(">ifii", frame, 0.25, rate, 1)
     body = struct.pack(f">B{count}f", count, *values[:count]) if count else b""
     return b"\x06" + names + time + body
@@ -29,18 +29,12 @@ def live_link_face(
 
 def facial_mocap(weights, head=(0, 0, 0), separator="-"):
     """Percent; pitch, yaw and roll in degrees, and a position."""
-    fields = []
-    for name in ARKIT_SHAPES:
-        spelled = (
-            name.replace("Left", "_L").replace("Right", "_R")
-            if name.endswith(("Left", "Right"))
-            else name
-        )
-        fields.append(f"{spelled}{separator}{round(100 * weights.get(name, 0.0))}")
+    spelled = [re.sub("(Left|Right)$", lambda side: f"_{side[0][0]}", n) for n in ARKIT_SHAPES]
+    percent = [round(100 * weights.get(name, 0.0)) for name in ARKIT_SHAPES]
+    fields = [f"{n}{separator}{value}" for n, value in zip(spelled, percent, strict=True)]
     angles = ",".join(f"{value}" for value in head)
-    return (
-        "|".join(fields) + f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|"
-    ).encode()
+    rest = f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|"
+    return ("|".join(fields) + rest).encode()
 
 
 def mixed(seed: int) -> dict[str, float]:

@@ -92,10 +92,8 @@ class Browser:
         self.requests.clear()
         self.errors.clear()
         self.send("Page.navigate", url=address)
-        self.evaluate(
-            "new Promise(done => document.readyState === 'complete' ? done() : "
-            "addEventListener('load', done))"
-        )
+        loaded = "document.readyState === 'complete' ? done() : addEventListener('load', done)"
+        self.evaluate(f"new Promise(done => {loaded})")
 
     def evaluate(self, expression: str) -> Any:
         """Value of a JavaScript expression; promises are awaited."""
@@ -109,9 +107,7 @@ class Browser:
         while b"\0" not in self._buffer:
             ready, _, _ = select.select([self._in], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
-                raise TimeoutError(
-                    f"no answer from the browser within {TIMEOUT_S:g} s; errors: {self.errors}"
-                )
+                raise TimeoutError(f"no answer within {TIMEOUT_S:g} s; errors: {self.errors}")
             part = os.read(self._in, 1 << 20)
             assert part, "the browser has closed"
             self._buffer += part
@@ -123,8 +119,7 @@ class Browser:
         if event.get("method") == "Network.requestWillBeSent":
             self.requests.append(details["request"]["url"])
         if event.get("method") == "Runtime.exceptionThrown":
-            self.errors.append(
-                details["exceptionDetails"].get("exception", {}).get("description", "exception")
-            )
+            thrown = details["exceptionDetails"].get("exception", {})
+            self.errors.append(thrown.get("description", "exception"))
         if event.get("method") == "Log.entryAdded" and details["entry"]["level"] == "error":
             self.errors.append(details["entry"]["text"])

@@ -1,7 +1,7 @@
 """A FLAME head with splats on it, in a motion of three frames."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,10 +60,8 @@ class Head:
     def data(
         self, rig: WebRig | None = None, exact: bool = False, controls: ShapeControls | None = None
     ) -> bytes:
-        views = {"front": self.camera}
-        playback = Playback(
-            title="Zoë", fps=2.0, views=views, selection=self.selection, controls=controls
-        )
+        playback = Playback("Zoë", 2.0, {"front": self.camera}, selection=self.selection)
+        playback = replace(playback, controls=controls)
         return data_file(self.avatar, rig or self.rig, playback, exact)
 
     @property
@@ -100,29 +98,25 @@ def make_head(
     sequence = FlameSequence(model, shape, offset, (0, 1, 2), frames.__getitem__)
     unit = 1.0 if convention == "gaussian_avatars" else 0.005
     splats = random_splats(5, SPLATS, len(model.faces), sh_degree)
-    object.__setattr__(splats, "xyz", splats.xyz * np.float32(0.3 * unit))
-    object.__setattr__(
+    size = np.float32(0.3 * unit), np.float32(np.log(0.8 * unit) + 1.2)
+    splats = replace(
         splats,
-        "log_scale",
-        splats.log_scale * np.float32(0.3) + np.float32(np.log(0.8 * unit) + 1.2),
+        xyz=splats.xyz * size[0],
+        log_scale=splats.log_scale * np.float32(0.3) + size[1],
+        sh=splats.sh * np.float32(0.3),
     )
-    object.__setattr__(splats, "sh", splats.sh * np.float32(0.3))
     if strain:
         strain_color = rng.normal(0, 0.1, (SPLATS, 3, 3)).astype(np.float32)
-        object.__setattr__(splats, "strain_color", strain_color)
+        splats = replace(splats, strain_color=strain_color)
     neutral = neutral_mesh(sequence).astype(np.float32)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
     limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
     moves = rng.normal(0, 0.3 * unit, (len(model.faces), 3, 3)).astype(np.float32)
-    avatar = Avatar(
-        splats,
-        convention,
-        neutral,
-        model.faces,
-        antialiased=antialiased,
-        strain_range=limits if strain or strain_position else None,
-        driven_offsets={"strain_position": moves} if strain_position else {},
-    )
+    avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased)
+    if strain or strain_position:
+        avatar = replace(avatar, strain_range=limits)
+    if strain_position:
+        avatar = replace(avatar, driven_offsets={"strain_position": moves})
     camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)
 

@@ -6,6 +6,7 @@ import struct
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
 
@@ -25,19 +26,14 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             arrays[name] = np.frombuffer(raw, "<f4", count, at).reshape(shape)
             at += 4 * count
             continue
-        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).reshape(
-            entry["planes"], count
-        )
+        planes = np.frombuffer(raw, np.uint8, entry["planes"] * count, at).astype(np.int64)
         at += planes.size
-        integers = (
-            sum(plane.astype(np.int64) << 8 * k for k, plane in enumerate(planes)) + entry["low"]
-        )
+        factors = 256 ** np.arange(entry["planes"])
+        integers = factors @ planes.reshape(entry["planes"], count) + entry["low"]
         integers = np.moveaxis(np.reshape(integers, [*shape[-1:], *shape[:-1]]), 0, -1)
-        arrays[name] = (
-            integers
-            if entry["type"] == "integer"
-            else (integers * entry["step"]).astype(np.float32)
-        )
+        arrays[name] = integers
+        if entry["type"] == "fixed":
+            arrays[name] = (integers * entry["step"]).astype(np.float32)
     assert at == len(raw)
     return header, arrays
 
@@ -54,6 +50,7 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
     opacity = np.clip(arrays["opacity"].astype(np.float64), 1e-6, 1 - 1e-6)
     rest = arrays.get("sh", np.zeros((count, 0))).reshape(count, -1, 3)
     per_face = arrays["splats_per_face"]
+    strained = arrays.get("strain_color", np.zeros((count, 0), np.float32))
     return Splats(
         xyz=arrays["xyz"],
         rotation=rotation.astype(np.float32),
@@ -62,9 +59,7 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
         sh=np.concatenate([arrays["color"][:, None], rest], axis=1).astype(np.float32),
         face=np.repeat(np.arange(len(per_face)), per_face).astype(np.int32),
         unbound=np.zeros(count, bool),
-        strain_color=arrays.get("strain_color", np.zeros((count, 0), np.float32)).reshape(
-            count, -1, 3
-        ),
+        strain_color=strained.reshape(count, -1, 3),
     )
 
 
@@ -77,14 +72,13 @@ def posed_mesh(
 ) -> np.ndarray:
     """Vertices (V, 3) of coefficients (R,), pose (J, 3) axis-angle and the translation of a
     frame."""
-    parents = header["parents"]
-    local = np.stack([_rotation(vector) for vector in pose])
+    local = Rotation.from_rotvec(pose).as_matrix()
     features = (local[1:] - np.eye(3)).ravel()
     shaped = arrays["base"] + np.einsum("r,rvc->vc", coefficients, arrays["basis"])
     shaped = shaped + np.einsum("p,pvc->vc", features, arrays["correctives"])
     joints = arrays["joint_rest"] + np.einsum("r,rjc->jc", coefficients, arrays["joint_basis"])
     world: list[np.ndarray] = []
-    for joint, parent in enumerate(parents):
+    for joint, parent in enumerate(header["parents"]):
         own = np.eye(4)
         own[:3, :3] = local[joint]
         own[:3, 3] = joints[joint] - (joints[parent] if parent >= 0 else 0)
@@ -94,11 +88,3 @@ def posed_mesh(
         moved = (shaped - joints[joint]) @ matrix[:3, :3].T + matrix[:3, 3]
         skinned += arrays["weights"][:, joint, None] * moved
     return skinned + arrays["translation"][frame]
-
-
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Matrix of an axis-angle vector (Rodrigues)."""
-    angle = max(float(np.linalg.norm(vector)), 1e-12)
-    x, y, z = np.asarray(vector, float) / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
