@@ -57,7 +57,7 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
         shade = 1 + SHADE * normal_images(mesh, faces, view.camera)[1][..., :1]
         darker = np.where(mask[..., None] > 0, image * GAIN * shade + OFFSET, image)
         Image.fromarray(np.clip(darker, 0, 255).astype(np.uint8)).save(root / view.name)
-    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": False}
+    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": True}
     write_json(root / "tracking.json", report)
     scale_capture(root, root / "model.npz", SCALE)
     write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
@@ -109,7 +109,8 @@ def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch) -> None:
     """Catches a cancelled tracking that begins anew, or goes on with what an avatar found that was
     trained again since."""
-    (run, root), calls, every = recording, list[int](), [1] * len(TIMESTEPS)
+    (run, root), calls = recording, list[int]()
+    every, twice = [1] * len(TIMESTEPS), [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")
 
     def counted(*arguments: Any) -> AvatarTracking:
@@ -117,10 +118,10 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
         return track_by_avatar(*arguments)
 
     monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", counted)
-    for trained_ns, expected in ((1, [*every, len(every)]), (1, []), (2, every)):
+    for trained_ns, expected in ((1, [*every, *twice]), (1, []), (2, [*every, *twice])):
         shutil.rmtree(root)
         shutil.copytree(tmp_path / "start", root)
         os.utime(run / AVATAR, ns=(trained_ns, trained_ns))
         calls.clear()
         track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore)
-        assert calls[: len(expected) or None] == expected
+        assert calls == expected
