@@ -194,9 +194,9 @@ def track_by_avatar(
     done; returns whether to stop. is_far: the starts are some way off, as of another recording: the
     first timestep is sought in small images first. scales: whether the head's size is sought too.
     shading: harmonics (9, 3) of a factor by the surface's normal, by which the light differs.
-    is_again: the starts are what the avatar has tracked, and smooth; else each timestep begins
-    where the one before has led. Raises StgaError where the capture has no parameters or is of
-    another head, and Cancelled.
+    is_again: the starts are what the avatar has tracked. Each timestep begins where the one before
+    has led. Raises StgaError where the capture has no parameters or is of another head, and
+    Cancelled.
     """
     tracker, found = _Tracker(avatar, settings, capture, is_far, scales, shading, is_again), []
     chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
@@ -301,10 +301,9 @@ class _Tracker:
         if not views:
             return tracked, np.diag(self._precision()), 0.0, 0.0, 0.0
         heights: tuple[int, ...] = (MAX_HEIGHT_PX,)
-        renderings, found = RENDERINGS, tracked
-        if self._is_again:
-            renderings = RENDERINGS_AGAIN
-        elif self._change is not None:
+        renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
+        found = tracked
+        if self._change is not None:
             shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
             starts = tracked, tracked + self._change
             found = min(starts, key=lambda start: self._loss(start, timestep, shots)[0])

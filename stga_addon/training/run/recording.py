@@ -81,13 +81,13 @@ def track_recording(
     total = rounds * len(timesteps)
     report(0, total)
     factor = _fit_scale(run, root, helpers, lambda: report(0, total))
+    source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
+    light = _light(*_open(*source, 0))
     for number in range(rounds):
-        source = run, (run / AVATAR).stat().st_mtime_ns, root, factor, number
-        avatar, settings, capture = _open(*source)
-        assert capture.flame is not None
-        light = _light(avatar, settings, capture)
+        sequence = _open(*source, number)[2].flame
+        assert sequence is not None
         parts = [
-            (*source, *light, timesteps[first : first + PART_TIMESTEPS], False)
+            (*source, number, *light, timesteps[first : first + PART_TIMESTEPS], False)
             for first in range(0, len(timesteps), PART_TIMESTEPS)
         ]
 
@@ -98,8 +98,8 @@ def track_recording(
         columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
         tracked = AvatarTracking(timesteps, **columns)
         if stored["in_order"]:
-            tracked = tracked.smoothed(capture.flame.model)
-        _replace_heads(root, capture.flame, tracked)
+            tracked = tracked.smoothed(sequence.model)
+        _replace_heads(root, sequence, tracked)
     stored = read_json(root / REPORT_FILE)  # which scaling changes
     shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
     stored["avatar"] = avatar_version(run)
