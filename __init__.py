@@ -9,11 +9,11 @@ def register() -> None:
     """Register everything or nothing. Imports are local because tests import this file without
     Blender, too."""
     from . import operators
-    from .operators import command_line, render_engine
-    from .ui import curve, panel, preferences, properties
+    from .operators import command_line
+    from .ui import panel, preferences, properties
 
     with ExitStack() as done:
-        for part in (properties, preferences, operators, render_engine, curve, panel, command_line):
+        for part in (properties, preferences, operators, panel, command_line):
             part.register()
             done.callback(part.unregister)
         _registered.enter_context(done.pop_all())

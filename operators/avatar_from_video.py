@@ -1,9 +1,10 @@
 """Makes an avatar from a video: tracks and trains in a process beside Blender, and shows both as
 they become."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -20,10 +21,10 @@ from ..stga_addon.jobs.track import (
 from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import make_settings
-from . import ids, monitor
-from .common import FileImport, file_filter, file_path, path_property, reporting
-from .options import option_property
-from .request import needs_idle, start
+from . import monitor, options
+from .common import Action, FileImport, file_path
+from .options import ONCE
+from .request import idle, start
 from .training_python import training_python
 
 MAX_FOLDERS = 1000
@@ -31,36 +32,24 @@ DIGITS = 3
 """Of numbers that Blender keeps in single precision, which continue only as they began."""
 
 
-class AvatarFromVideo(bpy.types.Operator, FileImport):
+class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
     """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What
     was begun with the same video is continued"""
 
-    bl_idname = ids.AVATAR_FROM_VIDEO
     bl_label = "Avatar from Video"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
+    needs = (idle(*TRAINS),)
 
-    filepath: path_property("Video", "Video of a face", options={"SKIP_SAVE"})
-    folder: path_property(  # not `directory`, which Blender's file browser sets to that of the file
+    filepath: options.path("Video", "Video of a face", options=ONCE)
+    folder: options.path(  # not `directory`, which Blender's file browser sets to that of the file
         "Folder",
         "Folder for capture and avatar; empty: one beside the .blend file, else beside the video",
         "DIR_PATH",
-        options={"SKIP_SAVE"},
+        options=ONCE,
     )
-    minutes: bpy.props.FloatProperty(
-        name="Minutes", description="Training time", default=5.0, min=0.01
-    )
-    focal: option_property(Track, "focal", "Focal Length", options={"SKIP_SAVE"})
-    python: bpy.props.StringProperty(
-        name="Python",
-        description="Python interpreter that tracks and trains; empty: that of the preferences, "
-        "or Blender's own",
-        subtype="FILE_PATH", options={"SKIP_SAVE", "HIDDEN"},
-    )  # fmt: skip
-    filter_glob: file_filter(*VIDEO_SUFFIXES)
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_idle(cls, context, *TRAINS)
+    minutes: options.number("Minutes", "Training time", default=5.0, min=0.01)
+    focal: options.field(Track, "focal", "Focal Length", options=ONCE)
+    python: options.python("tracks and trains", options={*ONCE, "HIDDEN"})
+    filter_glob: options.file_filter(*VIDEO_SUFFIXES)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         if not self.filepath:
@@ -76,14 +65,11 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         for name in ("folder", "minutes", "focal"):
             self.layout.prop(self, name)
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         if self.folder and not self.filepath:  # continues
             began_with = read_inputs(file_path(self.folder, "folder"))
-            self.filepath, self.focal = (
-                str(began_with.get("footage", "")),
-                began_with.get("focal") or 0.0,
-            )
+            self.filepath = str(began_with.get("footage", ""))
+            self.focal = began_with.get("focal") or 0.0
         video = file_path(self.filepath, "video").resolve()
         if not video.is_file():
             raise StgaError(f"{video}: is not a file; expected a video")
@@ -97,8 +83,7 @@ class AvatarFromVideo(bpy.types.Operator, FileImport):
         request = MakeAvatar(self._tracking(video, capture), train)
         monitor.show_panel()  # where it can be watched and cancelled, also after a drop
         if start(context.scene, request, python):
-            self.report({"INFO"}, f"Made {request.out}")
-        return {"FINISHED"}
+            self.inform(f"Made {request.out}")
 
     def _tracking(self, video: Path, capture: Path) -> Track:
         return Track(video, None, capture, focal=round(self.focal, DIGITS) or None)
@@ -108,16 +93,11 @@ def proposed_folder(track: Track) -> Path:
     """The folder of the capture in the first folder beside the .blend file, else beside the video,
     that is free or in which this video's avatar was begun."""
     beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent
-    names = [
-        f"{track.footage.stem} avatar",
-        *(f"{track.footage.stem} avatar {n}" for n in range(2, MAX_FOLDERS)),
-    ]
-    for capture in (beside / name / CAPTURE_FOLDER for name in names):
-        try:
+    name = f"{track.footage.stem} avatar"
+    for each in (name, *(f"{name} {number}" for number in range(2, MAX_FOLDERS))):
+        capture = beside / each / CAPTURE_FOLDER
+        with suppress(StgaError):
             check_inputs(replace(track, out=capture))
-        except StgaError:
-            continue
-        return capture
-    raise StgaError(
-        f"{beside}: holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder"
-    )
+            return capture
+    problem = f"holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder"
+    raise StgaError(f"{beside}: {problem}")

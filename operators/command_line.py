@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
+from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import motion_arrays
 from ..stga_addon.jobs.avatar_source import Played
@@ -19,8 +20,7 @@ from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
-from . import ids
-from .common import capture_of, capture_source, file_path, is_head, scene_settings
+from .common import capture_source, file_path, is_head, scene_frames
 from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")
@@ -55,10 +55,10 @@ def _run(arguments: list[str]) -> int:
 def _open_head() -> "OpenHead | None":
     from ..stga_addon.jobs.avatar_source import OpenHead
 
-    head = scene_settings(bpy.context).head
+    head = bpy.context.scene.stga.head
     if not is_head(head):
         return None
-    avatar = scene_settings(bpy.context).avatar
+    avatar = bpy.context.scene.stga.avatar
     capture, flame, principal_point = capture_source(head)
     return OpenHead(
         capture=capture,
@@ -96,12 +96,11 @@ def _make_avatar(arguments: list[str], options: Any) -> int:
     refined = options.out / RUN_FOLDER / TRACKING
 
     def apply_refined(head: Any) -> None:
-        scene_settings(bpy.context).head = head
+        bpy.context.scene.stga.head = head
         if refined.exists():  # PyTorch, which reads it into a capture, need not be here
             start = head[tags.TIMESTEPS][0]
-            bpy.ops.stga.apply_motion(
-                filepath=str(refined.resolve()), own_offsets=True, start=start
-            )
+            path = str(refined.resolve())
+            bpy.ops.stga.apply_motion(filepath=path, own_offsets=True, start=start)
 
     print(f"blender: {write_blend(options.out, lambda capture: capture, apply_refined)}")
     return 0
@@ -110,17 +109,17 @@ def _make_avatar(arguments: list[str], options: Any) -> int:
 def _played(head: Any) -> Played:
     """What the head plays in the scene's frames, however it is animated. Raises StgaError where its
     capture has moved, or a FLAME head has no rig."""
-    frames = range(bpy.context.scene.frame_start, bpy.context.scene.frame_end + 1)
+    frames = scene_frames(bpy.context.scene)
     meshes = {
         frame: np.asarray(evaluated_vertices(head), np.float64) for frame in iterate_frames(frames)
     }
-    flame = capture_of(head).flame
+    flame = open_capture(*capture_source(head)).flame
     motion = None if flame is None else motion_arrays(sample_motion(head, flame, frames))
     return Played(meshes, motion, training_selection(head))
 
 
 def register() -> None:
-    _commands.append(bpy.utils.register_cli_command(ids.CLI_COMMAND, _run))
+    _commands.append(bpy.utils.register_cli_command("stga", _run))
 
 
 def unregister() -> None:

@@ -1,43 +1,48 @@
-"""Shared by the operators: error reports, polls, paths, and the capture behind a head."""
+"""What operators share: their base, polls, paths, and the capture behind a head."""
 
 import os
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import bpy
 from bpy_extras.io_utils import ImportHelper
 
-from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import shape_key_names
-from . import ids
+from ..stga_addon.schema import alternatives, type_hints
+from . import options
+from .options import ONCE
 
+TAB = "STGA"  # of the 3D viewport's sidebar
 MAX_REPORT_CHARACTERS = 90
 """Of what popup and status bar show of a report."""
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
+Poll = Callable[[Any, Any], bool]
 
-def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
-    """Decorator of `execute`: a StgaError becomes the operator's error report, without a
-    traceback; the pointer says that Blender is busy."""
+
+def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, Any], set[str]]:
+    """Decorator: a StgaError becomes the operator's error report, without a traceback, and nothing
+    that is returned becomes FINISHED; the pointer says that Blender is busy."""
 
     def guarded(self: Any, context: Any) -> set[str]:
-        setattr(context.window_manager, ids.MESSAGE, "")
+        context.window_manager.stga_message = ""
         window = context.window
         if window is not None:
             window.cursor_modal_set("WAIT")
         try:
-            return execute(self, context)
+            return execute(self, context) or {"FINISHED"}
         except StgaError as error:
-            tell(self, "ERROR", str(error))
+            self.tell("ERROR", str(error))
             return {"CANCELLED"}
         finally:
             if window is not None:
@@ -46,14 +51,57 @@ def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], s
     return guarded
 
 
-def tell(operator: Any, kind: str, sentence: str) -> None:
-    """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in the
-    panel."""
-    brief, manager = short_sentence(sentence), bpy.context.window_manager
-    operator.report({kind}, sentence if bpy.app.background else brief)
-    # an operator that was called by another has told it at length
-    if brief != short_sentence(getattr(manager, ids.MESSAGE)):
-        setattr(manager, ids.MESSAGE, sentence)
+class Action:
+    """Mixin of operators that `run(context)` where every poll of `needs` holds. Identifier and, if
+    it has no other, label are the name of the class: `SolveAgain` is "stga.solve_again"."""
+
+    bl_options = frozenset({"REGISTER"})
+    needs: tuple[Poll, ...] = ()
+    run: Any
+
+    def __init_subclass__(cls) -> None:
+        words = re.findall("[A-Z][a-z]*", cls.__name__)
+        cls.bl_idname = f"stga.{'_'.join(words).lower()}"
+        if "bl_label" not in vars(cls):
+            cls.bl_label = " ".join(words)
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return all(need(cls, context) for need in cls.needs)
+
+    @reporting
+    def execute(self, context: Any) -> set[str] | None:
+        return self.run(context)
+
+    def inform(self: Any, sentence: str) -> None:
+        self.report({"INFO"}, sentence)
+
+    def warn(self, sentence: str) -> None:
+        self.tell("WARNING", sentence)
+
+    def tell(self: Any, kind: str, sentence: str) -> None:
+        """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in
+        the panel."""
+        brief, manager = short_sentence(sentence), bpy.context.window_manager
+        self.report({kind}, sentence if bpy.app.background else brief)
+        # an operator that was called by another has told it at length
+        if brief != short_sentence(manager.stga_message):
+            manager.stga_message = sentence
+
+
+class Edit(Action):
+    """Mixin of operators that change the file: a step to undo."""
+
+    bl_options = frozenset({"REGISTER", "UNDO"})
+
+
+def call(operator: Any, *arguments: Any, **options: Any) -> set[str]:
+    """Call another operator. Raises StgaError with what it reports as an error."""
+    try:
+        result: set[str] = operator(*arguments, **options)
+    except RuntimeError as error:
+        raise StgaError(str(error).strip().removeprefix("Error: ")) from error
+    return result
 
 
 def short_sentence(sentence: str) -> str:
@@ -62,14 +110,8 @@ def short_sentence(sentence: str) -> str:
     if len(text) <= MAX_REPORT_CHARACTERS:
         return text
     begin = text[: MAX_REPORT_CHARACTERS - 1]
-    ends = [begin.rfind(mark) for mark in ("; ", ". ", ", ", " (")]
-    end = max(ends) if max(ends) > MAX_REPORT_CHARACTERS / 3 else begin.rfind(" ")
-    return f"{begin[:end]}…"
-
-
-def scene_settings(context: Any) -> Any:
-    """The scene's property group (`ui.properties.SceneSettings`)."""
-    return getattr(context.scene, ids.SETTINGS)
+    end = max(begin.rfind(mark) for mark in ("; ", ". ", ", ", " ("))
+    return f"{begin[: end if end > MAX_REPORT_CHARACTERS / 3 else begin.rfind(' ')]}…"
 
 
 def preferences(context: Any) -> Any:
@@ -84,12 +126,11 @@ def package() -> str:
     return str(__package__).rpartition(".")[0]
 
 
-def head_of(context: Any) -> Any:
-    """The scene's head. Raises StgaError where it has none."""
-    head = scene_settings(context).head
-    if not is_head(head):
-        raise StgaError("No head in the scene; import a capture first")
-    return head
+def scene_frames(scene: Any) -> range:
+    return range(scene.frame_start, scene.frame_end + 1)
+
+
+# The head
 
 
 def is_head(thing: Any) -> bool:
@@ -97,49 +138,12 @@ def is_head(thing: Any) -> bool:
     return thing is not None and thing.get(tags.KIND) == tags.HEAD
 
 
-def polled(operator: Any, is_possible: bool, message: str) -> bool:
-    """Poll: whether an operator can be called; where not, Blender shows the message, which says
-    what to do."""
-    if not is_possible:
-        operator.poll_message_set(message)
-    return is_possible
-
-
-def needs_head(operator: Any, context: Any) -> bool:
-    """Poll: whether a capture was imported."""
-    return polled(operator, is_head(scene_settings(context).head), "Import a capture first")
-
-
-def needs_own_head(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head that can be changed here."""
-    if not needs_head(operator, context):
-        return False
-    head = scene_settings(context).head
-    is_own = head.library is None and head.data.library is None
-    return polled(
-        operator,
-        is_own,
-        "The head is linked from another file: open that file, or make the head local",
-    )
-
-
-def needs_rig(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head with a FLAME rig that can be animated."""
-    if not needs_own_head(operator, context):
-        return False
-    try:
-        rig_of(scene_settings(context).head)
-    except StgaError as error:
-        operator.poll_message_set(str(error))
-        return False
-    return True
-
-
-def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
-    """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
-    if not needs_own_head(operator, context):
-        return False
-    return bool(shape_key_names(scene_settings(context).head)) or needs_rig(operator, context)
+def head_of(context: Any) -> Any:
+    """The scene's head. Raises StgaError where it has none."""
+    head = context.scene.stga.head
+    if not is_head(head):
+        raise StgaError("No head in the scene; import a capture first")
+    return head
 
 
 def rig_or_none(head: Any) -> Any:
@@ -150,53 +154,90 @@ def rig_or_none(head: Any) -> Any:
         return None
 
 
-def path_property(
-    name: str,
-    description: str,
-    subtype: str = "FILE_PATH",
-    options: Collection[str] = (),
-    **more: Any,
-) -> Any:
-    """A path, which may begin with "//"."""
-    return bpy.props.StringProperty(
-        name=name,
-        description=description,
-        subtype=subtype,
-        options={*PATH_OPTIONS, *options},
-        **more,
-    )
+def capture_source(head: Any) -> tuple[Path, Path | None, str]:
+    """The capture that a head was imported from, its FLAME model and its convention of principal
+    points, as `open_capture` takes them."""
+    model, point = head.get(tags.FLAME_MODEL), tags.PRINCIPAL_POINT
+    capture = Path(head[tags.CAPTURE])
+    return capture, Path(model) if model else None, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
 
-def file_filter(*suffixes: str) -> Any:
-    """The files that a file browser shows."""
-    return bpy.props.StringProperty(
-        default=";".join(f"*{suffix}" for suffix in suffixes), options={"HIDDEN"}
-    )
+def own_motion(head: Any) -> FlameSequence:
+    """The FLAME parameters of the capture that a head was imported from. Raises StgaError where it
+    has moved or changed, or has none."""
+    return flame_motion(head.name, *capture_source(head))
+
+
+def flame_motion(name: str, source: Path, flame: Path | None, *point: str) -> FlameSequence:
+    """The FLAME parameters of a capture. Raises StgaError where it has none; `name` says whose."""
+    found = open_capture(source, flame, *point).flame
+    if found is None:
+        lacks = "so it has no parameters of expression and pose"
+        raise StgaError(f"{name}: was not tracked with FLAME, {lacks}")
+    return found
+
+
+# Polls
+
+
+def polled(operator: Any, is_possible: bool, message: str) -> bool:
+    """Poll: whether an operator can be called; where not, Blender shows the message, which says
+    what to do."""
+    if not is_possible:
+        operator.poll_message_set(message)
+    return is_possible
+
+
+def need(is_met: Callable[[Any], Any], message: str) -> Poll:
+    """Poll: whether `is_met(context)`."""
+    return lambda operator, context: polled(operator, bool(is_met(context)), message)
+
+
+needs_head = need(lambda context: is_head(context.scene.stga.head), "Import a capture first")
+
+
+def needs_own_head(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head that can be changed here."""
+    if not needs_head(operator, context):
+        return False
+    head = context.scene.stga.head
+    is_own = head.library is None and head.data.library is None
+    remedy = "open that file, or make the head local"
+    return polled(operator, is_own, f"The head is linked from another file: {remedy}")
+
+
+def needs_rig(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head with a FLAME rig that can be animated."""
+    if not needs_own_head(operator, context):
+        return False
+    try:
+        return rig_of(context.scene.stga.head) is not None
+    except StgaError as error:
+        return polled(operator, False, str(error))
+
+
+def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
+    """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
+    if not needs_own_head(operator, context):
+        return False
+    return bool(shape_key_names(context.scene.stga.head)) or needs_rig(operator, context)
+
+
+# Files
 
 
 class FileImport(ImportHelper):
     """Mixin of operators that import a file: asks for it, unless called with one, as when a file is
     dropped."""
 
-    filepath: path_property("File", "File to import", options={"SKIP_SAVE"})
+    filepath: options.path("File", "File to import", options=ONCE)
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
+    def invoke(self: Any, context: Any, event: Any) -> set[str]:
         if self.filepath:
-            result: set[str] = self.execute(context)  # type: ignore[attr-defined]
-            return result
+            return self.execute(context)
         if bpy.data.filepath:  # else Blender proposes the .blend file's own name
             self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), "")
-        return super().invoke(context, event)  # type: ignore[no-any-return]
-
-
-def flame_property() -> Any:
-    """FLAME model of an import operator."""
-    return path_property(
-        "FLAME Model",
-        "FLAME model file (.pkl or .npz), for captures and motions tracked with FLAME; empty: "
-        "that of the preferences",
-        options={"SKIP_SAVE"},
-    )
+        return super().invoke(context, event)
 
 
 def flame_model_path(context: Any, given: str = "") -> Path | None:
@@ -206,53 +247,36 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
     return file_path(path, "FLAME model") if path else None
 
 
-def capture_source(head: Any) -> tuple[Path, Path | None, str]:
-    """The capture that a head was imported from, its FLAME model and its convention of principal
-    points, as `open_capture` takes them."""
-    model, point = (
-        head.get(tags.FLAME_MODEL),
-        head.get(tags.PRINCIPAL_POINT, DEFAULT_PRINCIPAL_POINT),
-    )
-    return Path(head[tags.CAPTURE]), Path(model) if model else None, point
-
-
-def capture_of(head: Any) -> Capture:
-    """Open the capture that a head was imported from. Raises StgaError where it has moved or
-    changed."""
-    return open_capture(*capture_source(head))
-
-
-def flame_of(capture: Capture, name: str) -> FlameSequence:
-    """The FLAME parameters of a capture. Raises StgaError where it has none; `name` says whose."""
-    if capture.flame is None:
-        raise StgaError(
-            f"{name}: was not tracked with FLAME, so it has no parameters of expression and pose"
-        )
-    return capture.flame
-
-
 def file_path(value: str, what: str) -> Path:
     """Absolute path of a path property. Raises StgaError where it is empty, or relative to a file
     never saved."""
     if not value:
         raise StgaError(f"{what}: no path given")
     if value.startswith("//") and not bpy.data.filepath:
-        raise StgaError(
-            f"{what}: {value} is relative to the .blend file, which has not been saved yet"
-        )
+        problem = "is relative to the .blend file, which has not been saved yet"
+        raise StgaError(f"{what}: {value} {problem}")
     return Path(bpy.path.abspath(value))
+
+
+def given_values(operator: Any, kind: Any, *names: str) -> dict[str, Any]:
+    """Field -> value of an operator's properties, of those that are not left at None."""
+    found = {}
+    for name in names:
+        value, hints = getattr(operator, name), alternatives(type_hints(kind)[name])
+        if Path in hints and value:
+            value = file_path(value, name.replace("_", " ")).resolve()
+        if value or NoneType not in hints:
+            found[name] = value
+    return found
 
 
 def register_classes(classes: tuple[type, ...]) -> None:
     """Register all classes or none."""
-    done: list[type] = []
-    try:
+    with ExitStack() as registered:
         for cls in classes:
             bpy.utils.register_class(cls)
-            done.append(cls)
-    except Exception:
-        unregister_classes(tuple(done))
-        raise
+            registered.callback(bpy.utils.unregister_class, cls)
+        registered.pop_all()
 
 
 def unregister_classes(classes: tuple[type, ...]) -> None:

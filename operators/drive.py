@@ -1,8 +1,9 @@
-"""Driving the head live: starting and stopping to listen, calibrating, recording, choosing among
-senders."""
+"""Driving the head: live by a phone or program, with calibration and recording, and by a video of a
+face."""
 
+from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -11,30 +12,36 @@ from ..stga_addon.driving.live.sources import (
     LOOPBACK,
     SOURCES,
     Receiver,
-    Recording,
     leaves_this_machine,
 )
-from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions, trained_range
+from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.rig.motion import LivePose, store_range, stored_range
-from . import ids, live_session
-from .apply_motion import exchange_property
+from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.rig.motion import LivePose, stored_range
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
+from ..stga_addon.training.run.folder import has_run, read_run
+from . import live_session, options
+from .apply_motion import exchange_property, own_range, stay_trained_property
 from .common import (
-    capture_of,
+    Action,
+    Edit,
+    FileImport,
+    call,
     file_path,
-    flame_of,
+    given_values,
     head_of,
+    need,
     needs_rig,
     needs_rig_or_shapes,
-    path_property,
-    polled,
-    reporting,
+    own_motion,
     rig_or_none,
-    scene_settings,
-    tell,
 )
 from .live_session import LiveSession, Target, live_options
-from .options import option_property
+from .options import ONCE
+from .request import idle, start
+from .training_python import training_python
 
 MAX_PORT = 65535
 
@@ -42,193 +49,162 @@ MAX_PORT = 65535
 class DriveOptions:
     """What the panel stores about driving live; annotations of `ui.properties.DriveSettings`."""
 
-    source: bpy.props.EnumProperty(
-        name="Source", description="What sends the face",
-        items=[(name, source.label, source.hint) for name, source in SOURCES.items()],
-    )  # fmt: skip
-    address: bpy.props.StringProperty(
-        name="Listen On",
-        description=f"Address of this computer on which packets are received. {LOOPBACK}: from "
-        "this computer alone; 0.0.0.0: from every computer and phone of the network",
+    source: options.choice(
+        "Source",
+        "What sends the face",
+        *((name, source.label, source.hint) for name, source in SOURCES.items()),
+    )
+    address: options.text(
+        "Listen On",
+        f"Address of this computer on which packets are received. {LOOPBACK}: from this computer "
+        "alone; 0.0.0.0: from every computer and phone of the network",
         default=LOOPBACK,
     )
-    port: bpy.props.IntProperty(
-        name="Port", description="UDP port; 0: the source's usual one", min=0, max=MAX_PORT,
-        default=0,
-    )  # fmt: skip
-    phone: bpy.props.StringProperty(
-        name="Phone", description="IP address that the app on the phone shows", default=LOOPBACK
+    port: options.integer("Port", "UDP port; 0: the source's usual one", min=0, max=MAX_PORT)
+    phone: options.text("Phone", "IP address that the app on the phone shows", default=LOOPBACK)
+    strength: options.field(MotionOptions, "strength", soft_max=2.0)
+    smoothing: options.number(
+        "Smoothing",
+        "Time constant in seconds; the head follows later by as much",
+        min=0.0,
+        soft_max=0.2,
+        max=MAX_SMOOTHING_S,
     )
-    strength: option_property(MotionOptions, "strength", soft_max=2.0)
-    smoothing: bpy.props.FloatProperty(
-        name="Smoothing", description="Time constant in seconds; the head follows later by as much",
-        min=0.0, soft_max=0.2, max=MAX_SMOOTHING_S,
-    )  # fmt: skip
-    stay_trained: bpy.props.FloatProperty(
-        name="Stay Trained",
-        description="Lead expression, jaw and eyes softly back to the range of the head's own "
-        "recording; 1: fully",
-        min=0.0, max=1.0,
-    )  # fmt: skip
-    mirror: option_property(MotionOptions, "mirror")
+    stay_trained: stay_trained_property()
+    mirror: options.field(MotionOptions, "mirror")
     exchange_jaw: exchange_property("jaw")
     exchange_mouth: exchange_property("mouth")
-    takes: path_property(
+    takes: options.path(
         "Takes",
         "Folder for recorded takes (CSV); one that begins with // lies beside the .blend file",
-        "DIR_PATH", default="//stga_takes",
-    )  # fmt: skip
+        "DIR_PATH",
+        default="//stga_takes",
+    )
 
 
-class MeasureRange(bpy.types.Operator):
+class MeasureRange(Edit, bpy.types.Operator):
     """Measure the range of expression, jaw and eyes in the recording that the head was trained
     on"""
 
-    bl_idname = ids.MEASURE_RANGE
     bl_label = "Measure Trained Range"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+    needs = (needs_rig,)
 
-    poll = classmethod(needs_rig)
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         head = head_of(context)
-        own = flame_of(capture_of(head), head.name)
-        store_range(head, trained_range([own.frame(timestep) for timestep in own.timesteps]))
-        return {"FINISHED"}
+        own_range(head, own_motion(head))
 
 
-class DriveLive(bpy.types.Operator):
+# Live
+
+
+class DriveLive(Action, bpy.types.Operator):
     """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made
     by Record"""
 
-    bl_idname = ids.DRIVE_LIVE
-    bl_label = "Drive Live"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
+    needs = (needs_rig_or_shapes,)
 
-    poll = classmethod(needs_rig_or_shapes)
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        head, settings = head_of(context), scene_settings(context).drive
+    def run(self, context: Any) -> None:
+        head, settings = head_of(context), context.scene.stga.drive
         source = SOURCES[settings.source]
-        if (
-            leaves_this_machine(source, settings.address, settings.phone)
-            and not bpy.app.online_access
-        ):
+        leaves = leaves_this_machine(source, settings.address, settings.phone)
+        if leaves and not bpy.app.online_access:
             raise StgaError(
                 f"{source.label}: receives from other devices, but online access is off in "
                 f"Blender's preferences (System > Network); allow it, or listen on {LOOPBACK}"
             )
-        rig = rig_or_none(head)
-        pose = LivePose(head, rig)
+        pose = LivePose(head, rig_or_none(head))
         found = trained = None
         if pose.takes_frames:
-            own = flame_of(capture_of(head), head.name)
+            own = own_motion(head)
             found = head_map(own, head.name)
-            trained = stored_range(head)
-            if trained is None and own.timesteps:
-                trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
-                store_range(head, trained)
+            trained = stored_range(head) or own_range(head, own)
         receiver = Receiver(source, settings.address, settings.port, settings.phone)
         live_session.start(Target(context.scene.name, pose, found, trained), receiver)
-        return {"FINISHED"}
 
 
-class _NeedsSession:
-    """Mixin: an operator on the session that is running."""
+class _OfSession(Action):
+    """Mixin of operators on the session that is running."""
 
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
+    needs = (
+        need(lambda _: live_session.session(), "No source is listened to; choose Drive Live first"),
+    )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return polled(
-            cls,
-            live_session.session() is not None,
-            "No source is listened to; choose Drive Live first",
-        )
+    def run(self, context: Any) -> None:
+        running = live_session.session()
+        assert running is not None
+        self.act(context, running)
 
-    @property
-    def running(self) -> LiveSession:
-        found = live_session.session()
-        assert found is not None
-        return found
+    def keep_recording(self: Any, context: Any, running: LiveSession, min_faces: int) -> None:
+        """End the recording: write the take and apply it. Raises StgaError."""
+        recording, running.recording = running.recording, None
+        if recording is None or len(recording) < min_faces:
+            return
+        folder, warning = takes_folder(context)
+        if warning:
+            self.warn(warning)
+        path = live_session.write_take(recording, folder)
+        options = live_options(context.scene.stga.drive, recording.rest is not None)
+        names = ("strength", "neutral", "smoothing", "mirror")
+        chosen = {name: getattr(options, name) for name in names}
+        chosen |= {"start": recording.start, "stay_trained": options.stay_trained or 0.0}
+        call(bpy.ops.stga.apply_motion, filepath=str(path), **chosen)
+        self.inform(f"Recorded {len(recording)} faces: {path}")
 
 
-class StopLive(_NeedsSession, bpy.types.Operator):
+class StopLive(_OfSession, bpy.types.Operator):
     """Stop listening; the head goes back to its own animation, and a recording is kept"""
 
-    bl_idname = ids.STOP_LIVE
     bl_label = "Stop"
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        running = self.running
-        recording, running.recording = running.recording, None
+    def act(self, context: Any, running: LiveSession) -> None:
         running.stop()
-        if recording is not None and len(recording) > 1:
-            _apply(self, context, recording)
-        return {"FINISHED"}
+        self.keep_recording(context, running, min_faces=2)
 
 
-class CalibrateLive(_NeedsSession, bpy.types.Operator):
+class CalibrateLive(_OfSession, bpy.types.Operator):
     """Take the performer's face and head of this moment as the resting ones, which do not move the
     head"""
 
-    bl_idname = ids.CALIBRATE_LIVE
     bl_label = "Set Neutral"
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        self.running.calibrate()
-        return {"FINISHED"}
+    def act(self, context: Any, running: LiveSession) -> None:
+        running.calibrate()
 
 
-class RecordLive(_NeedsSession, bpy.types.Operator):
+class RecordLive(_OfSession, Edit, bpy.types.Operator):
     """Record what is received; again: write the take as CSV and apply it to the head as a new
     action"""
 
-    bl_idname = ids.RECORD_LIVE
     bl_label = "Record"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        running = self.running
+    def act(self, context: Any, running: LiveSession) -> None:
         if running.recording is None:
             running.start_recording(context.scene.frame_current)
-            return {"FINISHED"}
-        recording, running.recording = running.recording, None
-        _apply(self, context, recording)
+            return
+        self.keep_recording(context, running, min_faces=0)
         running.show_again()
-        return {"FINISHED"}
 
 
-class FollowLive(_NeedsSession, bpy.types.Operator):
+class FollowLive(_OfSession, bpy.types.Operator):
     """Follow this sender instead of the other"""
 
-    bl_idname = ids.FOLLOW_LIVE
     bl_label = "Follow"
 
-    address: bpy.props.StringProperty(name="Address", description="IP address of the sender")
-    subject: bpy.props.StringProperty(name="Subject", description="Its name for itself")
+    address: options.text("Address", "IP address of the sender")
+    subject: options.text("Subject", "Its name for itself")
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        self.running.stream.follow((self.address, self.subject))
-        return {"FINISHED"}
+    def act(self, context: Any, running: LiveSession) -> None:
+        running.stream.follow((self.address, self.subject))
 
 
 def takes_folder(context: Any) -> tuple[Path, str]:
     """The folder of takes, which is made, and a warning where it does not last, or "". Raises
     StgaError."""
-    folder = scene_settings(context).drive.takes
-    warning = ""
+    folder, warning = context.scene.stga.drive.takes, ""
     if folder.startswith("//") and not bpy.data.filepath:
         path = Path(bpy.app.tempdir)
-        warning = (
-            f"{path}: is emptied when Blender ends; save the .blend file to keep takes beside it"
-        )
+        remedy = "save the .blend file to keep takes beside it"
+        warning = f"{path}: is emptied when Blender ends; {remedy}"
     else:
         path = file_path(folder, "takes")
     try:
@@ -238,43 +214,37 @@ def takes_folder(context: Any) -> tuple[Path, str]:
     return path, warning
 
 
-def _apply(operator: Any, context: Any, recording: Recording) -> None:
-    """Write the take and apply it. Raises StgaError."""
-    folder, warning = takes_folder(context)
-    if warning:
-        tell(operator, "WARNING", warning)
-    path = live_session.write_take(recording, folder)
-    options = live_options(scene_settings(context).drive, recording.rest is not None)
-    try:
-        bpy.ops.stga.apply_motion(
-            filepath=str(path),
-            start=recording.start,
-            strength=options.strength,
-            neutral=options.neutral,
-            smoothing=options.smoothing,
-            mirror=options.mirror,
-            stay_trained=options.stay_trained or 0.0,
-        )
-    except RuntimeError as error:
-        raise StgaError(str(error).strip().removeprefix("Error: ")) from error
-    operator.report({"INFO"}, f"Recorded {len(recording)} faces: {path}")
+# By a video
 
 
-_keymap_items: list[tuple[Any, Any]] = []
+class DriveVideo(Action, bpy.types.Operator, FileImport):
+    """Find the motion of the face in a video, write it as a file into the takes, and apply it to
+    the head"""
 
+    bl_label = "Drive from Video"
+    needs = (idle(Kind.PERFORMANCE), needs_rig_or_shapes)
 
-def register() -> None:
-    """Let Esc over a 3D viewport stop the session; without a window, Blender has no keys."""
-    keys = bpy.context.window_manager.keyconfigs.addon
-    if keys is not None:
-        keymap = keys.keymaps.new(name="3D View", space_type="VIEW_3D")
-        _keymap_items.append((keymap, keymap.keymap_items.new(ids.STOP_LIVE, "ESC", "PRESS")))
+    avatar: options.field(
+        ConvertMotion, "avatar", "Track with Avatar", subtype="DIR_PATH", options=ONCE
+    )
+    filter_glob: options.file_filter(*VIDEO_SUFFIXES)
 
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        run = context.scene.stga.run_folder
+        if not self.avatar and run and has_run(Path(bpy.path.abspath(run))):
+            self.avatar = run
+        return super().invoke(context, event)
 
-def unregister() -> None:
-    running = live_session.session()
-    if running is not None:
-        running.stop()
-    for keymap, item in _keymap_items:
-        keymap.keymap_items.remove(item)
-    _keymap_items.clear()
+    def run(self, context: Any) -> None:
+        video, head = file_path(self.filepath, "video"), head_of(context)
+        if not is_video(video):
+            raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
+        folder, _ = takes_folder(context)
+        given, suffix = given_values(self, ConvertMotion, "avatar"), SHAPES_SUFFIX
+        is_trained_on = bool(given) and rig_or_none(head) is not None
+        if is_trained_on and read_run(given["avatar"]).capture == Path(head[tags.CAPTURE]):
+            suffix, render = ".npz", context.scene.render  # exact, a timestep for each frame
+            given["fps"] = render.fps / render.fps_base
+        names = (video.stem, *(f"{video.stem}_{number}" for number in count(2)))
+        output = next(path for name in names if not (path := folder / f"{name}{suffix}").exists())
+        start(context.scene, ConvertMotion(video, output, **given), training_python(context))

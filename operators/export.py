@@ -1,16 +1,23 @@
-"""Exports an avatar to the files of other viewers and tools."""
+"""Exports an avatar to the files of other viewers and tools; what the head plays, the cameras and a
+head model for tracking."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from queue import Empty, Queue
+from typing import Any
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.driving.head_map import page_controls
+from ..stga_addon.driving.inverse import captured_performance, write_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.formats import (
     FORMATS,
@@ -19,60 +26,60 @@ from ..stga_addon.export.formats import (
     check_suffix,
     export_avatar,
 )
+from ..stga_addon.export.playback import Playback
+from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
+from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene.arrays import evaluated_vertices
+from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_object import check_head
-from ..stga_addon.scene.objects import frames_per_second, iterate_frames
+from ..stga_addon.scene.objects import Warn, frames_per_second, iterate_frames
+from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
-from . import ids
+from ..stga_addon.scene.vertex_groups import training_selection
+from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
+from . import options
 from .common import (
-    capture_of,
-    file_filter,
+    Action,
     file_path,
-    flame_of,
     head_of,
+    need,
     needs_head,
-    path_property,
+    needs_rig,
+    own_motion,
     reporting,
-    scene_settings,
-    tell,
+    rig_or_none,
+    scene_frames,
 )
-from .export_range import RangeExport
-from .export_web import exact_motion, scene_playback
-from .options import option_property
+from .options import ONCE
 
 STEP_INTERVAL_S = 0.005
+MAX_WAITING_MESHES = 2
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
-class ExportAvatar(bpy.types.Operator, ExportHelper):
+class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
     """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian
     splats"""
 
-    bl_idname = ids.EXPORT_AVATAR
-    bl_label = "Export Avatar"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
+    needs = (needs_head,)
 
-    filepath: path_property(
+    filepath: options.path(
         "File or Folder",
         "A folder for PLY Sequence and GaussianAvatars, a file for the other formats",
-        options={"SKIP_SAVE"},
+        options=ONCE,
     )
-    avatar: path_property(
-        "Avatar", "Avatar file (.npz); empty: the one shown", options={"SKIP_SAVE"}
+    avatar: options.path("Avatar", "Avatar file (.npz); empty: the one shown", options=ONCE)
+    format: options.choice(
+        "Format",
+        "File format",
+        *((name, format.label, format.description) for name, format in FORMATS.items()),
     )
-    format: bpy.props.EnumProperty(
-        name="Format", description="File format",
-        items=tuple((name, format.label, format.description) for name, format in FORMATS.items()),
-    )  # fmt: skip
-
-    filter_glob: file_filter(*SUFFIXES)
-    motion_only: option_property(Export, "motion_only")
-    _range: RangeExport | None = None
+    filter_glob: options.file_filter(*SUFFIXES)
+    motion_only: options.field(Export, "motion_only")
+    _range: "RangeExport | None" = None
     _is_invoked = False
-
-    poll = classmethod(needs_head)
 
     @property
     def filename_ext(self) -> str:
@@ -91,57 +98,49 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        self.layout.prop(self, "format")
-        self.layout.prop(self, "avatar")
-        if self.format == "web":
-            self.layout.prop(self, "motion_only")
+        shown = ("format", "avatar", *(("motion_only",) if self.format == "web" else ()))
+        for name in shown:
+            self.layout.prop(self, name)
         if FORMATS[self.format].source == "range":
-            frames = _frames(context)
-            column = self.layout.column()
+            frames, column = scene_frames(context.scene), self.layout.column()
             column.label(text=f"Frames {frames[0]} to {frames[-1]} of the scene", icon="TIME")
-            column.label(text=self._size(context, len(frames)), icon="DISK_DRIVE")
-
-    def _size(self, context: Any, frames: int) -> str:
-        try:
-            source = self._source(context)
-            return (
-                f"About {format_bytes(_size(source, source.stat().st_mtime, self.format, frames))}"
-            )
-        except (StgaError, OSError) as error:
-            return str(error)
+            try:
+                source = self._source(context)
+                size = _size(source, source.stat().st_mtime, self.format, len(frames))
+                text = f"About {format_bytes(size)}"
+            except (StgaError, OSError) as error:
+                text = str(error)
+            column.label(text=text, icon="DISK_DRIVE")
 
     def _source(self, context: Any) -> Path:
-        return file_path(self.avatar or scene_settings(context).avatar, "avatar")
+        return file_path(self.avatar or context.scene.stga.avatar, "avatar")
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         self._is_invoked = True
-        return super().invoke(context, event)  # type: ignore[no-any-return]
+        return super().invoke(context, event)
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        head, frames = head_of(context), _frames(context)
+    def run(self, context: Any) -> set[str] | None:
+        head, scene = head_of(context), context.scene
+        frames = scene_frames(scene)
         path, write = self._writer(context, head, frames)
         if FORMATS[self.format].source != "range":
-            write((frame, evaluated_vertices(head)) for frame in (context.scene.frame_current,))
+            write(iter([(scene.frame_current, evaluated_vertices(head))]))
         elif not self._is_invoked:
             write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         else:
-            self._range = RangeExport(head, frames, write)
-            self._timer = context.window_manager.event_timer_add(
-                STEP_INTERVAL_S, window=context.window
-            )
-            context.window_manager.modal_handler_add(self)
+            self._range, manager = RangeExport(head, frames, write), context.window_manager
+            self._timer = manager.event_timer_add(STEP_INTERVAL_S, window=context.window)
+            manager.modal_handler_add(self)
             return {"RUNNING_MODAL"}
-        self.report({"INFO"}, f"Exported to {path}")
-        return {"FINISHED"}
+        self.inform(f"Exported to {path}")
+        return None
 
     def _writer(
         self, context: Any, head: Any, frames: range
     ) -> tuple[Path, Callable[[Meshes], Any]]:
         """Where the file comes to lie, and what writes it. Raises StgaError for what can be known
         before."""
-        format = FORMATS[self.format]
-        path = file_path(self.filepath, "export")
+        format, path = FORMATS[self.format], file_path(self.filepath, "export")
         if format.suffixes and not path.suffix:
             path = path.with_suffix(self.filename_ext)
         check_suffix(path, self.format)
@@ -149,27 +148,28 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         check_head(avatar, head)
         motion = playback = None
         if self.format == "web":
+            motion = None if self.motion_only else exact_motion(head, frames, self.warn)
             playback = scene_playback(context, head, frames, self.motion_only)
-            motion = None if self.motion_only else exact_motion(head, frames, self._warn)
             playback = replace(playback, controls=page_controls(motion))
         if format.source == "range":
-            check_free_space(path, FORMATS[self.format].size(avatar, len(frames)))
+            check_free_space(path, format.size(avatar, len(frames)))
         elif format.source == "motion":
-            motion = sample_motion(head, flame_of(capture_of(head), head.name), frames, self._warn)
+            motion = sample_motion(head, own_motion(head), frames, self.warn)
         fps = frames_per_second(context.scene)
-        return path, lambda meshes: export_avatar(
-            path, avatar, self.format, meshes, motion, fps, playback
-        )
+
+        def write(meshes: Meshes) -> None:
+            export_avatar(path, avatar, self.format, meshes, motion, fps, playback)
+
+        return path, write
 
     def modal(self, context: Any, event: Any) -> set[str]:
         """Export one frame a timer event; Esc cancels."""
         job = self._range
         assert job is not None
-        if event.type == "ESC" or event.type == "TIMER":
-            is_running = False if event.type == "ESC" else job.step()
-            context.workspace.status_text_set(
-                f"Exporting frame {job.done} of {job.total}   Esc: Cancel"
-            )
+        if event.type in ("ESC", "TIMER"):
+            is_running = event.type == "TIMER" and job.step()
+            progress = f"Exporting frame {job.done} of {job.total}   Esc: Cancel"
+            context.workspace.status_text_set(progress)
             if not is_running:
                 return self._end(context)
         return {"RUNNING_MODAL"}
@@ -186,13 +186,59 @@ class ExportAvatar(bpy.types.Operator, ExportHelper):
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
         if job.finish():
-            self.report({"INFO"}, f"Exported {job.total} frames to {self.filepath}")
+            self.inform(f"Exported {job.total} frames to {self.filepath}")
             return {"FINISHED"}
         self.report({"WARNING"}, f"Export cancelled after {job.done} of {job.total} frames")
         return {"CANCELLED"}
 
-    def _warn(self, sentence: str) -> None:
-        tell(self, "WARNING", sentence)
+
+class RangeExport:
+    """An export of a range of frames beside the user interface: Blender poses the head, a frame
+    whenever `step` is called, and a thread writes the files.
+
+    head: what plays; frames: of the scene; write: takes the numbered meshes, and raises StgaError
+    where it fails.
+    done, total: frames posed so far, and all.
+    """
+
+    def __init__(self, head: Any, frames: range, write: Callable[[Meshes], Any]) -> None:
+        self.done, self.total = 0, len(frames)
+        self._head, self._frames = head, iterate_frames(frames)
+        self._queue: Queue[Any] = Queue(MAX_WAITING_MESHES)
+        self._is_fed = False
+        pool = ThreadPoolExecutor(1, "stga export")
+        self._written = pool.submit(write, self._meshes())
+        pool.shutdown(wait=False)
+
+    def step(self) -> bool:
+        """Pose the next frame if the thread has room for it; whether the thread is still at
+        work."""
+        if not self._is_fed and not self._queue.full():
+            frame = next(self._frames, None)
+            self._is_fed = frame is None
+            self._queue.put(None if frame is None else (frame, evaluated_vertices(self._head)))
+            self.done += frame is not None
+        return not self._written.done()
+
+    def finish(self) -> bool:
+        """End the export, restore the scene's frame; whether it is whole. Raises what the thread
+        failed with."""
+        self._frames.close()
+        if not self._is_fed:
+            with suppress(Empty):
+                while True:
+                    self._queue.get_nowait()
+            self._queue.put(Cancelled())
+        with suppress(Cancelled):
+            self._written.result()
+            return True
+        return False
+
+    def _meshes(self) -> Meshes:
+        while (item := self._queue.get()) is not None:
+            if isinstance(item, Cancelled):
+                raise item
+            yield item
 
 
 @lru_cache(maxsize=8)
@@ -202,5 +248,112 @@ def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
     return FORMATS[format].size(read_avatar(avatar), frames)
 
 
-def _frames(context: Any) -> range:
-    return range(context.scene.frame_start, context.scene.frame_end + 1)
+# What of the scene plays in a web page
+
+
+def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) -> Playback:
+    """The scene's frame rate, camera, selection groups and upward direction, in the head's
+    space."""
+    to_head = np.linalg.inv(np.array(head.matrix_world, np.float64))
+    up = to_head[:3, :3] @ [0.0, 0.0, 1.0]
+    up /= np.linalg.norm(up)
+    selection = training_selection(head)
+    everything = np.ones(len(head.data.polygons), bool)
+    return Playback(
+        title=head.name,
+        fps=frames_per_second(context.scene),
+        views=_scene_camera(context, to_head),
+        up=(float(up[0]), float(up[1]), float(up[2])),
+        selection=[selection.get(frame, everything) for frame in frames] if selection else None,
+        motion_only=motion_only,
+    )
+
+
+def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
+    """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they
+    would not give the scene's meshes."""
+    if rig_or_none(head) is None:
+        return None
+    reasons: list[str] = []
+    motion = None
+    try:
+        motion = sample_motion(head, own_motion(head), frames, reasons.append)
+    except StgaError as error:
+        reasons.append(str(error))
+    if reasons:
+        warn(f"No sliders in the page: {reasons[0]}")
+        return None
+    return motion
+
+
+def _scene_camera(context: Any, to_head: np.ndarray) -> dict[str, Camera]:
+    """The scene's camera as the head sees it; none where the scene has no perspective camera."""
+    try:
+        found = scene_camera(context.evaluated_depsgraph_get())
+    except StgaError:
+        return {}
+    pose = to_head @ found.camera_to_world_gl
+    pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
+    lens = (found.fl_x, found.fl_y, found.cx, found.cy)
+    seen = camera_from_gl(pose, found.width, found.height, *lens)
+    return {bpy.path.display_name(context.scene.camera.name, has_ext=False): seen}
+
+
+# Other files
+
+
+class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
+    """Export expression, jaw, eyes and neck of the head in the scene's frame range as curves of
+    ARKit's 52 shapes"""
+
+    bl_label = "Export ARKit Curves"
+    needs = (needs_rig,)
+
+    filepath: options.path("File", "CSV file in Live Link Face's layout", options=ONCE)
+    filename_ext = ".csv"
+    filter_glob: options.file_filter(".csv")
+
+    def run(self, context: Any) -> None:
+        head, frames = head_of(context), scene_frames(context.scene)
+        path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
+        motion = sample_motion(head, own_motion(head), frames, self.warn)
+        fps = frames_per_second(context.scene)
+        write_performance(path, captured_performance(motion, head.name, fps))
+        self.inform(f"Exported {len(frames)} frames to {path}")
+
+
+class ExportCameras(Action, bpy.types.Operator, ExportHelper):
+    """Export cameras at the current frame as calibration of footage: each has a folder, video or
+    image of its name"""
+
+    filename_ext = ".json"
+    filepath: options.path("File", "transforms.json in the folder of the footage", options=ONCE)
+    filter_glob: options.file_filter(".json")
+    selected_only: options.boolean(
+        "Selected Only", "Export selected cameras instead of all in the scene"
+    )
+
+    def run(self, context: Any) -> None:
+        objects = context.selected_objects if self.selected_only else context.scene.objects
+        cameras = [thing for thing in objects if thing.type == "CAMERA"]
+        path = file_path(self.filepath, "export")
+        count = export_cameras(path, cameras, context.evaluated_depsgraph_get())
+        self.inform(f"Exported {count} cameras to {path}")
+
+
+class ExportHeadModel(Action, bpy.types.Operator, ExportHelper):
+    """Export the active object's shape keys as a head model for tracking; keys named identity… make
+    other persons"""
+
+    filename_ext = ".npz"
+    filter_glob: options.file_filter(".npz")
+
+    needs = (
+        need(
+            lambda context: has_shape_keys(context.active_object), "Select a mesh with shape keys"
+        ),
+    )
+
+    def run(self, context: Any) -> None:
+        path = file_path(self.filepath, "head model")
+        write_linear_model(path, shape_arrays(*shape_key_model(context.active_object)))

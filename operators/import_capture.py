@@ -1,11 +1,13 @@
-"""Imports a capture: the tracked head and the cameras."""
+"""The Capture step: imports captures, FLAME motions and mesh sequences as animated heads, and opens
+the capture of a generated person that the complete edition brings."""
 
-from functools import partial
+import shutil
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
+from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, has_transforms
 from ..stga_addon.errors import StgaError
@@ -15,101 +17,117 @@ from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
-from . import ids, monitor
-from .arkit_controls import begin_sliders
-from .common import (
-    FileImport,
-    file_filter,
-    file_path,
-    flame_model_path,
-    flame_property,
-    is_head,
-    path_property,
-    reporting,
-    scene_settings,
-    tell,
-)
-from .prepare import begin_preparing
+from ..stga_addon.training.run.folder import has_run
+from . import monitor, options
+from .common import Edit, FileImport, file_path, flame_model_path, is_head, need, package
+from .options import ONCE
+from .pose import begin_sliders
+from .training_python import begin_preparing
 
 FOLDERS_ABOVE_FILE = 3
 """In which the capture of an image, mask, mesh or parameter file is looked for."""
+DEMO = Path(__file__).parents[1] / "demo_capture"
+"""In the complete edition; the others have none."""
+DEMO_MINUTES = 1.0
 
 
-class ImportCapture(bpy.types.Operator, FileImport):
+class ImportCapture(Edit, bpy.types.Operator, FileImport):
     """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with
     images"""
 
-    bl_idname = ids.IMPORT_CAPTURE
-    bl_label = "Import Capture"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
-
-    filepath: path_property(
-        "File", "Folder of the capture, or any file in it", options={"SKIP_SAVE"}
-    )
-    directory: path_property(
+    filepath: options.path("File", "Folder of the capture, or any file in it", options=ONCE)
+    directory: options.path(
         "Capture",
         "Folder of the capture, with its transforms files or meshes; not needed where a file is "
         "given",
-        "DIR_PATH", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    flame: flame_property()
-    principal_point: bpy.props.EnumProperty(
-        name="Principal Point", description="Meaning of cx and cy in the transforms files",
-        items=(
-            (
-                "vhap",
-                "VHAP",
-                "cy is counted from the bottom of the image, as VHAP's exporter writes it",
-            ),
-            ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
-            ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
-        ),
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
-    correctives: bpy.props.EnumProperty(
-        name="Correctives",
-        description="FLAME joints that get pose correctives: shape keys, with drivers, that "
-        "correct the mesh",
-        items=(
-            ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
-            (
-                "moving",
-                "Moving Joints",
-                "Joints that move in this capture only: fewer shape keys and drivers",
-            ),
-        ),
+        "DIR_PATH",
+        options=ONCE,
     )
-    set_up_scene: bpy.props.BoolProperty(
-        name="Set Up Scene",
-        description="Set the scene's resolution, camera and frame rate to those of the capture, "
+    flame: options.flame()
+    principal_point: options.choice(
+        "Principal Point",
+        "Meaning of cx and cy in the transforms files",
+        ("vhap", "VHAP", "cy is counted from the bottom of the image, as VHAP's exporter does"),
+        ("opencv", "OpenCV", "cx and cy are counted from the top left corner of the image"),
+        ("center", "Image Center", "cx and cy are ignored, as GaussianAvatars does"),
+        options=ONCE,
+    )
+    correctives: options.choice(
+        "Correctives",
+        "FLAME joints that get pose correctives: shape keys, with drivers, that correct the mesh",
+        ("all", "All Joints", "Every bone can be posed by hand and gives FLAME's exact mesh"),
+        ("moving", "Moving Joints", "Joints that move in this capture only: fewer shape keys"),
+    )
+    set_up_scene: options.boolean(
+        "Set Up Scene",
+        "Set the scene's resolution, camera and frame rate to those of the capture, "
         "and its view transform to Standard, which the splats' colors are trained for",
         default=True,
     )
-    filter_glob: file_filter("")
+    filter_glob: options.file_filter("")
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        folder = _capture_folder(file_path(self.filepath or self.directory, "capture"))
-        bring_in(
-            self,
-            context,
-            folder,
-            self.flame,
-            self.principal_point,
-            self.set_up_scene,
-            self.correctives,
-        )
-        return {"FINISHED"}
+    def run(self, context: Any) -> None:
+        path = file_path(self.filepath or self.directory, "capture")
+        inside = [] if path.is_dir() else path.parents[:FOLDERS_ABOVE_FILE]
+        folder = next((parent for parent in inside if has_transforms(parent)), path)
+        if folder.is_file():
+            raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
+        point, set_up, correctives = self.principal_point, self.set_up_scene, self.correctives
+        bring_in(self, context, folder, self.flame, point, set_up, correctives)
 
 
-def _capture_folder(path: Path) -> Path:
-    """The folder of a capture that is given by its folder or by any file in it. Raises StgaError
-    for another file."""
-    inside = [] if path.is_dir() else path.parents[:FOLDERS_ABOVE_FILE]
-    folder = next((parent for parent in inside if has_transforms(parent)), path)
-    if folder.is_file():
-        raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
-    return folder
+class ImportMotion(Edit, bpy.types.Operator, FileImport):
+    """Import FLAME parameters (VHAP, GaussianAvatars, plain expression and pose) as a rigged,
+    animated head"""
+
+    bl_label = "Import FLAME Motion"
+
+    flame: options.flame()
+    filter_glob: options.file_filter(".npz")
+
+    def run(self, context: Any) -> None:
+        path = file_path(self.filepath, "motion")
+        if flame_model_path(context, self.flame) is None:
+            remedy = "choose your FLAME model in the add-on's preferences"
+            raise StgaError(f"{path}: holds FLAME parameters; {remedy}")
+        bring_in(self, context, path, self.flame)
+
+
+class ImportMeshes(Edit, bpy.types.Operator, FileImport):
+    """Import a folder of meshes with the same triangles, one for each frame, as an animated head"""
+
+    bl_label = "Import Mesh Sequence"
+
+    filepath: options.path(
+        "File", "Any mesh of the sequence; the whole folder is imported", options=ONCE
+    )
+    filter_glob: options.file_filter(*MESH_SUFFIXES)
+
+    def run(self, context: Any) -> None:
+        path = file_path(self.filepath, "mesh sequence")
+        bring_in(self, context, path if path.is_dir() else path.parent)
+
+
+class OpenDemo(Edit, bpy.types.Operator):
+    """Open a small capture of a generated person, to try training in a minute"""
+
+    bl_label = "Open Demo Capture"
+
+    needs = (need(lambda _: DEMO.is_dir(), "Only the complete edition brings the demo capture"),)
+
+    def run(self, context: Any) -> None:
+        # in Blender's folder for user files, where an update of the add-on leaves it in place
+        own = Path(bpy.utils.extension_path_user(package(), path="demo", create=True)) / "capture"
+        try:
+            shutil.copytree(DEMO, own, dirs_exist_ok=True)
+        except (OSError, shutil.Error) as error:
+            problem = getattr(error, "strerror", None) or error
+            raise StgaError(f"{own}: cannot be written ({problem})") from error
+        bring_in(self, context, own, set_up_scene=True)
+        runs = Path.home() / "STGA Demo"
+        names = ("run", *(f"run {number}" for number in range(2, 1000)))
+        free = next(runs / name for name in names if not has_run(runs / name))
+        context.scene.stga.run_folder, context.scene.stga.minutes = str(free), DEMO_MINUTES
 
 
 def bring_in(
@@ -123,18 +141,17 @@ def bring_in(
 ) -> None:
     """Import what `open_capture` reads from `source`, and make it the scene's head. Raises
     StgaError."""
-    warn = partial(tell, operator, "WARNING")
+    warn, scene, objects = operator.warn, context.scene, context.view_layer.objects
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
-    is_first = not any(is_head(thing) for thing in context.scene.objects)
+    is_first = not any(is_head(thing) for thing in scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(capture.flame_file or "")
     head[tags.PRINCIPAL_POINT] = principal_point
     head[tags.TRACKED] = is_tracked(capture.root)
-    scene_settings(context).head = head
-    scene, objects = context.scene, context.view_layer.objects
+    scene.stga.head = head
     scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
     scene.frame_set(capture.timesteps[0])
     leave_edit_mode()
@@ -155,10 +172,10 @@ def bring_in(
     for sentence in capture.warnings:
         warn(sentence)
     counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
-    operator.report({"INFO"}, ", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
+    operator.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
     begin_sliders(head)
     monitor.show_panel()
-    begin_preparing(context)
+    begin_preparing()
 
 
 def _hide_start_up_cube(context: Any) -> None:
@@ -167,8 +184,7 @@ def _hide_start_up_cube(context: Any) -> None:
     cube = context.view_layer.objects.get("Cube")
     if cube is None or cube.library or cube.type != "MESH" or len(cube.data.vertices) != 8:
         return
-    if cube.modifiers or cube.animation_data:
-        return
-    if cube.matrix_world.is_identity and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
+    is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
+    if not is_moved and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
         cube.hide_set(True)
         cube.hide_render = True

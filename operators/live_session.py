@@ -29,10 +29,11 @@ from ..stga_addon.driving.open_motion import (
     corrected,
     frames_of,
 )
-from ..stga_addon.driving.performance import EXCHANGEABLE, FacePacket, Performance
+from ..stga_addon.driving.performance import FacePacket, Performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene.rig.motion import LivePose
-from . import ids, monitor
+from . import monitor
+from .apply_motion import exchanged_pairs
 
 TICK_S = 1 / 60
 MIN_WAIT_S = 0.001
@@ -136,9 +137,7 @@ class LiveSession:
                 scene.frame_set(scene.frame_current)
 
     def _options(self) -> MotionOptions:
-        return live_options(
-            getattr(bpy.data.scenes[self.scene], ids.SETTINGS).drive, self.rest is not None
-        )
+        return live_options(bpy.data.scenes[self.scene].stga.drive, self.rest is not None)
 
     def _show(self, packet: FacePacket, now: float) -> None:
         options = self._options()
@@ -163,15 +162,10 @@ class LiveSession:
 def live_options(settings: Any, calibrated: bool) -> MotionOptions:
     """The panel's options of a live source, whose resting face is taken off where it is
     calibrated."""
-    exchange = tuple(pair for pair in EXCHANGEABLE if getattr(settings, f"exchange_{pair}"))
-    return MotionOptions(
-        strength=settings.strength,
-        neutral="calibrated" if calibrated else "none",
-        smoothing=settings.smoothing,
-        mirror=settings.mirror,
-        stay_trained=settings.stay_trained,
-        exchange=exchange,
-    )
+    names = ("strength", "smoothing", "mirror", "stay_trained")
+    chosen = {name: getattr(settings, name) for name in names}
+    neutral = "calibrated" if calibrated else "none"
+    return MotionOptions(neutral=neutral, exchange=exchanged_pairs(settings), **chosen)
 
 
 _session: LiveSession | None = None

@@ -2,17 +2,20 @@
 their scenes.
 
 What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and
-carries out effects, those that depend on the kind of request by the table in `results`.
+carries out effects, those that depend on the kind of request by the tables in `results`.
 """
 
+import os
 import shutil
 import traceback
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 from subprocess import Popen
 from time import monotonic, sleep
-from typing import Any, Protocol
+from typing import Any
 
 import bpy
 import numpy as np
@@ -44,10 +47,10 @@ from ..stga_addon.worker.status import (
     refuse_running_worker,
     request_cancel,
 )
-from . import ids
-from .common import is_head
-from .results import IN_SCENE, loader
-from .show import run_of
+from .common import TAB, is_head
+from .results import CHANGED, PLACES, SHOW, load_avatar, stop_loading
+
+MAX_SIDEBAR_ATTEMPTS = 10
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a
@@ -59,31 +62,25 @@ _curves: dict[Path, Curve | None] = {}
 """Run or capture folder -> its curve as last read."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
-
-
-class Watched(Protocol):
-    """What the timer calls beside its checks of requests, at a rate of its own."""
-
-    def tick(self) -> float | None:
-        """Seconds until the next call; None where there is none."""
-
-    def close(self) -> None:
-        """The file, or the extension, is gone."""
-
-
-_watched: list[Watched] = []
+_watched: list[Any] = []
+"""What the timer calls beside its checks of requests, at a rate of its own: `tick` returns the
+seconds until the next call, or None; `close` is called where file or extension is gone."""
 _requests_due = 0.0
 """Monotonic time of the next check of requests, while something is called more often."""
 
 
-def watch(thing: Watched) -> None:
-    """Call `thing` from the timer until it returns None, the file is closed, or the extension
-    ends."""
+def watch(thing: Any) -> None:
+    """Call `thing.tick` from the timer until it returns None, the file is closed, or the extension
+    ends; then, or after an error, `thing.close`."""
+    global _requests_due
     _watched.append(thing)
-    _restart_timer()
+    _requests_due = 0.0
+    if bpy.app.timers.is_registered(tick):  # at once, however long it would have waited
+        bpy.app.timers.unregister(tick)
+    _start_timer()
 
 
-def unwatch(thing: Watched) -> None:
+def unwatch(thing: Any) -> None:
     """Call it no more; without an effect where it is not called."""
     with suppress(ValueError):
         _watched.remove(thing)
@@ -92,7 +89,7 @@ def unwatch(thing: Watched) -> None:
 def state_of(scene: Any, kind: Kind) -> RequestState:
     """The scene's request as the timer last saw it; without a window, where no timer runs, as it
     is."""
-    state = _states.get(_key(scene, kind))
+    state = _states.get((scene.session_uid, kind))
     if has_timer():
         if state is None:
             _start_timer()
@@ -124,9 +121,8 @@ def follow(
 def finish(scene: Any, kind: Kind) -> RequestState:
     """Bring the result of a request that was waited for into the scene; what `Train` made is
     stored, not shown."""
-    state = _handle(
-        scene, kind, _read_status(scene, _states[_key(scene, kind)], kind != Kind.TRAINING)
-    )
+    state = _states[scene.session_uid, kind]
+    state = _handle(scene, kind, _read_status(scene, state, kind != Kind.TRAINING))
     while state.loading is not None:
         state = _handle(scene, kind, states.SceneFree())
         if state.loading is not None:
@@ -166,69 +162,54 @@ def has_timer() -> bool:
     return not bpy.app.background
 
 
+# The timer
+
+
 def tick() -> float | None:
     """Check every request, and call what is watched; seconds until the next call, None to stop the
     timer, as bpy.app.timers expects."""
-    intervals = [_check_requests(), *(_call_safely(thing) for thing in list(_watched))]
-    return min((interval for interval in intervals if interval is not None), default=None)
-
-
-def _check_requests() -> float | None:
-    """Check every request, unless the timer runs faster for something else and it is too early;
-    seconds until the next check, None where nothing is expected."""
     global _requests_due
     now = monotonic()
-    if _watched and now < _requests_due:
-        return _requests_due - now
-    scenes = [scene for scene in bpy.data.scenes if scene.library is None]
-    intervals = [_check_safely(scene, kind) for scene in scenes for kind in Kind]
-    interval = min((interval for interval in intervals if interval is not None), default=None)
-    _requests_due = now + (CHECK_INTERVAL_S if interval is None else interval)
-    return interval
-
-
-def _call_safely(thing: Watched) -> float | None:
-    """Call what is watched; after an unexpected error, which is reported, it is closed and called
-    no more."""
-    try:
-        interval = thing.tick()
-    except Exception as error:
-        print(_describe(error))
-        thing.close()
+    if _watched and now < _requests_due:  # the timer runs faster for something else
+        intervals = [_requests_due - now]
+    else:
+        scenes = [scene for scene in bpy.data.scenes if scene.library is None]
+        checked = [_check(scene, kind) for scene in scenes for kind in Kind]
+        intervals = [interval for interval in checked if interval is not None]
+        _requests_due = now + min(intervals, default=CHECK_INTERVAL_S)
+    for thing in list(_watched):
         interval = None
-    if interval is None:
-        unwatch(thing)
-    return interval
-
-
-def _check_safely(scene: Any, kind: Kind) -> float | None:
-    """Check one request; an unexpected error is reported once, and ends the monitoring of this
-    request only."""
-    try:
-        return _check(scene, kind)
-    except Exception as error:
-        _handle(
-            scene,
-            kind,
-            states.Failed(f"Monitoring stopped after an unexpected {_describe(error)}", stops=True),
-        )
-        return None
+        try:
+            interval = thing.tick()
+        except Exception as error:
+            print(_describe(error))
+            thing.close()
+        if interval is None:
+            unwatch(thing)
+        else:
+            intervals.append(interval)
+    return min(intervals, default=None)
 
 
 def _check(scene: Any, kind: Kind) -> float | None:
-    state = _read_scene(scene, kind)
-    if state.folder is None or state.stopped:
+    """Check one request; seconds until the next check. An unexpected error is reported once, and
+    ends the monitoring of this request only."""
+    try:
+        state = _read_scene(scene, kind)
+        if state.folder is None or state.stopped:
+            return None
+        if not state.building:
+            state = _handle(scene, kind, _read_status(scene, state))
+        if state.loading is not None and not bpy.app.is_job_running("RENDER"):
+            changed = CHANGED[kind](scene, state) if kind in CHANGED else None
+            # Blender crashes where a mesh changes while it renders, or in Edit Mode.
+            if changed is None or changed.mode != "EDIT":
+                state = _handle(scene, kind, states.SceneFree())
+        return state.interval_s
+    except Exception as error:
+        sentence = f"Monitoring stopped after an unexpected {_describe(error)}"
+        _handle(scene, kind, states.Failed(sentence, stops=True))
         return None
-    if not state.building:
-        state = _handle(scene, kind, _read_status(scene, state))
-    # Blender crashes where a mesh changes during these.
-    if (
-        state.loading is not None
-        and not bpy.app.is_job_running("RENDER")
-        and not _is_edited(scene, kind)
-    ):
-        state = _handle(scene, kind, states.SceneFree())
-    return state.interval_s
 
 
 def _describe(error: Exception) -> str:
@@ -237,13 +218,12 @@ def _describe(error: Exception) -> str:
     return f"error ({type(error).__name__}: {error}); see the console"
 
 
-def _key(scene: Any, kind: Kind) -> tuple[int, Kind]:
-    return scene.session_uid, kind
+def _start_timer() -> None:
+    if has_timer() and not bpy.app.timers.is_registered(tick):
+        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
-def _is_edited(scene: Any, kind: Kind) -> bool:
-    changed = IN_SCENE[kind].changed(scene, _states[_key(scene, kind)])
-    return changed is not None and changed.mode == "EDIT"
+# What is read
 
 
 def _stored_state(scene: Any, kind: Kind) -> RequestState:
@@ -256,12 +236,8 @@ def _stored_state(scene: Any, kind: Kind) -> RequestState:
 
 
 def _read_stored(scene: Any, kind: Kind) -> tuple[Path | None, bool]:
-    settings, (subject, result_shown) = (
-        getattr(scene, ids.SETTINGS),
-        IN_SCENE[kind].stored or ("", ""),
-    )
-    path = getattr(settings, subject)
-    return Path(path) if path else None, getattr(settings, result_shown)
+    path, result_shown = (getattr(scene.stga, name) for name in PLACES[kind])
+    return Path(path) if path else None, result_shown
 
 
 def _locate(scene: Any, state: RequestState) -> Path | None:
@@ -271,14 +247,14 @@ def _locate(scene: Any, state: RequestState) -> Path | None:
         return state.folder
     named = request_folder(state.subject)
     if state.kind == Kind.TRAINING and not named.is_dir():
-        beside = request_folder(Path(bpy.path.abspath(getattr(scene, ids.SETTINGS).run_folder)))
+        beside = request_folder(Path(bpy.path.abspath(scene.stga.run_folder)))
         return beside if beside.is_dir() else named
     return named
 
 
 def _read_scene(scene: Any, kind: Kind) -> RequestState:
     """Compare the request's state with what is stored in the scene."""
-    key = _key(scene, kind)
+    key = scene.session_uid, kind
     if key not in _states:
         _states[key] = _stored_state(scene, kind)
     elif kind in STORED:
@@ -293,14 +269,10 @@ def _read_status(
     assert folder is not None
     if state.kind not in STORED:
         return states.StatusRead(folder, inspect_status(folder))
-    settings, run = getattr(scene, ids.SETTINGS), replace(state, folder=folder).run
-    files = RunFiles(
-        _stamp(folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0])
-        if state.kind == Kind.AVATAR
-        else None,
-        _stamp(folder / PICTURE),
-        *map(_stamp, (folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)),
-    )
+    settings, run = scene.stga, replace(state, folder=folder).run
+    tracked = folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0]
+    made = (folder / PICTURE, folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)
+    files = RunFiles(_stamp(tracked) if state.kind == Kind.AVATAR else None, *map(_stamp, made))
     shown = settings.show_result if show_result is None else show_result
     return states.StatusRead(folder, inspect_status(folder), files, settings.live_preview, shown)
 
@@ -313,12 +285,30 @@ def _stamp(path: Path) -> states.Stamp | None:
     return found.st_mtime_ns, found.st_size
 
 
+def _read_curve(run: Path, folder: Path | None) -> Curve | None:
+    """What training, or the tracking of the request in the folder, shows; None where that is
+    damaged, which training reports."""
+    with suppress(StgaError, KeyError, TypeError, ValueError):
+        found = curve_image(read_metrics(run))
+        if found is not None:
+            return found
+    with suppress(StgaError, KeyError):
+        rgb = read_npz(folder / PICTURE)["rgb"] if folder is not None else np.empty(0)
+        if rgb.ndim == 3 and rgb.dtype == np.uint8:
+            rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
+            return rgba[::-1].astype(np.float32) / 255, "", ""
+    return None
+
+
+# Effects
+
+
 def _handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
     """Feed the event to the request's state, carry out the effects, and feed their answers in turn.
 
     Raises StgaError where files cannot be written or removed; the state is that of before then.
     """
-    key = _key(scene, kind)
+    key = scene.session_uid, kind
     state, effects = transition(_states.get(key) or _stored_state(scene, kind), event)
     answers = [_carry_out(scene, state, effect) for effect in effects]
     _states[key] = state
@@ -331,18 +321,23 @@ def _handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
 def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states.Event | None:
     match effect:
         case states.Store(subject, result_shown):
-            names = IN_SCENE[state.kind].stored
-            assert names is not None
-            for name, value in zip(names, (str(subject or ""), result_shown), strict=True):
-                setattr(getattr(scene, ids.SETTINGS), name, value)
+            path, shown = PLACES[state.kind]
+            setattr(scene.stga, path, str(subject or ""))
+            setattr(scene.stga, shown, result_shown)
         case states.StoreAvatar(path):
-            getattr(scene, ids.SETTINGS).avatar = str(path)
+            scene.stga.avatar = str(path)
         case states.LoadAvatar(path):
-            loader.load(scene, path)
+            load_avatar(scene, path)
         case states.Show():
-            return _show(scene, state)
+            try:
+                return SHOW[state.kind](scene, state)
+            # RuntimeError: Blender refuses, for example on linked objects
+            except (StgaError, RuntimeError) as error:
+                return states.Failed(str(error).strip().removeprefix("Error: "))
+            except Exception as error:
+                return states.Failed(f"Unexpected {_describe(error)}")
         case states.ReadCurve(run):
-            _curves[run] = _read_curve(run) or _read_picture(state.folder)
+            _curves[run] = _read_curve(run, state.folder)
         case states.StopWorker(folder):
             request_cancel(folder)
         case states.KillWorker(folder):
@@ -358,16 +353,6 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
     return None
 
 
-def _show(scene: Any, state: RequestState) -> states.Event | None:
-    try:
-        return IN_SCENE[state.kind].show(scene, state)
-    # RuntimeError: Blender refuses, for example on linked objects
-    except (StgaError, RuntimeError) as error:
-        return states.Failed(str(error).strip().removeprefix("Error: "))
-    except Exception as error:
-        return states.Failed(f"Unexpected {_describe(error)}")
-
-
 def _remove(kind: Kind, folder: Path) -> None:
     """Raises StgaError while the worker is running, or where a file cannot be removed."""
     if kind in STORED:  # a file from elsewhere may name any folder
@@ -381,46 +366,10 @@ def _remove(kind: Kind, folder: Path) -> None:
         _curves.pop(drawn, None)
 
 
-def _read_curve(run: Path) -> Curve | None:
-    try:
-        return curve_image(read_metrics(run))
-    except (StgaError, KeyError, TypeError, ValueError):
-        return None  # training reports a damaged file
-
-
-def _read_picture(folder: Path | None) -> Curve | None:
-    """What the tracking of the request in this folder shows."""
-    try:
-        rgb = read_npz(folder / PICTURE)["rgb"] if folder is not None else None
-    except (StgaError, KeyError):
-        return None
-    if rgb is None or rgb.ndim != 3 or rgb.dtype != np.uint8:
-        return None
-    return (
-        np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])[::-1].astype(np.float32) / 255,
-        "",
-        "",
-    )
-
-
 def push_undo() -> None:
     """Let undo come back to what is in the file now."""
     if bpy.ops.ed.undo_push.poll():
         bpy.ops.ed.undo_push(message="Show Result")
-
-
-def _restart_timer() -> None:
-    """Let the timer run at once, however long it would have waited."""
-    global _requests_due
-    _requests_due = 0.0
-    if bpy.app.timers.is_registered(tick):
-        bpy.app.timers.unregister(tick)
-    _start_timer()
-
-
-def _start_timer() -> None:
-    if has_timer() and not bpy.app.timers.is_registered(tick):
-        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
 def redraw() -> None:
@@ -432,14 +381,30 @@ def redraw() -> None:
                         region.tag_redraw()
 
 
-def _close_watched() -> None:
+def show_panel() -> None:
+    """Open the sidebar at the add-on's tab, from a timer and for a few seconds at most, where there
+    is a window."""
+    if has_timer():
+        attempt = partial(_open_sidebar, count(1))
+        bpy.app.timers.register(attempt, first_interval=CHECK_INTERVAL_S)
+
+
+def _open_sidebar(attempts: Any) -> float | None:
+    screens = [window.screen for window in bpy.context.window_manager.windows]
+    is_over = open_sidebar(TAB, screens) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
+    return None if is_over else CHECK_INTERVAL_S
+
+
+# Files that are opened and saved
+
+
+def _close() -> None:
+    """Stop what belongs to the open file, and the workers whose result only its scenes were to
+    have."""
+    stop_loading()
     for thing in list(_watched):
         thing.close()
     _watched.clear()
-
-
-def _end_unawaited() -> None:
-    """End the workers whose result only a scene that is gone was to have."""
     for (_, kind), state in list(_states.items()):
         if kind in TRANSIENT and state.folder is not None:
             for effect in transition(state, states.CancelAsked())[1]:
@@ -461,8 +426,7 @@ def _rebase(old: str, new: str) -> None:
     """Let scenes find their run and avatar from another .blend file: relative where they lie beside
     it or below, so that all can be moved together."""
     beside = Path(new).parent
-    own = [scene for scene in bpy.data.scenes if scene.library is None]
-    for settings in [getattr(scene, ids.SETTINGS) for scene in own]:
+    for settings in [scene.stga for scene in bpy.data.scenes if scene.library is None]:
         for name in ("run_folder", "avatar"):
             value = getattr(settings, name)
             place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
@@ -483,9 +447,7 @@ def _after_append(_: Any) -> None:
 
 @persistent
 def _after_load(_: Any) -> None:
-    loader.close()
-    _close_watched()
-    _end_unawaited()
+    _close()
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
     _after_append(None)
@@ -495,7 +457,7 @@ def _after_load(_: Any) -> None:
 def _adopt(scene: Any) -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
     `stga demo` does, or into which an avatar was appended."""
-    settings = getattr(scene, ids.SETTINGS)
+    settings = scene.stga
     heads = [thing for thing in scene.objects if is_head(thing)]
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
     if settings.head is None and len(heads) == 1:
@@ -508,33 +470,20 @@ def _adopt(scene: Any) -> None:
         settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
 
+def run_of(avatar: str) -> str:
+    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
+    folder = os.path.dirname(avatar)
+    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
+
+
 @persistent
 def _after_update(scene: Any, *_: Any) -> None:
     """Let the panel work on no head, and no splats, that were deleted: its pointers keep these in
     the file."""
-    settings = getattr(scene, ids.SETTINGS)
     for name in ("head", "splats"):
-        thing = getattr(settings, name)
+        thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:
-            setattr(settings, name, None)
-
-
-def show_panel() -> None:
-    """Open the sidebar at the add-on's tab, where there is a window."""
-    if has_timer():
-        bpy.app.timers.register(_Sidebar(), first_interval=CHECK_INTERVAL_S)
-
-
-class _Sidebar:
-    """Opens the sidebar at the add-on's tab, from a timer, for a few seconds at most."""
-
-    def __init__(self) -> None:
-        self._attempts = 10
-
-    def __call__(self) -> float | None:
-        self._attempts -= 1
-        screens = [window.screen for window in bpy.context.window_manager.windows]
-        return None if open_sidebar(ids.TAB, screens) or not self._attempts else CHECK_INTERVAL_S
+            setattr(scene.stga, name, None)
 
 
 HANDLERS = (
@@ -558,9 +507,7 @@ def unregister() -> None:
     for timer in (tick, push_undo):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    loader.close()
-    _close_watched()
-    _end_unawaited()
+    _close()
     for (_, kind), state in _states.items():
         if kind == Kind.VIDEO and state.folder is not None:
             with suppress(StgaError):  # its worker is running

@@ -1,8 +1,8 @@
-"""Fields of requests as Blender's properties: tooltip, limits and default are those of the command
-line."""
+"""Properties of operators and panels: paths, and fields of requests, whose tooltip, limits and
+default are those of the command line."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import inf
 from pathlib import Path
 from types import NoneType
@@ -10,15 +10,64 @@ from typing import Any
 
 import bpy
 
+from ..stga_addon.scene.compat import PATH_OPTIONS
 from ..stga_addon.schema import MAX_COUNT, alternatives, type_hints
-from .common import file_path, path_property
 
+ONCE = {"SKIP_SAVE"}
+"""Options of a property that holds for one call: Blender does not remember it for the next."""
 DEFAULT = re.compile(r" \(default:? ([^)]*)\)")
 """What a help says of the default, which Blender shows by itself, or for which 0 or nothing
 stands."""
 
 
-def option_property(
+def boolean(name: str, description: str, **more: Any) -> Any:
+    return bpy.props.BoolProperty(name=name, description=description, **more)
+
+
+def integer(name: str, description: str, **more: Any) -> Any:
+    return bpy.props.IntProperty(name=name, description=description, **more)
+
+
+def number(name: str, description: str, **more: Any) -> Any:
+    return bpy.props.FloatProperty(name=name, description=description, **more)
+
+
+def text(name: str, description: str, **more: Any) -> Any:
+    return bpy.props.StringProperty(name=name, description=description, **more)
+
+
+def choice(name: str, description: str, *items: tuple[str, str, str], **more: Any) -> Any:
+    """items: identifier, label and description of each choice."""
+    return bpy.props.EnumProperty(name=name, description=description, items=items, **more)
+
+
+def path(
+    name: str, description: str, subtype: str = "FILE_PATH", options: Any = (), **more: Any
+) -> Any:
+    """A path, which may begin with "//"."""
+    options = {*PATH_OPTIONS, *options}
+    return text(name, description, subtype=subtype, options=options, **more)
+
+
+def file_filter(*suffixes: str) -> Any:
+    """The files that a file browser shows."""
+    shown = ";".join(f"*{suffix}" for suffix in suffixes)
+    return bpy.props.StringProperty(default=shown, options={"HIDDEN"})
+
+
+def flame() -> Any:
+    """FLAME model of an import operator."""
+    purpose = "for captures and motions tracked with FLAME; empty: that of the preferences"
+    return path("FLAME Model", f"FLAME model file (.pkl or .npz), {purpose}", options=ONCE)
+
+
+def python(work: str, options: Collection[str] = ONCE) -> Any:
+    """The interpreter that does a work."""
+    about = f"Python interpreter that {work}; empty: that of the preferences, or Blender's own"
+    return text("Python", about, subtype="FILE_PATH", options=options)
+
+
+def field(
     kind: Any, name: str, label: str = "", labels: Mapping[str, str] | None = None, **more: Any
 ) -> Any:
     """A property for a field of a dataclass; 0 and "" stand for None.
@@ -31,20 +80,15 @@ def option_property(
     help, default = DEFAULT.sub("", asked["help"]), DEFAULT.search(asked["help"])
     if is_optional and (default is not None or hint is not Path):
         help += f"; {'empty' if hint is Path else 0}: {'none' if default is None else default[1]}"
-    about = {
-        "name": label or name.replace("_", " ").title(),
-        "description": help[0].upper() + help[1:],
-        **more,
-    }
+    label = label or name.replace("_", " ").title()
+    about = {"name": label, "description": help[0].upper() + help[1:], **more}
     if hint is Path:
-        return path_property(about.pop("name"), about.pop("description"), **about)
+        return path(about.pop("name"), about.pop("description"), **about)
     if asked["offered"]:
-        texts = asked["offered"]
-        named = {
-            choice: (labels or {}).get(choice, choice.replace("-", " ").title()) for choice in texts
-        }
+        named = {each: each.replace("-", " ").title() for each in asked["offered"]} | (labels or {})
         items = [
-            (choice, named[choice], text[0].upper() + text[1:]) for choice, text in texts.items()
+            (choice, named[choice], text[0].upper() + text[1:])
+            for choice, text in asked["offered"].items()
         ]
         return bpy.props.EnumProperty(items=items, **about)
     if isinstance(spec.default, bool | int | float):
@@ -52,21 +96,7 @@ def option_property(
     if hint is bool:
         return bpy.props.BoolProperty(**about)
     low, high = 0 if is_optional else max(asked["minimum"], asked["above"]), asked["maximum"]
-    limits = {
-        **({"min": low} if low > -inf else {}),
-        **({"max": min(high, MAX_COUNT)} if high < inf else {}),
-    }
-    return (bpy.props.IntProperty if hint is int else bpy.props.FloatProperty)(
-        **{**limits, **about}
-    )
-
-
-def given_values(operator: Any, kind: Any, *names: str) -> dict[str, Any]:
-    """Field -> value of an operator's properties, of those that are not left at None."""
-    found = {}
-    for name in names:
-        value, (hint, *none) = getattr(operator, name), alternatives(type_hints(kind)[name])
-        if none and not value:
-            continue
-        found[name] = file_path(value, name.replace("_", " ")).resolve() if hint is Path else value
-    return found
+    limits = {"min": low} if low > -inf else {}
+    limits |= {"max": min(high, MAX_COUNT)} if high < inf else {}
+    make = bpy.props.IntProperty if hint is int else bpy.props.FloatProperty
+    return make(**{**limits, **about})

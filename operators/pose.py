@@ -1,38 +1,48 @@
-"""Enters and leaves Pose mode on the head's rig."""
+"""Posing the head by hand: Pose mode on its rig, and sliders named as ARKit's blend shapes."""
 
-from typing import Any, ClassVar
+from contextlib import suppress
+from threading import Thread
+from typing import Any
 
 import bpy
+import numpy as np
+from bpy.app.handlers import persistent
 
+from ..stga_addon.driving.head_map import HeadMap, head_map
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import leave_edit_mode, show_kind
 from ..stga_addon.scene.rig.head import rig_of
-from ..stga_addon.scene.rig.keyframes import posing_bone
-from . import ids
-from .common import head_of, needs_rig, reporting
+from ..stga_addon.scene.rig.keyframes import (
+    EXPRESSION_NAMES,
+    add_shapes,
+    has_shapes,
+    head_shapes,
+    posing_bone,
+)
+from . import live_session, monitor
+from .common import Edit, capture_source, flame_motion, head_of, needs_rig, polled, rig_or_none
+
+POLL_INTERVAL_S = 0.3
+Shapes = tuple[HeadMap, np.ndarray, np.ndarray]
 
 
-class PoseHead(bpy.types.Operator):
+class PoseHead(Edit, bpy.types.Operator):
     """Show the bones and select one in Pose mode; again: back to Object mode. R turns a bone, I
     keeps its pose"""
 
-    bl_idname = ids.POSE_HEAD
     bl_label = "Pose the Head"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+    needs = (needs_rig,)
 
-    poll = classmethod(needs_rig)
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         head, objects = head_of(context), context.view_layer.objects
         rig = rig_of(head)
         was_posing = is_posing(context, rig)
         leave_edit_mode()
         show_kind(head.parent, tags.RIG, context.view_layer, not was_posing)
         if was_posing:
-            return {"FINISHED"}
+            return
         rig.hide_set(False)
         if not rig.visible_get(view_layer=context.view_layer):
             raise StgaError(f"{rig.name}: is hidden; show its collection in the Outliner")
@@ -46,15 +56,14 @@ class PoseHead(bpy.types.Operator):
         rig.data.bones.active = rig.data.bones[bone]
         if context.area is not None and context.area.type == "VIEW_3D":
             bpy.ops.wm.tool_set_by_id(name="builtin.rotate")
-        return {"FINISHED"}
 
 
 class TurnJaw(bpy.types.Operator):
     """Open and close the mouth: R turns the jaw about its hinge, from whatever side it is seen"""
 
-    bl_idname = ids.TURN_JAW
+    bl_idname = "stga.turn_jaw"
     bl_label = "Turn the Jaw"
-    bl_options: ClassVar[set[str]] = {"INTERNAL"}
+    bl_options = frozenset({"INTERNAL"})
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -72,18 +81,94 @@ def is_posing(context: Any, rig: Any) -> bool:
     return context.view_layer.objects.active is rig and rig.mode == "POSE"
 
 
-_keymap_items: list[tuple[Any, Any]] = []
+# Sliders
+
+
+class AddArkitControls(Edit, bpy.types.Operator):
+    """Add 52 sliders named as ARKit's blend shapes: jawOpen, mouthSmileLeft, …"""
+
+    bl_label = "Add Face Sliders"
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        has_names = EXPRESSION_NAMES in (context.scene.stga.head or {})
+        return needs_rig(cls, context) and polled(cls, not has_names, "The head has its sliders")
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        add_shapes(head, *_compute_shapes(capture_source(head), head.name))
+
+
+def _compute_shapes(source: tuple[Any, ...], name: str) -> Shapes:
+    """Seconds of work. Raises StgaError for a head whose face ARKit's shapes do not fit."""
+    sequence = flame_motion(name, *source)
+    found = head_map(sequence, name)
+    return found, *head_shapes(sequence, found)
+
+
+def needs_sliders(head: Any) -> bool:
+    """Whether a head has neither expressions with ARKit's names nor the sliders."""
+    rig = rig_or_none(head)
+    return rig is not None and EXPRESSION_NAMES not in head and not has_shapes(head)
+
+
+def begin_sliders(head: Any) -> None:
+    """Give a head that needs them its sliders as soon as a thread has computed them, and any its
+    map, for which *Drive Live* would wait; scripts call the operators."""
+    if monitor.has_timer() and rig_or_none(head) is not None and head.library is None:
+        monitor.watch(_Sliders(head))
+
+
+preparing: set[str] = set()
+"""Names of heads whose sliders are being computed."""
+
+
+class _Sliders:
+    """What a thread computes for a head, which is looked up by its name: undo moves it."""
+
+    def __init__(self, head: Any) -> None:
+        self._head, self._made = head.name, list[Shapes]()
+        arguments = capture_source(head), needs_sliders(head)
+        self._thread = Thread(target=self._make, args=arguments, daemon=True)
+        self._thread.start()
+        if needs_sliders(head):
+            preparing.add(self._head)
+
+    def _make(self, source: tuple[Any, ...], has_none: bool) -> None:
+        with suppress(StgaError):  # the operator says what is wrong
+            if has_none:
+                self._made.append(_compute_shapes(source, self._head))
+            else:
+                head_map(flame_motion(self._head, *source), self._head)
+
+    def tick(self) -> float | None:
+        is_driven = live_session.session() is not None  # which further sliders would end
+        if self._thread.is_alive() or is_driven or bpy.app.is_job_running("RENDER"):
+            return POLL_INTERVAL_S
+        preparing.discard(self._head)
+        head = bpy.data.objects.get(self._head)
+        if self._made and needs_sliders(head):
+            if head.mode == "EDIT":
+                return POLL_INTERVAL_S
+            add_shapes(head, *self._made[0])
+            monitor.push_undo()
+            monitor.redraw()
+        return None
+
+    def close(self) -> None:
+        preparing.discard(self._head)
+
+
+@persistent
+def _after_load(_: Any) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            begin_sliders(scene.stga.head)
 
 
 def register() -> None:
-    """R turns a jaw about its hinge; without a window, Blender has no keys."""
-    keys = bpy.context.window_manager.keyconfigs.addon
-    if keys is not None:
-        keymap = keys.keymaps.new(name="Pose")
-        _keymap_items.append((keymap, keymap.keymap_items.new(ids.TURN_JAW, "R", "PRESS")))
+    bpy.app.handlers.load_post.append(_after_load)
 
 
 def unregister() -> None:
-    for keymap, item in _keymap_items:
-        keymap.keymap_items.remove(item)
-    _keymap_items.clear()
+    bpy.app.handlers.load_post.remove(_after_load)

@@ -1,5 +1,5 @@
-"""Renders a video of the shown splats: Blender records what each image shows, a worker renders and
-encodes it."""
+"""Rendering: the engine and the GPU display of splats, and videos, of which Blender records what
+each image shows; a worker renders and encodes it."""
 
 import shutil
 import tempfile
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from math import pi
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
@@ -19,27 +19,20 @@ from ..stga_addon.jobs.render import Render
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
+from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.objects import frames_per_second
+from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
-from . import ids, monitor
-from .common import (
-    file_filter,
-    file_path,
-    is_head,
-    path_property,
-    polled,
-    reporting,
-    scene_settings,
-)
-from .options import option_property
-from .render_engine import render_device
-from .request import needs_idle, start
+from . import monitor, options
+from .common import Action, file_path, is_head, need, preferences, scene_frames
+from .options import ONCE
+from .request import idle, start
 from .training_python import has_training_python, training_python
 
 RECORDING = "recording.bin"
@@ -47,60 +40,58 @@ RECORDING_INTERVAL_S = 0.001
 """Between two recorded images, so that Blender handles its events."""
 
 
-class RenderVideo(bpy.types.Operator, ExportHelper):
+def render_device() -> str:
+    """The rendering device in the preferences, as `render.device.Composer` takes it."""
+    stored = preferences(bpy.context)
+    return str(stored.render_device) if stored else "auto"
+
+
+def _has_renderer(context: Any) -> bool:
+    return has_training_python(context) or has_gpu_context()
+
+
+class RenderVideo(Action, bpy.types.Operator, ExportHelper):
     """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working
     meanwhile"""
 
-    bl_idname = ids.RENDER_VIDEO
-    bl_label = "Render Video"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
-    filepath: path_property(
-        "File or Folder", "An .mp4 file, or a folder for PNGs", options={"SKIP_SAVE"}
+    needs = (
+        need(lambda context: context.scene.stga.splats, "Show an avatar first"),
+        idle(Kind.VIDEO),
+        need(_has_renderer, "Needs a GPU, or a Python that trains: choose one in the preferences"),
     )
-    path: bpy.props.EnumProperty(
-        name="Camera", description="How the camera moves",
-        items=(
-            (
-                "turntable",
-                "Turntable",
-                "The scene's camera moves around the head, which plays its motion to and fro",
-            ),
-            (
-                "scene",
-                "As Animated",
-                "The scene's camera and animation, from the scene's first to its last frame",
-            ),
+
+    filepath: options.path("File or Folder", "An .mp4 file, or a folder for PNGs", options=ONCE)
+    path: options.choice(
+        "Camera",
+        "How the camera moves",
+        (
+            "turntable",
+            "Turntable",
+            "The scene's camera moves around the head, which plays its motion to and fro",
         ),
-    )  # fmt: skip
-    format: bpy.props.EnumProperty(
-        name="Format", description="What is written",
-        items=(
-            ("mp4", "MP4", "One video file, H.264"),
-            ("png", "PNG Sequence", "One PNG per image; with alpha where the film is transparent"),
+        (
+            "scene",
+            "As Animated",
+            "The scene's camera and animation, from the scene's first to its last frame",
         ),
-    )  # fmt: skip
-    angle: bpy.props.FloatProperty(
-        name="Angle",
-        description="Of the turntable, to both sides; 0: the sides that the capture's cameras saw",
-        subtype="ANGLE", min=0.0, max=2 * pi, default=0.0,
-    )  # fmt: skip
-    seconds: option_property(Render, "seconds", min=0.1, soft_max=60.0)
+    )
+    format: options.choice(
+        "Format",
+        "What is written",
+        ("mp4", "MP4", "One video file, H.264"),
+        ("png", "PNG Sequence", "One PNG per image; with alpha where the film is transparent"),
+    )
+    angle: options.number(
+        "Angle",
+        "Of the turntable, to both sides; 0: the sides that the capture's cameras saw",
+        subtype="ANGLE",
+        min=0.0,
+        max=2 * pi,
+    )
+    seconds: options.field(Render, "seconds", min=0.1, soft_max=60.0)
     filename_ext = ""
-    filter_glob: file_filter(".mp4")
-
+    filter_glob: options.file_filter(".mp4")
     _recording: Any = None
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if not polled(cls, scene_settings(context).splats is not None, "Show an avatar first"):
-            return False
-        if not needs_idle(cls, context, Kind.VIDEO):
-            return False
-        message = (
-            "Needs a GPU, or a Python that trains, which is chosen in the add-on's preferences"
-        )
-        return polled(cls, has_training_python(context) or has_gpu_context(), message)
 
     def check(self, context: Any) -> bool:
         """Keep the path's extension in step with the format; whether it changed."""
@@ -110,34 +101,31 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
         changed, self.filepath = path != self.filepath, path
         return changed
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> set[str] | None:
         output = file_path(self.filepath, "video").resolve()
-        if self.format == "mp4" and output.suffix.lower() != ".mp4":
+        is_video, manager = output.suffix.lower() == ".mp4", context.window_manager
+        if self.format == "mp4" and not is_video:
             output = output.with_name(f"{output.name}.mp4")
-        if self.format == "png" and output.suffix.lower() == ".mp4":
+        if self.format == "png" and is_video:
             output = output.with_suffix("")
         self._python = training_python(context) if has_training_python(context) else None
-        frames = self._frames(context)
-        self._recording = _Recording(
-            context, output, frames, self._cameras(context, len(frames)), drawn=self._python is None
-        )
+        frames, drawn = self._frames(context.scene), self._python is None
+        cameras = self._cameras(context, len(frames))
+        self._recording = _Recording(context, output, frames, cameras, drawn)
         if bpy.app.background:
-            return self._record_and_render(context)
-        self._timer = context.window_manager.event_timer_add(
-            RECORDING_INTERVAL_S, window=context.window
-        )
-        context.window_manager.modal_handler_add(self)
+            self._record_and_render()
+            return None
+        self._timer = manager.event_timer_add(RECORDING_INTERVAL_S, window=context.window)
+        manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def _record_and_render(self, context: Any) -> set[str]:
+    def _record_and_render(self) -> None:
         """Without a window: nothing is left but the video."""
         try:
             while self._recording.record_next():
                 pass
             self._recording.render(self._python)
-            self.report({"INFO"}, f"Rendered {self._recording.output}")
-            return {"FINISHED"}
+            self.inform(f"Rendered {self._recording.output}")
         finally:
             self._recording.discard()
 
@@ -168,20 +156,18 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             context.window_manager.event_timer_remove(self._timer)
             self._recording.discard()
 
-    def _frames(self, context: Any) -> list[int]:
-        scene = context.scene
-        frames = list(range(scene.frame_start, scene.frame_end + 1))
+    def _frames(self, scene: Any) -> list[int]:
+        frames = list(scene_frames(scene))
         if self.path == "scene":
             return frames
-        return to_and_fro(
-            frames, max(len(frames), round(self.seconds * frames_per_second(scene)), 1)
-        )
+        asked = round(self.seconds * frames_per_second(scene))
+        return to_and_fro(frames, max(len(frames), asked))
 
     def _cameras(self, context: Any, count: int) -> Sequence[Camera] | None:
         """One camera per frame of `count`, None for the scene's own at each frame."""
         if self.path == "scene":
             return None
-        settings = scene_settings(context)
+        settings = context.scene.stga
         subject = settings.head if is_head(settings.head) else settings.splats
         return turntable_cameras(subject, context.evaluated_depsgraph_get(), count, self.angle)
 
@@ -216,9 +202,8 @@ class _Recording:
             self._status = self._files.enter_context(status_writer(self.folder))
             failed.callback(self._files.close)
             self._recorder = Recorder(self.folder / RECORDING)
-            self._drawn = (
-                DrawnVideo(self.folder, output, srgb_background(context.scene)) if drawn else None
-            )
+            background = srgb_background(context.scene)
+            self._drawn = DrawnVideo(self.folder, output, background) if drawn else None
             self._status.update(0.0, "Recording")
             monitor.follow(context.scene, Kind.VIDEO, output, self.folder)
             monitor.check_now(context.scene, Kind.VIDEO)
@@ -252,22 +237,16 @@ class _Recording:
         """
         self._restore()
         self._recorder.close()
+        scene, fps, count = self._scene, frames_per_second(self._scene), len(self._frames)
         if python is None:
             assert self._drawn is not None
-            self._drawn.encode(frames_per_second(self._scene))
+            self._drawn.encode(fps)
             self._files.close()
-            monitor.check_now(self._scene, Kind.VIDEO)
+            monitor.check_now(scene, Kind.VIDEO)
             return
         self._files.close()
-        request = RenderRecording(
-            self._recorder.path,
-            self.output,
-            len(self._frames),
-            frames_per_second(self._scene),
-            srgb_background(self._scene),
-            render_device(),
-        )
-        start(self._scene, request, python, self.folder)
+        how = (count, fps, srgb_background(scene), render_device())
+        start(scene, RenderRecording(self._recorder.path, self.output, *how), python, self.folder)
 
     def discard(self) -> None:
         """End the recording and remove its files."""
@@ -289,6 +268,17 @@ def _temporary_folder() -> Path:
     try:
         return Path(tempfile.mkdtemp(prefix="stga_video_"))
     except OSError as error:
-        raise StgaError(
-            f"{tempfile.gettempdir()}: cannot be written ({error.strerror or error})"
-        ) from error
+        problem = f"cannot be written ({error.strerror or error})"
+        raise StgaError(f"{tempfile.gettempdir()}: {problem}") from error
+
+
+def register() -> None:
+    light.register()
+    engine.register(lambda: training_python(bpy.context), render_device)
+    viewport_display.register()
+
+
+def unregister() -> None:
+    viewport_display.unregister()
+    engine.unregister()
+    light.unregister()

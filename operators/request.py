@@ -1,15 +1,17 @@
-"""Requests from Blender: starting a worker for one, or carrying it out here; cancelling and
-dismissing it."""
+"""Requests from Blender: starting a worker for one, or carrying it out here; cancelling, dismissing
+and reporting it."""
 
+import platform
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from subprocess import Popen
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
+from ..stga_addon import __version__
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.perform import (
     check_request,
@@ -29,10 +31,11 @@ from ..stga_addon.jobs.table import (
     Request,
 )
 from ..stga_addon.worker.launch import start_worker
-from ..stga_addon.worker.status import WorkerSnapshot, WorkerState, failure_report, inspect_worker
+from ..stga_addon.worker.status import WorkerState, failure_report
 from ..stga_addon.worker.training_python import missing_packages
-from . import ids, monitor
-from .common import polled, reporting
+from . import monitor, options
+from .common import Action, Poll, file_path, need, polled
+from .options import ONCE
 from .training_python import training_python
 
 
@@ -50,12 +53,14 @@ def start(
     job = JOBS[type(request)]
     kind, subject = job.kind, getattr(request, job.subject)
     assert kind is not None
-    if folder is None:
-        folder = (
-            request_folder(subject) if kind in STORED else Path(tempfile.mkdtemp(prefix="stga_"))
-        )
+    if folder is None and kind in STORED:
+        folder = request_folder(subject)
+    folder = folder or Path(tempfile.mkdtemp(prefix="stga_"))
     try:
-        process = _write_and_start(folder, request, python)
+        check_request(request)
+        write_request(folder, request)
+        arguments = worker_arguments(folder)
+        process = None if python is None else start_worker(folder, python, arguments)
     except StgaError:
         if kind in TRANSIENT:
             shutil.rmtree(folder, ignore_errors=True)
@@ -68,7 +73,9 @@ def start(
         return False
     else:
         process.wait()
-    last = final_snapshot(folder, process)
+    last = monitor.inspect_status(folder)
+    if last.state.failed:
+        print(failure_report(folder, last), file=sys.stderr)
     shown = monitor.finish(scene, kind)
     if last.state.failed or shown.error:
         raise StgaError(shown.error or last.status.error)
@@ -77,18 +84,8 @@ def start(
     return True
 
 
-def _write_and_start(folder: Path, request: Request, python: str | None) -> "Popen[bytes] | None":
-    check_request(request)
-    write_request(folder, request)
-    return None if python is None else start_worker(folder, python, worker_arguments(folder))
-
-
 def _perform_here(folder: Path) -> None:
-    """Carry out the request in the folder in Blender's own Python, with Blender's progress at the
-    pointer.
-
-    Raises what the work raises.
-    """
+    """Carry out the request in Blender's own Python, with Blender's progress at the pointer."""
     manager = bpy.context.window_manager
 
     def show(progress: Any) -> bool:
@@ -102,14 +99,6 @@ def _perform_here(folder: Path) -> None:
         manager.progress_end()
 
 
-def final_snapshot(folder: Path, process: "Popen[bytes] | None") -> WorkerSnapshot:
-    """The status of a worker that has ended; where it failed, its report goes to the console."""
-    last = inspect_worker(folder, process)
-    if last.state.failed:
-        print(failure_report(folder, last), file=sys.stderr)
-    return last
-
-
 def python_of(operator: Any, context: Any) -> str | None:
     """The interpreter that is to carry out a request; None: that of Blender, where it waits and has
     the packages.
@@ -121,34 +110,32 @@ def python_of(operator: Any, context: Any) -> str | None:
     return training_python(context, operator.python)
 
 
-def needs_idle(operator: Any, context: Any, *kinds: Kind) -> bool:
+def _running(context: Any) -> Callable[[Kind], bool]:
+    return lambda kind: monitor.state_of(context.scene, kind).is_running
+
+
+def _ended(context: Any) -> Callable[[Kind], bool]:
+    return lambda kind: monitor.state_of(context.scene, kind).can_be_dismissed
+
+
+def idle(*kinds: Kind) -> Poll:
     """Poll: whether no request of these kinds is running."""
-    running = next(
-        (kind for kind in kinds if monitor.state_of(context.scene, kind).is_running), None
-    )
-    return running is None or polled(
-        operator, False, f"{KINDS[running].label} is running; wait, or cancel it"
-    )
+
+    def poll(operator: Any, context: Any) -> bool:
+        kind = next(filter(_running(context), kinds), None)
+        message = "" if kind is None else f"{KINDS[kind].label} is running; wait, or cancel it"
+        return polled(operator, kind is None, message)
+
+    return poll
 
 
 def _kind_property(kinds: Any) -> Any:
-    return bpy.props.EnumProperty(
-        name="Request",
-        description="What was asked for",
-        items=[
-            (kind.value, kind.value.capitalize(), KINDS[kind].label)
-            for kind in Kind
-            if kind in kinds
-        ],
-    )
+    items = [(kind.value, kind.value.capitalize(), KINDS[kind].label) for kind in sorted(kinds)]
+    return options.choice("Request", "What was asked for", *items)
 
 
-class Cancel(bpy.types.Operator):
+class Cancel(Action, bpy.types.Operator):
     """Stop a request that is running"""
-
-    bl_idname = ids.CANCEL
-    bl_label = "Cancel"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
 
     request: _kind_property(Kind)
 
@@ -156,41 +143,47 @@ class Cancel(bpy.types.Operator):
     def description(cls, context: Any, properties: Any) -> str:
         return KINDS[Kind(properties.request)].cancel
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        is_running = any(monitor.state_of(context.scene, kind).is_running for kind in Kind)
-        return polled(cls, is_running, "Nothing is running")
+    needs = (need(lambda context: any(map(_running(context), Kind)), "Nothing is running"),)
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         kind = Kind(self.request)
-        if not monitor.state_of(context.scene, kind).is_running:
+        if not _running(context)(kind):
             raise StgaError(f"{KINDS[kind].label} is not running")
         monitor.cancel(context.scene, kind)
-        return {"FINISHED"}
 
 
-class Dismiss(bpy.types.Operator):
+class Dismiss(Action, bpy.types.Operator):
     """Remove status and log of a request that has ended; what it made stays, such as a run with its
     checkpoints"""
 
-    bl_idname = ids.DISMISS
-    bl_label = "Dismiss"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
-
     request: _kind_property(DISMISSIBLE)
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        has_ended = any(
-            monitor.state_of(context.scene, kind).can_be_dismissed for kind in DISMISSIBLE
-        )
-        return polled(cls, has_ended, "Nothing has ended in this scene that could be dismissed")
+    needs = (
+        need(lambda context: any(map(_ended(context), DISMISSIBLE)), "Nothing has ended here"),
+    )
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         kind = Kind(self.request)
-        if not monitor.state_of(context.scene, kind).can_be_dismissed:
+        if not _ended(context)(kind):
             raise StgaError(f"{KINDS[kind].label} is running, or was never asked for in this scene")
         monitor.dismiss(context.scene, kind)
-        return {"FINISHED"}
+
+
+class CopyReport(Action, bpy.types.Operator):
+    """Copy the error message, traceback and log of a worker to the clipboard"""
+
+    directory: options.text(
+        "Folder",
+        "Status folder of the worker; empty: that of the scene's training",
+        subtype="DIR_PATH",
+        options=ONCE,
+    )
+
+    def run(self, context: Any) -> None:
+        training = monitor.state_of(context.scene, Kind.TRAINING).folder
+        is_given = self.directory or training is None
+        folder = file_path(self.directory, "folder") if is_given else training
+        versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
+        report = failure_report(folder, monitor.inspect_status(folder))
+        context.window_manager.clipboard = f"{versions}\n{report}"
+        self.inform("Copied to the clipboard")

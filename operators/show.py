@@ -1,97 +1,225 @@
-"""Shows an avatar file as splats that follow the head."""
+"""The Show step: avatars and splats of files, their display, and their light."""
 
-import os
-from pathlib import Path
-from typing import Any, ClassVar
+from contextlib import suppress
+from math import radians
+from typing import Any
 
 import bpy
 
-from ..stga_addon.avatar.file import Avatar, read_avatar
+from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.errors import StgaError
+from ..stga_addon.export.ply import read_ply
+from ..stga_addon.jobs.finished_run import Relight
+from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.avatar_scene import show_world
-from ..stga_addon.scene.display.splat_attributes import SplatAttributes
-from ..stga_addon.scene.display.splat_object import hide_object, show_avatar
-from ..stga_addon.training.run.folder import has_run
-from . import ids
-from .common import (
-    FileImport,
-    file_filter,
-    file_path,
-    head_of,
-    needs_head,
-    reporting,
-    scene_settings,
-    tell,
+from ..stga_addon.scene.compat import NATIVE_SPLATS
+from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
+from ..stga_addon.scene.display.splat_object import (
+    get_input,
+    hide_object,
+    set_input,
+    show_avatar,
+    show_world_splats,
+    shows_nodes,
+    use_transparent_bounces,
+    view_transform_hint,
 )
+from ..stga_addon.scene.light import throw_shadow, throws_shadow
+from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
+from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
+from . import options
+from .common import (
+    Action,
+    Edit,
+    FileImport,
+    file_path,
+    flame_model_path,
+    head_of,
+    need,
+    needs_head,
+)
+from .monitor import run_of
+from .options import ONCE
+from .request import idle, start
+from .training_python import training_python
+
+GRAY = ("WIREFRAME", "SOLID")
+"""Kinds of shading that show colors of splats as trained only."""
+OFFERED = [mode for mode in LIMITS if mode != NATIVE or NATIVE_SPLATS]
+UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
+"""Up axis of a file -> rotation about x that turns it to Blender's."""
 
 
-class ShowAvatar(bpy.types.Operator, FileImport):
+class ShowAvatar(Edit, bpy.types.Operator, FileImport):
     """Show a trained avatar: splats that follow the animated head"""
 
-    bl_idname = ids.SHOW_AVATAR
-    bl_label = "Show Avatar"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
+    needs = (needs_head,)
 
-    filename_ext = ".npz"
-    hide_head: bpy.props.BoolProperty(
-        name="Hide Head",
-        description="Hide the head's mesh, which covers the splats; it still deforms them",
+    hide_head: options.boolean(
+        "Hide Head",
+        "Hide the head's mesh, which covers the splats; it still deforms them",
         default=True,
     )
-    filter_glob: file_filter(".npz")
+    filter_glob: options.file_filter(".npz")
 
-    poll = classmethod(needs_head)
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         path, head = file_path(self.filepath, "avatar"), head_of(context)
+        settings = context.scene.stga
         avatar = read_avatar(path)
-        show(context.scene, avatar, head, f"{head.name} {path.stem}", self.hide_head)
+        settings.splats = show_avatar(avatar, head, f"{head.name} {path.stem}")
+        if self.hide_head:
+            hide_object(head, context.scene)
         show_world(path, head)
-        settings = scene_settings(context)
         settings.avatar = self.filepath
         settings.run_folder = run_of(self.filepath) or settings.run_folder
         if self.hide_head and head.library is not None:
-            sentence = (
-                f"{head.name}: is linked, and covers the splats in renders; hide it in its file"
-            )
-            tell(self, "WARNING", sentence)
-        self.report({"INFO"}, f"{len(avatar.splats)} splats")
-        return {"FINISHED"}
+            problem = "is linked, and covers the splats in renders; hide it in its file"
+            self.warn(f"{head.name}: {problem}")
+        self.inform(f"{len(avatar.splats)} splats")
 
 
-def run_of(avatar: str) -> str:
-    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
-    folder = os.path.dirname(avatar)
-    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
+class ImportPly(Edit, bpy.types.Operator, FileImport):
+    """Import a 3D Gaussian Splatting PLY file"""
+
+    bl_label = "Import Gaussian Splats"
+
+    filter_glob: options.file_filter(".ply")
+    up: options.choice(
+        "Up",
+        "Axis of the file that points up",
+        ("Y", "Y", "Captures tracked with FLAME, and what this add-on exports"),
+        ("-Y", "-Y", "Scenes reconstructed with COLMAP"),
+        ("Z", "Z", "Blender's up axis"),
+    )
+
+    def run(self, context: Any) -> None:
+        path = file_path(self.filepath, "PLY")
+        splats = read_ply(path)
+        shown = context.scene.stga.splats = show_world_splats(splats, path.stem)
+        shown.rotation_euler = (radians(UP_ROTATION_DEG[self.up]), 0.0, 0.0)
+        self.inform(f"{len(splats)} splats")
 
 
-def show(
-    scene: Any,
-    avatar: Avatar,
-    head: Any,
-    name: str,
-    hide_head: bool = True,
-    attributes: SplatAttributes | None = None,
-) -> Any:
-    """Show the avatar on the head, and make the splat object the one that the panel works on.
-
-    attributes: those of the avatar, where they are computed already.
-    """
-    shown = show_avatar(avatar, head, name, attributes)
-    if hide_head:
-        hide_object(head, scene)
-    getattr(scene, ids.SETTINGS).splats = shown
-    return shown
+# Display
 
 
-class StandardView(bpy.types.Operator):
+def _has_own_splats(context: Any) -> bool:
+    splats = context.scene.stga.splats
+    return splats is not None and splats.library is None
+
+
+class ChooseDisplay(Edit, bpy.types.Operator):
+    """Choose how the splats are displayed, in a shading that shows their colors"""
+
+    bl_label = "Display"
+    needs = (need(_has_own_splats, "Show an avatar first"),)
+
+    display: options.choice(
+        "Display", "How splats are displayed", *((mode, mode, LIMITS[mode]) for mode in OFFERED)
+    )
+
+    def run(self, context: Any) -> None:
+        set_input(context.scene.stga.splats, splat_nodes.DISPLAY, self.display)
+        space = context.space_data
+        is_viewport = getattr(space, "type", "") == "VIEW_3D"  # a script has none
+        if is_viewport and self.display != AS_TRAINED and space.shading.type in GRAY:
+            space.shading.type = "MATERIAL"
+
+
+def _own_as_trained(context: Any) -> list[Any]:
+    """The splat objects that are displayed as trained, but linked ones, whose display cannot be
+    changed."""
+    own = [thing for thing in context.view_layer.objects if thing.library is None]
+    return [thing for thing in own if is_shown_as_trained(thing)]
+
+
+class PreviewImages(Edit, bpy.types.Operator):
+    """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads
+    that face it, without one as points"""
+
+    bl_label = "Preview for EEVEE/Cycles"
+
+    needs = (need(_own_as_trained, "No splats are displayed as trained"),)
+
+    def run(self, context: Any) -> None:
+        scene, space = context.scene, context.space_data
+        mode = QUADS if scene.camera is not None else POINTS
+        for thing in _own_as_trained(context):
+            set_input(thing, splat_nodes.DISPLAY, mode)
+        use_transparent_bounces(scene)
+        if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
+            # Material Preview is EEVEE, whatever the scene's engine is.
+            space.shading.type = "RENDERED" if shows_nodes(scene) else "MATERIAL"
+            if scene.camera is not None:
+                space.region_3d.view_perspective = "CAMERA"
+        if hint := view_transform_hint(scene):
+            self.warn(hint)
+        else:
+            self.inform(f"{mode}: {LIMITS[mode]}")
+
+
+class StandardView(Edit, bpy.types.Operator):
     """Show colors as trained: set the scene's view transform to Standard"""
 
-    bl_idname = ids.STANDARD_VIEW
     bl_label = "Use Standard View"
-    bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         context.scene.view_settings.view_transform = "Standard"
         context.scene.view_settings.look = "None"
-        return {"FINISHED"}
+
+
+# Light
+
+
+def _follows_head(context: Any) -> bool:
+    splats, head = context.scene.stga.splats, None
+    with suppress(StgaError):
+        head = None if splats is None else get_input(splats, splat_nodes.HEAD)
+    return head is not None
+
+
+_needs_splats = need(_follows_head, "Show an avatar first")
+
+
+class EstimateLight(Action, bpy.types.Operator):
+    """Find out the light of the capture that the avatar was trained on, so that the scene can light
+    the avatar"""
+
+    needs = (idle(Kind.LIGHT), _needs_splats)
+
+    directory: options.path("Run Folder", "Folder of the avatar's run", "DIR_PATH")
+
+    def run(self, context: Any) -> None:
+        run = file_path(self.directory or context.scene.stga.run_folder, "run folder")
+        request = Relight(run, flame=flame_model_path(context))
+        start(context.scene, request, training_python(context))
+
+
+class RelightFrame(Edit, bpy.types.Operator):
+    """Give the splats the colors of the scene's light at this frame, for EEVEE and Cycles; other
+    frames keep them"""
+
+    needs = (_needs_splats,)
+
+    clear: options.boolean("Clear", "Show recorded colors again", options=ONCE)
+
+    def run(self, context: Any) -> None:
+        splats = context.scene.stga.splats
+        if self.clear:
+            forget_frame(splats)
+        else:
+            relight_frame(splats, context.scene)
+
+
+class HeadShadow(Edit, bpy.types.Operator):
+    """Let the head's mesh throw shadows onto other objects in EEVEE and Cycles, without being seen;
+    again: hide it"""
+
+    needs = (_needs_splats,)
+
+    def run(self, context: Any) -> None:
+        splats = context.scene.stga.splats
+        is_on = not throws_shadow(splats)
+        throw_shadow(splats, is_on)
+        self.inform("The head throws shadows" if is_on else "The head throws no shadows")

@@ -1,35 +1,66 @@
-"""Trains the avatar in a worker process beside Blender."""
+"""The Train step, in a worker process beside Blender: analyzing the capture, training an avatar,
+refining a region of it, and extending it by a further take of the same head."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
+import numpy as np
 
+from ..stga_addon.capture.meshes import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.table import TRAINS
-from ..stga_addon.jobs.train import Extend, Refine, Resume
+from ..stga_addon.jobs.analyze import Analyze
+from ..stga_addon.jobs.table import TRAINS, Kind
+from ..stga_addon.jobs.train import Extend as ExtendRequest
+from ..stga_addon.jobs.train import Refine as RefineRequest
+from ..stga_addon.jobs.train import Resume, SelectForTake
 from ..stga_addon.jobs.train import Train as TrainRequest
-from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_decisions import parse_choice
-from ..stga_addon.training.run.folder import read_run
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.vertex_groups import (
+    read_triangle_weights,
+    selected_triangles,
+    training_selection,
+)
+from ..stga_addon.training.effect_catalog import parse_choice
+from ..stga_addon.training.run.folder import AVATAR, next_folder, read_run
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
-from . import ids
-from .common import capture_source, file_path, head_of, needs_head, path_property, reporting
-from .options import option_property
-from .request import needs_idle, python_of, start
-from .training_python import test
+from . import options
+from .common import Action, Edit, capture_source, file_path, head_of, needs_head, needs_own_head
+from .options import ONCE
+from .request import idle, python_of, start
+from .training_python import test, training_python
+
+ALL_FRAMES = {"default": -1, "min": -1, "options": ONCE}
+
+
+class AnalyzeCapture(Action, bpy.types.Operator):
+    """Find out which effects the capture calls for, and how long each preset takes on this
+    machine"""
+
+    needs = (idle(Kind.ANALYSIS), needs_head)
+
+    def run(self, context: Any) -> None:
+        settings, source = context.scene.stga, capture_source(head_of(context))
+        effects = dict(map(parse_choice, chosen_effects(settings)))
+        request = Analyze(*source, effects, settings.device, timed=True)
+        start(context.scene, request, training_python(context))
+
+
+def chosen_effects(settings: Any) -> list[str]:
+    """The user's choices of effects, as NAME=on or NAME=off."""
+    return [f"{row.name}={row.choice}" for row in settings.effects if row.choice != "auto"]
+
+
+# Options of the operators, and of the panel that calls them
 
 
 def preset_property(**more: Any) -> Any:
     """Training preset: of the operator, and of the panel, which also takes over its time."""
-    purposes = [
+    purposes = (
         (name, name.capitalize(), preset.purpose.capitalize()) for name, preset in PRESETS.items()
-    ]
-    return bpy.props.EnumProperty(
-        name="Preset",
-        description="Accuracy, and with it training time",
-        items=(("none", "Default", "Default settings, trained for the time in Minutes"), *purposes),
-        **more,
     )
+    default = ("none", "Default", "Default settings, trained for the time in Minutes")
+    description = "Accuracy, and with it training time"
+    return options.choice("Preset", description, default, *purposes, **more)
 
 
 def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
@@ -38,135 +69,219 @@ def list_adapters(owner: Any, context: Any, text: str) -> list[str]:
 
 
 class DeviceOptions:
-    """Where an operator trains: of the operators, and of the panel that calls them."""
+    """Where an avatar is trained."""
 
-    device: bpy.props.EnumProperty(
-        name="Device",
-        description="Device that trains. Auto resumes a run on the device that it was trained on",
-        items=(
-            ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
-            ("cpu", "CPU", "The processor"),
-            ("gpu", "GPU", "A GPU; training fails if none works"),
-        ),
+    device: options.choice(
+        "Device",
+        "Device that trains. Auto resumes a run on the device that it was trained on",
+        ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
+        ("cpu", "CPU", "The processor"),
+        ("gpu", "GPU", "A GPU; training fails if none works"),
     )
-    adapter: bpy.props.StringProperty(
-        name="GPU",
-        description="Name of the GPU; empty: the first. The list is that of the last test of the "
-        "Python",
-        search=list_adapters, search_options={"SUGGESTION"},
-    )  # fmt: skip
+    adapter: options.text(
+        "GPU",
+        "Name of the GPU; empty: the first. The list is that of the last test of the Python",
+        search=list_adapters,
+        search_options={"SUGGESTION"},
+    )
 
 
 class TrainOptions(DeviceOptions):
-    """How an avatar is trained: of the operator, and of the panel that calls it."""
+    """How an avatar is trained."""
 
-    minutes: bpy.props.FloatProperty(
-        name="Minutes", description="Training time", default=5.0, min=0.01
-    )
-    strategy: option_property(
+    minutes: options.number("Minutes", "Training time", default=5.0, min=0.01)
+    strategy: options.field(
         TrainingSettings, "strategy", labels={"gaussian-avatars": "GaussianAvatars"}
     )
     preset: preset_property()
 
 
-class TrainingOperator:
-    """Options of an operator that trains which no panel has."""
+class RefineOptions:
+    """What is refined, and for how long."""
 
-    iterations: option_property(TrainingSettings, "iterations", options={"SKIP_SAVE"})
-    python: bpy.props.StringProperty(
-        name="Python",
-        description="Python interpreter that trains; empty: that of the preferences, or Blender's "
-        "own",
-        subtype="FILE_PATH", options={"SKIP_SAVE"},
-    )  # fmt: skip
-    wait: bpy.props.BoolProperty(
-        name="Wait",
-        description="Return when training has ended, as always without a window; Blender's own "
-        "Python trains then, if it has the packages",
-        options={"SKIP_SAVE"},
+    group: options.text(
+        "Vertex Group",
+        "Vertex group whose triangles are refined; empty: the active one. In Edit Mode, the "
+        "selected triangles are refined instead",
+    )
+    seconds: options.field(
+        RefineRequest, "seconds", description="Training time", default=20.0, min=0.1
+    )
+    growth: options.field(RefineRequest, "growth", "More Splats", soft_max=2.0, subtype="FACTOR")
+
+
+class ExtendOptions:
+    """What a run is extended by, and for how long."""
+
+    take: options.path("Take", "Folder of a further capture of the same head", "DIR_PATH")
+    seconds: options.field(
+        ExtendRequest, "seconds", description="Training time", default=60.0, min=0.1
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return needs_head(cls, context) and needs_idle(cls, context, *TRAINS)
+
+class TrainingOperator(Action):
+    """Mixin of operators that train: options which no panel has, and the start of a training."""
+
+    needs = (needs_head, idle(*TRAINS))
+
+    iterations: options.field(TrainingSettings, "iterations", options=ONCE)
+    python: options.python("trains")
+    wait: options.boolean(
+        "Wait",
+        "Return when training has ended, as always without a window; Blender's own Python trains "
+        "then, if it has the packages",
+        options=ONCE,
+    )
+
+    def start(self: Any, context: Any, request: Any) -> None:
+        """Start the training, or wait for it. Raises StgaError."""
+        if start(context.scene, request, python_of(self, context), wait=self.wait):
+            self.inform(f"Trained {request.run}")
+
+    @property
+    def chosen_device(self: Any) -> str:
+        """What `choose_device` takes."""
+        is_named = self.device == "gpu" and self.adapter
+        return f"gpu:{self.adapter}" if is_named else str(self.device)
+
+    def budget(self: Any, seconds: float) -> dict[str, Any]:
+        return {"iterations": self.iterations} if self.iterations else {"seconds": seconds}
 
 
 class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     """Train the avatar on the capture's images, in a process that continues when Blender is
     closed"""
 
-    bl_idname = ids.TRAIN
     bl_label = "Train Avatar"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
 
-    directory: path_property("Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH")
-    seed: option_property(TrainingSettings, "seed", options={"SKIP_SAVE"})
-    effects: bpy.props.StringProperty(
-        name="Effects",
-        description="NAME=on or NAME=off, separated by spaces, for effects that the capture "
-        "should not decide",
-        options={"SKIP_SAVE"},
+    directory: options.path("Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH")
+    seed: options.field(TrainingSettings, "seed", options=ONCE)
+    effects: options.text(
+        "Effects",
+        "NAME=on or NAME=off, separated by spaces, for effects that the capture should not decide",
+        options=ONCE,
     )
-    resume: bpy.props.BoolProperty(
-        name="Resume",
-        description="Continue the run in the folder with the settings and budget that it was "
-        "started with",
-        options={"SKIP_SAVE"},
+    resume: options.boolean(
+        "Resume",
+        "Continue the run in the folder with the settings and budget that it was started with",
+        options=ONCE,
     )
 
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        return start_training(self, context, self._request(head_of(context)))
-
-    def _request(self, head: Any) -> TrainRequest | Resume:
-        run = file_path(self.directory, "run folder").resolve()
-        capture, flame, principal_point = capture_source(head)
+    def run(self, context: Any) -> None:
+        head, run = head_of(context), file_path(self.directory, "run folder").resolve()
+        capture, *source = capture_source(head)
         if not capture.is_dir():
-            raise StgaError(
-                f"{capture}: is not a folder; expected the capture that the head was imported from"
-            )
+            expected = "expected the capture that the head was imported from"
+            raise StgaError(f"{capture}: is not a folder; {expected}")
+        how = {"device": self.chosen_device, "selection": training_selection(head)}
         if self.resume:
-            # The head may be that of any take.
+            # with takes, the head may be that of any of them
             moved = None if read_run(run).takes else capture
-            return Resume(
-                run, moved, flame, principal_point, device_of(self), training_selection(head)
-            )
-        effects = (
-            None
-            if self.strategy == "gaussian-avatars"
-            else dict(map(parse_choice, self.effects.split()))
-        )
-        preset = None if self.preset == "none" else self.preset
-        budget = (
-            {"iterations": self.iterations} if self.iterations else {"seconds": 60 * self.minutes}
-        )
+            self.start(context, Resume(run, moved, *source, **how))
+            return
+        preset, effects = None if self.preset == "none" else self.preset, None
+        if self.strategy != "gaussian-avatars":
+            effects = dict(map(parse_choice, self.effects.split()))
+        budget = self.budget(60 * self.minutes)
         settings = make_settings(
             self.strategy, preset=preset, seed=self.seed, effects=effects, **budget
         )
-        return TrainRequest(
-            run,
-            capture,
-            settings,
-            flame,
-            principal_point,
-            device=device_of(self),
-            selection=training_selection(head),
-        )
+        self.start(context, TrainRequest(run, capture, settings, *source, **how))
 
 
-def device_of(operator: Any) -> str:
-    """What `choose_device` takes, of an operator with `DeviceOptions`."""
-    return (
-        f"gpu:{operator.adapter}"
-        if operator.device == "gpu" and operator.adapter
-        else str(operator.device)
+class ContinueOperator(TrainingOperator, Edit):
+    """Mixin of operators that train a run further, in a new folder."""
+
+    def parent_run(self: Any) -> Any:
+        """The run's folder. Raises StgaError where it holds no avatar."""
+        parent = file_path(self.directory, "run folder").resolve()
+        if not (parent / AVATAR).is_file():
+            raise StgaError(f"{parent}: holds no trained avatar; train one first")
+        return parent
+
+    def how(self: Any, head: Any) -> dict[str, Any]:
+        """What both requests have: budget, FLAME model and device."""
+        source = {"flame": capture_source(head)[1], "device": self.chosen_device}
+        return self.budget(self.seconds) | source
+
+    def start(self, context: Any, request: Any) -> None:
+        """Start the training; the splats that show the run before show the new one, so that its
+        preview changes them."""
+        super().start(context, request)
+        settings, parent = context.scene.stga, str(request.parent)
+        shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == parent]
+        if not shown and settings.splats is not None:
+            shown = [settings.splats]
+        for thing in shown:
+            thing[tags.RUN] = str(request.run)
+        settings.run_folder = str(request.run)
+
+
+class Refine(ContinueOperator, RefineOptions, DeviceOptions, bpy.types.Operator):
+    """Train one region of the avatar further; all other splats stay as they are. In Edit Mode the
+    region is the selected triangles, otherwise a vertex group"""
+
+    directory: options.path("Run Folder", "Folder of the run to refine", "DIR_PATH")
+    region: options.text(
+        "Region",
+        "Region of the capture, such as mouth, to refine instead of a vertex group",
+        options=ONCE,
     )
+    first: options.integer("First Frame", "First frame to train on", **ALL_FRAMES)
+    last: options.integer("Last Frame", "Last frame to train on; -1: all", **ALL_FRAMES)
+
+    def run(self, context: Any) -> None:
+        head = head_of(context)
+        weights = None if self.region else _painted_region(head, self.group)
+        frames = None if self.last < 0 else (max(self.first, 0), self.last)
+        parent, more = self.parent_run(), {"growth": self.growth, **self.how(head)}
+        place = next_folder(parent), parent
+        self.start(context, RefineRequest(*place, self.region, weights, frames, **more))
 
 
-def start_training(
-    operator: Any, context: Any, request: TrainRequest | Resume | Refine | Extend
-) -> set[str]:
-    """Start a training, or wait for it. Raises StgaError."""
-    if start(context.scene, request, python_of(operator, context), wait=operator.wait):
-        operator.report({"INFO"}, f"Trained {request.run}")
-    return {"FINISHED"}
+class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator):
+    """Train a further take of the same head into the avatar, which keeps what it has learned"""
+
+    bl_label = "Extend with Take"
+
+    directory: options.path("Run Folder", "Folder of the run to extend", "DIR_PATH")
+
+    def run(self, context: Any) -> None:
+        take = file_path(self.take, "take").resolve()
+        if not take.is_dir():
+            raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
+        parent, more = self.parent_run(), self.how(head_of(context))
+        self.start(context, ExtendRequest(next_folder(parent), parent, (take,), **more))
+
+
+def _painted_region(head: Any, group: str) -> np.ndarray:
+    """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises StgaError
+    for none."""
+    if head.mode == "EDIT":
+        weights = selected_triangles(head).astype(np.float32)
+        where = "no triangle is selected in Edit Mode"
+    else:
+        found = head.vertex_groups.get(group) if group else head.vertex_groups.active
+        if found is None:
+            problem = f"has no vertex group '{group}' to refine"
+            raise StgaError(f"{head.name}: {problem}; paint one, or select in Edit Mode")
+        weights = read_triangle_weights(head, found.name)
+        where = f"no triangle has all its corners in the vertex group '{found.name}'"
+    if not (weights >= SELECTED_WEIGHT).any():
+        raise StgaError(f"{head.name}: {where}")
+    return weights
+
+
+class SelectExtension(Action, bpy.types.Operator):
+    """Select the triangles that extending the run by this head's take would train in each frame:
+    those that move, and those that look different than in the run's images"""
+
+    bl_label = "Select for Extend"
+    needs = (idle(Kind.SELECTION), needs_own_head)
+
+    directory: options.path("Run Folder", "Folder of the run to extend", "DIR_PATH")
+
+    def run(self, context: Any) -> None:
+        run = file_path(self.directory, "run folder")
+        take, flame, _ = capture_source(head_of(context))
+        start(context.scene, SelectForTake(run, take, flame), training_python(context))

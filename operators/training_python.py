@@ -1,19 +1,29 @@
-"""The choice of the Python that tracks and trains, and its test."""
+"""The Python that tracks and trains: its choice, its test, and the kernels that it compiles before
+they are asked for."""
 
+import os
+from contextlib import suppress
 from functools import lru_cache
 from subprocess import Popen
 from time import monotonic
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.python_check import CHECK_TIMEOUT_S, Checked, finish_check, start_check
+from ..stga_addon.raster.kernel_cache import has_kernels
+from ..stga_addon.worker.launch import CACHE_VARIABLE, KERNELS, cache_folder, start_in_background
 from ..stga_addon.worker.training_python import find_training_python
-from . import ids, monitor
-from .common import polled, preferences, reporting
+from . import monitor, options
+from .common import Action, need, package, preferences
 
 POLL_INTERVAL_S = 0.3
+PREPARATION = "stga_addon.jobs.perform"
+START_DELAY_S = 1.0
+"""After the extension was enabled: neither enabling nor Blender's start waits for a process."""
+
+_preparations: list["Popen[bytes]"] = []
 
 
 def training_python(context: Any, given: str = "") -> str:
@@ -49,7 +59,7 @@ class _Test:
     def __init__(self) -> None:
         self.python, self.error = "", ""
         self.found: Checked | None = None
-        self._process: Popen[str] | None = None
+        self._process: Any = None
         self._begun_s = 0.0
 
     @property
@@ -61,9 +71,8 @@ class _Test:
         self._process, self._begun_s = start_check(python), monotonic()
         self.python, self.found, self.error = python, None, ""
 
-    def end(self, timeout_s: float) -> None:
+    def end(self, timeout_s: float = 1.0) -> None:
         """Wait for what the test finds."""
-        assert self._process is not None
         try:
             self.found = finish_check(self.python, self._process, timeout_s)
         except StgaError as error:
@@ -71,47 +80,74 @@ class _Test:
         self._process = None
 
     def tick(self) -> float | None:
-        assert self._process is not None
         if self._process.poll() is None and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
             return POLL_INTERVAL_S
-        self.end(timeout_s=1.0)
+        self.end()
         monitor.redraw()
         return None
 
     def close(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self.end(timeout_s=1.0)
+            self.end()
 
 
 test = _Test()
 
 
-class TestPython(bpy.types.Operator):
+class TestPython(Action, bpy.types.Operator):
     """Start the Python that tracks and trains, and report its versions of torch and numba and its
     device, or what it lacks"""
 
-    bl_idname = ids.TEST_PYTHON
     bl_label = "Test"
-    bl_options: ClassVar[set[str]] = {"REGISTER"}
+    needs = (need(lambda _: not test.is_running, "A test is running"),)
 
-    python: bpy.props.StringProperty(
-        name="Python", description="The interpreter to test; empty: the one that trains",
-        subtype="FILE_PATH",
-    )  # fmt: skip
+    python: options.text(
+        "Python", "The interpreter to test; empty: the one that trains", subtype="FILE_PATH"
+    )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return polled(cls, not test.is_running, "A test is running")
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
+    def run(self, context: Any) -> None:
         test.begin(training_python(context, self.python))
         if monitor.has_timer():
             monitor.watch(test)
-            return {"FINISHED"}
+            return
         test.end(CHECK_TIMEOUT_S)
         if test.found is None:
             raise StgaError(test.error)
-        self.report({"INFO"}, test.found.line)
-        return {"FINISHED"}
+        self.inform(test.found.line)
+
+
+# Kernels
+
+
+def begin_preparing() -> None:
+    """Compile in the background what the first training would wait for; nothing without a window,
+    without a Python that trains, or where it is compiled or is being compiled."""
+    is_needed = not bpy.app.background and CACHE_VARIABLE in os.environ
+    if not is_needed or has_kernels(cache_folder() / KERNELS):
+        return
+    if all(process.poll() is not None for process in _preparations):
+        with suppress(StgaError):  # training says what is missing
+            python = training_python(bpy.context)
+            _preparations.append(start_in_background(python, [PREPARATION]))
+
+
+def register() -> None:
+    with suppress(ValueError):  # a checkout, which is no extension
+        cache = bpy.utils.extension_path_user(package(), path="cache")
+        os.environ.setdefault(CACHE_VARIABLE, cache)
+    if not bpy.app.background:
+        bpy.app.timers.register(begin_preparing, first_interval=START_DELAY_S)
+
+
+def unregister() -> None:
+    """End what is compiling, which would write into a folder that is being removed."""
+    if bpy.app.timers.is_registered(begin_preparing):
+        bpy.app.timers.unregister(begin_preparing)
+    for process in _preparations:
+        process.kill()
+        process.wait()
+    _preparations.clear()
+    with suppress(ValueError):
+        if os.environ.get(CACHE_VARIABLE) == bpy.utils.extension_path_user(package(), path="cache"):
+            del os.environ[CACHE_VARIABLE]

@@ -1,111 +1,91 @@
 """The hint on top of the sidebar tab: what to do next, with its button; once an avatar is shown,
 what to try."""
 
+from contextlib import suppress
 from typing import Any
 
 import bpy
 
-from ..operators import ids, monitor
-from ..operators.common import is_head, package, rig_or_none, scene_settings
-from ..operators.open_demo import OpenDemo
+from ..operators import monitor
+from ..operators.common import is_head, rig_or_none
+from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.scene import tags
-from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.splat_object import input_identifier, splat_modifier
+from ..stga_addon.scene.display.splat_object import splat_modifier
 from ..stga_addon.worker.status import WorkerState
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
-from .request import draw_end, draw_running
-from .sidebar import SidebarPanel
-from .text import draw_text
-from .train_panel import draw_missing_python, draw_train_button
+from .select_panel import has_selection
+from .show_panel import draw_input
+from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
+from .train_panel import draw_missing_python, draw_preferences, draw_train_button
+
+GO_ON = "Go on working, save, or quit Blender"
 
 
 class NextStepPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_next_step"
     bl_label = "Next Step"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, scene_settings(context)
-        training, tracking = (
-            monitor.state_of(context.scene, kind) for kind in (Kind.TRAINING, Kind.TRACKING)
-        )
-        making = monitor.state_of(context.scene, Kind.AVATAR)
+        layout, settings, scene = self.layout, context.scene.stga, context.scene
         _draw_message(layout, context)
         if draw_running(layout, context, Kind.AVATAR):
-            draw_text(
-                layout,
-                context,
-                "Head, then splats appear. Go on working, save, or quit Blender",
-                "INFO",
-            )
+            draw_text(layout, context, f"Head, then splats appear. {GO_ON}", "INFO")
             return
+        making = monitor.state_of(scene, Kind.AVATAR)
         if making.subject is not None:
             draw_end(layout, context, making)
             if making.snapshot.state != WorkerState.FINISHED:
-                layout.operator(
-                    ids.AVATAR_FROM_VIDEO, text="Continue", icon="FRAME_NEXT"
-                ).folder = str(making.subject)
+                make = "stga.avatar_from_video"
+                button = layout.operator(make, text="Continue", icon="FRAME_NEXT")
+                button.folder = str(making.subject)
+        tracking = monitor.state_of(scene, Kind.TRACKING)
         if tracking.is_running:
             done = f"Tracking, {100 * tracking.snapshot.status.progress:.0f} %"
-            draw_text(
-                layout,
-                context,
-                f"{done}: the head is imported when it is done. Go on working, save, or quit "
-                "Blender",
-            )
+            draw_text(layout, context, f"{done}: the head is imported when it is done. {GO_ON}")
         elif not is_head(settings.head) and settings.splats is None:
-            draw_text(
-                layout,
-                context,
-                "Choose a video of a face. Or import a capture: a tracked head, its cameras and "
-                "their images",
-            )
+            tracked = "a tracked head, its cameras and their images"
+            hint = f"Choose a video of a face. Or import a capture: {tracked}"
+            draw_text(layout, context, hint)
             draw_missing_python(layout, context)
-            layout.operator(ids.AVATAR_FROM_VIDEO, text="Avatar from Video…", icon="FILE_MOVIE")
-            layout.operator(ids.IMPORT_CAPTURE, icon="IMPORT")
+            text, icon = "Avatar from Video…", "FILE_MOVIE"
+            layout.operator("stga.avatar_from_video", text=text, icon=icon)
+            layout.operator("stga.import_capture", icon="IMPORT")
             if OpenDemo.poll(context):
-                layout.operator(ids.OPEN_DEMO, icon="USER")
+                layout.operator("stga.open_demo", icon="USER")
         elif settings.splats is not None:
             _draw_what_to_try(layout, context, settings)
-        elif training.is_running:
-            draw_text(
-                layout,
-                context,
-                "Training: splats appear on the head soon. Go on working, save, or quit Blender",
-            )
+        elif monitor.state_of(scene, Kind.TRAINING).is_running:
+            draw_text(layout, context, f"Training: splats appear on the head soon. {GO_ON}")
         elif settings.avatar:
             draw_text(layout, context, "Show the trained avatar on the head")
-            layout.operator(ids.SHOW_AVATAR, icon="HIDE_OFF").filepath = settings.avatar
+            layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
         elif has_training_python(context):
             draw_text(layout, context, "Train an avatar, or choose a trained one under 4 Show")
             draw_train_button(layout, settings)
         else:
-            draw_text(
-                layout, context, "Training needs a Python; to show a trained avatar, go to 4 Show"
-            )
+            hint = "Training needs a Python; to show a trained avatar, go to 4 Show"
+            draw_text(layout, context, hint)
             draw_missing_python(layout, context)
 
 
 def _draw_message(layout: Any, context: Any) -> None:
     """Draw what the last operator could not do, as a whole, with the button that helps."""
-    text = getattr(context.window_manager, ids.MESSAGE)
+    text = context.window_manager.stga_message
     if not text:
         return
     box = layout.box()
     row = box.row()
     row.label(text="Not Done", icon="ERROR")
     close = row.operator("wm.context_set_string", text="", icon="X", emboss=False)
-    close.data_path, close.value = f"window_manager.{ids.MESSAGE}", ""
+    close.data_path, close.value = "window_manager.stga_message", ""
     draw_text(box, context, text)
     if PYTHON_VARIABLE in text:
         draw_missing_python(box, context)
     elif "FLAME model" in text:
-        show = box.operator("preferences.addon_show", text="Choose It", icon="PREFERENCES")
-        show.module = package()
+        draw_preferences(box, "Choose It")
     elif "not been saved" in text:
         box.operator("wm.save_mainfile", text="Save the File", icon="FILE_TICK")
 
@@ -113,41 +93,28 @@ def _draw_message(layout: Any, context: Any) -> None:
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
     """Buttons that bring a shown avatar to life."""
     layout.label(text="Orbit the avatar, or try", icon="INFO")
-    playing = context.screen.is_animation_playing
-    play = "Pause" if playing else "Play  (Space)"
     column = layout.column(align=True)
-    column.operator("screen.animation_play", text=play, icon="PAUSE" if playing else "PLAY")
+    is_playing = context.screen.is_animation_playing
+    text, icon = ("Pause", "PAUSE") if is_playing else ("Play  (Space)", "PLAY")
+    column.operator("screen.animation_play", text=text, icon=icon)
     rig = rig_or_none(settings.head)
     if rig is not None:
         posing = is_posing(context, rig)
         text = "Done Posing" if posing else "Pose the Head"
-        column.operator(ids.POSE_HEAD, text=text, icon="ARMATURE_DATA", depress=posing)
+        column.operator("stga.pose_head", text=text, icon="ARMATURE_DATA", depress=posing)
         if posing:
             mouth = settings.head.data.shape_keys.key_blocks.get("jawOpen")
             if mouth is not None:
                 column.prop(mouth, "value", text="Open Mouth", slider=True)
-            draw_text(
-                column, context, "R turns the selected bone; I keeps the pose as a keyframe", "INFO"
-            )
-    groups = settings.head.vertex_groups if is_head(settings.head) else ()
-    if any(tags.group_timestep(group.name) is not None for group in groups):
-        _draw_selection_toggle(column, settings.splats)
+            hint = "R turns the selected bone; I keeps the pose as a keyframe"
+            draw_text(column, context, hint, "INFO")
+    if is_head(settings.head) and has_selection(settings.head):
+        with suppress(StgaError):  # splats without the node tree
+            # grays out what the current frame's selection freezes
+            toggle = {"icon": "RESTRICT_SELECT_OFF", "toggle": True}
+            modifier = splat_modifier(settings.splats)
+            draw_input(column, modifier, splat_nodes.SHOW_SELECTION, **toggle)
     draw_video(column, context)
-
-
-def _draw_selection_toggle(layout: Any, splats: Any) -> None:
-    """Draw the switch that grays out what the current frame's selection freezes, where the splats
-    have it."""
-    try:
-        modifier = splat_modifier(splats)
-    except StgaError:
-        return
-    identifier = input_identifier(modifier, splat_nodes.SHOW_SELECTION)
-    if identifier is not None:
-        owner, prop = modifier_input_owner(modifier, identifier)
-        layout.prop(
-            owner, prop, text=splat_nodes.SHOW_SELECTION, icon="RESTRICT_SELECT_OFF", toggle=True
-        )
 
 
 def draw_video(layout: Any, context: Any) -> None:
@@ -156,7 +123,7 @@ def draw_video(layout: Any, context: Any) -> None:
         return
     video = monitor.state_of(context.scene, Kind.VIDEO)
     if video.subject is None:
-        layout.operator(ids.RENDER_VIDEO, text="Render Video…", icon="RENDER_ANIMATION")
+        layout.operator("stga.render_video", text="Render Video…", icon="RENDER_ANIMATION")
         return
     box = draw_end(layout, context, video)
     if video.snapshot.state == WorkerState.FINISHED:

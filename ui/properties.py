@@ -5,24 +5,28 @@ from typing import Any
 
 import bpy
 
-from ..operators import ids
-from ..operators.common import path_property, register_classes, unregister_classes
-from ..operators.continue_run import ExtendOptions, RefineOptions
+from ..operators import options
+from ..operators.common import register_classes, unregister_classes
 from ..operators.drive import DriveOptions
 from ..operators.track import TrackOptions
-from ..operators.train import TrainOptions, preset_property
+from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
+
+
+def object_property(name: str, description: str, **more: Any) -> Any:
+    about = {"name": name, "description": description, **more}
+    return bpy.props.PointerProperty(type=bpy.types.Object, **about)
+
+
+def _hidden(kind: Any) -> Any:
+    return kind(options={"HIDDEN"})
 
 
 class SelectedFrame(bpy.types.PropertyGroup):
     """Row of the table of selected triangles; filled by `operators.select`."""
 
-    frame: bpy.props.IntProperty(
-        name="Frame", description="Frame of the scene: the timestep of the capture"
-    )
-    triangles: bpy.props.IntProperty(
-        name="Triangles", description="Triangles selected in the frame"
-    )
-    splats: bpy.props.IntProperty(name="Splats", description="Splats on those triangles")
+    frame: options.integer("Frame", "Frame of the scene: the timestep of the capture")
+    triangles: options.integer("Triangles", "Triangles selected in the frame")
+    splats: options.integer("Splats", "Splats on those triangles")
 
 
 def _forget_rows(settings: Any, context: Any) -> None:
@@ -55,26 +59,23 @@ def _take_minutes(settings: Any, context: Any) -> None:
 class EffectRow(bpy.types.PropertyGroup):
     """Row of the table of effects, `name` is the effect's; filled by `operators.analyze`."""
 
-    choice: bpy.props.EnumProperty(
-        name="Choice", description="Whether training models this effect",
-        items=(
-            ("auto", "Auto", "Decided by analyzing the capture"),
-            ("on", "On", "Always"),
-            ("off", "Off", "Never"),
-        ),
-    )  # fmt: skip
+    choice: options.choice(
+        "Choice",
+        "Whether training models this effect",
+        ("auto", "Auto", "Decided by analyzing the capture"),
+        ("on", "On", "Always"),
+        ("off", "Off", "Never"),
+    )
     on: bpy.props.BoolProperty(name="On")
     reason: bpy.props.StringProperty(name="Reason")
     cost: bpy.props.StringProperty(name="Cost")
-    is_open: bpy.props.BoolProperty(
-        name="Details", description="Choose whether it is on, and see why and at what cost it is"
-    )
+    is_open: options.boolean("Details", "Choose whether it is on; see why, and at what cost")
 
 
 class TrackSettings(TrackOptions, bpy.types.PropertyGroup):
     """The panel's options of Track Footage."""
 
-    directory: path_property(
+    directory: options.path(
         "Capture", "Folder for the tracked capture", "DIR_PATH", default="//stga_capture"
     )
 
@@ -82,11 +83,11 @@ class TrackSettings(TrackOptions, bpy.types.PropertyGroup):
 class RefineSettings(RefineOptions, bpy.types.PropertyGroup):
     """The panel's options of Refine."""
 
-    all_frames: bpy.props.BoolProperty(
-        name="All Frames", description="Train the region on all frames of the capture", default=True
+    all_frames: options.boolean(
+        "All Frames", "Train the region on all frames of the capture", default=True
     )
-    first: bpy.props.IntProperty(name="First Frame", description="First frame to train on", min=0)
-    last: bpy.props.IntProperty(name="Last Frame", description="Last frame to train on", min=0)
+    first: options.integer("First Frame", "First frame to train on", min=0)
+    last: options.integer("Last Frame", "Last frame to train on", min=0)
 
 
 class ExtendSettings(ExtendOptions, bpy.types.PropertyGroup):
@@ -104,49 +105,39 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update
     # function; Blender does not.
 
-    head: bpy.props.PointerProperty(
-        name="Head", description="Imported head that the steps work on", type=bpy.types.Object,
-        update=_forget_rows,
-    )  # fmt: skip
+    head: object_property("Head", "Imported head that the steps work on", update=_forget_rows)
     track: bpy.props.PointerProperty(type=TrackSettings)
     # absolute path of the current or last tracking
-    tracking_capture: bpy.props.StringProperty(options={"HIDDEN"})
-    tracking_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it was imported
+    tracking_capture: _hidden(bpy.props.StringProperty)
+    tracking_shown: _hidden(bpy.props.BoolProperty)  # it was imported
     # absolute path of the current or last video's avatar
-    avatar_folder: bpy.props.StringProperty(options={"HIDDEN"})
-    avatar_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # it has reached the scene
+    avatar_folder: _hidden(bpy.props.StringProperty)
+    avatar_shown: _hidden(bpy.props.BoolProperty)  # it has reached the scene
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
-    selected_row: bpy.props.IntProperty(
-        name="Frame", description="Go to this frame", get=_current_row, set=_go_to_row
+    selected_row: options.integer("Frame", "Go to this frame", get=_current_row, set=_go_to_row)
+    motion_source: object_property(
+        "From", "Another imported head, whose motion is applied to this one"
     )
-    motion_source: bpy.props.PointerProperty(
-        name="From", description="Another imported head, whose motion is applied to this one",
-        type=bpy.types.Object,
-    )  # fmt: skip
     drive: bpy.props.PointerProperty(type=DriveSettings)
-    splats: bpy.props.PointerProperty(
-        name="Splats", description="Splats whose display is set here", type=bpy.types.Object
-    )
-    run_folder: path_property(
+    splats: object_property("Splats", "Splats whose display is set here")
+    run_folder: options.path(
         "Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH", default="//stga_run"
     )
     refine: bpy.props.PointerProperty(type=RefineSettings)
     extend: bpy.props.PointerProperty(type=ExtendSettings)
     preset: preset_property(update=_take_minutes)
-    preset_timing: bpy.props.StringProperty(options={"HIDDEN"})  # JSON of `preset_times`
+    preset_timing: _hidden(bpy.props.StringProperty)  # JSON of `preset_times`
     effects: bpy.props.CollectionProperty(type=EffectRow)
-    live_preview: bpy.props.BoolProperty(
-        name="Live Preview", description="Update the splats every few seconds during training",
-        default=True,
-    )  # fmt: skip
-    show_result: bpy.props.BoolProperty(
-        name="Show When Trained",
-        description="Show the avatar on the head when training has finished", default=True,
-    )  # fmt: skip
+    live_preview: options.boolean(
+        "Live Preview", "Update the splats every few seconds during training", default=True
+    )
+    show_result: options.boolean(
+        "Show When Trained", "Show the avatar on the head when training has finished", default=True
+    )
     # absolute path of the current or last run
-    training_run: bpy.props.StringProperty(options={"HIDDEN"})
-    result_shown: bpy.props.BoolProperty(options={"HIDDEN"})  # its avatar has reached the scene
-    avatar: path_property("Avatar", "Trained avatar file (.npz)")
+    training_run: _hidden(bpy.props.StringProperty)
+    result_shown: _hidden(bpy.props.BoolProperty)  # its avatar has reached the scene
+    avatar: options.path("Avatar", "Trained avatar file (.npz)")
 
 
 CLASSES = (
@@ -162,11 +153,12 @@ CLASSES = (
 
 def register() -> None:
     register_classes(CLASSES)
-    setattr(bpy.types.Scene, ids.SETTINGS, bpy.props.PointerProperty(type=SceneSettings))
-    setattr(bpy.types.WindowManager, ids.MESSAGE, bpy.props.StringProperty())
+    bpy.types.Scene.stga = bpy.props.PointerProperty(type=SceneSettings)
+    # what the last operator could not do
+    bpy.types.WindowManager.stga_message = bpy.props.StringProperty()
 
 
 def unregister() -> None:
-    delattr(bpy.types.WindowManager, ids.MESSAGE)
-    delattr(bpy.types.Scene, ids.SETTINGS)
+    del bpy.types.WindowManager.stga_message
+    del bpy.types.Scene.stga
     unregister_classes(CLASSES)

@@ -1,15 +1,40 @@
-"""The Select step: regions selected as a whole, table of selected triangles, heat map."""
+"""The Capture and Select steps: the imported head, regions selected as a whole, table of selected
+triangles, heat map."""
 
 from typing import Any
 
 import bpy
 
-from ..operators import ids
-from ..operators.common import is_head, scene_settings
+from ..operators.common import is_head
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import layers_of
 from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
 from .sidebar import SidebarPanel
+
+LAYERS = ((tags.RIG, "Bones", "BONE_DATA"), (tags.CAMERA, "Cameras", "CAMERA_DATA"))
+"""Collections that switches show and hide in viewports."""
+
+
+class CapturePanel(SidebarPanel, bpy.types.Panel):
+    bl_label = "1 Capture"
+
+    def draw(self, context: Any) -> None:
+        layout, head = self.layout, context.scene.stga.head
+        layout.operator("stga.import_capture", icon="IMPORT")
+        row = layout.row(align=True)
+        row.operator("stga.import_motion", text="FLAME Motion", icon="ARMATURE_DATA")
+        row.operator("stga.import_meshes", text="Meshes", icon="MESH_DATA")
+        layout.prop(context.scene.stga, "head")
+        if not is_head(head):
+            return
+        timesteps, triangles = len(head[tags.TIMESTEPS]), len(head.data.polygons)
+        layout.label(text=f"{timesteps} timesteps, {triangles} triangles")
+        row, root = layout.row(align=True), head.parent
+        for kind, text, icon in LAYERS if root is not None else ():
+            how = {"text": text, "icon": icon, "toggle": True, "invert_checkbox": True}
+            for layer in layers_of(root, kind, context.view_layer):
+                row.prop(layer, "hide_viewport", **how)
 
 
 class SelectedFrames(bpy.types.UIList):
@@ -18,14 +43,7 @@ class SelectedFrames(bpy.types.UIList):
     bl_idname = "STGA_UL_selected_frames"
 
     def draw_item(
-        self,
-        context: Any,
-        layout: Any,
-        data: Any,
-        item: Any,
-        icon: int,
-        active_data: Any,
-        active_propname: str,
+        self, context: Any, layout: Any, data: Any, item: Any, icon: int, active_data: Any
     ) -> None:
         row = layout.row()
         row.active = item.triangles > 0
@@ -34,29 +52,34 @@ class SelectedFrames(bpy.types.UIList):
 
 
 class SelectPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_select"
     bl_label = "2 Select"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, scene_settings(context)
-        layout.operator(ids.SELECT, icon="GROUP_VERTEX")
-        if not is_head(settings.head):
+        layout, settings = self.layout, context.scene.stga
+        head = settings.head
+        layout.operator("stga.select", icon="GROUP_VERTEX")
+        if not is_head(head):
             return
-        _draw_regions(layout, settings.head)
+        _draw_regions(layout, head)
         if settings.selected_frames:
-            _draw_table(layout, settings)
-        if any(
-            tags.group_timestep(group.name) is not None for group in settings.head.vertex_groups
-        ):
-            row = layout.row(align=True)
-            row.operator(ids.COUNT_SELECTED, icon="FILE_REFRESH")
-            shown = has_heat_map(settings.head) and not shows_residuals(settings.head)
-            text = "Hide Heat Map" if shown else "Show Heat Map"
-            row.operator(
-                ids.HEAT_MAP, text=text, icon="BRUSHES_ALL", depress=shown
-            ).show = not shown
-        else:
+            heading = layout.row()
+            for text in ("Frame", "Triangles", "Splats"):
+                heading.label(text=text)
+            rows = (settings, "selected_frames", settings, "selected_row")
+            layout.template_list(SelectedFrames.bl_idname, "", *rows, rows=4, maxrows=5)
+        if not has_selection(head):
             layout.label(text="No selection yet")
+            return
+        row = layout.row(align=True)
+        row.operator("stga.count_selected", icon="FILE_REFRESH")
+        shown = has_heat_map(head) and not shows_residuals(head)
+        how = {"text": "Hide Heat Map" if shown else "Show Heat Map", "depress": shown}
+        row.operator("stga.heat_map", icon="BRUSHES_ALL", **how).show = not shown
+
+
+def has_selection(head: Any) -> bool:
+    """Whether a head has a vertex group that is the selection of a frame."""
+    return any(tags.group_timestep(group.name) is not None for group in head.vertex_groups)
 
 
 def _draw_regions(layout: Any, head: Any) -> None:
@@ -66,23 +89,6 @@ def _draw_regions(layout: Any, head: Any) -> None:
     layout.label(text="Whole Regions")
     grid = layout.grid_flow(columns=2, align=True, row_major=True)
     for name in possible:
-        icon = "CHECKBOX_HLT" if name in ticked else "CHECKBOX_DEHLT"
-        grid.operator(
-            ids.TOGGLE_REGION, text=name.replace("_", " "), icon=icon, depress=name in ticked
-        ).name = name
-
-
-def _draw_table(layout: Any, settings: Any) -> None:
-    heading = layout.row()
-    for text in ("Frame", "Triangles", "Splats"):
-        heading.label(text=text)
-    layout.template_list(
-        SelectedFrames.bl_idname,
-        "",
-        settings,
-        "selected_frames",
-        settings,
-        "selected_row",
-        rows=4,
-        maxrows=5,
-    )
+        is_on = name in ticked
+        how = {"icon": "CHECKBOX_HLT" if is_on else "CHECKBOX_DEHLT", "depress": is_on}
+        grid.operator("stga.toggle_region", text=name.replace("_", " "), **how).name = name

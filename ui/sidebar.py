@@ -1,9 +1,149 @@
-"""Base of the panels in the sidebar tab."""
+"""What the panels of the sidebar tab share: their base, wrapped text, options of buttons, and how a
+request is drawn: progress with Cancel, end with Dismiss, failure with the end of the log."""
 
-from ..operators import ids
+import re
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import bpy.utils.previews
+import numpy as np
+
+from ..operators import monitor
+from ..operators.common import TAB
+from ..stga_addon.format import describe_figures
+from ..stga_addon.jobs.monitor_state import RequestState
+from ..stga_addon.jobs.table import KINDS, STORED, Kind
+from ..stga_addon.worker.status import WorkerState
+
+LETTER_WIDTH_PX = 7
+"""Average, at a resolution scale of 1."""
+WAITING = "Done; shown as soon as Edit Mode or rendering ends"
+SCALE = 8.0
+"""Side of the picture in the panel, in heights of a button."""
+
+_previews: Any = None
+"""Blender's preview collection: pictures that are not saved in the .blend file."""
+_shown: dict[Path, monitor.Curve] = {}
+"""Run folder -> the curve that its preview shows."""
 
 
 class SidebarPanel:
+    """Mixin of panels, whose identifier is the name of the class: `TrainPanel` is
+    "STGA_PT_train"."""
+
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
-    bl_category = ids.TAB
+    bl_category = TAB
+
+    def __init_subclass__(cls) -> None:
+        words = re.findall("[A-Z][a-z]*", cls.__name__.removesuffix("Panel"))
+        cls.bl_idname = f"STGA_PT_{'_'.join(words).lower()}"
+
+
+class ClosedPanel(SidebarPanel):
+    bl_options = frozenset({"DEFAULT_CLOSED"})
+
+
+def draw_text(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
+    """Draw the text as labels, one for each line, because Blender truncates labels instead of
+    wrapping them; the icon before the first."""
+    column = layout.column(align=True)
+    lines = textwrap.wrap(text, _columns(context) - (3 if icon != "NONE" else 0))
+    for row, line in enumerate(lines):
+        column.label(text=line, icon=icon if row == 0 or icon == "NONE" else "BLANK1")
+
+
+def _columns(context: Any) -> int:
+    """Number of letters that fit into a label of the panel's region."""
+    letter_px = LETTER_WIDTH_PX * context.preferences.system.ui_scale
+    return max(20, int(context.region.width / letter_px) - 4)
+
+
+def set_options(button: Any, settings: Any, options: type) -> None:
+    """Give an operator's button the settings' values of the properties that both take from the
+    class `options`."""
+    for base in options.__mro__[:-1]:
+        for name in base.__annotations__:
+            setattr(button, name, getattr(settings, name))
+
+
+# Requests
+
+
+def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
+    """Draw the progress of the scene's request with its Cancel button; returns False where none is
+    running."""
+    state = monitor.state_of(context.scene, kind)
+    if state.error:
+        draw_text(layout, context, state.error, "ERROR")
+    if not state.is_running:
+        return False
+    now, percent = state.snapshot, 100 * state.snapshot.status.progress
+    text = WAITING
+    if now.state in (WorkerState.STARTING, WorkerState.CANCELLING):
+        text = now.state.value.capitalize()
+    elif now.state.is_alive:
+        text = now.status.message
+    layout.progress(factor=now.status.progress, text=f"{percent:.0f} %  {text}")
+    column = layout.column(align=True)
+    for line in (*describe_figures(now.status.figures), now.status.detail):
+        draw_text(column, context, line)
+    if kind in STORED:
+        draw_curve(layout, state.run)
+    layout.operator("stga.cancel", text="Cancel", icon="CANCEL").request = kind
+    return True
+
+
+def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
+    """Draw how a request has ended, its failure with the end of the log and a button that copies
+    the report, and its Dismiss button; returns the box, for more."""
+    box, now = layout.box(), state.snapshot
+    worker = WorkerState.FAILED if now.state.failed else now.state
+    row = box.row()
+    icons = {WorkerState.FINISHED: "CHECKMARK", WorkerState.CANCELLED: "INFO"}
+    ends = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.NONE)
+    texts = dict(zip(ends, KINDS[state.kind].ends, strict=True))
+    row.label(text=texts.get(worker, ""), icon=icons.get(worker, "ERROR"))
+    if state.can_be_dismissed:
+        row.operator("stga.dismiss", text="", icon="X", emboss=False).request = state.kind
+    if now.state.failed:
+        draw_text(box, context, now.status.error)
+        width, log = _columns(context), box.column(align=True)
+        log.active = False
+        for line in now.log_tail:
+            short = textwrap.shorten(line, width, placeholder="…")
+            log.label(text=short if len(line) > width else line)
+        box.operator("stga.copy_report", icon="COPYDOWN").directory = str(state.folder)
+    if state.loading is not None:
+        draw_text(box, context, WAITING, "INFO")
+    return box
+
+
+def draw_curve(layout: Any, folder: Path) -> None:
+    """Draw the curve of the run in this folder, or the head over the footage that is tracked;
+    nothing before then."""
+    curve = monitor.curve(folder)
+    if curve is None:
+        return
+    name = str(folder)
+    if _shown.get(folder) is not curve:
+        _shown[folder], pixels = curve, curve[0]
+        _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
+        preview = _previews.new(name)
+        preview.image_size = pixels.shape[1], pixels.shape[0]
+        preview.image_pixels_float.foreach_set(np.ascontiguousarray(pixels).ravel())
+    column = layout.column(align=True)
+    column.template_icon(_previews[name].icon_id, scale=SCALE)
+    for text in filter(None, curve[1:]):
+        column.label(text=text)
+
+
+def register() -> None:
+    global _previews
+    _previews = bpy.utils.previews.new()
+
+
+def unregister() -> None:
+    bpy.utils.previews.remove(_previews)
+    _shown.clear()

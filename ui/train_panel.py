@@ -1,65 +1,82 @@
-"""The Train step: settings, progress, and result or failure."""
+"""The Train step: settings, progress, and result or failure; refining a region of the trained
+avatar, and extending it by a further take; what the analysis decided about effects, and why."""
 
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
-from ..operators import ids, monitor
-from ..operators.analyze import chosen_effects
-from ..operators.common import is_head, package, scene_settings
-from ..operators.train import TrainOptions
+from ..operators import monitor
+from ..operators.common import is_head, package
+from ..operators.train import (
+    DeviceOptions,
+    ExtendOptions,
+    RefineOptions,
+    TrainOptions,
+    chosen_effects,
+)
 from ..operators.training_python import has_training_python
 from ..stga_addon.format import describe_figures, format_duration
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.vertex_groups import shows_residuals
+from ..stga_addon.training.effect_catalog import EFFECTS
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.status import WorkerState
-from .curve import draw_curve
-from .options import set_options
 from .properties import preset_times
-from .request import draw_end, draw_running
-from .sidebar import SidebarPanel
-from .text import draw_text
+from .sidebar import (
+    ClosedPanel,
+    SidebarPanel,
+    draw_curve,
+    draw_end,
+    draw_running,
+    draw_text,
+    set_options,
+)
 
 
 class TrainPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_train"
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
-        if draw_running(self.layout, context, Kind.TRAINING):
+        layout, settings = self.layout, context.scene.stga
+        if draw_running(layout, context, Kind.TRAINING):
             return
         training = monitor.state_of(context.scene, Kind.TRAINING)
         if training.subject is not None:
-            _draw_end(self.layout, context, training)
-        _draw_choices(self.layout, context)
+            _draw_end(layout, context, training)
+        layout.prop(settings, "run_folder", text="Folder")
+        layout.prop(settings, "preset")
+        times = [f"{name} {format_duration(s)}" for name, s in preset_times(settings).items()]
+        if times:
+            draw_text(layout, context, f"On this machine: {', '.join(times)}", "TIME")
+        layout.prop(settings, "minutes")
+        row = layout.row(align=True)
+        draw_train_button(row, settings)
+        draw_train_button(row, settings, resume=True)
+        draw_missing_python(layout, context)
 
 
-def _draw_choices(layout: Any, context: Any) -> None:
-    settings = scene_settings(context)
-    layout.prop(settings, "run_folder", text="Folder")
-    layout.prop(settings, "preset")
-    times = ", ".join(
-        f"{name} {format_duration(seconds)}" for name, seconds in preset_times(settings).items()
-    )
-    if times:
-        draw_text(layout, context, f"On this machine: {times}", "TIME")
-    layout.prop(settings, "minutes")
-    row = layout.row(align=True)
-    draw_train_button(row, settings)
-    draw_train_button(row, settings, resume=True)
-    draw_missing_python(layout, context)
+def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
+    box, state, run = draw_end(layout, context, training), training.snapshot.state, training.place
+    if state == WorkerState.NONE:
+        remedy = "choose its new folder and press Resume"
+        draw_text(box, context, f"{run}: does not exist; {remedy}")
+    elif not state.failed:
+        for line in describe_figures(training.snapshot.status.figures)[1:]:
+            draw_text(box, context, line)
+        draw_curve(box, run)
+        if training.files.tracking is not None:  # the splats were trained with it
+            head, text = context.scene.stga.head, "Apply Refined Tracking"
+            apply = box.operator("stga.apply_motion", text=text, icon="CON_FOLLOWTRACK")
+            apply.filepath, apply.own_offsets = str(run / TRACKING), True
+            apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1
 
 
 def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     """Draw the button that starts, or resumes, training with the panel's settings."""
-    train = layout.operator(
-        ids.TRAIN,
-        text="Resume" if resume else "Train",
-        icon="FRAME_NEXT" if resume else "MOD_PARTICLES",
-    )
+    text, icon = ("Resume", "FRAME_NEXT") if resume else ("Train", "MOD_PARTICLES")
+    train = layout.operator("stga.train", text=text, icon=icon)
     set_options(train, settings, TrainOptions)
     train.directory, train.resume = settings.run_folder, resume
     train.effects = " ".join(chosen_effects(settings))
@@ -68,45 +85,91 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
 def draw_missing_python(layout: Any, context: Any) -> None:
     """Where no Python here can track and train, say where one is chosen."""
     if not has_training_python(context):
-        show = layout.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
-        show.module = package()
+        draw_preferences(layout, "Choose a Python")
 
 
-class TrainOptionsPanel(SidebarPanel, bpy.types.Panel):
-    bl_idname = "STGA_PT_train_options"
+def draw_preferences(layout: Any, text: str) -> None:
+    """Draw a button that opens the add-on's preferences."""
+    show = layout.operator("preferences.addon_show", text=text, icon="PREFERENCES")
+    show.module = package()
+
+
+class TrainOptionsPanel(ClosedPanel, bpy.types.Panel):
     bl_label = "Options"
     bl_parent_id = TrainPanel.bl_idname
-    bl_options: ClassVar[set[str]] = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
-        settings = scene_settings(context)
-        names = ["strategy", "device", "show_result", "live_preview"]
-        if settings.device == "gpu":
-            names.insert(2, "adapter")
-        for name in names:
-            self.layout.prop(settings, name)
+        settings = context.scene.stga
+        for name in ("strategy", "device", "adapter", "show_result", "live_preview"):
+            if name != "adapter" or settings.device == "gpu":
+                self.layout.prop(settings, name)
 
 
-def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
-    box, state = draw_end(layout, context, training), training.snapshot.state
-    if state == WorkerState.NONE:
-        draw_text(
-            box,
-            context,
-            f"{training.place}: does not exist; choose its new folder and press Resume",
-        )
-    elif not state.failed:
-        for line in describe_figures(training.snapshot.status.figures)[1:]:
-            draw_text(box, context, line)
-        draw_curve(box, training.place)
-        if training.files.tracking is not None:
-            _draw_refined(box, context, training.place / TRACKING)
+class ContinuePanel(ClosedPanel, bpy.types.Panel):
+    bl_label = "Refine and Extend"
+    bl_parent_id = TrainPanel.bl_idname
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return is_head(context.scene.stga.head)
+
+    def draw(self, context: Any) -> None:
+        settings = context.scene.stga
+        self._draw_refine(settings)
+        column = self.layout.column()
+        column.prop(settings.extend, "take")
+        column.prop(settings.extend, "seconds")
+        extend = column.operator("stga.extend", icon="ADD")
+        set_options(extend, settings, DeviceOptions)
+        set_options(extend, settings.extend, ExtendOptions)
+        extend.directory = settings.run_folder
+        if not draw_running(column, context, Kind.SELECTION):
+            select = column.operator("stga.select_extension", icon="GROUP_VERTEX")
+            select.directory = settings.run_folder
+
+    def _draw_refine(self, settings: Any) -> None:
+        column, head, options = self.layout.column(), settings.head, settings.refine
+        shown, editing = shows_residuals(head), head.mode == "EDIT"
+        text = "Hide Residuals" if shown else "Show Residuals"
+        residuals = column.operator("stga.heat_map", text=text, icon="BRUSHES_ALL", depress=shown)
+        residuals.show, residuals.of = not shown, "RESIDUAL"
+        if not editing:
+            column.prop_search(options, "group", head, "vertex_groups", text="Region")
+        row = column.row(align=True)
+        row.prop(options, "all_frames", toggle=True)
+        frames = row.row(align=True)
+        frames.active = not options.all_frames
+        frames.prop(options, "first", text="")
+        frames.prop(options, "last", text="")
+        fields = column.column(align=True)
+        fields.prop(options, "seconds")
+        fields.prop(options, "growth")
+        text = "Refine Selected Faces" if editing else "Refine Vertex Group"
+        refine = column.operator("stga.refine", text=text, icon="SCULPTMODE_HLT")
+        set_options(refine, settings, DeviceOptions)
+        set_options(refine, options, RefineOptions)
+        refine.directory = residuals.directory = settings.run_folder
+        if not options.all_frames:
+            refine.first, refine.last = options.first, max(options.first, options.last)
 
 
-def _draw_refined(layout: Any, context: Any, path: Path) -> None:
-    """Draw a button that exchanges the imported tracking for the refined one, which the splats were
-    trained with."""
-    head = scene_settings(context).head
-    apply = layout.operator(ids.APPLY_MOTION, text="Apply Refined Tracking", icon="CON_FOLLOWTRACK")
-    apply.filepath, apply.own_offsets = str(path), True
-    apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1
+class EffectsPanel(ClosedPanel, bpy.types.Panel):
+    bl_label = "Effects"
+    bl_parent_id = TrainPanel.bl_idname
+
+    def draw(self, context: Any) -> None:
+        if not draw_running(self.layout, context, Kind.ANALYSIS):
+            self.layout.operator("stga.analyze_capture", icon="VIEWZOOM")
+        for row in context.scene.stga.effects:
+            effect, box = EFFECTS[row.name], self.layout.column(align=True)
+            line = box.row(align=True)
+            arrow = "DISCLOSURE_TRI_DOWN" if row.is_open else "DISCLOSURE_TRI_RIGHT"
+            line.prop(row, "is_open", text="", icon=arrow, emboss=False)
+            line.label(text=effect.title, icon="CHECKMARK" if row.on else "REMOVE")
+            price = line.row()
+            price.active, price.alignment = row.on, "RIGHT"
+            price.label(text=effect.price)
+            if row.is_open:
+                box.row().prop(row, "choice", expand=True)
+                for text in (f"{row.name}: {row.reason}", f"Cost: {row.cost}"):
+                    draw_text(box, context, text, "BLANK1")

@@ -87,20 +87,17 @@ class RayEngine(Engine):
             ready, _ = self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=0)
             for task in ready:
                 job = self._jobs.pop(task)
-                end = self._end(task, job)
-                if end.snapshot.state.is_alive:  # on a machine that Ray had given up
+                try:
+                    code = self._ray.get(task)
+                # its machine or Ray's worker has gone, more often than NODE_RETRIES
+                except self._ray.exceptions.RayError:
+                    code = -1
+                snapshot = inspect_worker(job.request_folder)
+                if snapshot.state.is_alive:  # on a machine that Ray had given up
                     self.adopt(job)
                 else:
-                    found[job.name] = end
+                    found[job.name] = Ended(snapshot, code < 0)
         return found
-
-    def _end(self, task: Any, job: Job) -> Ended:
-        try:
-            code = self._ray.get(task)
-        # its machine or Ray's worker has gone, more often than NODE_RETRIES
-        except self._ray.exceptions.RayError:
-            code = -1
-        return Ended(inspect_worker(job.request_folder), code < 0)
 
     def withdraw(self) -> Sequence[str]:
         """Take back the tasks that have not begun."""

@@ -267,7 +267,7 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     from ..avatar.file import read_avatar
     from ..capture.images import read_image
     from ..render.render import render_avatar
-    from ..training.evaluate.evaluation_views import choose_evaluation_views
+    from ..training.evaluate.metrics import choose_evaluation_views
     from ..training.run.folder import AVATAR, open_refined
 
     capture = open_refined(run)

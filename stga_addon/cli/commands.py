@@ -313,10 +313,6 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
 # Captures
 
 
-def _select(options: Namespace, head: OpenHead | None) -> None:
-    _write_selection(Select(**given_options(options, Select)), options.out)
-
-
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
     """Carry out the request; write timestep -> triangles into an .npz where asked to."""
     found = carry_out(request, with_bar=False)
@@ -441,7 +437,9 @@ COMMANDS = {
     "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
     "eval": _asking(Evaluate, with_bar=False),
     "select": Command(
-        _about(Select), _select, (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
+        _about(Select),
+        lambda options, _: _write_selection(Select(**given_options(options, Select)), options.out),
+        (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),

@@ -10,7 +10,7 @@ from ..options import like, option
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
-from ..training.effect_decisions import EffectDecision
+from ..training.effect_catalog import EffectDecision
 from ..training.settings import TrainingSettings, make_settings
 from .train import Selected, Train
 

@@ -79,7 +79,7 @@ def add_light(
     """Write the light of a capture into a run's avatar file; what there is to say. Raises
     StgaError, also while another process works on the run."""
     from ..light.estimate import Known, estimate_light
-    from ..training.evaluate.match_exposure import known_exposure
+    from ..training.evaluate.metrics import known_exposure
 
     with locked(avatar_file.parent):
         avatar = read_avatar(avatar_file)

@@ -256,7 +256,7 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
     """Write what stands still behind the person, where its effect is on; what there is to say."""
     if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
         return ()
-    from ..training.world.world_splats import world_of
+    from ..training.world import world_of
 
     path = prepared.request.run / WORLD_FILE
     try:

@@ -53,8 +53,7 @@ def correct_capture(
     places, used, _, _ = _landmarks(out, capture)
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
-    chosen = SurfacePoints(places.face[used], places.barycentric[used])
-    heads = corrected(person, chosen, solved, trust, rows, span)
+    heads = corrected(person, places[used], solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"

@@ -13,6 +13,7 @@ from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
 from stga_addon.worker.training_python import missing_packages
 
+collect_ignore_glob = [] if importlib.util.find_spec("bpy") else ["test_*.py"]
 ROOT = Path(__file__).resolve().parents[2]
 
 

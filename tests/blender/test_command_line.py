@@ -4,20 +4,19 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.embedding import to_world
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.capture.open import open_capture
+from stga_addon.export.ply import read_ply
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.vertex_groups import read_selection
 
-from capture.factory import ball, write_flame_capture, write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.embedding import face_frames, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar  # noqa: E402
-from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.export.ply import read_ply  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
+from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
@@ -40,29 +39,17 @@ def save_and_open(path: Path) -> None:
 
 
 def show_avatar(path: Path, capture) -> Avatar:
-    faces = ball()[1].astype(np.int32)
-    avatar = Avatar(
-        lattice_splats(capture.neutral, faces, order=0),
-        "stga",
-        capture.neutral.astype(np.float32),
-        faces,
-    )
-    write_avatar(path, avatar)
+    avatar = write_ball_avatar(path, capture.neutral, order=0)
     bpy.ops.stga.show_avatar(filepath=str(path))
     return avatar
 
 
-def test_without_a_head_everything_is_named(stga, folder, capsys):
-    """Catches a parser that asks for less than it needs."""
-    assert stga("info", folder) == 0
-    with pytest.raises(SystemExit) as stopped:
-        stga("info")
-    assert stopped.value.code == 2
-    assert "CAPTURE" in capsys.readouterr().err
-
-
 def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capfd):
-    """Catches a command on nothing, or on the open head although another is named."""
+    """Catches a parser that asks for less than it needs, a command on nothing, or on the open head
+    although another is named."""
+    with pytest.raises(SystemExit, match="2"):
+        stga("info")
+    assert "CAPTURE" in capfd.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
@@ -88,19 +75,12 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
     keys.key_blocks["expr_001"].value = 4.0
     save_and_open(tmp_path / "head.blend")
     assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
-    assert (
-        stga(
-            "export", tmp_path / "a.npz", "--format", "gaussian-avatars", "--out", tmp_path / "pair"
-        )
-        == 0
-    )
-    assert sorted(path.name for path in (tmp_path / "plys").glob("*.ply")) == [
-        f"{t:05d}.ply" for t in range(4)
-    ]
+    pair = ("--format", "gaussian-avatars", "--out", tmp_path / "pair")
+    assert stga("export", tmp_path / "a.npz", *pair) == 0
+    written = sorted(path.name for path in (tmp_path / "plys").glob("*.ply"))
+    assert written == [f"{timestep:05d}.ply" for timestep in range(4)]
     bpy.context.scene.frame_set(2)  # not among the tracked timesteps
-    frames = face_frames(
-        evaluated_vertices(bpy.context.scene.stga.head), avatar.faces, avatar.neutral
-    )
+    frames = avatar.frames(evaluated_vertices(bpy.context.scene.stga.head))
     expected = to_world(avatar.splats, frames).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
@@ -147,9 +127,8 @@ def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
         extension.stga_addon.worker.training_python, "missing_packages", lambda: ["torch"]
     )
     assert stga("train", folder, "--out", folder / "run") == 2
-    assert (
-        "Install the complete edition of the add-on, or choose a Python" in capsys.readouterr().err
-    )
+    expected = "Install the complete edition of the add-on, or choose a Python"
+    assert expected in capsys.readouterr().err
     bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
@@ -161,22 +140,11 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
     monkeypatch.setenv(extension.stga_addon.worker.training_python.PYTHON_VARIABLE, str(chosen))
-    arguments = [
-        command,
-        "FOOTAGE",
-        *([] if command == "train" else ["--model", "HEAD"]),
-        "--out",
-        "OUT",
-    ]
+    model = [] if command == "train" else ["--model", "HEAD"]
     more = ["--iterations", "2"] if command != "track" else []
-    assert stga(*arguments, *more) == 7
-    expected = [
-        "-m",
-        "stga_addon",
-        *arguments,
-        *more,
-        *(["--no-blend"] if command == "avatar" else []),
-    ]
+    arguments = [command, "FOOTAGE", *model, "--out", "OUT", *more]
+    assert stga(*arguments) == 7
+    expected = ["-m", "stga_addon", *arguments, *(["--no-blend"] if command == "avatar" else [])]
     assert (tmp_path / "asked").read_text().split() == expected
 
 
@@ -194,9 +162,7 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
     save_and_open(tmp_path / "head.blend")
     options = {"iterations": 8, "strategy": "selective", "seed": 3}
     by_worker = {"wait": True, "python": sys.executable}
-    assert bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options) == {
-        "FINISHED"
-    }
+    bpy.ops.stga.train(directory=str(tmp_path / "panel"), **by_worker, **options)
     arguments = [item for name, value in options.items() for item in (f"--{name}", value)]
     assert here("train", "--out", tmp_path / "headless", *arguments) == 0
     assert stga("train", "--out", tmp_path / "delegated", *arguments) == 0
@@ -213,10 +179,8 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
 
 def test_a_farms_python_comes_first(extension, monkeypatch):
     """Catches a farm's variable that is ignored, or overrules an operator's Python."""
-    operators, worker = (
-        extension.operators.training_python,
-        extension.stga_addon.worker.training_python,
-    )
+    operators = extension.operators.training_python
+    worker = extension.stga_addon.worker.training_python
     monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
     assert operators.training_python(bpy.context) == "/farm/python"
     assert operators.training_python(bpy.context, "/given/python") == "/given/python"

@@ -27,10 +27,7 @@ from stga_addon.progress import ignore
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 
-OWN_PACKAGES = (
-    "bpy", "numpy", "numpy.libs", "zstandard", "requests", "urllib3", "idna", "certifi",
-    "charset_normalizer",
-)  # fmt: skip
+OWN_PACKAGES = "bpy numpy numpy.libs zstandard requests urllib3 idna certifi charset_normalizer"
 """What a Blender's Python has of its own."""
 OFFLINE = ["unshare", "-rn"]
 ITERATIONS = 60
@@ -80,35 +77,26 @@ print("RESULT " + json.dumps(result))
 """
 
 
-@pytest.fixture(scope="module")
-def target() -> Target:
-    return Target(
-        this_platform(), f"{sys.version_info[0]}.{sys.version_info[1]}", ("4.2.0", "5.1.0")
-    )
+TARGET = Target(this_platform(), "{}.{}".format(*sys.version_info), ("4.2.0", "5.1.0"))
 
 
 @pytest.fixture(scope="module")
 def archive(
-    target: Target,
-    demo: Path,
-    kernel_bundle: tuple[Path, str],
-    tmp_path_factory: pytest.TempPathFactory,
+    demo: Path, kernel_bundle: tuple[Path, str], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     try:
-        check_wheels(collect_wheels(wheel_folder(target), target), target)
+        check_wheels(collect_wheels(wheel_folder(TARGET), TARGET), TARGET)
     except StgaError as error:
         pytest.skip(f"wheels not present and not downloadable: {error}")
-    kernels = sorted(kernel_bundle[0].glob("*/*"))
-    return build_zip(
-        tmp_path_factory.mktemp("dist"), edition=complete(target), demo=demo, kernels=kernels
-    )
+    parts = {"demo": demo, "kernels": sorted(kernel_bundle[0].glob("*/*"))}
+    return build_zip(tmp_path_factory.mktemp("dist"), edition=complete(TARGET), **parts)
 
 
 def bare_python(folder: Path) -> Path:
     """A Python of this version with Blender and numpy alone."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     site = next(folder.glob("lib/python*/site-packages"))
-    for name in OWN_PACKAGES:
+    for name in OWN_PACKAGES.split():
         source = Path(np.__file__).parents[1] / name
         if source.exists():
             (site / name).symlink_to(source)
@@ -123,24 +111,12 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     write_head_video(video, 6)
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("PYTHON", "NUMBA_"))
-    }
-    command = [
-        *offline,
-        str(python),
-        "-c",
-        SCRIPT,
-        str(archive),
-        str(tmp_path),
-        str(ITERATIONS),
-        str(video),
-    ]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=kept | profile, capture_output=True, text=True, check=False
-    )
+    others = ("PYTHON", "NUMBA_")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
+    arguments = [str(each) for each in (archive, tmp_path, ITERATIONS, video)]
+    command = [*offline, str(python), "-c", SCRIPT, *arguments]
+    how = {"cwd": tmp_path, "env": kept | profile}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **how)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
     result = json.loads(line.removeprefix("RESULT "))
@@ -158,19 +134,18 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     assert (tmp_path / "avatar/avatar.blend").is_file()
     settings = make_settings("global", iterations=ITERATIONS, effects={})  # as the operator
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
-    found, expected = (
-        read_metrics(run)[-1]["psnr"] for run in (Path(result["run"]), tmp_path / "here")
-    )
+    runs = (Path(result["run"]), tmp_path / "here")
+    found, expected = (read_metrics(run)[-1]["psnr"] for run in runs)
     assert abs(found - expected) < MAX_DIFFERENCE_DB
 
 
-def test_bundled_wheels_are_unmodified(archive: Path, target: Target) -> None:
+def test_bundled_wheels_are_unmodified(archive: Path) -> None:
     """Catches a wheel that the build changes, and a zip whose manifest names others than it
     holds."""
     with zipfile.ZipFile(archive) as made:
         names = {name for name in made.namelist() if name.startswith("wheels/")}
         for name in names:
-            assert made.read(name) == (wheel_folder(target) / Path(name).name).read_bytes()
+            assert made.read(name) == (wheel_folder(TARGET) / Path(name).name).read_bytes()
         manifest = made.read("blender_manifest.toml").decode()
     assert names
     assert all(f'"./{name}"' in manifest for name in names)

@@ -72,7 +72,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged
     file, and images that are saved in the .blend file."""
     bpy = pytest.importorskip("bpy")
-    curve, monitor = extension.ui.curve, extension.operators.monitor
+    curve, monitor = extension.ui.sidebar, extension.operators.monitor
     drawn = []
     layout = SimpleNamespace(
         column=lambda **_: SimpleNamespace(
@@ -83,7 +83,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     def draw() -> list[str]:
         """Read evaluations as the training monitor does, and draw; the texts below."""
         drawn.clear()
-        monitor._curves[tmp_path] = monitor._read_curve(tmp_path)
+        monitor._curves[tmp_path] = monitor._read_curve(tmp_path, None)
         curve.draw_curve(layout, tmp_path)
         return list(drawn)
 

@@ -1,13 +1,14 @@
 """Files dropped into the viewport: which operator a handler calls, and the result."""
 
+from types import SimpleNamespace
+
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-
-from .test_import_operators import ball_avatar, write_motion  # noqa: E402
+from .test_import_operators import write_motion
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -20,17 +21,10 @@ HANDLERS = {
 }
 
 
-@pytest.fixture
-def head(tmp_path):
-    """A rigged head."""
-    folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    return bpy.context.scene.stga.head
-
-
 @pytest.mark.parametrize("name", HANDLERS)
 def test_handlers_call_operators_that_take_a_file(name):
-    """Catches a handler whose operator is missing, or has no property for the path."""
+    """Catches a handler whose operator is missing, or has no property for the path, and a capture
+    that is imported because its JSON was dropped into the text editor."""
     handler = getattr(bpy.types, name)
     extensions, operator = HANDLERS[name]
     assert (handler.bl_file_extensions, handler.bl_import_operator) == (extensions, operator)
@@ -38,17 +32,9 @@ def test_handlers_call_operators_that_take_a_file(name):
     properties = getattr(getattr(bpy.ops, group), function).get_rna_type().properties
     assert properties["filepath"].subtype == "FILE_PATH"
     assert properties["filepath"].is_skip_save
-
-
-def test_drops_are_accepted_by_the_viewport_only():
-    """Catches a capture that is imported because its JSON was dropped into the text editor."""
-    from types import SimpleNamespace
-
-    for name in HANDLERS:
-        poll = getattr(bpy.types, name).poll_drop
-        assert poll(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
-        assert not poll(SimpleNamespace(area=SimpleNamespace(type="TEXT_EDITOR")))
-        assert not poll(SimpleNamespace(area=None))
+    assert handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
+    assert not handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="TEXT_EDITOR")))
+    assert not handler.poll_drop(SimpleNamespace(area=None))
 
 
 def test_a_file_stands_for_its_capture(tmp_path):
@@ -58,48 +44,34 @@ def test_a_file_stands_for_its_capture(tmp_path):
     image = next(folder.rglob("*.png"))
     for given in (folder / "transforms_train.json", image, folder / "demo.blend"):
         bpy.ops.wm.read_homefile(use_empty=True)
-        assert bpy.ops.stga.import_capture(filepath=str(given)) == {"FINISHED"}
+        bpy.ops.stga.import_capture(filepath=str(given))
         assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
     (tmp_path / "notes.json").write_text("{}")
     with pytest.raises(RuntimeError, match=r"notes.json: is in no capture; choose"):
         bpy.ops.stga.import_capture(filepath=str(tmp_path / "notes.json"))
 
 
-def test_avatar_is_shown(head, tmp_path):
-    """Catches an avatar taken for a motion: both are .npz with an array `rotation`."""
-    assert bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
-    assert bpy.context.scene.stga.splats is not None
-
-
-def test_motion_is_applied_to_the_head(head, tmp_path):
-    """Catches a motion that arrives as a second head."""
-    objects = len(bpy.data.objects)
-    assert bpy.ops.stga.open_npz(filepath=str(write_motion(tmp_path / "smile.npz"))) == {"FINISHED"}
-    assert len(bpy.data.objects) == objects
-    assert [action for action in bpy.data.actions if "smile" in action.name]
-
-
-def test_motion_without_a_head_needs_a_model(tmp_path):
-    """Catches a motion that cannot be dropped into an empty scene, and a traceback where the model
-    is missing."""
-    with pytest.raises(RuntimeError, match=r"^Error: .*smile\.npz: .* choose your FLAME model"):
-        bpy.ops.stga.open_npz(filepath=str(write_motion(tmp_path / "smile.npz")))
-
-
-def test_avatar_without_a_head_is_a_sentence(tmp_path):
-    """Catches a poll that fails with the name of a Python function."""
-    with pytest.raises(RuntimeError, match=r"^Error: .*a\.npz: .*import a capture first"):
-        bpy.ops.stga.open_npz(filepath=str(ball_avatar(tmp_path / "a.npz")))
-
-
-def test_other_files_are_refused(tmp_path):
-    """Catches a traceback, or an error on FLAME, for neither avatar nor motion."""
+def test_an_npz_is_opened_by_its_content(tmp_path):
+    """Catches an avatar taken for a motion, where both have an array `rotation`, a motion that
+    arrives as a second head, and a traceback or an error on FLAME for anything else."""
+    avatar, motion = tmp_path / "a.npz", write_motion(tmp_path / "smile.npz")
+    write_ball_avatar(avatar)
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "noise.npz").write_bytes(b"no archive")
     for name, sentence in (
+        ("a.npz", ".*import a capture first"),
+        ("smile.npz", ".* choose your FLAME model"),
         ("other.npz", "is neither an avatar .* nor a FLAME motion"),
         ("noise.npz", "cannot be read as an .npz file"),
         ("gone.npz", "cannot be read as an .npz file"),
     ):
         with pytest.raises(RuntimeError, match=f"^Error: .*{name}: {sentence}"):
             bpy.ops.stga.open_npz(filepath=str(tmp_path / name))
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    objects = len(bpy.data.objects)
+    bpy.ops.stga.open_npz(filepath=str(motion))
+    assert len(bpy.data.objects) == objects
+    assert [action for action in bpy.data.actions if "smile" in action.name]
+    bpy.ops.stga.open_npz(filepath=str(avatar))
+    assert bpy.context.scene.stga.splats is not None

@@ -1,29 +1,21 @@
 """What an imported capture looks like: framed viewports, bones that are posed by one button."""
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_flame_capture, write_mesh_capture
+from mathutils import Vector
 from PIL import Image
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.development.demo.capture import unpack_capture
+from stga_addon.export.ply import write_ply
+from stga_addon.scene import tags
+from stga_addon.scene.avatar_scene import frame_head
+from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, POINTS, QUADS
+from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
+from stga_addon.scene.objects import layers_of
 
-from capture.factory import write_flame_capture, write_mesh_capture  # noqa: E402
-from mathutils import Vector  # noqa: E402
-
-from stga_addon.development.demo.capture import unpack_capture  # noqa: E402
-from stga_addon.export.ply import write_ply  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.avatar_scene import frame_head  # noqa: E402
-from stga_addon.scene.display.splat_nodes import (  # noqa: E402
-    AS_TRAINED,
-    DISPLAY,
-    LIMITS,
-    POINTS,
-    QUADS,
-)
-from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
-from stga_addon.scene.objects import layers_of  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
@@ -66,37 +58,27 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
     (world,) = [thing for thing in bpy.data.objects if thing.get(tags.WORLD)]
     head = bpy.context.scene.stga.head
     bpy.context.view_layer.update()
-    assert (world.hide_get(), world.hide_render, bpy.context.scene.stga.splats is not world) == (
-        True,
-        True,
-        True,
-    )
+    assert world.hide_get()
+    assert world.hide_render
+    assert bpy.context.scene.stga.splats is not world
     np.testing.assert_allclose(np.array(world.matrix_world), np.array(head.matrix_world), atol=1e-6)
     assert len(world.data.vertices) == len(avatar.splats)
 
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
-    """Catches a first look from within the default cube, and an artist's cube removed."""
-    bpy.ops.mesh.primitive_cube_add()
-    cube = bpy.context.object
-    cube.location.x = float(moved)
-    bpy.context.view_layer.update()
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    assert (cube.name, cube.hide_get(), cube.hide_render) == ("Cube", not moved, not moved)
-
-
-def test_a_cube_that_the_artist_shows_again_stays(extension, tmp_path):
-    """Catches a cube that every import hides, also where it is meant to be seen."""
+    """Catches a first look from within the default cube, an artist's cube removed, and one that
+    every import hides again."""
     bpy.ops.mesh.primitive_cube_add()
     cube, folder = bpy.context.object, str(write_mesh_capture(tmp_path / "capture"))
+    cube.location.x = float(moved)
+    bpy.context.view_layer.update()
     bpy.ops.stga.import_capture(directory=folder)
-    assert cube.hide_get()
+    assert (cube.name, cube.hide_get(), cube.hide_render) == ("Cube", not moved, not moved)
     cube.hide_set(False)
     cube.hide_render = False
     bpy.ops.stga.import_capture(directory=folder)
-    assert not cube.hide_get()
-    assert not cube.hide_render
+    assert (cube.hide_get(), cube.hide_render) == (False, False)
 
 
 def test_pose_the_jaw_and_back(head):
@@ -104,84 +86,70 @@ def test_pose_the_jaw_and_back(head):
     layer = bpy.context.view_layer
     (bones,) = layers_of(head.parent, tags.RIG, layer)
     assert bones.hide_viewport
-    assert bpy.ops.stga.pose_head() == {"FINISHED"}
+    bpy.ops.stga.pose_head()
     rig = layer.objects.active
     assert (rig.get(tags.KIND), rig.mode, bones.hide_viewport) == (tags.RIG, "POSE", False)
     owners = rig.pose.bones if bpy.app.version >= (5, 0, 0) else rig.data.bones
     assert [bone.name for bone in owners if bone.select] == ["jaw"]
     assert rig.data.bones.active.name == "jaw"
-    assert bpy.ops.stga.pose_head() == {"FINISHED"}
+    bpy.ops.stga.pose_head()
     assert (rig.mode, bones.hide_viewport) == ("OBJECT", True)
 
 
-def test_pose_the_bundled_head(extension, tmp_path):
-    """Catches a button that selects the jaw of a head whose jaw no bone moves."""
-    unpack_capture(tmp_path)
-    bpy.ops.stga.import_capture(directory=str(tmp_path))
+def test_pose_heads_of_other_kinds(extension, tmp_path):
+    """Catches a button that selects the jaw of a head whose jaw no bone moves, and a traceback
+    where a head has no rig."""
+    unpack_capture(tmp_path / "bundled")
+    bpy.ops.stga.import_capture(directory=str(tmp_path / "bundled"))
     bpy.ops.stga.pose_head()
     assert bpy.context.view_layer.objects.active.data.bones.active.name == "neck"
-
-
-def test_heads_without_bones_say_so(extension, tmp_path):
-    """Catches a traceback, or a mode without bones, where a head has no rig."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     with pytest.raises(RuntimeError, match="poll"):
         bpy.ops.stga.pose_head()
 
 
-def test_images_by_cycles_show_as_trained_by_quads(extension, tmp_path):
-    """Catches images by Blender's engines where an avatar is missing, or points."""
+@pytest.fixture
+def shown(extension, tmp_path):
+    """The splats of an avatar on a mesh capture's head."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    scene = bpy.context.scene
+    return bpy.context.scene.stga.splats
+
+
+def test_images_by_cycles_show_as_trained_by_quads(shown, tmp_path):
+    """Catches images by Blender's engines where an avatar is missing, or points."""
+    scene, path = bpy.context.scene, tmp_path / "image.png"
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
-    scene.render.image_settings.file_format, scene.render.filepath = (
-        "PNG",
-        str(tmp_path / "image.png"),
-    )
+    scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(path)
     images = {}
     for mode in (AS_TRAINED, QUADS, POINTS):
-        set_input(scene.stga.splats, DISPLAY, mode)
+        set_input(shown, DISPLAY, mode)
         bpy.ops.render.render(write_still=True)
-        images[mode] = np.asarray(Image.open(tmp_path / "image.png")).astype(int)
+        images[mode] = np.asarray(Image.open(path)).astype(int)
     assert images[QUADS][..., :3].max() > 50
     np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
 
 
-def test_cycles_sees_through_splats_that_are_shown(extension, tmp_path):
-    """Catches F12 in Cycles with holes, and limits lowered or raised needlessly."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    write_ball_avatar(tmp_path / "avatar.npz")
-    other, cycles = bpy.data.scenes.new("other").cycles, bpy.context.scene.cycles
-    before = other.transparent_max_bounces, other.min_transparent_bounces
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+def test_preview_for_other_engines(shown, tmp_path):
+    """Catches quads that face no camera, F12 in Cycles with holes, limits lowered or raised
+    needlessly, and displays without limits."""
+    scene, cycles = bpy.context.scene, bpy.context.scene.cycles
+    other = bpy.data.scenes.new("other").cycles
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (64, 64)
+    assert other.transparent_max_bounces < 64
     cycles.transparent_max_bounces, cycles.min_transparent_bounces = 200, 8
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (200, 64)
-    assert (other.transparent_max_bounces, other.min_transparent_bounces) == before
-
-
-def test_preview_for_other_engines(extension, tmp_path):
-    """Catches quads that face no camera, black holes, and displays without limits."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    write_ball_avatar(tmp_path / "avatar.npz")
-    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    scene = bpy.context.scene
-    shown, scene.render.engine, scene.cycles.transparent_max_bounces = (
-        scene.stga.splats,
-        "CYCLES",
-        8,
-    )
-    assert bpy.ops.stga.preview_images() == {"FINISHED"}
-    assert (display_mode(shown), scene.cycles.transparent_max_bounces) == (QUADS, 64)
+    shown, scene.render.engine, cycles.transparent_max_bounces = scene.stga.splats, "CYCLES", 8
+    bpy.ops.stga.preview_images()
+    assert (display_mode(shown), cycles.transparent_max_bounces) == (QUADS, 64)
     with pytest.raises(RuntimeError, match="displayed as trained"):
         bpy.ops.stga.preview_images()
     set_input(shown, DISPLAY, AS_TRAINED)
     scene.camera = None
-    assert bpy.ops.stga.preview_images() == {"FINISHED"}
+    bpy.ops.stga.preview_images()
     assert display_mode(shown) == POINTS
     tree = splat_modifier(shown).node_group
     menu = next(node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch")

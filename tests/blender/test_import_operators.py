@@ -1,13 +1,12 @@
 """Importing heads without a capture, and importing again."""
 
+from functools import partial
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
-
-bpy = pytest.importorskip("bpy")
-
-from capture.factory import (  # noqa: E402
+from capture.factory import (
     ball,
     flame_parameters,
     moved,
@@ -17,11 +16,11 @@ from capture.factory import (  # noqa: E402
     write_mesh_capture,
 )
 
-from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
-from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
+from stga_addon.capture.open import open_capture
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.display.splat_object import evaluated_splats
+
+from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 
@@ -34,11 +33,8 @@ def model(tmp_path) -> Path:
 def write_motion(path: Path, timesteps: int = 4) -> Path:
     """All timesteps in one file, as VHAP's tracker leaves it."""
     frames = [flame_parameters(timestep) for timestep in range(timesteps)]
-    moving = {
-        name: np.concatenate([f[name] for f in frames])
-        for name, value in frames[0].items()
-        if value.ndim == 2
-    }
+    names = [name for name, value in frames[0].items() if value.ndim == 2]
+    moving = {name: np.concatenate([frame[name] for frame in frames]) for name in names}
     np.savez(path, **moving, shape=frames[0]["shape"], static_offset=frames[0]["static_offset"])
     return path
 
@@ -51,68 +47,50 @@ def write_meshes(folder: Path, timesteps: int = 3) -> Path:
     return folder / "001.obj"
 
 
-def ball_avatar(path: Path) -> Path:
-    """Of the capture's head, with a splat a triangle."""
-    vertices, faces = ball()[0].astype(np.float32), ball()[1].astype(np.int32)
-    write_avatar(path, Avatar(lattice_splats(vertices, faces, order=0), "stga", vertices, faces))
-    return path
-
-
 def state_of_file() -> dict[str, list[str]]:
-    kinds = (
-        "objects", "meshes", "actions", "armatures", "collections", "node_groups", "materials",
-        "cameras", "images",
-    )  # fmt: skip
-    return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds}
+    kinds = "objects meshes actions armatures collections node_groups materials cameras images"
+    return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds.split()}
 
 
 def test_a_motion_file_is_a_rig(tmp_path, model):
     """Catches a motion that can be imported and then not worked with, because there is no folder
     around it."""
     path = write_motion(tmp_path / "tracked_flame_params_30.npz")
-    assert bpy.ops.stga.import_motion(filepath=str(path), flame=str(model)) == {"FINISHED"}
+    bpy.ops.stga.import_motion(filepath=str(path), flame=str(model))
     scene, capture = bpy.context.scene, open_capture(path, model)
     assert (scene.frame_start, scene.frame_end) == (0, 3)
     for timestep in capture.timesteps:
         scene.frame_set(timestep)
-        np.testing.assert_allclose(
-            evaluated_vertices(scene.stga.head), capture.mesh(timestep), atol=2e-6
-        )
-    assert bpy.ops.stga.select(threshold=0.001) == {"FINISHED"}
-
-
-def test_a_folder_of_meshes_by_one_of_them(tmp_path):
-    """Catches an import of the one mesh that was clicked."""
-    path = write_meshes(tmp_path / "meshes")
-    assert bpy.ops.stga.import_meshes(filepath=str(path)) == {"FINISHED"}
-    bpy.context.scene.frame_set(2)
-    head = bpy.context.scene.stga.head
-    np.testing.assert_allclose(evaluated_vertices(head), moved(2, ball()[0]), atol=1e-6)
+        found = evaluated_vertices(scene.stga.head)
+        np.testing.assert_allclose(found, capture.mesh(timestep), atol=2e-6)
+    bpy.ops.stga.select(threshold=0.001)
 
 
 @pytest.mark.parametrize("kind", ["capture", "flame", "motion", "meshes"])
 def test_importing_again_doubles_nothing(tmp_path, model, kind):
-    """Catches a second head, rig, camera, action or image for the same source."""
-
-    def bring() -> None:
-        if kind == "capture":
-            bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"))
-        elif kind == "flame":
-            bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"), flame=str(model))
-        elif kind == "motion":
-            bpy.ops.stga.import_motion(filepath=str(tmp_path / "motion.npz"), flame=str(model))
-        else:
-            bpy.ops.stga.import_meshes(filepath=str(tmp_path / "meshes/001.obj"))
-
-    write = {"capture": write_mesh_capture, "flame": write_flame_capture}
-    write_motion(tmp_path / "motion.npz")
-    write_meshes(tmp_path / "meshes")
-    if kind in write:
-        write[kind](tmp_path / "capture")
+    """Catches a second head, rig, camera, action or image for the same source, and an import of the
+    one mesh that was clicked."""
+    folder, motion = tmp_path / "capture", tmp_path / "motion.npz"
+    if kind == "capture":
+        write_mesh_capture(folder)
+        bring = partial(bpy.ops.stga.import_capture, directory=str(folder))
+    elif kind == "flame":
+        write_flame_capture(folder)
+        bring = partial(bpy.ops.stga.import_capture, directory=str(folder), flame=str(model))
+    elif kind == "motion":
+        write_motion(motion)
+        bring = partial(bpy.ops.stga.import_motion, filepath=str(motion), flame=str(model))
+    else:
+        mesh = write_meshes(tmp_path / "meshes")
+        bring = partial(bpy.ops.stga.import_meshes, filepath=str(mesh))
     bring()
     once = state_of_file()
     bring()
     assert state_of_file() == once
+    if kind == "meshes":
+        bpy.context.scene.frame_set(2)
+        found = evaluated_vertices(bpy.context.scene.stga.head)
+        np.testing.assert_allclose(found, moved(2, ball()[0]), atol=1e-6)
 
 
 def test_importing_again_keeps_what_an_artist_painted(tmp_path):
@@ -147,10 +125,8 @@ def test_what_came_in_is_selected(tmp_path):
     assert bpy.context.selected_objects == [head]
     assert bpy.context.view_layer.objects.active == head
     cameras = [thing for thing in bpy.data.objects if thing.type == "CAMERA"]
-    assert all(
-        camera.data.display_size < 0.3 * camera.matrix_world.translation.length
-        for camera in cameras
-    )
+    for camera in cameras:
+        assert camera.data.display_size < 0.3 * camera.matrix_world.translation.length
 
 
 def test_wrong_files_change_nothing(tmp_path, model):
@@ -159,19 +135,16 @@ def test_wrong_files_change_nothing(tmp_path, model):
     np.savez(tmp_path / "other.npz", xyz=np.zeros(3))
     (tmp_path / "empty").mkdir()
     before = state_of_file()
-    for name, message in (
-        ("noise.npz", "noise"),
-        ("other.npz", "has none of expr"),
-        ("gone.npz", "gone"),
+    write_motion(tmp_path / "a.npz")
+    for name, flame, message in (
+        ("noise.npz", model, "noise"),
+        ("other.npz", model, "has none of expr"),
+        ("gone.npz", model, "gone"),
+        ("other.npz", "", "choose your FLAME model in the add-on's preferences"),
+        ("a.npz", tmp_path / "no model.npz", "no model"),
     ):
         with pytest.raises(RuntimeError, match=message):
-            bpy.ops.stga.import_motion(filepath=str(tmp_path / name), flame=str(model))
-    with pytest.raises(RuntimeError, match="choose your FLAME model in the add-on's preferences"):
-        bpy.ops.stga.import_motion(filepath=str(tmp_path / "other.npz"))
-    with pytest.raises(RuntimeError, match="no model"):
-        bpy.ops.stga.import_motion(
-            filepath=str(write_motion(tmp_path / "a.npz")), flame=str(tmp_path / "no model.npz")
-        )
+            bpy.ops.stga.import_motion(filepath=str(tmp_path / name), flame=str(flame))
     with pytest.raises(RuntimeError, match="is not a capture"):
         bpy.ops.stga.import_meshes(filepath=str(tmp_path / "empty/a.obj"))
     assert state_of_file() == before
@@ -190,8 +163,9 @@ def test_linked_heads_are_left_alone(tmp_path):
     bpy.context.scene.collection.children.link(target.collections[0])
     linked = target.collections[0].objects[name]
     bpy.context.scene.stga.head = linked
-    assert bpy.ops.stga.show_avatar(filepath=str(ball_avatar(tmp_path / "a.npz"))) == {"FINISHED"}
-    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(linked.data.polygons)
+    avatar = write_ball_avatar(tmp_path / "a.npz", order=0)
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    assert len(evaluated_splats(bpy.context.scene.stga.splats)[0]) == len(avatar.splats)
     assert not linked.hide_render
     for operator in ("select", "heat_map", "apply_motion"):
         with pytest.raises(RuntimeError, match="linked from another file"):

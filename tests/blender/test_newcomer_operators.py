@@ -5,24 +5,22 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
+from light.scenes import lit_avatar
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import triangle_mesh
+from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display.splat_nodes import POINTS
+from stga_addon.scene.display.splat_object import display_mode, show_avatar
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.training.effect_catalog import EFFECTS
 
-from capture.factory import write_mesh_capture  # noqa: E402
-from light.scenes import lit_avatar  # noqa: E402
-
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.splat_nodes import POINTS  # noqa: E402
-from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
-from stga_addon.training.effect_catalog import EFFECTS  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
-from .test_panel import draw  # noqa: E402
+from .test_operators import write_ball_avatar
+from .test_panel import draw
 
 LACKS = (
     "/opt/blender/5.2/python/bin/python3.13 (Python 3.13.2) lacks torch, numba, scipy, pillow. "
@@ -53,11 +51,11 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
     def fail(self, context):
         raise extension.stga_addon.errors.StgaError(sentence)
 
-    class Operator:
-        def report(self, kind, text):
-            reports.append((kind, text))
+    class Operator(common.Action):
+        report = staticmethod(lambda kind, text: reports.append((kind, text)))
+        run = fail
 
-    assert common.reporting(fail)(Operator(), bpy.context) == {"CANCELLED"}
+    assert Operator().execute(bpy.context) == {"CANCELLED"}
     assert reports == [({"ERROR"}, sentence)], "without a window there is no panel"
     brief = common.short_sentence(sentence)
     assert len(brief) <= 90
@@ -65,7 +63,8 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
     texts = draw(extension, "next_step")
     assert sentence in texts
     assert BUTTONS[sentence] in texts
-    assert common.reporting(lambda self, context: {"FINISHED"})(Operator(), bpy.context)
+    Operator.run = lambda self, context: None
+    assert Operator().execute(bpy.context) == {"FINISHED"}
     assert sentence not in draw(extension, "next_step")
 
 
@@ -91,19 +90,26 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
     assert settings.run_folder == str(tmp_path / "moved/run")
 
 
-def test_a_file_made_without_the_panel_knows_its_run(extension, head, tmp_path):
-    """Catches demo.blend, whose panel proposes a folder without a run."""
+def test_a_file_made_without_the_panel(extension, head, tmp_path):
+    """Catches demo.blend, whose panel is empty or proposes a folder without a run, and a chosen
+    head that is replaced at loading."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.json").write_text("{}")
     write_ball_avatar(tmp_path / "run/avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "run/avatar.npz"))
-    settings = bpy.context.scene.stga
+    settings, name, path = bpy.context.scene.stga, head.name, str(tmp_path / "demo.blend")
     settings.splats[tags.AVATAR] = "//run/avatar.npz"
-    for name in ("head", "splats", "avatar", "run_folder"):
-        settings.property_unset(name)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "demo.blend"))
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "demo.blend"))
+    for each in ("head", "splats", "avatar", "run_folder"):
+        settings.property_unset(each)
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
     assert bpy.context.scene.stga.run_folder == "//run"
+    assert bpy.context.scene.stga.head.name == name
+    other = bpy.context.scene.stga.head = bpy.data.objects.new("other", None)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert bpy.context.scene.stga.head.name == "other"
 
 
 def test_effects_are_a_line_each(extension, head):

@@ -6,16 +6,14 @@ import json
 import os
 from types import SimpleNamespace
 
+import bpy
 import pytest
+from capture.factory import write_mesh_capture
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.jobs.table import Kind
 
-from capture.factory import write_mesh_capture  # noqa: E402
-
-from stga_addon.jobs.table import Kind  # noqa: E402
-
-from .test_curve import lines  # noqa: E402
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_curve import lines
+from .test_operators import write_ball_avatar
 
 
 class Layout:

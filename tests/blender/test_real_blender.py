@@ -1,12 +1,10 @@
 """The complete edition in real Blenders without a network, from installing to uninstalling.
 
-STGA_BLENDER is the command that starts a Blender; several, separated by " ; ", are tried one after
-another. The wheels of the Python of each are downloaded into build/wheels, where they are missing.
+The wheels of the Python of each are downloaded into build/wheels, where they are missing.
 """
 
 import json
 import os
-import shlex
 import subprocess
 import time
 import tomllib
@@ -29,27 +27,17 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.status import WorkerState, inspect_worker
 
-from .zips import with_version
+from .zips import BLENDERS, OLD_VERSION, name_of, with_version
 
-BLENDERS = [
-    shlex.split(command)
-    for command in os.environ.get("STGA_BLENDER", "").split(" ; ")
-    if command.strip()
-]
 pytestmark = [
     pytest.mark.nightly,
     pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"),
 ]
 SCRIPT = Path(__file__).with_name("complete_script.py")
-OLD_VERSION = "0.1.9"
 ITERATIONS, UPDATE_ITERATIONS = 60, 3000
 """Of a training; of one that is still at work when the update has ended."""
 MAX_DIFFERENCE_DB = 0.3
 TIMEOUT_S = 1800.0
-
-
-def name_of(command: list[str]) -> str:
-    return "-".join(command[-2:])
 
 
 def offline() -> list[str]:
@@ -74,22 +62,13 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
     return build_zip(out, edition=complete(target), demo=demo, kernels=kernels)
 
 
-def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
+def blender(command: list[str], home: Path, *arguments: object) -> None:
     """Run a Blender in a home folder of its own, without a network."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("PYTHON", "BLENDER", "STGA", "NUMBA"))
-    }
-    full = [*offline(), *command, *(["--background"] if background else []), *map(str, arguments)]
-    done = subprocess.run(
-        full,
-        cwd=ROOT,
-        env={**kept, "HOME": str(home)},
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
+    others = ("PYTHON", "BLENDER", "STGA", "NUMBA")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
+    full = [*offline(), *command, "--background", *map(str, arguments)]
+    how = {"env": {**kept, "HOME": str(home)}, "timeout": TIMEOUT_S}
+    done = subprocess.run(full, cwd=ROOT, capture_output=True, text=True, **how)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
 
 
@@ -109,20 +88,13 @@ def files_of(home: Path) -> set[str]:
         ".config/blender",
         ".local",
     )
-    extension = (
-        "extensions/user_default/stga/",
-        "extensions/.local/lib",
-        "extensions/.user/user_default/stga",
-    )
+    extension = ("/user_default/stga/", "extensions/.local/lib", ".user/user_default/stga")
     names = {path.relative_to(home).as_posix() for path in home.rglob("*") if not path.is_dir()}
     # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python
     # has compiled.
     names = {name for name in names if "/site-packages/__pycache__/" not in name}
-    return {
-        name
-        for name in names
-        if not name.startswith(own) or any(part in name for part in extension)
-    }
+    is_ours = {name: any(part in name for part in extension) for name in names}
+    return {name for name in names if is_ours[name] or not name.startswith(own)}
 
 
 @pytest.fixture(scope="module")
@@ -207,10 +179,5 @@ def other_profiles(home: Path, version: str) -> dict[str, int]:
     """Files of the extensions of other Blender versions in the home folder, and when they were
     changed."""
     profiles = [path for path in home.glob(".config/blender/*") if path.name != short(version)]
-    files = [
-        path
-        for profile in profiles
-        for path in (profile / "extensions").rglob("*")
-        if path.is_file()
-    ]
-    return {str(path): path.stat().st_mtime_ns for path in files}
+    files = [path for profile in profiles for path in (profile / "extensions").rglob("*")]
+    return {str(path): path.stat().st_mtime_ns for path in files if path.is_file()}

@@ -58,25 +58,20 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
     rng = np.random.default_rng(2)
     splats = lattice_splats(capture.neutral, faces, order=0)
     positions = rng.normal(0, 0.003, (len(faces), 3, 3)).astype(np.float32)
-    avatar = Avatar(
-        splats,
-        "stga",
-        capture.neutral.astype(np.float32),
-        faces,
-        driven_offsets={"strain_position": positions},
-    )
+    neutral = capture.neutral.astype(np.float32)
+    avatar = Avatar(splats, "stga", neutral, faces, driven_offsets={"strain_position": positions})
     write_avatar(tmp_path / "a.npz", avatar)
-    other = {
-        "expr": rng.normal(size=(5, 2)),
-        "pose": rng.normal(0, 0.3, (5, 15)),
-        "shape": np.ones(4),
-    }
+    moving = {"expr": rng.normal(size=(5, 2)), "pose": rng.normal(0, 0.3, (5, 15))}
+    other = moving | {"shape": np.ones(4)}
     np.savez(tmp_path / "other.npz", **other)
 
-    result = run(
-        python, build_zip(tmp_path / "dist", kernels=sorted(kernel_bundle[0].glob("*/*"))), tmp_path
-    )
+    kernels = sorted(kernel_bundle[0].glob("*/*"))
+    result = run(python, build_zip(tmp_path / "dist", kernels=kernels), tmp_path)
     assert version == "this" or result["version"].startswith(version)
+    assert result["heavy"] == []
+    assert {f"STGA_PT_{step}" for step in ("capture", "select", "train", "show")} <= {
+        *result["tabs"]
+    }
     assert max(result["counted"]) > 0
     assert result["left"] == []
     if result["can train"] or TRAINING_PYTHON:
@@ -86,14 +81,12 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
     pair = read_motion(tmp_path / "pair/flame_param.npz", own.model)
     for row in range(5):
         pose = other["pose"][row]
-        frame = FlameFrame(
-            other["expr"][row], pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:]
-        )
+        turns = (pose[:3], pose[3:6], pose[6:9], np.zeros(3), pose[9:])
+        frame = FlameFrame(other["expr"][row], *turns)
         mesh = flame_forward(own.model, own.shape, frame, own.static_offset)
         expected = to_world(avatar.splats, avatar.frames(mesh)).xyz
-        np.testing.assert_allclose(
-            read_ply(tmp_path / f"plys/{1 + row:05d}.ply").xyz, expected, atol=1e-5
-        )
+        written = read_ply(tmp_path / f"plys/{1 + row:05d}.ply").xyz
+        np.testing.assert_allclose(written, expected, atol=1e-5)
         np.testing.assert_allclose(pair.frame(row).pose, frame.pose, atol=1e-5)
         if 1 + row == result["frame"]:
             np.testing.assert_allclose(np.reshape(result["shown"], (-1, 3)), expected, atol=1e-5)
@@ -103,13 +96,8 @@ def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
     """What `workflow.py` reports, from a fresh Blender profile."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     environment = kept | {"BLENDER_USER_RESOURCES": str(folder / "profile")}
-    command = [
-        python,
-        str(Path(__file__).with_name("workflow.py")),
-        str(archive),
-        str(folder),
-        TRAINING_PYTHON,
-    ]
+    script = str(Path(__file__).with_name("workflow.py"))
+    command = [python, script, str(archive), str(folder), TRAINING_PYTHON]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))

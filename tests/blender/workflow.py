@@ -26,6 +26,8 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.preferences.addon_enable(module=MODULE)
     ops = bpy.ops.stga
+    heavy = {"torch", "numba", "trimesh", "tqdm"} & {name.split(".")[0] for name in sys.modules}
+    tabs = [name for name in dir(bpy.types) if name.startswith("STGA_PT_")]
 
     ops.import_capture(directory=str(folder / "capture"), flame=str(folder / "model.npz"))
     ops.select(threshold=0.0005)
@@ -37,12 +39,8 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     trained = 0
     if can_train() or python:
         # Without torch, whose bytecode a new extension would write first
-        ops.train(
-            directory=str(folder / "run"),
-            iterations=3,
-            effects="tracking=off",
-            python=python if can_train() else "",
-        )
+        own = {"python": python if can_train() else ""}
+        ops.train(directory=str(folder / "run"), iterations=3, effects="tracking=off", **own)
         ops.show_avatar(filepath=bpy.context.scene.stga.avatar)
         trained = len(positions()) // 3
         bpy.data.objects.remove(bpy.context.scene.stga.splats)
@@ -65,6 +63,8 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
     left += [path.name for path in Path(repos[index].directory).glob("stga*")]
     return {
         "version": bpy.app.version_string,
+        "heavy": sorted(heavy),
+        "tabs": tabs,
         "counted": counted,
         "can train": can_train(),
         "trained": trained,
@@ -75,10 +75,7 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
 
 
 def can_train() -> bool:
-    return all(
-        importlib.util.find_spec(name)
-        for name in ("torch", "numba", "scipy", "PIL", "platformdirs")
-    )
+    return all(map(importlib.util.find_spec, ("torch", "numba", "scipy", "PIL", "platformdirs")))
 
 
 def positions() -> list[float]:

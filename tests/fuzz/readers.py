@@ -32,14 +32,13 @@ from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
 from stga_addon.tracking.footage.calibrations import read_nerfstudio
 from stga_addon.tracking.footage.colmap import read_colmap
-from stga_addon.tracking.footage.lens import undistortion
 from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
 from stga_addon.tracking.footage.photogrammetry import (
     read_metashape,
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.shots import Shot
+from stga_addon.tracking.footage.shots import Shot, undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_camera, read_places

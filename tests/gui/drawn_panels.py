@@ -8,8 +8,9 @@ import blf
 import bpy
 from in_window import in_viewport, module, viewport
 
-PADDING, ICON = 8, 20
-"""Around a text in its button, and an icon, in pixels at a resolution scale of 1, as all widths."""
+PADDING, ICON, NUMBER = 8, 20, 40
+"""Around a text in its button, an icon, and the value in a field, in pixels at a resolution scale
+of 1, as all widths."""
 PANEL_MARGIN = 36
 """Of a sidebar's width: tabs, and the borders of panel and sub-panel."""
 NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
@@ -44,34 +45,33 @@ class Layout:
     def width(self) -> float:
         """That the texts need."""
         widths = [item.width for item in self.items] or [0.0]
-        if self.kind == "row":
-            return sum(widths)
+        if self.kind == "row":  # whose items are equally wide
+            return len(widths) * max(widths)
         if self.kind == "split":
             return widths[0] / self.options.get("factor", 0.5)
         return max(widths) * max(self.options.get("columns", 1), 1)
 
 
 class Leaf:
-    """A label, field or button."""
+    """A label, field or button, with its width: that of the text, the icon and the value."""
 
     def __init__(self, kind: str, arguments: Any, options: dict[str, Any]) -> None:
         self.kind, self.arguments, self.options = kind, arguments, options
-        self.leaves, self.button, self.text = [self], SimpleNamespace(), options.get("text", "")
-        if "text" in options:
-            return
-        if kind == "operator" and arguments:
+        self.leaves, self.button, self.text, self.is_number = [self], SimpleNamespace(), "", False
+        if kind == "operator":
             group, name = arguments[0].split(".")
             self.text = getattr(getattr(bpy.ops, group), name).get_rna_type().name
         elif kind in ("prop", "prop_search") and hasattr(arguments[0], "bl_rna"):
-            self.text = arguments[0].bl_rna.properties[arguments[1]].name
+            field = arguments[0].bl_rna.properties[arguments[1]]
+            self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
+        self.text = options.get("text", self.text)
 
     @property
     def width(self) -> float:
-        """Of the text with its icon."""
         blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
         text = blf.dimensions(0, self.text)[0] + PADDING if self.text else 0.0
         has_icon = self.options.get("icon", "NONE") != "NONE" or "icon_value" in self.options
-        return float(text + (ICON if has_icon else 0))
+        return float(text + (ICON if has_icon else 0) + (NUMBER if self.is_number else 0))
 
 
 def draw(panel: Any) -> Layout:

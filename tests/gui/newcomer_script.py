@@ -27,9 +27,7 @@ from in_window import ARGUMENTS, chosen, extension, in_viewport, module, play, s
 
 FOLDER = Path(ARGUMENTS[0])
 FIRST = FOLDER / "first.blend"
-LOOK_S = 10.0
-"""For which a newcomer looks at the head before Train is clicked."""
-NECK_ANGLE, MOUTH, VIDEO_S, PORT = 0.3, 0.6, 2.0, 21112
+NECK_ANGLE, MOUTH, PORT = 0.3, 0.6, 21112
 DRIVEN_S, RATE, PACKETS = 5.0, 60, 10_000
 IMAGE_PX, SAMPLES = 160, 8
 OUTSIDE = ("wm.path_open", "wm.save_mainfile")
@@ -45,7 +43,7 @@ def shot(name: str) -> None:
     in_window.picture(FOLDER / f"{name}.png")
 
 
-def click(name: str, action: Callable[..., Any], *how: Any, **options: Any) -> Any:
+def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -> Any:
     """Do what a click does, and draw the window; notes for how long both hold Blender up, in
     seconds of processor time of its thread, without what a window costs in which nothing changes,
     and by the clock."""
@@ -107,9 +105,8 @@ def digest() -> dict[str, Any]:
     for owner in (chosen(), scene.stga_lighting):
         names = {*owner.bl_rna.properties.keys()} - {"rna_type", "name"}
         found |= {name: getattr(owner, name) for name in names}
-    found = {
-        name: what for name, what in found.items() if isinstance(what, bool | int | float | str)
-    }
+    plain = bool | int | float | str
+    found = {name: what for name, what in found.items() if isinstance(what, plain)}
     for thing in scene.objects:
         keys = getattr(thing.data, "shape_keys", None)
         found[thing.name] = str(
@@ -118,7 +115,6 @@ def digest() -> dict[str, Any]:
                 [*map(tuple, thing.matrix_world)],
                 [round(key.value, 5) for key in keys.key_blocks] if keys else [],
                 getattr(getattr(thing.animation_data, "action", None), "name", ""),
-                sorted((name, str(item)) for name, item in thing.items() if isinstance(item, str)),
             ]
         )
     return found
@@ -131,8 +127,8 @@ def running() -> list[Any]:
 def browser() -> Any:
     """The window and area of a file browser that is open."""
     windows = bpy.context.window_manager.windows
-    areas = [(window, area) for window in windows for area in window.screen.areas]
-    return next((found for found in areas if found[1].type == "FILE_BROWSER"), None)
+    found = [(window, area) for window in windows for area in window.screen.areas]
+    return next((pair for pair in found if pair[1].type == "FILE_BROWSER"), None)
 
 
 def press(state: str) -> Iterator[Any]:
@@ -146,7 +142,6 @@ def press(state: str) -> Iterator[Any]:
                 seen["pressed"].setdefault(what, "gray")
                 continue
             bpy.ops.ed.undo_push(message="before")
-        print("PRESS", label, flush=True)
         before = digest()
         try:
             how = click(label, operator, "INVOKE_DEFAULT", True, **options)
@@ -174,21 +169,15 @@ def press(state: str) -> Iterator[Any]:
         else:
             if name == "stga.drive_live":
                 click(f"{state}, Stop", bpy.ops.stga.stop_live)
-            undo(label, operator, before)
+            with in_viewport():
+                if "UNDO" not in operator.bl_options:
+                    bpy.ops.ed.undo_push(message="after")
+                bpy.ops.ed.undo()
+            after = digest()
+            changed = [name for name in before if before[name] != after.get(name)]
+            if changed or len(after) != len(before):
+                seen["undo"][label] = [[name, before[name], after.get(name)] for name in changed]
         yield 0.2
-
-
-def undo(label: str, operator: Any, before: dict[str, Any]) -> None:
-    """Undo the operator, whose own undo step there is only where it says so."""
-    with in_viewport():
-        if "UNDO" not in operator.bl_options:
-            bpy.ops.ed.undo_push(message="after")
-        bpy.ops.ed.undo()
-    after = digest()
-    names = sorted(before.keys() | after.keys())
-    changed = [name for name in names if before.get(name) != after.get(name)]
-    if changed:
-        seen["undo"][label] = [[name, before.get(name), after.get(name)] for name in changed]
 
 
 def stop_workers() -> Iterator[Any]:
@@ -226,8 +215,6 @@ def misunderstand() -> Iterator[Any]:
 
 
 def train() -> Iterator[Any]:
-    yield LOOK_S
-    seen["seconds"]["until Train is clicked"] = round(time.monotonic() - STARTED, 2)
     begin = time.monotonic()
     settings = {"directory": chosen().run_folder, "minutes": chosen().minutes}
     click("Train", bpy.ops.stga.train, **settings)
@@ -320,15 +307,6 @@ def live() -> Iterator[Any]:
     yield opened(FIRST)
 
 
-def turntable() -> Iterator[Any]:
-    begin, file = time.monotonic(), str(FOLDER / "turntable.mp4")
-    click("Render Video", bpy.ops.stga.render_video, filepath=file, seconds=VIDEO_S)
-    yield lambda: not monitor.state_of(bpy.context.scene, kinds("video")).is_running
-    seen["seconds"]["to the video"] = round(time.monotonic() - begin, 2)
-    seen["video"] = str(monitor.state_of(bpy.context.scene, kinds("video")).snapshot.state)
-    shot("turntable")
-
-
 def export() -> Iterator[Any]:
     """Every format; then what can be opened again."""
     seen["exported"] = {}
@@ -390,7 +368,6 @@ def pressed() -> Iterator[Any]:
     yield from panels_unfolded("demo")
     yield from press("demo")
     seen["left"] = chosen().splats is not None
-    shot("pressed")
 
 
 def select_only(*things: Any) -> None:
@@ -451,9 +428,7 @@ def delete() -> Iterator[Any]:
     with in_viewport():
         bpy.ops.ed.undo()
         bpy.ops.ed.undo()
-    yield 0.2
     seen["deletion undone"] = {*bpy.data.objects.keys()} == names
-    shot("deletion undone")
 
 
 def disable() -> Iterator[Any]:
@@ -509,15 +484,15 @@ def render() -> Iterator[Any]:
 
 def drop() -> Iterator[Any]:
     """Drop a video: the dialog of Avatar from Video."""
-    options = {"filepath": str(FOLDER / "turntable.mp4")}
-    click("Drop", bpy.ops.stga.avatar_from_video, "INVOKE_DEFAULT", **options)
+    video = str(FOLDER / "CYCLES.mp4")
+    click("Drop", bpy.ops.stga.avatar_from_video, "INVOKE_DEFAULT", filepath=video)
     yield 0.3
     shot("dropped video")
     subprocess.run(["xdotool", "key", "Escape"], check=True)
     yield 0.3
 
 
-STEPS = """fresh open_demo misunderstand train pose live turntable display select export reopen
+STEPS = """fresh open_demo misunderstand train pose live display select export reopen
 pressed duplicate delete append render drop disable"""
 
 

@@ -40,9 +40,8 @@ def test_the_first_hour(tmp_path: Path) -> None:
     assert [text for text in texts if len(text.split()) > MAX_WORDS] == []
     assert (seen["cut"], seen["undo"], seen["kept"]) == ({}, {}, [])
     assert not any(name.endswith(".blend") for name in seen["proposed"].values())
-    assert (seen["video"], seen["left"], seen["run found"]) == ("finished", True, True)
-    assert seen["appended"]
-    assert seen["deletion undone"]
+    names = ("left", "run found", "appended", "deletion undone")
+    assert [name for name in names if not seen[name]] == []
     assert [*seen["duplicates undone"].values()] == [True, True]
     assert len({*seen["frame of row"], *seen["opened again"]}) == 2
     assert abs(seen["exposure"]) > 0.1

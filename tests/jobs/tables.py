@@ -16,7 +16,7 @@ from stga_addon.jobs.table import Benchmark, Request, Result
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
 from stga_addon.jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from stga_addon.progress import Written
-from stga_addon.training.effect_decisions import EffectDecision
+from stga_addon.training.effect_catalog import EffectDecision
 from stga_addon.training.settings import make_settings
 
 HEAD = Path("/captures/anna")

@@ -306,10 +306,8 @@ def test_folder_that_cannot_be_written(tmp_path):
     for use in (prepare_status_folder, request_cancel):
         with pytest.raises(StgaError, match=r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
-    with (
-        pytest.raises(StgaError, match=r"cannot be written"),
-        status_writer(tmp_path / "file" / "status"),
-    ):
+    writing = status_writer(tmp_path / "file" / "status")
+    with pytest.raises(StgaError, match="cannot be written"), writing:
         pass
 
 
@@ -351,18 +349,12 @@ def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
     theirs.mkdir(parents=True)
     (theirs / "strange_package.py").touch()
     variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
-    looking = (
-        "import importlib.util as u, sys; sys.exit(3 if u.find_spec('strange_package') else 0)"
-    )
+    looking = "import importlib.util as u; exit(3 if u.find_spec('strange_package') else 0)"
     variables["PYTHONPATH"] = str(theirs)
     for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
         command = [sys.executable, "-c", looking]
-        assert (
-            subprocess.run(
-                command, env=environment, stdin=subprocess.DEVNULL, check=False
-            ).returncode
-            == code
-        )
+        done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False)
+        assert done.returncode == code
     assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
 
 
@@ -383,8 +375,7 @@ def test_own_python(monkeypatch, tmp_path):
 
 def test_log_lines(tmp_path):
     """Catches progress bars, which use carriage returns, and a character that is cut in half."""
-    (tmp_path / LOG_FILE).write_bytes(
-        "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
-    )
+    text = "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
+    (tmp_path / LOG_FILE).write_bytes(text)
     assert log_lines(tmp_path, 2) == ["second", "third"]
     assert log_lines(tmp_path / "none", 2) == []

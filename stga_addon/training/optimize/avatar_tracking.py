@@ -41,12 +41,18 @@ from ...flame.sequence import (
 from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar
-from ...tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
-from ...tracking.dense_terms import POINT_SHARE, inside, projection_derivative
+from ...tracking.appearance import (
+    CHANNEL_WEIGHTS,
+    NOISE_LEVELS,
+    POINT_SHARE,
+    inside,
+    projection_derivative,
+    pyramid,
+    sampled,
+)
 from ...tracking.head_model import HeadModel
-from ...tracking.photo_consistency import facing, in_sight
 from ...tracking.posed_points import PosedPoints
-from ...tracking.seen_surface import surface_points
+from ...tracking.seen_surface import facing, in_sight, surface_points
 from ...tracking.solve import (
     TRANSLATION_ACCELERATION_M,
     WEIGHT_EXCESS_SIGMA,

@@ -1,0 +1,166 @@
+"""The Motion step: applying the motion of others, sliders of the face, and driving the head by a
+phone or program."""
+
+from time import monotonic
+from typing import Any
+
+import bpy
+
+from ..operators import live_session
+from ..operators.common import is_head, rig_or_none
+from ..operators.pose import needs_sliders, preparing
+from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
+from ..stga_addon.driving.performance import ARKIT_SHAPES
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.scene.rig.keyframes import EXPRESSION_KEY, IDENTITY_KEY
+from ..stga_addon.scene.rig.motion import outside_now, stored_range
+from .sidebar import ClosedPanel, SidebarPanel, draw_running, draw_text
+
+MAX_SLIDERS = 10  # the first components vary most
+SILENT_S = 1.0
+
+
+class MotionPanel(SidebarPanel, bpy.types.Panel):
+    bl_label = "5 Motion"
+
+    def draw(self, context: Any) -> None:
+        layout, settings = self.layout, context.scene.stga
+        layout.operator("stga.apply_motion", text="Apply Motion…", icon="IMPORT")
+        row, other = layout.row(align=True), settings.motion_source
+        row.prop(settings, "motion_source")
+        if other is not None:
+            row.operator("stga.apply_motion", text="", icon="CHECKMARK").source = other.name
+
+
+class FacePanel(SidebarPanel, bpy.types.Panel):
+    bl_label = "Face"
+    bl_parent_id = MotionPanel.bl_idname
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return rig_or_none(context.scene.stga.head) is not None
+
+    def draw(self, context: Any) -> None:
+        head = context.scene.stga.head
+        if head.name in preparing:
+            self.layout.label(text="Sliders follow in a moment", icon="TIME")
+            return
+        if needs_sliders(head):
+            self.layout.operator("stga.add_arkit_controls", icon="ADD")
+            return
+        keys = head.data.shape_keys.key_blocks
+        _draw_keys(self.layout, [keys[name] for name in ARKIT_SHAPES if name in keys])
+
+
+def _draw_keys(layout: Any, keys: list[Any]) -> None:
+    column = layout.column(align=True)
+    for key in keys:
+        column.prop(key, "value", text=key.name, slider=True)
+
+
+class TrainedPanel(ClosedPanel, bpy.types.Panel):
+    """Meters of how far outside the trained range the head is posed in this frame."""
+
+    bl_label = "Trained Range"
+    bl_parent_id = MotionPanel.bl_idname
+
+    def draw(self, context: Any) -> None:
+        head = context.scene.stga.head
+        rig = rig_or_none(head)
+        trained = stored_range(head) if rig is not None else None
+        if trained is None:
+            self.layout.operator("stga.measure_range", icon="DRIVER_DISTANCE")
+            return
+        for part, beyond in outside_now(head, rig, trained).items():
+            where = f"{beyond:.1f} half widths outside" if beyond else "inside"
+            self.layout.progress(factor=min(beyond, 1.0), text=f"{part.capitalize()}: {where}")
+
+
+class CoefficientsPanel(ClosedPanel, bpy.types.Panel):
+    """Sliders of a FLAME head without names: of expression, and of other persons."""
+
+    bl_label = "Coefficients"
+    bl_parent_id = MotionPanel.bl_idname
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return bool(_coefficients(context.scene.stga.head))
+
+    def draw(self, context: Any) -> None:
+        for keys in _coefficients(context.scene.stga.head):
+            _draw_keys(self.layout, keys[:MAX_SLIDERS])
+
+
+def _coefficients(head: Any) -> list[list[Any]]:
+    if not is_head(head) or head.data.shape_keys is None:
+        return []
+    keys = head.data.shape_keys.key_blocks
+    prefixes = (EXPRESSION_KEY, IDENTITY_KEY)
+    found = [[key for key in keys if key.name.startswith(prefix)] for prefix in prefixes]
+    return [part for part in found if part]
+
+
+class DrivePanel(ClosedPanel, bpy.types.Panel):
+    bl_label = "Drive"
+    bl_parent_id = MotionPanel.bl_idname
+
+    def draw(self, context: Any) -> None:
+        layout, settings = self.layout, context.scene.stga.drive
+        running = live_session.session()
+        if running is None:
+            _draw_source(layout, context, settings)
+            layout.operator("stga.drive_live", icon="PLAY")
+        else:
+            layout.operator("stga.stop_live", icon="PAUSE")
+            _draw_status(layout.column(align=True), running)
+            row = layout.row(align=True)
+            row.operator("stga.calibrate_live", icon="PIVOT_ACTIVE")
+            recording = running.recording
+            text = "Record" if recording is None else f"Stop Recording ({len(recording)})"
+            row.operator("stga.record_live", text=text, icon="REC", depress=recording is not None)
+        column = layout.column(align=True)
+        for name in ("strength", "smoothing", "stay_trained", "mirror"):
+            column.prop(settings, name)
+        row = column.row(align=True)
+        row.prop(settings, "exchange_jaw", text="Swap Jaw", toggle=True)
+        row.prop(settings, "exchange_mouth", text="Swap Mouth", toggle=True)
+        layout.prop(settings, "takes")
+        if not draw_running(layout, context, Kind.PERFORMANCE):
+            layout.operator("stga.drive_video", text="Drive from Video…", icon="FILE_MOVIE")
+
+
+def _draw_source(layout: Any, context: Any, settings: Any) -> None:
+    source = SOURCES[settings.source]
+    layout.prop(settings, "source")
+    if source.request:
+        layout.prop(settings, "phone")
+    layout.prop(settings, "address")
+    layout.prop(settings, "port", text=f"Port (0: {source.port})")
+    draw_text(layout, context, source.hint)
+    if settings.address == LOOPBACK:
+        hint = "Only programs on this computer are heard; for a phone, listen on 0.0.0.0"
+        draw_text(layout, context, hint)
+
+
+def _draw_status(column: Any, running: Any) -> None:
+    now, stream = monotonic(), running.stream
+    silent, health = stream.silent_s(now), stream.health(now)
+    if silent is None:
+        column.label(text=f"Waiting on port {running.receiver.port}", icon="INFO")
+    elif silent > SILENT_S:
+        column.label(text=f"Nothing received for {silent:.0f} s", icon="ERROR")
+    elif not stream.has_face:
+        column.label(text="No face in the picture", icon="ERROR")
+    else:
+        column.label(text=f"{health.rate:.0f} packets per second", icon="CHECKMARK")
+    lost = "not numbered" if health.lost is None else str(health.lost)
+    column.label(text=f"Lost: {lost}   Late: {health.late}   Foreign: {health.foreign}")
+    delay = "no clock" if health.delay_s is None else f"+{1000 * health.delay_s:.0f} ms"
+    column.label(text=f"Network: {delay}   Slowest pose: {1000 * running.slowest_tick_s:.0f} ms")
+    if len(stream.senders) < 2:
+        return
+    for sender in sorted(stream.senders):
+        row = column.row()
+        row.label(text=" ".join(filter(None, sender)))
+        button = row.operator("stga.follow_live", depress=sender == stream.followed)
+        button.address, button.subject = sender

@@ -1,0 +1,206 @@
+"""The Show step: the avatar, its display, and which light it shows, of which images that show
+another one say so; render properties of the engine STGA Splats."""
+
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..operators.show import GRAY
+from ..operators.training_python import has_training_python
+from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs.table import Kind
+from ..stga_addon.render.client import missing_packages
+from ..stga_addon.scene.compat import modifier_input_owner
+from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
+from ..stga_addon.scene.display.splat_object import (
+    display_mode,
+    input_identifier,
+    shows_nodes,
+    splat_modifier,
+    stored_light,
+    view_transform_hint,
+)
+from ..stga_addon.scene.gpu.renderer import has_gpu_context
+from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
+from ..stga_addon.scene.render import viewport_display
+from ..stga_addon.scene.render.engine import ENGINE
+from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
+from .sidebar import SidebarPanel, draw_running, draw_text
+
+DISPLAY_INPUTS = (
+    splat_nodes.SIZE,
+    splat_nodes.OPACITY_THRESHOLD,
+    splat_nodes.PERCENTAGE,
+    splat_nodes.VIEW_DEPENDENT,
+    splat_nodes.SHOW_SELECTION,
+    splat_nodes.SELECTED_ONLY,
+)
+_is_told = False
+"""Whether the render job in progress has said that it does not show the scene's light."""
+
+
+class ShowPanel(SidebarPanel, bpy.types.Panel):
+    bl_label = "4 Show"
+
+    def draw(self, context: Any) -> None:
+        layout, settings = self.layout, context.scene.stga
+        layout.prop(settings, "avatar")
+        layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
+        layout.operator("stga.export_avatar", icon="EXPORT").avatar = settings.avatar
+        layout.prop(settings, "splats")
+        if settings.splats is not None:
+            self._draw_display(layout, context, settings.splats)
+
+    def _draw_display(self, layout: Any, context: Any, splats: Any) -> None:
+        try:
+            modifier = splat_modifier(splats)
+        except StgaError as error:
+            layout.label(text=str(error), icon="ERROR")
+            return
+        mode = display_mode(splats)
+        layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
+        column = layout.column(align=True)
+        for name in DISPLAY_INPUTS:
+            draw_input(column, modifier, name)
+        if viewport_display.display.problem:
+            draw_text(layout, context, viewport_display.display.problem, "ERROR")
+        if mode == AS_TRAINED:
+            layout.operator("stga.preview_images", icon="SHADING_RENDERED")
+            return
+        if viewport_display.is_engine_view(context):  # shows every display as trained
+            return
+        draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
+        if context.space_data.shading.type in GRAY:
+            choose = "stga.choose_display"
+            show = layout.operator(choose, text="Show Colors", icon="SHADING_TEXTURE")
+            show.display = mode
+        elif view_transform_hint(context.scene):
+            layout.label(text="View transform changes the colors", icon="ERROR")
+            layout.operator("stga.standard_view")
+
+
+def draw_input(layout: Any, modifier: Any, name: str, **how: Any) -> None:
+    """Draw an input of the splats' node tree, where this display has it."""
+    identifier = input_identifier(modifier, name)
+    if identifier is not None:
+        owner, prop = modifier_input_owner(modifier, identifier)
+        layout.prop(owner, prop, text=name, **how)
+
+
+class LightingPanel(SidebarPanel, bpy.types.Panel):
+    bl_parent_id = ShowPanel.bl_idname
+    bl_label = "Lighting"
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return context.scene.stga.splats is not None
+
+    def draw(self, context: Any) -> None:
+        layout, settings = self.layout, lighting_settings(context.scene)
+        light = stored_light(context.scene.stga.splats)
+        if light is None:
+            draw_text(layout, context, "The avatar does not know the light of its capture", "INFO")
+            if not draw_running(layout, context, Kind.LIGHT):
+                folder = context.scene.stga.run_folder
+                layout.operator("stga.estimate_light", icon="LIGHT_SUN").directory = folder
+            return
+        layout.row().prop(settings, "mode", expand=True)
+        hint = light_hint(context.scene)
+        if hint:
+            draw_text(layout, context, hint, "ERROR" if shows_nodes(context.scene) else "INFO")
+        if settings.mode != "recorded":
+            self._draw_settings(layout, context, settings)
+        if light.damping:
+            text = f"The capture's light was hard: albedo is evened out by {light.damping:.0%}"
+            draw_text(layout, context, text, "INFO")
+        row = layout.row(align=True)
+        row.operator("stga.relight_frame")
+        row.operator("stga.relight_frame", text="", icon="X").clear = True
+        layout.operator("stga.head_shadow")
+
+    def _draw_settings(self, layout: Any, context: Any, settings: Any) -> None:
+        column = layout.column()
+        column.use_property_split = True
+        if settings.mode == "mix":
+            column.prop(settings, "mix")
+        for name in ("exposure", "white", "roughness", "specular", "shadows", "world", "lights"):
+            column.prop(settings, name)
+        if settings.world and world_light(context.scene.world) is None:
+            draw_text(layout, context, "Of worlds, colors and environment textures count", "ERROR")
+
+
+def _begin_exposure(scene: Any) -> None:
+    """Light avatars as brightly as they were recorded, until an exposure is chosen."""
+    settings = lighting_settings(scene)
+    if settings.mode != "recorded" and not settings.is_property_set("exposure"):
+        if bpy.context.window is not None:
+            bpy.context.window.cursor_set("WAIT")  # until the mouse moves
+        with suppress(StgaError):  # the display says what is wrong
+            exposure = level_exposure(viewport_display.display.cache)
+            if exposure is not None:
+                settings.exposure = exposure
+
+
+@persistent
+def _before_job(*_: Any) -> None:
+    global _is_told
+    _is_told = False
+
+
+@persistent
+def _before_image(scene: Any, *_: Any) -> None:
+    """Say once a job that an image does not show the scene's light."""
+    global _is_told
+    hint = light_hint(scene) if shows_nodes(scene) and not _is_told else None
+    if hint:
+        _is_told = True
+        print(f"STGA: {hint}")
+        if not bpy.app.background:  # this is the job's thread
+            bpy.app.timers.register(partial(_pop_up, hint))
+
+
+def _pop_up(hint: str) -> None:
+    """Show the sentence in the window that was opened last: that of the image, where it has one."""
+    manager = bpy.context.window_manager
+    with bpy.context.temp_override(window=manager.windows[-1]):
+        manager.popup_menu(
+            lambda menu, _: menu.layout.label(text=hint), title="STGA Lighting", icon="ERROR"
+        )
+
+
+class RenderPanel(bpy.types.Panel):
+    bl_idname = "STGA_PT_render"
+    bl_label = "STGA Splats"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "render"
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return bool(context.scene.render.engine == ENGINE)
+
+    def draw(self, context: Any) -> None:
+        layout, has_python = self.layout, has_training_python(context)
+        layout.use_property_split = True
+        layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
+        layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")
+        if missing_packages() and not has_gpu_context():
+            renderer = "Rendered by another Python" if has_python else "No Python here can render"
+            lacks = f"Blender's Python lacks {', '.join(missing_packages())}"
+            layout.label(text=f"{renderer}: {lacks}", icon="INFO")
+
+
+def register() -> None:
+    MODE_CHANGED.append(_begin_exposure)
+    bpy.app.handlers.render_init.append(_before_job)
+    bpy.app.handlers.render_pre.append(_before_image)
+
+
+def unregister() -> None:
+    MODE_CHANGED.remove(_begin_exposure)
+    bpy.app.handlers.render_init.remove(_before_job)
+    bpy.app.handlers.render_pre.remove(_before_image)
