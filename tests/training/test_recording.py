@@ -19,7 +19,11 @@ from stga_addon.tracking.folder import (
     read_torso_points,
     write_torso_points,
 )
-from stga_addon.training.optimize.avatar_tracking import AvatarTracking, track_by_avatar
+from stga_addon.training.optimize.avatar_tracking import (
+    AvatarTracking,
+    normal_images,
+    track_by_avatar,
+)
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
     avatar_person,
@@ -31,7 +35,7 @@ from stga_addon.worker.helpers import Helpers
 from .heads import TIMESTEPS
 from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
 
-SCALE, GAIN, OFFSET = 1.02, 0.85, 12
+SCALE, GAIN, OFFSET, SHADE = 1.02, 0.85, 12, 0.3
 
 
 def ignore(done: int, total: int) -> None:
@@ -40,21 +44,20 @@ def ignore(done: int, total: int) -> None:
 
 @pytest.fixture
 def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
-    """A run, and a capture that is darker and in a world that is too large."""
+    """A run, and a capture that is darker, lit from a side, and in a world that is too large."""
     avatar, settings = person
     run, root = tmp_path / "run", tmp_path / "recording"
     run.mkdir()
     shutil.copytree(lost[0].root, root)
     write_run(run, Run(root, root / "model.npz", "vhap", settings))
     write_avatar(run / AVATAR, avatar)
-    for path in (root / "images").iterdir():
-        image, mask = (
-            np.asarray(Image.open(path)),
-            np.asarray(Image.open(root / "fg_masks" / path.name)),
-        )
-        darker = np.where(mask[..., None] > 0, image * GAIN + OFFSET, image)
-        Image.fromarray(darker.astype(np.uint8)).save(path)
-    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": False}
+    for view in (view for views in lost[0].views.values() for view in views):
+        image, mask = (np.asarray(Image.open(path)) for path in (view.image, view.mask))
+        mesh, faces = lost[1][view.timestep], lost[0].faces
+        shade = 1 + SHADE * normal_images(mesh, faces, view.camera)[1][..., :1]
+        darker = np.where(mask[..., None] > 0, image * GAIN * shade + OFFSET, image)
+        Image.fromarray(np.clip(darker, 0, 255).astype(np.uint8)).save(root / view.name)
+    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": True}
     write_json(root / "tracking.json", report)
     scale_capture(root, root / "model.npz", SCALE)
     write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
@@ -62,9 +65,9 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
 
 
 def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
-    """Catches colors of another exposure that are taken for shading of another pose, a head that
-    keeps the size that landmarks gave it, files that keep the old parameters, and identities that
-    change."""
+    """Catches colors of another exposure or light that are taken for those of another pose, a head
+    that keeps the size that landmarks gave it, files that keep the old parameters, and identities
+    that change."""
     run, root = recording
     before = json.loads((root / "transforms_train.json").read_text())["frames"]
     found = track_recording(run, root, Helpers(1), ignore)
@@ -106,7 +109,8 @@ def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch) -> None:
     """Catches a cancelled tracking that begins anew, or goes on with what an avatar found that was
     trained again since."""
-    (run, root), calls, every = recording, list[int](), [1] * len(TIMESTEPS)
+    (run, root), calls = recording, list[int]()
+    every, twice = [1] * len(TIMESTEPS), [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")
 
     def counted(*arguments: Any) -> AvatarTracking:
@@ -114,10 +118,10 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
         return track_by_avatar(*arguments)
 
     monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", counted)
-    for trained_ns, expected in ((1, [*every, len(every)]), (1, []), (2, every)):
+    for trained_ns, expected in ((1, [*every, *twice]), (1, []), (2, [*every, *twice])):
         shutil.rmtree(root)
         shutil.copytree(tmp_path / "start", root)
         os.utime(run / AVATAR, ns=(trained_ns, trained_ns))
         calls.clear()
         track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore)
-        assert calls[: len(expected) or None] == expected
+        assert calls == expected

@@ -67,8 +67,9 @@ from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
 from .state import new_offset, new_state
 
-RENDERINGS = 7
-"""Of each view of a timestep: more of them hardly lower the loss."""
+RENDERINGS, RENDERINGS_AGAIN = 7, 5
+"""Of each view of a timestep, at first and once it was tracked by the avatar already: more of them
+hardly lower the loss."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to
 it."""
@@ -190,6 +191,7 @@ def track_by_avatar(
     is_far: bool = False,
     scales: bool = False,
     shading: np.ndarray | None = None,
+    is_again: bool = False,
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
@@ -198,10 +200,11 @@ def track_by_avatar(
     done; returns whether to stop. is_far: the starts are some way off, as of another recording: the
     first timestep is sought in small images first. scales: whether the head's size is sought too.
     shading: harmonics (9, 3) of a factor by the surface's normal, by which the light differs.
-    Each timestep begins where the one before has led. Raises StgaError where the capture has no
-    parameters or is of another head, and Cancelled.
+    is_again: the starts are what the avatar has tracked. Each timestep begins where the one before
+    has led. Raises StgaError where the capture has no parameters or is of another head, and
+    Cancelled.
     """
-    tracker, found = _Tracker(avatar, settings, capture, is_far, scales, shading), []
+    tracker, found = _Tracker(avatar, settings, capture, is_far, scales, shading, is_again), []
     chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
     number = 0
     while number < len(chosen):
@@ -258,6 +261,7 @@ class _Tracker:
         is_far: bool,
         scales: bool,
         shading: np.ndarray | None,
+        is_again: bool,
     ) -> None:
         sequence = capture.flame
         if sequence is None:
@@ -277,6 +281,7 @@ class _Tracker:
         shapes = [person.shapedirs, torso_shapes(person), grown]
         person = replace(person, shapedirs=np.concatenate(shapes, axis=2))
         self._is_far, self._added, self._shading = is_far, SHIFT_SIZE + scales, shading
+        self._is_again = is_again
         self._change: np.ndarray | None = None
         self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
@@ -302,7 +307,8 @@ class _Tracker:
         if not views:
             return tracked, np.diag(self._precision()), 0.0, 0.0, 0.0
         heights: tuple[int, ...] = (MAX_HEIGHT_PX,)
-        renderings, found = RENDERINGS, tracked
+        renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
+        found = tracked
         if self._change is not None:
             shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
             starts = tracked, tracked + self._change

@@ -14,7 +14,7 @@ from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
-from ...flame.sequence import torso_offset, torso_shapes, with_identity
+from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar
 from ...tracking.fit import HeadFit
@@ -43,6 +43,8 @@ SHADING_PRIOR, SHADING_ITERATIONS = 0.01, 6
 """Weight of the light that the avatar was trained in, as a share of the pixels."""
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
+ROUNDS = 2
+"""Of tracking, each from the smooth motion that the one before has led to."""
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 
@@ -74,31 +76,31 @@ def track_recording(
     share of the images is left unexplained. Raises StgaError, and what `report` raises.
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
-    report(0, len(timesteps))
-    factor = _fit_scale(run, root, helpers, lambda: report(0, len(timesteps)))
+    stored = read_json(root / REPORT_FILE)
+    rounds = ROUNDS if stored["in_order"] else 1
+    total = rounds * len(timesteps)
+    report(0, total)
+    factor = _fit_scale(run, root, helpers, lambda: report(0, total))
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
-    avatar, settings, capture = _open(*source)
-    assert capture.flame is not None
-    light = _light(avatar, settings, capture)
-    parts = [
-        (*source, *light, timesteps[first : first + PART_TIMESTEPS], False)
-        for first in range(0, len(timesteps), PART_TIMESTEPS)
-    ]
-    found = helpers.map(
-        _track_part, parts, lambda done: report(min(done, len(timesteps)), len(timesteps)), True
-    )
-    columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    tracked, stored = AvatarTracking(timesteps, **columns), read_json(root / REPORT_FILE)
-    if stored["in_order"]:
-        tracked = tracked.smoothed(capture.flame.model)
-    frame, torso = capture.flame.frame, torso_shapes(capture.flame.model)
-    for timestep, values, shift in zip(timesteps, tracked.parameters, tracked.shift, strict=True):
-        path = root / PARAMETERS / f"{timestep:05d}.npz"
-        arrays = {**read_npz(path), **moving_arrays(values)}  # the identity stays
-        offset = torso_offset(torso, shift, frame(timestep).dynamic_offset)
-        if offset is not None:
-            arrays["dynamic_offset"] = offset[None].astype(np.float32)
-        write_npz(path, arrays)
+    light = _light(*_open(*source, 0))
+    for number in range(rounds):
+        sequence = _open(*source, number)[2].flame
+        assert sequence is not None
+        parts = [
+            (*source, number, *light, timesteps[first : first + PART_TIMESTEPS], False)
+            for first in range(0, len(timesteps), PART_TIMESTEPS)
+        ]
+
+        def count(done: int, before: int = number * len(timesteps)) -> None:
+            report(min(before + done, total), total)
+
+        found = helpers.map(_track_part, parts, count, True)
+        columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
+        tracked = AvatarTracking(timesteps, **columns)
+        if stored["in_order"]:
+            tracked = tracked.smoothed(sequence.model)
+        _replace_heads(root, sequence, tracked)
+    stored = read_json(root / REPORT_FILE)  # which scaling changes
     shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
     stored["avatar"] = avatar_version(run)
     stored["image_misfit"][AVATAR_MISFIT] = {str(t): round(share, 3) for t, share in shares}
@@ -106,18 +108,31 @@ def track_recording(
     return tracked
 
 
+def _replace_heads(root: Path, sequence: FlameSequence, tracked: AvatarTracking) -> None:
+    torso = torso_shapes(sequence.model)
+    rows = zip(tracked.timesteps, tracked.parameters, tracked.shift, strict=True)
+    for timestep, values, shift in rows:
+        path = root / PARAMETERS / f"{timestep:05d}.npz"
+        arrays = {**read_npz(path), **moving_arrays(values)}  # the identity stays
+        offset = torso_offset(torso, shift, sequence.frame(timestep).dynamic_offset)
+        if offset is not None:
+            arrays["dynamic_offset"] = offset[None].astype(np.float32)
+        write_npz(path, arrays)
+
+
 def _track_part(
     run: Path,
     trained_ns: int,
     root: Path,
     factor: float,
+    number: int,
     exposure: Sequence[Sequence[float]],
     shading: np.ndarray,
     timesteps: Sequence[int],
     scales: bool,
     step: Step,
 ) -> dict[str, np.ndarray]:
-    avatar, settings, capture = _open(run, trained_ns, root, factor)
+    avatar, settings, capture = _open(run, trained_ns, root, factor, number)
     settings = replace(settings, exposure=tuple(map(tuple, exposure)))
 
     def report(done: int, total: int) -> bool:
@@ -125,8 +140,9 @@ def _track_part(
             step()
         return False
 
+    again = number > 0
     found = track_by_avatar(
-        avatar, settings, capture, timesteps, None, report, True, scales, shading
+        avatar, settings, capture, timesteps, None, report, not again, scales, shading, again
     )
     step()
     names = ("parameters", "before", "after", "misfit", "shift", "scale", "information")
@@ -136,7 +152,7 @@ def _track_part(
 def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], None]) -> float:
     """Scale the capture's world such that the head is as large as the avatar's; landmarks alone are
     off by some percent. One camera does not see scale. Returns the factor."""
-    source = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0
+    source = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0, 0
     avatar, settings, capture = _open(*source)
     cameras = {view.camera_index for views in capture.views.values() for view in views}
     if len(cameras) < 2:
@@ -176,10 +192,10 @@ def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
 
 @lru_cache(1)
 def _open(
-    run: Path, trained_ns: int, root: Path, factor: float
+    run: Path, trained_ns: int, root: Path, factor: float, number: int
 ) -> tuple[Avatar, TrainingSettings, Capture]:
-    """Of the capture once it was scaled by the factor; trained_ns: when the avatar's file was
-    written."""
+    """Of the capture once it was scaled by the factor, and tracked in a number of rounds;
+    trained_ns: when the avatar's file was written."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     return read_avatar(run / AVATAR), stored.settings, capture
