@@ -35,8 +35,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects.facts import CaptureFacts
-from stga_addon.training.effects.plan import plan_effects
-from stga_addon.training.effects.rules import RULES
+from stga_addon.training.effects.plan import RULES, plan_effects
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.run.folder import Run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics

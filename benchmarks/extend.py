@@ -37,8 +37,7 @@ from stga_addon.jobs.train import Extend, Prepared, Refine, prepare
 from stga_addon.progress import ignore
 from stga_addon.selection import SelectionOptions, select_capture
 from stga_addon.training.effects.plan import add_effects, plan_effects
-from stga_addon.training.evaluate.match_exposure import known_exposure
-from stga_addon.training.evaluate.metrics import evaluate
+from stga_addon.training.evaluate.metrics import evaluate, known_exposure
 from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.optimize.precompile import precompile_kernels
 from stga_addon.training.optimize.strategies import Strategy

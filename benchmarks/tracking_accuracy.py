@@ -27,7 +27,7 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_places
-from stga_addon.tracking.photo_consistency import facing, in_sight
+from stga_addon.tracking.seen_surface import facing, in_sight
 from stga_addon.tracking.track import track
 
 FACE_RADIUS_M = 0.09

@@ -7,7 +7,7 @@ import bpy
 
 from ..stga_addon.jobs.analyze import Analyze
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.training.effect_decisions import parse_choice
+from ..stga_addon.training.effect_catalog import parse_choice
 from . import ids
 from .common import capture_source, head_of, needs_head, reporting, scene_settings
 from .request import needs_idle, start

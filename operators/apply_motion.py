@@ -24,7 +24,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.rig.arkit import apply_weights, checked_shape_keys, has_shapes
+from ..stga_addon.scene.rig.keyframes import apply_weights, checked_shape_keys, has_shapes
 from ..stga_addon.scene.rig.motion import (
     WEIGHT_RANGE,
     apply_motion,

@@ -11,9 +11,8 @@ from bpy.app.handlers import persistent
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.driving.head_map import HeadMap, head_map
 from ..stga_addon.errors import StgaError
-from ..stga_addon.scene.rig.arkit import add_shapes, has_shapes, head_shapes
-from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES
-from . import ids, monitor
+from ..stga_addon.scene.rig.keyframes import EXPRESSION_NAMES, add_shapes, has_shapes, head_shapes
+from . import ids, live_session, monitor
 from .common import (
     capture_source,
     flame_of,
@@ -62,9 +61,9 @@ def needs_sliders(head: Any) -> bool:
 
 
 def begin_sliders(head: Any) -> None:
-    """Give a head that needs them its sliders as soon as a thread has computed them; scripts call
-    the operator."""
-    if monitor.has_timer() and needs_sliders(head) and head.library is None:
+    """Give a head that needs them its sliders as soon as a thread has computed them, and any its
+    map, for which *Drive Live* would wait; scripts call the operators."""
+    if monitor.has_timer() and rig_or_none(head) is not None and head.library is None:
         monitor.watch(_Sliders(head))
 
 
@@ -77,16 +76,22 @@ class _Sliders:
 
     def __init__(self, head: Any) -> None:
         self._head, self._made = head.name, list[Shapes]()
-        self._thread = Thread(target=self._make, args=(capture_source(head),), daemon=True)
+        arguments = capture_source(head), needs_sliders(head)
+        self._thread = Thread(target=self._make, args=arguments, daemon=True)
         self._thread.start()
-        preparing.add(self._head)
+        if needs_sliders(head):
+            preparing.add(self._head)
 
-    def _make(self, source: tuple[Any, ...]) -> None:
+    def _make(self, source: tuple[Any, ...], has_none: bool) -> None:
         with suppress(StgaError):  # the operator says what is wrong
-            self._made.append(_compute_shapes(source, self._head))
+            if has_none:
+                self._made.append(_compute_shapes(source, self._head))
+            else:
+                head_map(flame_of(open_capture(*source), self._head), self._head)
 
     def tick(self) -> float | None:
-        if self._thread.is_alive() or bpy.app.is_job_running("RENDER"):
+        is_driven = live_session.session() is not None  # which further sliders would end
+        if self._thread.is_alive() or is_driven or bpy.app.is_job_running("RENDER"):
             return POLL_INTERVAL_S
         preparing.discard(self._head)
         head = bpy.data.objects.get(self._head)

@@ -14,7 +14,7 @@ from ..stga_addon.flame.sequence import motion_arrays
 from ..stga_addon.jobs.avatar_source import Played
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.blend_file import frames_per_second, iterate_frames
+from ..stga_addon.scene.objects import frames_per_second, iterate_frames
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING

@@ -16,8 +16,8 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import PATH_OPTIONS
-from ..stga_addon.scene.rig.arkit import shape_key_names
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.head import rig_of
+from ..stga_addon.scene.rig.keyframes import shape_key_names
 from . import ids
 
 MAX_REPORT_CHARACTERS = 90
@@ -27,15 +27,21 @@ PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 def reporting(execute: Callable[[Any, Any], set[str]]) -> Callable[[Any, Any], set[str]]:
     """Decorator of `execute`: a StgaError becomes the operator's error report, without a
-    traceback."""
+    traceback; the pointer says that Blender is busy."""
 
     def guarded(self: Any, context: Any) -> set[str]:
         setattr(context.window_manager, ids.MESSAGE, "")
+        window = context.window
+        if window is not None:
+            window.cursor_modal_set("WAIT")
         try:
             return execute(self, context)
         except StgaError as error:
             tell(self, "ERROR", str(error))
             return {"CANCELLED"}
+        finally:
+            if window is not None:
+                window.cursor_modal_restore()
 
     return guarded
 

@@ -22,8 +22,8 @@ from ..stga_addon.export.formats import (
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.blend_file import frames_per_second, iterate_frames
 from ..stga_addon.scene.display.splat_object import check_head
+from ..stga_addon.scene.objects import frames_per_second, iterate_frames
 from ..stga_addon.scene.rig.motion import sample_motion
 from . import ids
 from .common import (

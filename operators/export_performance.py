@@ -7,7 +7,7 @@ import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.driving.inverse import captured_performance, write_performance
-from ..stga_addon.scene.blend_file import frames_per_second
+from ..stga_addon.scene.objects import frames_per_second
 from ..stga_addon.scene.rig.motion import sample_motion
 from . import ids
 from .common import (

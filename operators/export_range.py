@@ -10,7 +10,7 @@ from typing import Any
 from ..stga_addon.export.formats import Meshes
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene.arrays import evaluated_vertices
-from ..stga_addon.scene.blend_file import iterate_frames
+from ..stga_addon.scene.objects import iterate_frames
 
 MAX_WAITING_MESHES = 2
 

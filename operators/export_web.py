@@ -9,10 +9,9 @@ from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.playback import Playback
 from ..stga_addon.flame.sequence import FlameSequence
-from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.cameras import scene_camera
-from ..stga_addon.scene.objects import Warn
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.objects import Warn, frames_per_second
+from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from .common import capture_of, flame_of

@@ -53,7 +53,7 @@ class RelightFrame(bpy.types.Operator):
     frames keep them"""
 
     bl_idname = ids.RELIGHT_FRAME
-    bl_label = "Relight Frame for EEVEE and Cycles"
+    bl_label = "Relight Frame"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     clear: bpy.props.BoolProperty(
@@ -77,7 +77,7 @@ class HeadShadow(bpy.types.Operator):
     again: hide it"""
 
     bl_idname = ids.HEAD_SHADOW
-    bl_label = "Shadow onto the Scene"
+    bl_label = "Head Shadow"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     poll = classmethod(_needs_splats)

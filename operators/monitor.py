@@ -21,7 +21,6 @@ from bpy.app.handlers import persistent
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
-from ..stga_addon.jobs.folder import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.jobs.monitor_state import (
     CHECK_INTERVAL_S,
     SLICE_INTERVAL_S,
@@ -29,11 +28,13 @@ from ..stga_addon.jobs.monitor_state import (
     RunFiles,
     transition,
 )
+from ..stga_addon.jobs.perform import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import open_sidebar
+from ..stga_addon.scene.compat import APPENDED
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
@@ -474,21 +475,26 @@ def _rebase(old: str, new: str) -> None:
 
 
 @persistent
+def _after_append(_: Any) -> None:
+    for scene in bpy.data.scenes:
+        if scene.library is None:
+            _adopt(scene)
+
+
+@persistent
 def _after_load(_: Any) -> None:
     loader.close()
     _close_watched()
     _end_unawaited()
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            _adopt(scene)
+    _after_append(None)
     _start_timer()
 
 
 def _adopt(scene: Any) -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
-    `stga demo` does."""
+    `stga demo` does, or into which an avatar was appended."""
     settings = getattr(scene, ids.SETTINGS)
     heads = [thing for thing in scene.objects if is_head(thing)]
     shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
@@ -500,6 +506,17 @@ def _adopt(scene: Any) -> None:
             settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
     if not has_run(Path(bpy.path.abspath(settings.run_folder))):
         settings.run_folder = run_of(settings.avatar) or settings.run_folder
+
+
+@persistent
+def _after_update(scene: Any, *_: Any) -> None:
+    """Let the panel work on no head, and no splats, that were deleted: its pointers keep these in
+    the file."""
+    settings = getattr(scene, ids.SETTINGS)
+    for name in ("head", "splats"):
+        thing = getattr(settings, name)
+        if thing is not None and thing.name not in scene.objects and not thing.users_collection:
+            setattr(settings, name, None)
 
 
 def show_panel() -> None:
@@ -524,6 +541,8 @@ HANDLERS = (
     (bpy.app.handlers.load_post, _after_load),
     (bpy.app.handlers.save_pre, _before_save),
     (bpy.app.handlers.save_post, _after_save),
+    (bpy.app.handlers.depsgraph_update_post, _after_update),
+    (APPENDED, _after_append),
 )
 
 

@@ -8,7 +8,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import leave_edit_mode, show_kind
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import posing_bone
 from . import ids
 from .common import head_of, needs_rig, reporting

@@ -14,7 +14,7 @@ from ..stga_addon.worker.launch import CACHE_VARIABLE, KERNELS, cache_folder, st
 from .common import package
 from .training_python import training_python
 
-PREPARATION = "stga_addon.jobs.preparation"
+PREPARATION = "stga_addon.jobs.perform"
 START_DELAY_S = 1.0
 """After the extension was enabled: neither enabling nor Blender's start waits for a process."""
 

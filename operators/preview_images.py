@@ -5,8 +5,14 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.scene.compat import NATIVE_SPLATS
-from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
-from ..stga_addon.scene.display.splat_nodes import DISPLAY
+from ..stga_addon.scene.display.splat_nodes import (
+    AS_TRAINED,
+    DISPLAY,
+    LIMITS,
+    NATIVE,
+    POINTS,
+    QUADS,
+)
 from ..stga_addon.scene.display.splat_object import (
     set_input,
     shows_nodes,

@@ -19,10 +19,10 @@ from ..stga_addon.jobs.render import Render
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
-from ..stga_addon.scene.blend_file import frames_per_second
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
+from ..stga_addon.scene.objects import frames_per_second
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
@@ -88,6 +88,8 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
     seconds: option_property(Render, "seconds", min=0.1, soft_max=60.0)
     filename_ext = ""
     filter_glob: file_filter(".mp4")
+
+    _recording: Any = None
 
     @classmethod
     def poll(cls, context: Any) -> bool:
@@ -160,9 +162,11 @@ class RenderVideo(bpy.types.Operator, ExportHelper):
             raise
 
     def cancel(self, context: Any) -> None:
-        """End the recording, also when Blender quits or loads another file meanwhile."""
-        context.window_manager.event_timer_remove(self._timer)
-        self._recording.discard()
+        """End the recording, also when Blender quits or loads another file meanwhile; the file
+        dialog that is left has none."""
+        if self._recording is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._recording.discard()
 
     def _frames(self, context: Any) -> list[int]:
         scene = context.scene

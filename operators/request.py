@@ -11,7 +11,13 @@ from typing import Any, ClassVar
 import bpy
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.folder import check_request, request_folder, worker_arguments, write_request
+from ..stga_addon.jobs.perform import (
+    check_request,
+    perform_in_folder,
+    request_folder,
+    worker_arguments,
+    write_request,
+)
 from ..stga_addon.jobs.table import (
     DISMISSIBLE,
     JOBS,
@@ -83,8 +89,6 @@ def _perform_here(folder: Path) -> None:
 
     Raises what the work raises.
     """
-    from ..stga_addon.jobs.perform import perform_in_folder
-
     manager = bpy.context.window_manager
 
     def show(progress: Any) -> bool:

@@ -12,8 +12,8 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.folder import read_request, read_result
 from ..stga_addon.jobs.monitor_state import RequestState, Shown, SliceBuilt
+from ..stga_addon.jobs.perform import read_request, read_result
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar
 from ..stga_addon.scene import tags

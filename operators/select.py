@@ -9,16 +9,14 @@ import numpy as np
 from ..stga_addon.capture.model import Capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import (
+from ..stga_addon.scene.vertex_groups import (
     RESIDUAL,
     has_heat_map,
     hide_heat_map,
-    show_heat_map,
-    shows_residuals,
-)
-from ..stga_addon.scene.vertex_groups import (
     read_regions,
     read_selection,
+    show_heat_map,
+    shows_residuals,
     splats_per_face,
     write_selection,
 )

@@ -18,7 +18,7 @@ class SelectExtension(bpy.types.Operator):
     those that move, and those that look different than in the run's images"""
 
     bl_idname = ids.SELECT_EXTENSION
-    bl_label = "Select What Extend Trains"
+    bl_label = "Select for Extend"
     # the selection, which comes later, is the step to undo
     bl_options: ClassVar[set[str]] = {"REGISTER"}
 

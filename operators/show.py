@@ -88,7 +88,7 @@ class StandardView(bpy.types.Operator):
     """Show colors as trained: set the scene's view transform to Standard"""
 
     bl_idname = ids.STANDARD_VIEW
-    bl_label = "Use Standard View Transform"
+    bl_label = "Use Standard View"
     bl_options: ClassVar[set[str]] = {"REGISTER", "UNDO"}
 
     def execute(self, context: Any) -> set[str]:

@@ -13,7 +13,7 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.jobs.track import SolveAgain as SolveAgainRequest
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
-from ..stga_addon.scene.rig.flame_rig import rig_of
+from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from . import ids

@@ -9,7 +9,7 @@ from ..stga_addon.jobs.table import TRAINS
 from ..stga_addon.jobs.train import Extend, Refine, Resume
 from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.scene.vertex_groups import training_selection
-from ..stga_addon.training.effect_decisions import parse_choice
+from ..stga_addon.training.effect_catalog import parse_choice
 from ..stga_addon.training.run.folder import read_run
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
 from . import ids

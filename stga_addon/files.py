@@ -73,7 +73,7 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
         partial = path.with_name(
             f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
         )
-        with _naming(path):
+        with naming(path):
             folder = path.parent
             missing = []
             try:
@@ -94,7 +94,7 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
     try:
         yield new_file
         for path, partial in partials.items():
-            with _naming(path):
+            with naming(path):
                 _once_free(partial_call(os.replace, partial, path), patience_s)
     except BaseException:
         for partial in partials.values():
@@ -120,7 +120,7 @@ class NumberedFiles:
         self._list = folder / SEQUENCE_FILE
         text = self._list.read_text(errors="replace") if self._list.is_file() else ""
         listed = set(text.splitlines())
-        with _naming(folder):
+        with naming(folder):
             self._earlier = [
                 path for path in self._found() if self._line(path.name, path) in listed
             ]
@@ -131,7 +131,7 @@ class NumberedFiles:
 
     def add(self, name: str, content: Path) -> None:
         """List a file before it gets its name; `content`: the whole file, under another one."""
-        with _naming(self._list), self._list.open("a") as stream:
+        with naming(self._list), self._list.open("a") as stream:
             self._written[name] = self._line(name, content)
             stream.write(self._written[name] + "\n")
 
@@ -142,7 +142,7 @@ class NumberedFiles:
             return
         for path in self._earlier:
             if path.name not in self._written:
-                with _naming(path, "removed"):
+                with naming(path, "removed"):
                     _once_free(path.unlink, RENAME_PATIENCE_S)
         with replacing(self._list) as partial:
             partial.write_text("".join(f"{line}\n" for line in self._written.values()))
@@ -157,8 +157,8 @@ class NumberedFiles:
 
 
 @contextmanager
-def _naming(path: Path, done: str = "written") -> Iterator[None]:
-    """Turn an OSError of the block into a StgaError that names the file."""
+def naming(path: Path, done: str = "written") -> Iterator[None]:
+    """Turn an OSError of the block into a StgaError that names the file: "cannot be written"."""
     try:
         yield
     except OSError as error:
@@ -243,10 +243,8 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     size = file_size(path)
     if size > limit:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
-    try:
+    with naming(path, "read"):
         return path.read_bytes()
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def read_json(path: Path) -> Any:
@@ -288,37 +286,35 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle. Raises StgaError where it is missing, truncated,
     above 4 GiB unpacked, or holds objects."""
     file_size(path)  # refuses pipes, whose reading need never end
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-            if unpacked > MAX_UNPACKED_BYTES:
-                problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
-                raise StgaError(f"{path}: {problem}")
-            return {
-                entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
-                for entry in archive.infolist()
-            }
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except StgaError:
-        raise
-    except Exception as error:
-        # A damaged archive can make its decompressor or the parser of an array header raise nearly
-        # anything.
-        problem = f"is not a readable npz file ({error or type(error).__name__})"
-        raise StgaError(f"{path}: {problem}") from error
+    with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > MAX_UNPACKED_BYTES:
+            problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
+            raise StgaError(f"{path}: {problem}")
+        return {
+            entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
+            for entry in archive.infolist()
+        }
 
 
 def read_npy(path: Path) -> np.ndarray:
     """Read the array of a npy file without pickle. Raises StgaError as `read_npz` does."""
     size = file_size(path)
+    with _reading(path, "npy"), path.open("rb") as stream:
+        return _read_array(stream, size)
+
+
+@contextmanager
+def _reading(path: Path, kind: str) -> Iterator[None]:
+    """A damaged archive can make its decompressor or the parser of an array header raise nearly
+    anything."""
     try:
-        with path.open("rb") as stream:
-            return _read_array(stream, size)
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # as above
-        problem = f"is not a readable npy file ({error or type(error).__name__})"
+        with naming(path, "read"):
+            yield
+    except StgaError:
+        raise
+    except Exception as error:
+        problem = f"is not a readable {kind} file ({error or type(error).__name__})"
         raise StgaError(f"{path}: {problem}") from error
 
 
@@ -334,9 +330,8 @@ def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """The array of a npy stream of `size` bytes, which bounds what its header promises."""
     start = stream.read(12).ljust(12, b"\0")
-    length = struct.unpack("<H" if start[6] == 1 else "<L", start[8 : 10 if start[6] == 1 else 12])[
-        0
-    ]
+    size_format, end = ("<H", 10) if start[6] == 1 else ("<L", 12)
+    (length,) = struct.unpack(size_format, start[8:end])
     if length > MAX_HEADER_BYTES:
         raise ValueError(f"an array header of {length} bytes")
     stream.seek(0)

@@ -108,12 +108,8 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
 
 def _help(spec: Any) -> str:
     help, default = str(spec.metadata["help"]), spec.default
-    if (
-        isinstance(default, str | int | float)
-        and default
-        and default is not True
-        and "default" not in help
-    ):
+    is_told = isinstance(default, str | int | float) and default and default is not True
+    if is_told and "default" not in help:
         help += f" (default {default})"
     return help.replace("%", "%%")
 
@@ -149,19 +145,17 @@ def refuse_useless(value: Any) -> None:
 
 
 def _is_changed(value: Any, spec: Any) -> bool:
-    factory = spec.default_factory
-    return bool(
-        getattr(value, spec.name) != (spec.default if factory is dataclasses.MISSING else factory())
-    )
+    is_made = spec.default_factory is not dataclasses.MISSING
+    default = spec.default_factory() if is_made else spec.default
+    return bool(getattr(value, spec.name) != default)
 
 
 def _flag_of_change(value: Any, spec: Any) -> str:
     nested = getattr(value, spec.name)
     if not dataclasses.is_dataclass(nested):
         return flag_of(spec)
-    return next(
-        flag_of(inner) for inner in option_fields(type(nested)) if _is_changed(nested, inner)
-    )
+    inner = option_fields(type(nested))
+    return next(flag_of(spec) for spec in inner if _is_changed(nested, spec))
 
 
 # Values on the command line

@@ -41,6 +41,14 @@ Report = Callable[[Progress], bool]
 Say = Callable[[str], None]  # Called with a line for people
 
 
+@dataclass(frozen=True)
+class Written:
+    """What work has written: a file or a folder. lines: what there is to say about it."""
+
+    path: Path
+    lines: tuple[str, ...] = ()
+
+
 class TimeLeft:
     """Seconds that are left of work, as its share grows."""
 

@@ -10,7 +10,15 @@ from typing import Any
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.options import add_options, duration, given_options, like, option, refuse_useless
+from stga_addon.options import (
+    add_options,
+    color,
+    duration,
+    given_options,
+    like,
+    option,
+    refuse_useless,
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,30 @@ def test_values_without_meaning(words, message, capsys):
     with pytest.raises(SystemExit, match="2"):
         parsed(*words.split())
     assert message in capsys.readouterr().err
+
+
+DURATIONS = {
+    "90": 90, "90s": 90, "10m": 600, "1h30m": 5400, "1h": 3600, "1.5m": 90, "1m30": 90, " 2m ": 120
+}  # fmt: skip
+COLORS = {
+    "white": (1, 1, 1), "black": (0, 0, 0), "0.25,1,0": (0.25, 1, 0), "0, .5 ,1.0": (0, 0.5, 1)
+}  # fmt: skip
+NO_DURATIONS = "", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m", "٣"
+NO_COLORS = "", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "nan,0,0", "0,0,inf", "a,b,c"
+
+
+def test_times_and_colors() -> None:
+    """Catches minutes taken for seconds, 0…255 taken for 0…1, channels in another order, and a
+    value that means something else than what was typed."""
+    assert {text: duration(text) for text in DURATIONS} == DURATIONS
+    assert {text: color(text) for text in COLORS} == COLORS
+    for read, texts, message in (
+        (duration, NO_DURATIONS, "is not a time such as"),
+        (color, NO_COLORS, "is not white, black or R,G,B"),
+    ):
+        for text in texts:
+            with pytest.raises(StgaError, match=message):
+                read(text)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ import pytest
 from capture import factory
 from PIL import Image
 
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.flame.forward import FlameFrame, flame_forward
@@ -21,12 +20,7 @@ def parts(tmp_path: Path) -> dict[str, Path]:
     cameras."""
     folder, model = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
-    splats = lattice_splats(capture.neutral, capture.faces, order=0)
-    splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
-    write_avatar(
-        tmp_path / "a.npz",
-        Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces),
-    )
+    factory.write_avatar_of(capture, tmp_path / "a.npz", is_colored=True)
     rng = np.random.default_rng(1)
     pose, expr = rng.normal(0, 0.3, (2, 15)), rng.normal(size=(2, 2))
     np.savez(tmp_path / "other.npz", expr=expr, pose=pose, shape=np.full(4, 2.0))

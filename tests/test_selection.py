@@ -30,60 +30,42 @@ def region(*faces: int) -> np.ndarray:
     return np.isin(np.arange(COUNT), faces)
 
 
-def selected(offsets: dict[int, float], **regions: np.ndarray) -> list[int]:
-    return np.flatnonzero(select_faces(moved(offsets), NEUTRAL, FACES, regions, THRESHOLD)).tolist()
+TWO = {"mouth": region(0, 4), "nose": region(3, 4, 5, 6)}
+RULES: list[tuple[dict[int, float], dict[str, np.ndarray], list[int]]] = [
+    # a triangle outside of regions by its own offset
+    ({1: 0.011, 2: 0.0099, 5: 0.5}, {}, [1, 5]),
+    ({}, {}, []),
+    # a region by its mean: 0.021 over two triangles is 0.0105, which alone decides
+    ({0: 0.021}, {"mouth": region(0, 1)}, [0, 1]),
+    ({0: 0.019}, {"mouth": region(0, 1)}, []),
+    ({0: 0.03, 7: 0.03}, {"mouth": region(0, 1, 2, 3)}, [7]),
+    # a triangle of two regions by either, whichever comes later
+    ({0: 0.03}, TWO, [0, 4]),
+    ({0: 0.03}, dict(reversed(TWO.items())), [0, 4]),
+    # none by a region without triangles, whose mean is NaN
+    ({1: 0.02}, {"mouth": region()}, [1]),
+]
 
 
-def test_triangles_outside_regions_go_by_their_own_offset():
-    """Catches a mean taken over everything, and a threshold that is not strict enough or too
-    strict."""
-    assert selected({1: 0.011, 2: 0.0099, 5: 0.5}) == [1, 5]
-    assert selected({}) == []
+@pytest.mark.parametrize(("offsets", "regions", "expected"), RULES)
+def test_rules(offsets, regions, expected):
+    """Catches a mean taken over everything, a threshold that is not strict, a maximum or a
+    per-triangle rule inside a region, and a later region that unselects what an earlier one
+    selected."""
+    with np.errstate(all="raise"):
+        chosen = select_faces(moved(offsets), NEUTRAL, FACES, regions, THRESHOLD)
+    assert np.flatnonzero(chosen).tolist() == expected
 
 
-def test_region_goes_by_its_mean_offset():
-    """Catches the maximum, or a per-triangle rule, inside a region: 0.021 over two of them is
-    0.0105 on average."""
-    assert selected({0: 0.021}, mouth=region(0, 1)) == [0, 1]
-    assert selected({0: 0.019}, mouth=region(0, 1)) == []
-
-
-def test_large_offset_inside_an_unmoved_region_is_not_selected():
-    """Catches the own-distance rule leaking into key regions, whose mean decides alone."""
-    assert selected({0: 0.03, 7: 0.03}, mouth=region(0, 1, 2, 3)) == [7]
-
-
-def test_mean_is_of_distances_not_of_vectors():
-    """Catches opposite movements, as of the two lips, that cancel each other."""
+def test_offsets_are_distances_of_centers():
+    """Catches opposite movements, as of the two lips, that cancel each other, and vertex distances:
+    a triangle that turns about its center has not moved."""
     mesh = NEUTRAL.copy()
     mesh[FACES[0], 1] += 0.02
     mesh[FACES[1], 1] -= 0.02
+    mesh[FACES[2]] = np.roll(mesh[FACES[2]], 1, axis=0)
     chosen = select_faces(mesh, NEUTRAL, FACES, {"mouth": region(0, 1)}, THRESHOLD)
     assert np.flatnonzero(chosen).tolist() == [0, 1]
-
-
-def test_offset_is_that_of_the_center():
-    """Catches vertex distances: a triangle that turns about its center has not moved."""
-    mesh = NEUTRAL.copy()
-    corners = mesh[FACES[2]]
-    mesh[FACES[2]] = np.roll(corners, 1, axis=0)
-    assert not select_faces(mesh, NEUTRAL, FACES, {}, THRESHOLD).any()
-
-
-def test_triangle_of_two_regions_is_selected_by_either():
-    """Catches a later region that unselects what an earlier one selected."""
-    for names in (("nose", "mouth"), ("mouth", "nose")):
-        regions = dict.fromkeys(names, region(4)) | {
-            "mouth": region(0, 4),
-            "nose": region(3, 4, 5, 6),
-        }
-        assert selected({0: 0.03}, **regions) == [0, 4]
-
-
-def test_empty_region_selects_nothing():
-    """Catches the mean of nothing, which is NaN and a warning."""
-    with np.errstate(all="raise"):
-        assert selected({1: 0.02}, mouth=region()) == [1]
 
 
 def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]) -> Capture:
@@ -122,22 +104,14 @@ def test_selection_that_came_with_the_capture_wins():
     assert asked == [(1, "head")]
 
 
-@pytest.mark.parametrize("threshold", [float("nan"), -1.0, float("inf"), "5", None])
-def test_threshold_is_a_distance(threshold: object) -> None:
-    """Catches a threshold that selects nothing, or everything, without saying so."""
-    with pytest.raises(StgaError, match="selection threshold must be a distance"):
-        SelectionOptions(threshold=threshold)  # type: ignore[arg-type]
-
-
-def test_defaults_select_flames_regions_and_any_motion() -> None:
-    """Catches a key region under another name than captures give it, which is then never selected
-    as a whole, and a threshold of zero that is refused."""
-    assert set(KEY_REGIONS) == set(KEY_MASKS)
+def test_options() -> None:
+    """Catches a threshold that selects nothing, or everything, without saying so, one of zero that
+    is refused, a misspelled zero pose that is found only where the first FLAME mesh is posed, and a
+    key region under another name than captures give it."""
+    for threshold in (float("nan"), -1.0, float("inf"), "5", None):
+        with pytest.raises(StgaError, match="selection threshold must be a distance"):
+            SelectionOptions(threshold=threshold)  # type: ignore[arg-type]
     assert SelectionOptions(threshold=0.0).threshold == 0
-
-
-def test_zero_pose_is_known() -> None:
-    """Catches a misspelled option that is found only where the first FLAME mesh is posed, or
-    never."""
     with pytest.raises(StgaError, match="zero_pose is 'face'"):
         SelectionOptions(zero_pose="face")
+    assert set(KEY_REGIONS) == set(KEY_MASKS)

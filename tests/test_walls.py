@@ -33,14 +33,13 @@ LAYERS = (
     {"development"}, {"__main__", "__init__"},
 )  # fmt: skip
 NAMED_WHERE_THERE = dict.fromkeys(
-    ("stga_addon/cli/main.py", "stga_addon/jobs/perform.py", "stga_addon/jobs/table.py"),
-    "development",
+    ("stga_addon/cli/main.py", "stga_addon/jobs/table.py"), "development"
 )
 """Files that name modules of a room after their own, because the extension's zip leaves that room
 out."""
 LIGHT = (
     "errors", "files", "flame", "capture", "capture.open", "avatar", "avatar.file", "export.ply",
-    "selection", "jobs.folder", "jobs.perform", "jobs.monitor_state", "jobs.python_check",
+    "selection", "jobs.perform", "jobs.monitor_state", "jobs.python_check",
 )  # fmt: skip
 
 

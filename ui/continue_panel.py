@@ -10,7 +10,7 @@ from ..operators.common import is_head, scene_settings
 from ..operators.continue_run import ExtendOptions, RefineOptions
 from ..operators.train import DeviceOptions
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.scene.display.heat_map import shows_residuals
+from ..stga_addon.scene.vertex_groups import shows_residuals
 from .options import set_options
 from .request import draw_running
 from .sidebar import SidebarPanel
@@ -52,9 +52,9 @@ def _draw_refine(layout: Any, settings: Any) -> None:
     frames.active = not options.all_frames
     frames.prop(options, "first", text="")
     frames.prop(options, "last", text="")
-    row = column.row(align=True)
-    row.prop(options, "seconds")
-    row.prop(options, "growth")
+    fields = column.column(align=True)
+    fields.prop(options, "seconds")
+    fields.prop(options, "growth")
     refine = column.operator(
         ids.REFINE,
         text="Refine Selected Faces" if editing else "Refine Vertex Group",

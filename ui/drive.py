@@ -46,7 +46,7 @@ class DrivePanel(SidebarPanel, bpy.types.Panel):
         row.prop(settings, "exchange_mouth", text="Swap Mouth", toggle=True)
         layout.prop(settings, "takes")
         if not draw_running(layout, context, Kind.PERFORMANCE):
-            layout.operator(ids.DRIVE_VIDEO, text="From a Video of a Face", icon="FILE_MOVIE")
+            layout.operator(ids.DRIVE_VIDEO, text="Drive from Video…", icon="FILE_MOVIE")
 
 
 def _draw_source(layout: Any, context: Any, settings: Any) -> None:

@@ -55,7 +55,7 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
                 "INFO",
             )
         row = layout.row(align=True)
-        row.operator(ids.RELIGHT_FRAME, text="Relight Frame (EEVEE, Cycles)")
+        row.operator(ids.RELIGHT_FRAME)
         row.operator(ids.RELIGHT_FRAME, text="", icon="X").clear = True
         layout.operator(ids.HEAD_SHADOW)
 

@@ -21,7 +21,7 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, scene_settings(context)
-        layout.operator(ids.APPLY_MOTION, text="Apply Motion from File", icon="IMPORT")
+        layout.operator(ids.APPLY_MOTION, text="Apply Motion…", icon="IMPORT")
         row = layout.row(align=True)
         row.prop(settings, "motion_source")
         if settings.motion_source is not None:

@@ -11,7 +11,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes
-from ..stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
 from ..stga_addon.scene.display.splat_object import (
     display_mode,
     input_identifier,

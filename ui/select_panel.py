@@ -8,7 +8,7 @@ from ..operators import ids
 from ..operators.common import is_head, scene_settings
 from ..operators.select import key_regions, possible_regions
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.display.heat_map import has_heat_map, shows_residuals
+from ..stga_addon.scene.vertex_groups import has_heat_map, shows_residuals
 from .sidebar import SidebarPanel
 
 
@@ -63,7 +63,7 @@ def _draw_regions(layout: Any, head: Any) -> None:
     possible, ticked = possible_regions(head), key_regions(head)
     if not possible:
         return
-    layout.label(text="Selected as a Whole")
+    layout.label(text="Whole Regions")
     grid = layout.grid_flow(columns=2, align=True, row_major=True)
     for name in possible:
         icon = "CHECKBOX_HLT" if name in ticked else "CHECKBOX_DEHLT"

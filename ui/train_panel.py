@@ -68,9 +68,7 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
 def draw_missing_python(layout: Any, context: Any) -> None:
     """Where no Python here can track and train, say where one is chosen."""
     if not has_training_python(context):
-        show = layout.operator(
-            "preferences.addon_show", text="Choose a Python in Preferences", icon="PREFERENCES"
-        )
+        show = layout.operator("preferences.addon_show", text="Choose a Python", icon="PREFERENCES")
         show.module = package()
 
 

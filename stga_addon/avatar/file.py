@@ -280,11 +280,9 @@ def light_from(
     """The reverse of `light_arrays`. Raises StgaError naming the file and what is wrong."""
     values: dict[str, Any] = {}
     for name, shape in _LIGHT_ARRAYS.items():
-        array, expected = arrays.get(_PREFIX + name), tuple(vertices if n < 0 else n for n in shape)
-        fits = array is not None and array.dtype == np.float16 and array.shape == expected
-        if array is None or not fits or not np.isfinite(array).all():
-            text = f"is missing or damaged, expected float16 {expected}, finite"
-            raise StgaError(f"{path}: {_PREFIX}{name} {text}")
+        array = arrays.get(_PREFIX + name, np.zeros(0))
+        sizes = tuple(vertices if size < 0 else size for size in shape)
+        check_array(path, _PREFIX + name, array, "float16", sizes)
         values[name] = array.astype(np.float32)
     if not isinstance(rest, dict) or rest.get("source") not in SOURCES:
         expected_fields = "expected residual, damping and source"

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Set
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -16,14 +16,14 @@ from pathlib import Path
 from filelock import SoftFileLease
 
 from ..errors import StgaError
-from ..files import read_json, write_json
-from ..jobs.folder import has_request, write_request
+from ..files import naming, read_json, write_json
+from ..jobs.perform import has_request, write_request
 from ..jobs.table import Request
 from ..schema import from_json, setting, to_json
 from ..training.run.folder import AVATAR, RUN, has_run
 from ..training.run.identity import file_digest
 from ..worker.launch import prepare_status_folder
-from ..worker.lock import hold_lock, is_locked, lock_owner
+from ..worker.lock import hold_folder, is_locked
 from ..worker.status import LOCK_FILE, WorkerState, read_status
 from .plan import REPLACED, Job, Plan, input_paths, output_field
 
@@ -56,10 +56,7 @@ def _written(plan: Plan) -> Set[str]:
     """The batch's folder, and what its jobs write elsewhere, without symbolic links."""
     fields = ((job.request, output_field(type(job.request))) for job in plan.jobs)
     outputs = (getattr(request, name) for request, name in fields if name is not None)
-    elsewhere = (
-        path for path in outputs if isinstance(path, Path) and not path.is_relative_to(plan.out)
-    )
-    return {os.path.realpath(path) for path in (plan.out, *elsewhere)}
+    return {os.path.realpath(path) for path in (plan.out, *outputs) if isinstance(path, Path)}
 
 
 def _input_digest(path: Path, written: Set[str]) -> str:
@@ -98,19 +95,10 @@ JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
 
 
 @contextmanager
-def hold_folder(folder: Path) -> Iterator[SoftFileLease]:
+def hold_batch(folder: Path) -> Iterator[SoftFileLease]:
     """Hold a batch's folder, which is made, on whichever machine. Raises StgaError while another
     batch works in it."""
-    path = folder / LOCK
-    with ExitStack() as held:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lease = held.enter_context(hold_lock(path, leased=True))
-        except BlockingIOError as error:
-            problem = f"another batch is working in this folder (process {lock_owner(path)})"
-            raise StgaError(f"{folder}: {problem}") from error
-        except OSError as error:
-            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    with hold_folder(folder, LOCK, "batch is working in this folder", leased=True) as lease:
         assert lease is not None
         yield lease
 
@@ -133,9 +121,8 @@ class JobRecord:
 
 def write_record(job: Job, record: JobRecord) -> None:
     """Raises StgaError on a full disk."""
-    write_json(
-        job.request_folder / JOB_FILE, {"format": FORMAT, "version": VERSION, **to_json(record)}
-    )
+    values = {"format": FORMAT, "version": VERSION, **to_json(record)}
+    write_json(job.request_folder / JOB_FILE, values)
 
 
 def read_record(job: Job) -> JobRecord | None:
@@ -143,12 +130,10 @@ def read_record(job: Job) -> JobRecord | None:
     try:
         values = read_json(job.request_folder / JOB_FILE)
         named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
-        record: JobRecord | None = (
-            from_json(JobRecord, values) if named == (FORMAT, VERSION) else None
-        )
+        record: JobRecord = from_json(JobRecord, values)
     except StgaError:
         return None
-    return record
+    return record if named == (FORMAT, VERSION) else None
 
 
 def is_done(job: Job, digest: str) -> bool:
@@ -163,9 +148,8 @@ def is_done(job: Job, digest: str) -> bool:
 def is_running(job: Job, digest: str) -> bool:
     """Whether a worker of an earlier start is carrying out this very job."""
     record = read_record(job)
-    return (
-        record is not None and record.digest == digest and is_locked(job.request_folder / LOCK_FILE)
-    )
+    is_same = record is not None and record.digest == digest
+    return is_same and is_locked(job.request_folder / LOCK_FILE)
 
 
 def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
@@ -178,12 +162,9 @@ def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
         kept, name = job.folder.parent / REPLACED, job.folder.name
         names = (name if n == 1 else f"{name}_{n}" for n in count(1))
         moved, record = next(kept / name for name in names if not (kept / name).exists()), None
-        try:
+        with naming(job.folder, f"moved to {moved}"):
             kept.mkdir(exist_ok=True)
             job.folder.rename(moved)
-        except OSError as error:
-            reason = f"cannot be moved to {moved} ({error.strerror or error})"
-            raise StgaError(f"{job.folder}: {reason}") from error
     if record is None:
         held = job.folder.iterdir() if job.folder.is_dir() else ()
         if any(path.name != job.request_folder.name for path in held):

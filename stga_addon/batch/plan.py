@@ -28,12 +28,12 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, Protocol, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from ..errors import StgaError, shorten
 from ..files import read_toml
 from ..jobs.blender import RenderBlend
-from ..jobs.folder import request_folder, worker_arguments
+from ..jobs.perform import request_folder, worker_arguments
 from ..jobs.table import Request
 from ..jobs.track import MakeAvatar
 from ..jobs.train import Extend, Refine, Resume, Train
@@ -163,7 +163,7 @@ class Ended:
     is_lost: bool = False
 
 
-class Engine(Protocol):
+class Engine:
     """Carries out jobs.
 
     takes_all    it is given all jobs at once, and minds what they come after itself; else each when
@@ -171,26 +171,32 @@ class Engine(Protocol):
     interval_s   seconds between two questions after what has ended
     """
 
-    takes_all: bool
-    interval_s: float
+    takes_all = False
+    interval_s = 0.1
 
     def has_room(self, job: Job) -> bool:
         """Whether the job can be submitted now."""
+        return True
 
     def submit(self, jobs: Sequence[Job]) -> None:
         """Carry out jobs, each after those it comes after. Raises StgaError if it cannot begin."""
+        raise NotImplementedError
 
     def adopt(self, job: Job) -> None:
         """Watch the worker that an earlier start of the batch left running."""
+        raise NotImplementedError
 
     def running(self) -> Mapping[str, str]:
         """Name of each job that a machine carries out -> the machine, "" where unknown."""
+        raise NotImplementedError
 
     def ended(self) -> Mapping[str, Ended]:
         """The jobs whose workers have ended since this was called last."""
+        raise NotImplementedError
 
     def withdraw(self) -> Sequence[str]:
         """Take back what was submitted and has not begun; returns the names of these jobs."""
+        return ()
 
     def close(self) -> None:
         """Leave the engine; the work of running jobs is not touched."""
@@ -248,15 +254,11 @@ def _names(folders: Sequence[Path]) -> list[str]:
     """Job names of folders: their own, with that above where several share it, or numbered."""
     names = [_slug(path.name) for path in folders]
     shared = Counter(names)
-    names = [
-        _slug("-".join(p.parts[-2:])) if shared[n] > 1 else n
-        for n, p in zip(names, folders, strict=True)
-    ]
-    earlier = [names[:number].count(name) for number, name in enumerate(names)]
-    return [
-        name if not count else f"{name}_{count + 1}"
-        for name, count in zip(names, earlier, strict=True)
-    ]
+    pairs = zip(names, folders, strict=True)
+    names = [_slug("-".join(p.parts[-2:])) if shared[n] > 1 else n for n, p in pairs]
+    counts = [names[: number + 1].count(name) for number, name in enumerate(names)]
+    numbered = zip(names, counts, strict=True)
+    return [name if count == 1 else f"{name}_{count}" for name, count in numbered]
 
 
 def _slug(text: str) -> str:
@@ -275,10 +277,9 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
     shared = _resources(f"{source}: [resources]", values.get("resources", {}), Resources())
     jobs = [_job(source, name, table, base, folder, shared) for name, table in tables.items()]
     by_name = {job.name: job for job in _with_inputs(source, jobs)}
+    after = {name: job.after for name, job in by_name.items()}
     try:
-        order = list(
-            TopologicalSorter({name: job.after for name, job in by_name.items()}).static_order()
-        )
+        order = list(TopologicalSorter(after).static_order())
     except CycleError as error:
         circle = " → ".join(map(str, error.args[1]))
         raise StgaError(f"{source}: these jobs wait for each other: {circle}") from error
@@ -356,11 +357,8 @@ def _request(
 
 def _completed(spec: Any, value: Any) -> Any:
     """A field's value or default as JSON has it, tables completed; MISSING without either."""
-    if spec.default_factory is not MISSING:
-        default = to_json(spec.default_factory())
-        return (
-            default if value is None else {**default, **value} if isinstance(value, dict) else value
-        )
+    if spec.default_factory is not MISSING and isinstance(value, dict | None):
+        return {**to_json(spec.default_factory()), **(value or {})}
     if value is not None:
         return value
     return list(spec.default) if isinstance(spec.default, tuple) else spec.default

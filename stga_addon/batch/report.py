@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from ..capture.model import evenly_spread
 from ..errors import StgaError, one_line
 from ..files import replacing
 from ..format import format_duration
@@ -108,22 +109,18 @@ def _row(entry: Entry, width: int) -> str:
 def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
     rows = [_plan_row(entry) for entry in batch.entries.values()]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        lines.append("  ".join(cells).rstrip())
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     unfinished = [entry for entry in batch.entries.values() if not entry.state.is_over]
     known = [entry.forecast_s for entry in unfinished if entry.forecast_s]
-    total = sum(known)
     unknown = len(unfinished) - len(known)
     text = f"{len(rows)} jobs, {len(unfinished)} to do"
-    text += f"; {format_duration(total)} of work" if known else ""
-    on_cores = sum(
-        entry.forecast_s * min(max(entry.job.resources.threads, 1), cores) for entry in unfinished
-    )
-    shared = max(on_cores / max(1, cores), *known, 0.0)
-    text += f", about {format_duration(shared)} on this machine" if known else ""
+    if known:
+        threads = [min(max(entry.job.resources.threads, 1), cores) for entry in unfinished]
+        each = zip(unfinished, threads, strict=True)
+        shared = max(sum(entry.forecast_s * n for entry, n in each) / max(1, cores), *known)
+        text += f"; {format_duration(sum(known))} of work, about {format_duration(shared)} on this "
+        text += "machine"
     if unknown:
         text += f"; of {unknown} jobs the time is not known before one of their kind is finished"
     return [*lines, text]
@@ -192,25 +189,16 @@ def _figures(run: Run) -> dict[str, Any]:
     return {}
 
 
-def _spread(runs: Sequence[Run], count: int) -> list[Run]:
-    """So many of the runs, evenly spread, the first and the last among them."""
-    if len(runs) <= count:
-        return list(runs)
-    return [runs[round(index)] for index in np.linspace(0, len(runs) - 1, count)]
-
-
 def _summary(batch: Batch) -> str:
     entries = batch.entries.values()
-    counts = [(state, sum(entry.state == state for entry in entries)) for state in JobState]
-    text = ", ".join(f"{count} {state}" for state, count in counts if count)
+    counts = Counter(entry.state for entry in entries)
+    text = ", ".join(f"{counts[state]} {state}" for state in JobState if counts[state])
     seconds = sum(entry.seconds for entry in entries)
     off = [abs(miss) for entry in entries if (miss := _forecast_error(entry)) is not None]
-    forecasts = (
-        f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})." if off else ""
-    )
-    source = html.escape(batch.plan.source)
-    worked = f"{format_duration(seconds)} of work"
-    return f"<p>{source}: {len(entries)} jobs: {text}. {worked}.{forecasts}</p>"
+    worked = f"{format_duration(seconds)} of work."
+    if off:
+        worked += f" Forecasts were off by {np.median(off):.0%} (median of {len(off)})."
+    return f"<p>{html.escape(batch.plan.source)}: {len(entries)} jobs: {text}. {worked}</p>"
 
 
 def _forecast_error(entry: Entry) -> float | None:
@@ -225,19 +213,17 @@ def _failures(batch: Batch) -> str:
     for entry in failed[:MAX_FAILURES]:
         name, error = html.escape(entry.job.name), html.escape(entry.error or entry.state)
         parts.append(f'<p><b>{name}</b>: <span class="failed">{error}</span></p>')
-        log = (
-            log_lines(entry.job.request_folder, LOG_LINES) if entry.state == JobState.FAILED else []
-        )
-        parts += [f"<pre>{html.escape(chr(10).join(log))}</pre>"] if log else []
-    parts += (
-        [f"<p>… and {len(failed) - MAX_FAILURES} more</p>"] if len(failed) > MAX_FAILURES else []
-    )
+        log = log_lines(entry.job.request_folder, LOG_LINES)
+        if log and entry.state == JobState.FAILED:
+            parts.append(f"<pre>{html.escape(chr(10).join(log))}</pre>")
+    if len(failed) > MAX_FAILURES:
+        parts.append(f"<p>… and {len(failed) - MAX_FAILURES} more</p>")
     return f"<h2>Failures</h2>{''.join(parts)}" if failed else ""
 
 
 def _chart(runs: Sequence[Run]) -> str:
     """PSNR over training time as SVG."""
-    shown = [run for run in _spread(runs, MAX_CURVES) if curve_of(run[1])]
+    shown = [run for run in evenly_spread(runs, MAX_CURVES) if curve_of(run[1])]
     if not shown or find_spec("matplotlib") is None:
         return ""
     from ..report import finish_axes, psnr_axes
@@ -256,7 +242,7 @@ def _chart(runs: Sequence[Run]) -> str:
 def _pictures(runs: Sequence[Run]) -> str:
     """A held-out image of each run beside its avatar, where its capture has one here."""
     shown = []
-    for entry, metrics in _spread(runs, MAX_PICTURES):
+    for entry, metrics in evenly_spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
             pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
             if pair is not None:
@@ -281,7 +267,7 @@ def held_out_pair(run: Path) -> np.ndarray | None:
     from ..avatar.file import read_avatar
     from ..capture.images import read_image
     from ..render.render import render_avatar
-    from ..training.evaluate.evaluation_views import choose_evaluation_views
+    from ..training.evaluate.metrics import choose_evaluation_views
     from ..training.run.folder import AVATAR, open_refined
 
     capture = open_refined(run)
@@ -300,15 +286,12 @@ def _table(batch: Batch, runs: Iterable[Run]) -> str:
     figures = {run[0].job.name: _figures(run) for run in runs}
     names = ("job", "request", "state", "machine")
     numbers = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
-    heads = "".join(f"<th>{name}</th>" for name in names) + "".join(
-        f'<th class="n">{name}</th>' for name in numbers
-    )
+    heads = [f"<th>{name}</th>" for name in names]
+    heads += [f'<th class="n">{name}</th>' for name in numbers]
     entries = list(batch.entries.values())
-    rows = "".join(
-        _table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS]
-    )
+    rows = [_table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS]]
     more = f"<p>… and {len(entries) - MAX_ROWS} more</p>" if len(entries) > MAX_ROWS else ""
-    return f"<h2>Jobs</h2><table><tr>{heads}</tr>{rows}</table>{more}"
+    return f"<h2>Jobs</h2><table><tr>{''.join(heads)}</tr>{''.join(rows)}</table>{more}"
 
 
 def _table_row(entry: Entry, figures: dict[str, Any]) -> str:

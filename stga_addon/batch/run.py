@@ -1,8 +1,8 @@
 """Running a batch: which jobs are to be done, what each comes after, and what became of it."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from graphlib import TopologicalSorter
@@ -136,11 +136,8 @@ class _Loop:
         self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None],
         say: Say,
     ) -> None:  # fmt: skip
-        self._batch = batch
-        self._engine = engine
-        self._lease = lease
-        self._show = show
-        self._say = say
+        self._batch, self._engine, self._lease = batch, engine, lease
+        self._show, self._say = show, say
         self._entries = batch.entries
         self._shown_s = 0.0
         waiting = {n: e for n, e in self._entries.items() if e.state == JobState.WAITING}
@@ -154,7 +151,12 @@ class _Loop:
         self._ready = dict.fromkeys(n for n in waiting if engine.takes_all or n in free)
 
     def work(self) -> None:
-        self._adopt()
+        for name in list(self._ready):  # workers that an earlier start left running
+            entry = self._entries[name]
+            if is_running(entry.job, entry.digest):
+                self._mark_running(entry)
+                self._engine.adopt(entry.job)
+                self._say(f"{name}: goes on in the worker of an earlier start")
         while self._left:
             if self._lease.compromise is not None:
                 problem = "another batch has taken this folder; this one has ended"
@@ -181,15 +183,6 @@ class _Loop:
         for entry in running:
             if entry.state == JobState.RUNNING:  # Ctrl-C came between its end and the note of it
                 self._over(entry, JobState.CANCELLED)
-
-    def _adopt(self) -> None:
-        """Watch the workers that an earlier start of the batch left running."""
-        for name in list(self._ready):
-            entry = self._entries[name]
-            if is_running(entry.job, entry.digest):
-                self._mark_running(entry)
-                self._engine.adopt(entry.job)
-                self._say(f"{name}: goes on in the worker of an earlier start")
 
     def _begin(self) -> bool:
         """Submit what can start; whether there was something."""
@@ -325,17 +318,15 @@ def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, floa
         record = read_record(job)
         if record is not None and record.seconds:
             taken.setdefault(type(job.request), []).append((record.seconds, stated[job.name]))
-    found = {
-        job.name: _corrected(stated[job.name], taken.get(type(job.request), ())) for job in jobs
-    }
-    return {name: seconds for name, seconds in found.items() if seconds is not None}
-
-
-def _corrected(stated: float | None, taken: Sequence[tuple[float, float | None]]) -> float | None:
-    if stated is None:
-        return median(seconds for seconds, _ in taken) if taken else None
-    factors = [seconds / expected for seconds, expected in taken if expected]
-    return stated * median(factors) if factors else stated
+    found: dict[str, float] = {}
+    for job in jobs:
+        alike, expected = taken.get(type(job.request), []), stated[job.name]
+        factors = [seconds / before for seconds, before in alike if before]
+        if expected is not None:
+            found[job.name] = expected * median(factors) if factors else expected
+        elif alike:
+            found[job.name] = median(seconds for seconds, _ in alike)
+    return found
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:
@@ -362,29 +353,21 @@ def pace(job: Job, request: Train) -> float | None:
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
     from ..capture.open import open_capture
+    from ..raster.cpu.threads import set_threads, threads
     from ..render.device import choose_device
     from ..training.effects.plan import plan_effects
     from ..training.preset_timing import seconds_per_iteration
 
+    before = threads()
+    set_threads(job.resources.threads or before)
     try:
-        with _threads(job.resources.threads):
-            device, _ = choose_device(request.device)
-            capture = open_capture(request.capture, request.flame, request.principal_point)
-            if not capture.views.get("train"):
-                return None
-            settings, _ = plan_effects(capture, request.settings, device)
-            return seconds_per_iteration(capture, settings, device=device)
+        device, _ = choose_device(request.device)
+        capture = open_capture(request.capture, request.flame, request.principal_point)
+        if not capture.views.get("train"):
+            return None
+        settings, _ = plan_effects(capture, request.settings, device)
+        return seconds_per_iteration(capture, settings, device=device)
     except StgaError:  # the job itself will say so
         return None
-
-
-@contextmanager
-def _threads(count: int) -> Iterator[None]:
-    from ..raster.cpu.threads import set_threads, threads
-
-    before = threads()
-    set_threads(count or before)
-    try:
-        yield
     finally:
         set_threads(before)

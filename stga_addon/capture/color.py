@@ -1,5 +1,6 @@
 """sRGB, linear light, and colors of videos and PNG's cICP by the codes of ITU-T H.273 as sRGB."""
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -21,6 +22,7 @@ REFERENCE_WHITE_CD_M2 = 203.0
 HLG_PEAK_CD_M2, HLG_SYSTEM_GAMMA = 1000.0, 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 BAND_PIXELS = 1 << 18
+"""Converted at a time: wide intermediate numbers of a large image would fill the memory."""
 
 
 def is_srgb(primaries: int, transfer: int) -> bool:
@@ -38,14 +40,23 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     table = _linear(transfer, np.iinfo(pixels.dtype).max + 1)
     known = primaries if primaries in CHROMATICITIES else SRGB
     matrix = np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(known), np.float32)
-    found = np.empty(pixels.shape, np.uint8)
+
+    def convert(band: np.ndarray) -> np.ndarray:
+        light = _displayed(table[band]) if transfer == HLG else table[band]
+        return 255 * linear_to_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
+
+    return in_bands(pixels, 3, convert)
+
+
+def in_bands(
+    pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """(H, W, channels) uint8 of `convert` applied to the rows of an image, some at a time."""
+    converted = np.empty((*pixels.shape[:2], channels), np.uint8)
     step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
     for start in range(0, len(pixels), step):
-        light = table[pixels[start : start + step]]
-        if transfer == HLG:
-            light = _displayed(light)
-        found[start : start + step] = 255 * linear_to_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
-    return found
+        converted[start : start + step] = convert(pixels[start : start + step])
+    return converted
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:

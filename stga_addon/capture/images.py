@@ -13,7 +13,7 @@ from PIL import Image, ImageCms, ImageOps
 
 from ..errors import StgaError
 from .camera import MAX_IMAGE_PIXELS, is_image_size
-from .color import is_srgb, to_srgb, with_gamma
+from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
@@ -21,9 +21,6 @@ WHITE_LEVEL = 247
 """Of all channels, from which a pixel without a mask counts as a white background."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
-BAND_PIXELS = 1 << 20
-"""Converted at a time: wide intermediate numbers of a large image would fill the memory."""
-
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
 SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02
@@ -105,57 +102,13 @@ def read_view(
 
 
 def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Shrink (H, W) or (H, W, C) uint8 to height x width: exact mean over each new pixel's area,
-    rounded.
-
-    An integral image, read at the new pixels' edges and differenced, down and then across, a band
-    of rows at a time.
-    """
+    """Shrink (H, W) or (H, W, C) uint8 to height x width: mean over each new pixel's area,
+    rounded."""
     if pixels.shape[:2] == (height, width):
         return pixels
-    small = np.empty((height, width, *pixels.shape[2:]), np.uint8)
-    whole, part = _edges(len(pixels), height)
-    above = np.zeros((1, *pixels.shape[1:]))  # sum of the rows above the band
-    step = max(1, BAND_PIXELS // pixels.shape[1] * height // len(pixels))
-    for start in range(0, height, step):
-        edges = slice(start, min(start + step, height) + 1)
-        rows = whole[edges] - whole[edges][0]
-        lines = pixels[whole[edges][0] : whole[edges][-1] + 1].astype(np.float64)
-        integral = np.concatenate([above, lines]).cumsum(axis=0)
-        mean = _differences(integral, lines, rows, part[edges]) * (height / len(pixels))
-        columns = mean.swapaxes(0, 1)
-        integral_across = np.concatenate([np.zeros_like(columns[:1]), np.cumsum(columns, axis=0)])
-        mean = _differences(integral_across, columns, *_edges(len(columns), width))
-        mean = mean * (width / len(columns))
-        small[edges.start : edges.stop - 1] = mean.swapaxes(0, 1) + 0.5
-        above = integral[rows[-1]][None]
-    return small
+    import cv2
 
-
-def _edges(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Whole and fractional part (new + 1,) of the new pixels' edges, in old pixels."""
-    edges = np.linspace(0, old, new + 1)
-    whole = np.minimum(edges.astype(int), old - 1)
-    return whole, edges - whole
-
-
-def _differences(
-    integral: np.ndarray, lines: np.ndarray, whole: np.ndarray, part: np.ndarray
-) -> np.ndarray:
-    """Sums of `lines` between consecutive edges, from their integral."""
-    at_edges = integral[whole] + part.reshape(-1, *[1] * (lines.ndim - 1)) * lines[whole]
-    return np.diff(at_edges, axis=0)
-
-
-def _in_bands(
-    pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """(H, W, channels) uint8 of `convert` applied to the rows of an image, some at a time."""
-    converted = np.empty((*pixels.shape[:2], channels), np.uint8)
-    step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))
-    for start in range(0, len(pixels), step):
-        converted[start : start + step] = convert(pixels[start : start + step])
-    return converted
+    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _decode(path: Path, view: View, kind: str) -> np.ndarray:
@@ -269,7 +222,7 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
         def narrow(band: np.ndarray) -> np.ndarray:
             return np.asarray((band.astype(np.int64)[..., None] * 255 + 32767) // 65535)
 
-        return _in_bands(wide, 1, narrow)[..., 0]
+        return in_bands(wide, 1, narrow)[..., 0]
     if image.mode == "F":
         raise ValueError("holds floating-point pixels")
     if image.mode in ("L", "LA", "RGB", "RGBA"):
@@ -293,7 +246,7 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
         alpha, behind = band[..., -1:].astype(np.uint32), np.array(background, np.uint32)
         return np.asarray((band[..., :-1] * alpha + behind * (255 - alpha) + 127) // 255)
 
-    return _in_bands(pixels, 3, blend)
+    return in_bands(pixels, 3, blend)
 
 
 def _transparency(pixels: np.ndarray) -> np.ndarray | None:

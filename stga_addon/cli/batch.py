@@ -47,7 +47,7 @@ class EngineOptions:
     threads: int | None = option("threads of each job that names none", None, 1, metavar="N")
     dry_run: bool = option("print the jobs, and how long they are expected to take", False)
     engine: str = option(
-        "; ".join(f"{name}: {what}" for name, (_, what) in ENGINES.items()),
+        "; ".join(f"{name}: {what}" for name, what in ENGINES.items()),
         "local",
         choices=ENGINES,
     )
@@ -63,11 +63,11 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
-        from ..batch.folder import hold_folder, prepare
+        from ..batch.folder import hold_batch, prepare
         from ..batch.plan import job_command
         from ..batch.run import Batch
 
-        with hold_folder(plan.out):
+        with hold_batch(plan.out):
             batch = Batch(plan)
             for job in batch.unfinished:
                 prepare(job, batch.entries[job.name].digest, 0.0)
@@ -131,11 +131,11 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     """Carry out what is not finished, with table and report. Raises StgaError where a job failed,
     KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
     from ..batch.engines import make_engine
-    from ..batch.folder import hold_folder
+    from ..batch.folder import hold_batch
     from ..batch.report import LiveTable, summary_line, write_report
     from ..batch.run import Batch, forecast_seconds, run_batch
 
-    with hold_folder(plan.out) as lease:
+    with hold_batch(plan.out) as lease:
         batch = Batch(plan)
         engine = make_engine(engine_name, address)
         batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))

@@ -1,15 +1,17 @@
-"""The commands: the dataclasses whose fields are their options, and what they do with them."""
+"""The commands: the dataclasses whose fields are their options, what they do with them, and the
+progress of that on a terminal."""
 
 import json
 import os
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, make_dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..avatar.file import read_avatar
 from ..capture.model import Capture, summarize_capture
@@ -18,27 +20,86 @@ from ..errors import StgaError
 from ..export.formats import FORMATS
 from ..export.ply import is_ply
 from ..files import write_npz
-from ..format import format_table
+from ..format import describe_figures, format_table
 from ..jobs.analyze import Analyze, Select, TimePresets
 from ..jobs.avatar_source import OpenHead, avatar_path
 from ..jobs.convert_motion import ConvertMotion
 from ..jobs.export import Export
 from ..jobs.finished_run import Evaluate, Relight
 from ..jobs.render import Render
-from ..jobs.results import Selected
+from ..jobs.table import Request, Result
 from ..jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, read_inputs
-from ..jobs.train import Extend, Refine, Resume, SelectForTake, Train
+from ..jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from ..options import add_options, flag_of, given_options, like, option, option_fields
-from ..progress import ignore
+from ..progress import Progress, ignore
 from ..schema import to_json
 from ..selection import SelectionOptions
 from ..training.run.folder import AVATAR, RUN, Run, has_run, next_folder, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
-from .carry_out import ProgressBar, carry_out
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 BLEND = "avatar.blend"
 TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0  # Budgets where none is given
+
+
+LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
+LAYOUT_WITH_TIME_LEFT = LAYOUT.replace("{elapsed}", "{elapsed}<{remaining}")
+
+
+def carry_out(request: Request, with_bar: bool = True) -> Result:
+    """Carry out the request with a progress bar, and print what it says; raises as `perform`."""
+    from ..jobs.perform import perform
+
+    with ProgressBar() as bar:
+        result = perform(request, bar.report if with_bar else ignore, bar.say)
+    for line in getattr(result, "lines", ()):
+        print(line)
+    return result
+
+
+class ProgressBar:
+    """A bar on stderr with stage and figures; what is said or logged goes above it."""
+
+    def __enter__(self) -> "ProgressBar":
+        self._bar: tqdm[Any] | None = None
+        self._stage = ""
+        self._opened = ExitStack()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            # a bar of work that failed before it began would stand above the reason
+            self._bar.leave = self._bar.n > 0
+        self._opened.close()
+
+    def report(self, progress: Progress) -> bool:
+        if self._bar is None:
+            from tqdm import tqdm
+            from tqdm.contrib.logging import logging_redirect_tqdm
+
+            bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
+            self._bar = self._opened.enter_context(bar)
+            self._opened.enter_context(logging_redirect_tqdm())
+        self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
+        self._stage = progress.stage
+        figures = progress.figures()
+        self._bar.bar_format = LAYOUT if "left_s" in figures else LAYOUT_WITH_TIME_LEFT
+        told = [*describe_figures(figures), progress.detail]
+        self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
+        self._bar.update(progress.share - self._bar.n)
+        return False
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        if self._bar is None:
+            print(line)
+            return
+        self._bar.clear()
+        print(line, flush=True)
+        sys.stderr.flush()
 
 
 @dataclass(frozen=True)
@@ -113,11 +174,8 @@ def _train(options: Namespace, head: OpenHead | None) -> None:
     if options.resume:
         _refuse_changes(options, read_run(options.run))
         carry_out(Resume(**given))
-        return
-    if has_run(options.run):
-        problem = "already holds a run; give --resume to continue it, or another --out"
-        raise StgaError(f"{options.run}: {problem}")
-    carry_out(Train(settings=_settings(options), **given))
+    else:
+        carry_out(Train(settings=_settings(options), **given))
 
 
 def _settings(options: Namespace) -> TrainingSettings:
@@ -193,7 +251,7 @@ def write_blend(
     """
     from ..export.playback import playback_fps
     from ..scene.avatar_scene import set_up_head, show_on_head, show_world
-    from ..scene.blend_file import empty_file, save_file
+    from ..scene.objects import empty_file, save_file
     from ..tracking.folder import is_flame
 
     inputs, run = read_inputs(out), out / RUN_FOLDER
@@ -229,13 +287,10 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
         if options.resume:
             flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
             flags += ["--select-only"] if only else []
-            useless = next(
-                (flag for flag in flags if flag not in ("RUN", "--flame", "--device")), None
-            )
+            kept = "RUN", "--flame", "--device"
+            useless = next((flag for flag in flags if flag not in kept), None)
             if useless is not None:
-                problem = (
-                    "cannot be combined with --resume, which continues the run in RUN as it began"
-                )
+                problem = "cannot be combined with --resume, which continues RUN as it began"
                 raise StgaError(f"{useless}: {problem}")
             if read_run(given["parent"]).continuation is None:
                 problem = "does not continue another run; resume it with `stga train --resume`"
@@ -247,10 +302,7 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
                 raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
             _write_selection(SelectForTake(options.parent, takes[0], options.flame), only)
         else:
-            folder = given.setdefault("run", next_folder(options.parent))
-            if has_run(folder):
-                problem = "choose another --out, or give --resume and this folder"
-                raise StgaError(f"{folder}: already holds a run; {problem}")
+            given.setdefault("run", next_folder(options.parent))
             if not {"seconds", "iterations"} & given.keys():
                 given["seconds"] = seconds
             carry_out(kind(**given))
@@ -259,10 +311,6 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
 
 
 # Captures
-
-
-def _select(options: Namespace, head: OpenHead | None) -> None:
-    _write_selection(Select(**given_options(options, Select)), options.out)
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
@@ -367,12 +415,12 @@ COMMANDS = {
         "again with the same arguments, it continues where it was interrupted.", _avatar,
         ((Track, *TRACKED_AS), AvatarOptions, TrainingSettings,
          (SelectionOptions, "threshold"), (Train, "device")),
-        may_lack=("model",),
+        may_lack=("model",)
     ),
     "track": _asking(Track, may_lack=("model",)),
     "train": Command(
         _about(Train), _train,
-        (Train, TrainingSettings, (SelectionOptions, "threshold"), RESUME_RUN), uses_head=True,
+        (Train, TrainingSettings, (SelectionOptions, "threshold"), RESUME_RUN), uses_head=True
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
     "extend": _continuing(Extend, EXTEND_SECONDS, _lone("select_only", Path | None, SELECT_ONLY)),
@@ -380,16 +428,18 @@ COMMANDS = {
     "perform": Command(
         "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
         "farm does. The folder holds request.json; status, previews and result are written beside "
-        "it.", _perform, (PerformOptions,),
+        "it.", _perform, (PerformOptions,)
     ),
     "batch": Command(
         "Carry out a plan of many jobs, or train many captures, on this machine or on the engine "
-        "that is there.", run_batch_command, (BatchOptions, EngineOptions),
+        "that is there.", run_batch_command, (BatchOptions, EngineOptions)
     ),
     "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
     "eval": _asking(Evaluate, with_bar=False),
     "select": Command(
-        _about(Select), _select, (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
+        _about(Select),
+        lambda options, _: _write_selection(Select(**given_options(options, Select)), options.out),
+        (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),

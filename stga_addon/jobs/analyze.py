@@ -10,9 +10,9 @@ from ..options import like, option
 from ..progress import Progress, Report, Say
 from ..render.device import choose_device
 from ..selection import SelectionOptions, select_capture
+from ..training.effect_catalog import EffectDecision
 from ..training.settings import TrainingSettings, make_settings
-from .results import Analyzed, Selected
-from .train import Train
+from .train import Selected, Train
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,14 @@ class Select(_OfCapture):
         SelectionOptions, "zero_pose", default=None,
         help="motion that does not count as expression (default head)",
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Analyzed:
+    """Effects that a capture calls for. seconds: preset -> training time on this machine."""
+
+    plan: tuple[EffectDecision, ...]
+    seconds: Mapping[str, float]
 
 
 def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:

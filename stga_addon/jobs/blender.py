@@ -15,13 +15,12 @@ from tempfile import TemporaryDirectory
 
 from ..errors import StgaError
 from ..options import like
-from ..progress import Cancelled, Progress, Report, Say, counted
+from ..progress import Cancelled, Progress, Report, Say, Written, counted
 from ..render.device import Composer
 from ..render.video import finished, is_video, recorded_images, sequence_writer, video_writer
 from ..schema import MAX_COUNT, setting
 from ..worker.launch import end_with_this_process
 from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
-from .results import Written
 from .train import Train
 
 PARTIAL = ".rendering-"

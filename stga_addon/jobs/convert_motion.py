@@ -21,12 +21,11 @@ from ..flame.quaternions import from_axis_angle, from_matrices, to_axis_angle, t
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
 from ..flame.teeth import flame_model
 from ..options import like, option
-from ..progress import Progress, Report, Say
+from ..progress import Progress, Report, Say, Written
 from ..tracking.folder import AVATAR_MISFIT, REPORT_FILE, is_written
 from ..tracking.footage.sources import is_video
-from ..training.run.folder import open_refined, read_run
+from ..training.run.folder import avatar_version, open_refined, read_run
 from .avatar_source import findings, motion_options_field
-from .results import Written
 from .track import MAX_MISFIT, Track, track
 from .train import Train
 
@@ -126,6 +125,8 @@ def _tracked_by_avatar(
     count, flame = len(open_footage(request.source).timesteps), read_run(avatar).flame
     for suffix, step in ((CHECK_SUFFIX, max(1, count // CHECKED_TIMESTEPS)), (TRACKING_SUFFIX, 1)):
         out = Path(f"{request.output}{suffix}")
+        if is_written(out) and read_json(out / REPORT_FILE)["avatar"] != avatar_version(avatar):
+            shutil.rmtree(out)
         if not is_written(out):
             track(Track(request.source, None, out, avatar=avatar, step=step), report, say)
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]

@@ -19,7 +19,7 @@ from ..flame.sequence import FlameSequence
 from ..format import format_bytes
 from ..light.relight import albedo_avatar
 from ..options import flag_of, like, option
-from ..progress import Report, Say, counted
+from ..progress import Report, Say, Written, counted
 from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
 from .avatar_source import (
@@ -32,7 +32,6 @@ from .avatar_source import (
     required_capture,
     timesteps_between,
 )  # fmt: skip
-from .results import Written
 from .train import Train
 
 

@@ -15,7 +15,7 @@ from ..export.ply import read_ply
 from ..files import write_json
 from ..light.environment import harmonics_of, read_hdr
 from ..options import like, option
-from ..progress import Progress, Report, Say, ignore
+from ..progress import Progress, Report, Say, Written, ignore
 from ..training.run.folder import (
     AVATAR,
     WORLD_FILE,
@@ -24,7 +24,6 @@ from ..training.run.folder import (
     open_run,
     with_refined_tracking,
 )
-from .results import Written
 
 if TYPE_CHECKING:
     from ..light.estimate import Known
@@ -80,7 +79,7 @@ def add_light(
     """Write the light of a capture into a run's avatar file; what there is to say. Raises
     StgaError, also while another process works on the run."""
     from ..light.estimate import Known, estimate_light
-    from ..training.evaluate.match_exposure import known_exposure
+    from ..training.evaluate.metrics import known_exposure
 
     with locked(avatar_file.parent):
         avatar = read_avatar(avatar_file)

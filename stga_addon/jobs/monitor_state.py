@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..training.run.folder import AVATAR
 from ..worker.status import WorkerSnapshot, WorkerState
-from .folder import PREVIEW
+from .perform import PREVIEW
 from .table import DISMISSIBLE, STORED, TRAINS, TRANSIENT, Kind
 from .track import CAPTURE_FOLDER, RUN_FOLDER
 
@@ -82,15 +82,12 @@ class RequestState:
     @property
     def has_result(self) -> bool:
         """Whether the worker has ended with a result that is still to be shown."""
-        state = self.snapshot.state
-        ended = state == WorkerState.FINISHED or (
-            state == WorkerState.CANCELLED and self.kind in TRAINS
-        )
         # An avatar's tracking may have been cancelled; a video changes nothing in the scene.
-        is_there = (
-            self.files.avatar is not None if self.kind == Kind.AVATAR else self.kind != Kind.VIDEO
-        )
-        return ended and is_there and not self.result_shown
+        if self.kind == Kind.VIDEO or (self.kind == Kind.AVATAR and self.files.avatar is None):
+            return False
+        state = self.snapshot.state
+        is_kept = state == WorkerState.CANCELLED and self.kind in TRAINS
+        return (is_kept or state == WorkerState.FINISHED) and not self.result_shown
 
     @property
     def is_running(self) -> bool:
@@ -259,9 +256,8 @@ def transition(state: RequestState, event: Event) -> Outcome:
         case Shown(undoable):
             return _loading_ended(state, undoable)
         case Failed(sentence, stops=True):
-            return replace(state, error=sentence, stopped=True, loading=None, building=False), (
-                Redraw(),
-            )
+            state = replace(state, error=sentence, stopped=True, loading=None, building=False)
+            return state, (Redraw(),)
         case Failed(sentence):
             return _loading_ended(state, error=sentence)
 

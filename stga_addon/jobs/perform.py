@@ -1,30 +1,139 @@
-"""Carrying out requests, in this process or as the worker of a folder."""
+"""Carrying out requests, in this process or as the worker of a folder, which holds
 
+request.json   the request
+request.npz    its arrays
+result.json    what was found, where the request asks for something other than files; result.npz:
+               its arrays
+preview.npz    of a training: the avatar of a few seconds ago
+picture.npz    of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
+besides the files of the worker's status (`worker.status`). `python -m` this module compiles ahead
+of a training, which Blender starts with a capture.
+"""
+
+import os
 from contextlib import suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import walk_packages
 from time import monotonic
+from typing import Any
 
 from ..errors import StgaError
-from ..files import write_npz
+from ..files import read_json, read_npz, write_json, write_npz
 from ..options import refuse_useless
-from ..progress import Cancelled, Progress, Report, Say, ignore
-from ..schema import validate
+from ..progress import Cancelled, Progress, Report, Say, Written, ignore
+from ..raster.kernel_cache import OWN_KERNELS
+from ..render.video import check_output
+from ..schema import Arrays, from_json, to_json, validate
 from ..tracking.folder import is_written
-from ..training.run.folder import has_run
-from ..worker.status import StatusWriter, status_writer
-from .folder import PICTURE, PREVIEW, has_request, read_request, write_result
-from .results import Result, Written
-from .table import JOBS, Request
-from .track import MakeAvatar, Track
-from .train import Extend, Refine, Resume, Train, resumed
+from ..training.run.folder import has_run, read_run
+from ..worker.launch import PREPARING, cache_folder, prepare_status_folder
+from ..worker.lock import hold_lock
+from ..worker.status import StatusWriter, remove_status_folder, status_writer
+from .blender import RenderRecording
+from .table import JOBS, Request, Result
+from .track import MakeAvatar, SolveAgain, Track, check_inputs
+from .train import Extend, Refine, Resume, Train, refuse_run, resumed
 
+FORMAT, VERSION = "stga-request", 1
+REQUEST, REQUEST_ARRAYS = "request.json", "request.npz"
+RESULT, RESULT_ARRAYS = "result.json", "result.npz"
+PREVIEW, PICTURE = "preview.npz", "picture.npz"
+FILES = (REQUEST, REQUEST_ARRAYS, RESULT, RESULT_ARRAYS, PREVIEW, PICTURE)
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
 TORCH_MODULES = ("raster.cpu.autograd",)  # Modules in them that import torch, which takes seconds
 PREVIEW_INTERVAL_S = 4.0  # Seconds between two previews of a training
+
+
+def request_folder(subject: Path) -> Path:
+    """The folder of a request inside that of its run or capture, so that they move together."""
+    return subject / "job"
+
+
+def check_request(request: Request) -> None:
+    """Raise StgaError for what can be known to fail before a worker is started."""
+    match request:
+        case Train() | Refine() | Extend():
+            refuse_run(request.run)
+        case Resume():
+            read_run(request.run)
+        case Track() if is_written(request.out):
+            raise StgaError(f"{request.out}: already holds a capture; choose another folder")
+        case MakeAvatar():
+            check_inputs(request.track)
+        case SolveAgain() if not is_written(request.capture):
+            raise StgaError(f"{request.capture}: holds no tracked capture to solve again")
+        case RenderRecording():
+            check_output(request.output)
+
+
+def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
+    """What a worker's interpreter runs after `-m` for the request in the folder."""
+    limit = [] if threads is None else ["--threads", str(threads)]
+    return ["stga_addon", "perform", str(folder.resolve()), *limit, *["--resume"] * resume]
+
+
+def write_request(folder: Path, request: Request) -> None:
+    """Prepare the folder for a worker. Raises StgaError while one works in it."""
+    prepare_status_folder(folder)
+    for stale in FILES:
+        (folder / stale).unlink(missing_ok=True)
+    _write(folder / REQUEST, folder / REQUEST_ARRAYS, request, Request)
+
+
+def read_request(folder: Path) -> Request:
+    """Raises StgaError where the folder holds no request, or a damaged one."""
+    if not (folder / REQUEST).is_file():
+        raise StgaError(f"{folder}: holds no request ({REQUEST} is missing)")
+    request: Request = _read(folder / REQUEST, folder / REQUEST_ARRAYS, Request)
+    return request
+
+
+def has_request(folder: Path) -> bool:
+    return (folder / REQUEST).is_file()
+
+
+def remove_request(folder: Path) -> None:
+    """Remove the files of a request, if the folder holds one, and its worker's status. Raises
+    StgaError while its worker is working."""
+    if has_request(folder):
+        remove_status_folder(folder, FILES)
+
+
+def write_result(folder: Path, result: Result) -> None:
+    """Raises StgaError on a full disk."""
+    _write(folder / RESULT, folder / RESULT_ARRAYS, result, Result)
+
+
+def read_result(folder: Path) -> Result:
+    """Raises StgaError where the folder holds no result, or a damaged one."""
+    result: Result = _read(folder / RESULT, folder / RESULT_ARRAYS, Result)
+    return result
+
+
+def _write(path: Path, arrays_path: Path, value: Any, kinds: Any) -> None:
+    arrays: Arrays = {}
+    values = to_json(value, arrays, kinds)
+    if arrays:
+        write_npz(arrays_path, arrays, compressed=True)
+    write_json(path, {"format": FORMAT, "version": VERSION, **values})
+
+
+def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
+    values = read_json(path)
+    named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
+    if named != (FORMAT, VERSION):
+        known = f"(format '{FORMAT}', version {VERSION})"
+        raise StgaError(f"{path}: is not a request that this version reads {known}")
+    arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
+    try:
+        return from_json(kinds, values, arrays=arrays)
+    except StgaError as error:
+        raise StgaError(f"{path}: {error}") from error
+
+
+# Carrying out
 
 
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
@@ -36,11 +145,7 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     """
     refuse_useless(request)
     validate(request)
-    module, _, function = JOBS[type(request)].work.rpartition(".")
-    if module.startswith("..") and find_spec("..development", __package__) is None:
-        raise StgaError(f"{type(request).__name__}: can be carried out in a checkout only")
-    result: Result = getattr(import_module(module, __package__), function)(request, report, say)
-    return result
+    return JOBS[type(request)].work(request, report, say)
 
 
 def perform_in_folder(
@@ -89,11 +194,9 @@ def load_ahead() -> None:
 
 def remaining(request: Request) -> Request:
     """What is left of an interrupted request: trainings are resumed, others write anew."""
-    return (
-        resumed(request)
-        if isinstance(request, Train | Refine | Extend) and has_run(request.run)
-        else request
-    )
+    if isinstance(request, Train | Refine | Extend) and has_run(request.run):
+        return resumed(request)
+    return request
 
 
 class _StatusReport:
@@ -104,9 +207,8 @@ class _StatusReport:
         self._previewed_s = monotonic()
 
     def __call__(self, progress: Progress) -> bool:
-        stop = self._writer.update(
-            progress.share, progress.stage, progress.detail, progress.figures
-        )
+        said = progress.stage, progress.detail
+        stop = self._writer.update(progress.share, *said, progress.figures)
         if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self._writer.folder / PREVIEW)
             self._previewed_s = monotonic()
@@ -115,3 +217,28 @@ class _StatusReport:
             with suppress(StgaError):  # a full disk, which the work reports itself
                 write_npz(self._writer.folder / PICTURE, {"rgb": picture})
         return self._also(progress) or stop
+
+
+def prepare() -> None:
+    """Compile Numba's kernels and the bytecode of an extension's packages for the first training on
+    this machine; no effect while another process does, or without room."""
+    os.environ[OWN_KERNELS] = "1"
+    folder = cache_folder()
+    with suppress(OSError):  # BlockingIOError among them
+        folder.mkdir(parents=True, exist_ok=True)
+        with hold_lock(folder / PREPARING):
+            from ..raster.cpu.precompile import rasterizer_helper
+
+            rasterizer_helper()
+            load_ahead()
+            from ..training.optimize.precompile import compile_for_cpu
+
+            compile_for_cpu()
+            # The first lists the machine's fonts; torch's bytecode is not written by `load_ahead`.
+            for library in ("matplotlib.font_manager", "torch"):
+                with suppress(ImportError):
+                    import_module(library)
+
+
+if __name__ == "__main__":
+    prepare()

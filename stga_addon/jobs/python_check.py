@@ -1,6 +1,10 @@
-"""Whether an interpreter can track and train: `python_report` runs in it, and is judged here."""
+"""Whether an interpreter can track and train: `python -m` this module reports its packages and
+device as JSON in it, which is judged here."""
 
+import importlib
 import json
+import os
+import platform
 import subprocess
 import sys
 from contextlib import suppress
@@ -8,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import StgaError
-from ..worker.launch import start_python
 from ..worker.training_python import REQUIREMENTS, package_name
 
 MIN_PYTHON = 3, 11
@@ -26,8 +29,10 @@ class Checked:
 
 def start_check(python: str) -> "subprocess.Popen[str]":
     """The process that `finish_check` judges. Raises StgaError where it cannot start."""
+    from ..worker.launch import start_python  # needs a package that this Python may lack
+
     return start_python(
-        python, ["stga_addon.jobs.python_report"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        python, ["stga_addon.jobs.python_check"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True, errors="replace",
     )  # fmt: skip
 
@@ -53,7 +58,7 @@ def finish_check(
 
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
-    """The line of a check by python_report's JSON. Raises StgaError for what is missing."""
+    """The line of a check by the JSON of `main`. Raises StgaError for what is missing."""
     version, versions, failures = report["python"], report["versions"], report["failures"]
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
@@ -67,3 +72,36 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         raise StgaError(f"{python}: {problem}")
     known = f"torch {versions['torch']}, numba {versions['numba']}"
     return f"Python {version}, {known}, {report['device']}"
+
+
+def main() -> None:
+    versions, failures = {}, {}
+    for name in REQUIREMENTS:
+        try:
+            versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
+        except Exception as error:  # a library that fails to load raises what it likes
+            failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
+    names, device = _adapters()
+    report = {
+        "python": platform.python_version(), "versions": versions, "failures": failures,
+        "device": device, "adapters": names,
+    }  # fmt: skip
+    print(json.dumps(report))
+
+
+def _adapters() -> tuple[list[str], str]:
+    """GPUs for `--device gpu:NAME`, and the device to report; `choose_device` tries it later."""
+    cpu = f"CPU with {os.cpu_count()} threads"
+    try:
+        from ..raster.gpu.adapters import adapters, is_software
+
+        found = adapters()
+    except Exception:  # a package is missing, or a driver fails: the CPU trains
+        return [], cpu
+    return list(found), next(
+        (name for name, adapter in found.items() if not is_software(adapter)), cpu
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -20,7 +20,7 @@ from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..options import like, option
-from ..progress import Report, Say, counted
+from ..progress import Report, Say, Written, counted
 from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
@@ -33,7 +33,6 @@ from .avatar_source import (
     open_avatar,
     open_avatar_motion,
 )  # fmt: skip
-from .results import Written
 from .train import Train
 
 MAX_TURNTABLE_IMAGES = 100_000

@@ -1,19 +1,24 @@
 """The one table of jobs: each request, its work, and what Blender's sidebar shows of it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
+from ..errors import StgaError
 from ..options import like, option
+from ..progress import Report, Say, Written
 from ..schema import setting
-from .analyze import Analyze, Select, TimePresets
-from .blender import RenderBlend, RenderRecording
-from .convert_motion import ConvertMotion
-from .export import Export
-from .finished_run import Evaluate, Relight
-from .render import Render
-from .track import MakeAvatar, SolveAgain, Track
-from .train import Extend, Refine, Resume, SelectForTake, Train
+from .analyze import Analyze, Analyzed, Select, TimePresets, analyze, select, time_each_preset
+from .blender import RenderBlend, RenderRecording, render_blend, render_recording
+from .convert_motion import ConvertMotion, convert_motion
+from .export import Export, export
+from .finished_run import Evaluate, Relight, evaluate, relight
+from .render import Render, render
+from .track import MakeAvatar, SolveAgain, Track, make_avatar, solve_again, track
+from .train import Extend, Refine, Resume, Selected, SelectForTake, Train, select_for_take, train
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,9 @@ Request = (
     | Render | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets
     | Evaluate | Benchmark | Relight
 )  # fmt: skip
+Result = Written | Selected | Analyzed
+Work = Callable[..., Result]
+"""Called with a request, a `Report` and a `Say`; raises what `perform` does."""
 
 
 class Kind(StrEnum):
@@ -57,37 +65,41 @@ class Kind(StrEnum):
     VIDEO = "video"
 
 
+def train_benchmark(request: Benchmark, report: Report, say: Say) -> Result:
+    """Carry out a benchmark. Raises StgaError where `development` is not installed."""
+    if find_spec("..development", __package__) is None:
+        raise StgaError("Benchmark: can be carried out in a checkout only")
+    module, _, name = "..development.benchmark.slice.train_slice".rpartition(".")
+    work: Work = getattr(import_module(module, __package__), name)
+    return work(request, report, say)
+
+
 @dataclass(frozen=True)
 class Job:
     """The work of a request, and what Blender knows of it.
 
-    work     module and function, loaded when they are needed; the extension's zip leaves
-             `development` out
     kind     of those that Blender asks for; subject: the field that names what it is about
     """
 
-    work: str
+    work: Work
     kind: Kind | None = None
     subject: str = ""
 
 
 JOBS: dict[type[Request], Job] = {
-    Train: Job(".train.train", Kind.TRAINING, "run"),
-    Resume: Job(".train.train", Kind.TRAINING, "run"),
-    Refine: Job(".train.train", Kind.TRAINING, "run"),
-    Extend: Job(".train.train", Kind.TRAINING, "run"),
-    SelectForTake: Job(".train.select_for_take", Kind.SELECTION, "capture"),
-    Track: Job(".track.track", Kind.TRACKING, "out"),
-    SolveAgain: Job(".track.solve_again", Kind.TRACKING, "capture"),
-    MakeAvatar: Job(".track.make_avatar", Kind.AVATAR, "out"),
-    Analyze: Job(".analyze.analyze", Kind.ANALYSIS, "capture"),
-    TimePresets: Job(".analyze.time_each_preset"), Select: Job(".analyze.select"),
-    Evaluate: Job(".finished_run.evaluate"),
-    Relight: Job(".finished_run.relight", Kind.LIGHT, "run"), Render: Job(".render.render"),
-    RenderRecording: Job(".blender.render_recording", Kind.VIDEO, "output"),
-    RenderBlend: Job(".blender.render_blend"), Export: Job(".export.export"),
-    ConvertMotion: Job(".convert_motion.convert_motion", Kind.PERFORMANCE, "output"),
-    Benchmark: Job("..development.benchmark.slice.train_slice"),
+    Train: Job(train, Kind.TRAINING, "run"), Resume: Job(train, Kind.TRAINING, "run"),
+    Refine: Job(train, Kind.TRAINING, "run"), Extend: Job(train, Kind.TRAINING, "run"),
+    SelectForTake: Job(select_for_take, Kind.SELECTION, "capture"),
+    Track: Job(track, Kind.TRACKING, "out"),
+    SolveAgain: Job(solve_again, Kind.TRACKING, "capture"),
+    MakeAvatar: Job(make_avatar, Kind.AVATAR, "out"),
+    Analyze: Job(analyze, Kind.ANALYSIS, "capture"),
+    TimePresets: Job(time_each_preset), Select: Job(select), Evaluate: Job(evaluate),
+    Relight: Job(relight, Kind.LIGHT, "run"), Render: Job(render),
+    RenderRecording: Job(render_recording, Kind.VIDEO, "output"),
+    RenderBlend: Job(render_blend), Export: Job(export),
+    ConvertMotion: Job(convert_motion, Kind.PERFORMANCE, "output"),
+    Benchmark: Job(train_benchmark),
 }  # fmt: skip
 
 
@@ -116,19 +128,19 @@ KINDS = {
     Kind.TRAINING: RequestKind(
         "Training", "Stop training and keep the avatar trained so far; Resume continues from there",
         ("Trained", "Cancelled, avatar kept", "Training failed", "Run not found"),
-        is_stored=True, trains=True,
+        is_stored=True, trains=True
     ),
     Kind.TRACKING: RequestKind(
         "Tracking", "Stop tracking; the landmarks of whole cameras are kept, and Track continues "
         "with the others",
         ("Tracked", "Cancelled; Track continues", "Tracking failed", "Capture not found"),
-        is_stored=True,
+        is_stored=True
     ),
     Kind.AVATAR: RequestKind(
         "Making an avatar", "Stop, and keep what there is so far; Avatar from Video with the same "
         "video continues",
         ("Avatar made", "Cancelled; Avatar from Video continues", "Making the avatar failed",
-         "Its folder was not found"), is_stored=True, trains=True,
+         "Its folder was not found"), is_stored=True, trains=True
     ),
     Kind.ANALYSIS: RequestKind(
         "The analysis", "Stop the analysis; earlier results stay", is_transient=True
@@ -138,14 +150,14 @@ KINDS = {
     ),
     Kind.PERFORMANCE: RequestKind(
         "The performance of the video", "Stop watching the video; nothing is written",
-        is_transient=True,
+        is_transient=True
     ),
     Kind.LIGHT: RequestKind(
         "The estimate of light", "Stop; the avatar stays as it is", is_transient=True
     ),
     Kind.VIDEO: RequestKind(
         "The video", "Stop making the video; nothing is written, or the PNGs that are finished "
-        "stay", ("Video rendered", "Video cancelled", "Video failed", ""),
+        "stay", ("Video rendered", "Video cancelled", "Video failed", "")
     ),
 }  # fmt: skip
 STORED, TRAINS, TRANSIENT = (

@@ -15,12 +15,11 @@ from ..errors import StgaError, shorten
 from ..files import read_json, write_json
 from ..format import format_duration
 from ..options import option, usable_path
-from ..progress import Cancelled, Progress, Report, Say, TimeLeft
+from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, REPORT_FILE, SHEET_FILE, is_flame, is_written
 from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
-from .results import Written
 from .train import Train, resumed, train
 
 WORLDS = {
@@ -171,6 +170,7 @@ FOCAL_SOURCES = {
 
 def track(request: Track, report: Report, say: Say) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError."""
+    from ..tracking.correct import report_errors
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
     from ..tracking.track import end_tracking
@@ -191,9 +191,7 @@ def track(request: Track, report: Report, say: Say) -> Written:
         footage, model, out, request.landmarks, request.meshes, request.world,
         request.mattes == "auto", steps.report, steps.show, person,
     )  # fmt: skip
-    lines = [f"warning: {warning}" for warning in found.warnings]
-    where = "by camera and timestep in tracking.json"
-    lines.append(f"reprojection error: {found.median_px:.2f} px (median); {where}")
+    lines, pixels = [f"warning: {warning}" for warning in found.warnings], found.median_px
     if found.focal_px is not None:
         lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
     if found.torso is not None:
@@ -203,12 +201,15 @@ def track(request: Track, report: Report, say: Say) -> Written:
             tracked = track_recording(
                 request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE)
             )
+        pixels = report_errors(out, model)
         end_tracking(out)
         share = float(np.median(tracked.misfit))
         lines.append(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
         if share > MAX_MISFIT:
             lines.append("warning: the avatar does not look like the person of this footage")
-    report(Progress(1.0, "Tracked", f"Reprojection error {found.median_px:.1f} px (median)"))
+    where = "by camera and timestep in tracking.json"
+    lines.append(f"reprojection error: {pixels:.2f} px (median); {where}")
+    report(Progress(1.0, "Tracked", f"Reprojection error {pixels:.1f} px (median)"))
     return Written(out, (*lines, f"capture: {out}"))
 
 

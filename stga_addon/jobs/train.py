@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from ..errors import StgaError
 from ..export.ply import write_ply
 from ..format import format_table
 from ..options import like, option
-from ..progress import Cancelled, Progress, Report, Say
+from ..progress import Cancelled, Progress, Report, Say, Written
 from ..render.device import EXPECTED_DEVICE, choose_device, is_device
 from ..report import CurveUpdater, report_run
 from ..schema import setting
@@ -42,7 +43,6 @@ from ..training.run.folder import (
 )
 from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
-from .results import Selected, Written
 
 MAX_NAMED_VIEWS = 6  # Views that a warning names
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
@@ -166,6 +166,13 @@ class Extend(_Continue):
 
 
 @dataclass(frozen=True)
+class Selected:
+    """timestep -> (F,) bool: triangles."""
+
+    selection: Selection
+
+
+@dataclass(frozen=True)
 class SelectForTake:
     """Find out which triangles extending a run by a take would train."""
 
@@ -249,7 +256,7 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
     """Write what stands still behind the person, where its effect is on; what there is to say."""
     if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
         return ()
-    from ..training.world.world_splats import world_of
+    from ..training.world import world_of
 
     path = prepared.request.run / WORLD_FILE
     try:
@@ -260,25 +267,24 @@ def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
     return (f"world: {path} ({len(splats)} splats)",)
 
 
+def refuse_run(folder: Path) -> None:
+    """Raise StgaError where the folder holds a run."""
+    if has_run(folder):
+        raise StgaError(f"{folder}: already holds a run; resume it, or choose another folder")
+
+
 def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
-    if not isinstance(request, Resume) and has_run(request.run):
-        problem = "already holds a run; resume it (--resume), or choose another folder (--out)"
-        raise StgaError(f"{request.run}: {problem}")
-    match request:
-        case Train():
-            return _new_run(request, report, say)
-        case Refine():
-            return _refinement(request, report, say)
-        case Extend():
-            return _extension(request, report, say)
-        case Resume():
-            flame, principal_point = request.flame, request.principal_point
-            opened = open_run(request.run, request.capture, flame, principal_point)
-            device, why = device_of(opened.run, request.device)
-            say(why)
-            run = replace(opened.run, device=device)
-            return Prepared(request, run, opened.capture, request.selection)
+    if isinstance(request, Resume):
+        flame, principal_point = request.flame, request.principal_point
+        opened = open_run(request.run, request.capture, flame, principal_point)
+        device, why = device_of(opened.run, request.device)
+        say(why)
+        run = replace(opened.run, device=device)
+        return Prepared(request, run, opened.capture, request.selection)
+    refuse_run(request.run)
+    begin: Any = {Train: _new_run, Refine: _refinement, Extend: _extension}[type(request)]
+    return cast(Prepared, begin(request, report, say))
 
 
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:

@@ -13,7 +13,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..export.playback import check_rate
-from ..files import NumberedFiles, check_writable, replacing
+from ..files import NumberedFiles, check_writable, naming, replacing
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from .device import Composer
 from .server import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
@@ -126,7 +126,7 @@ class Recorder:
     def __init__(self, path: Path) -> None:
         """Raises StgaError where the file cannot be written."""
         self.path = path
-        with self._reported():
+        with naming(path):
             self._stream: BinaryIO = path.open("wb")
         self._before: Sequence[PosedSplats] = ()
 
@@ -134,21 +134,13 @@ class Recorder:
         """Append an image. Raises StgaError on a full disk."""
         message = {**pack_camera(camera), **pack_layers(layers, self._before)}
         self._before = layers
-        with self._reported():
+        with naming(self.path):
             send(self._stream, message)
 
     def close(self) -> None:
         """Raises StgaError on a full disk, and closes all the same."""
-        with self._reported():
+        with naming(self.path):
             self._stream.close()
-
-    @contextmanager
-    def _reported(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            reason = error.strerror or error
-            raise StgaError(f"{self.path}: cannot be written ({reason})") from error
 
 
 def recorded_images(path: Path, count: int, composer: Composer) -> Iterator[ComposedImage]:

@@ -40,10 +40,8 @@ def has_triangles(mesh: Any, faces: np.ndarray) -> bool:
 
 
 def evaluated_vertices(obj: Any) -> np.ndarray:
-    """(V, 3) float32 vertex positions of a mesh object at the current frame, in object space.
-
-    Shape keys, drivers and modifiers are applied.
-    """
+    """(V, 3) float32 vertex positions of a mesh object at the current frame, in object space. Shape
+    keys, drivers and modifiers are applied."""
     evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     try:
@@ -70,46 +68,36 @@ def key_points(key: Any) -> np.ndarray:
     return read_values(key.points, "co", 3).astype(np.float64)
 
 
-def write_curve(
-    curves: Any, data_path: str, index: int, frames: Any, values: Any, interpolation: str = "LINEAR"
+def write_curves(
+    owner: Any, data_path: str, frames: Any, values: Any, interpolation: str = "LINEAR"
 ) -> None:
-    """Add one f-curve with all its keyframes at once.
-
-    curves: from `action_curves`; index: of the array element, 0 for a scalar; frames, values (K,),
-    frames ascending.
-    """
-    points = curves.new(data_path, index=index).keyframe_points
-    points.add(len(frames))
-    points.foreach_set("co", np.column_stack([frames, values]).astype(np.float32).ravel())
+    """Add f-curves with all their keyframes at once to the action of the data-block `owner`. frames
+    (K,): ascending; values: (K,) of a scalar, (K, C) of an array's elements."""
+    curves, values = action_curves(owner), np.asarray(values)
     mode = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value
-    points.foreach_set("interpolation", np.full(len(frames), mode, np.int32))
-
-
-def write_curves(curves: Any, data_path: str, frames: Any, values: np.ndarray) -> None:
-    """Add an f-curve for each of the C elements of an array by values (K, C), as `write_curve`."""
-    for index, column in enumerate(values.T):
-        write_curve(curves, data_path, index, frames, column)
+    for index, column in enumerate(values.reshape(len(values), -1).T):
+        points = curves.new(data_path, index=index).keyframe_points
+        points.add(len(frames))
+        points.foreach_set("co", np.column_stack([frames, column]).astype(np.float32).ravel())
+        points.foreach_set("interpolation", np.full(len(frames), mode, np.int32))
 
 
 def write_triangle_curves(
     owner: Any, paths: Sequence[str], timesteps: Sequence[float], interpolation: str = "LINEAR"
 ) -> None:
     """Animate values (T) of `owner`: each is 1 at its timestep and 0 at others, ascending."""
-    curves, frames = action_curves(owner), np.asarray(timesteps, np.float64)
     for row, path in enumerate(paths):
-        near = np.arange(max(row - 1, 0), min(row + 2, len(frames)))
-        write_curve(curves, path, 0, frames[near], near == row, interpolation)
+        near = np.arange(max(row - 1, 0), min(row + 2, len(paths)))
+        write_curves(owner, path, np.asarray(timesteps)[near], near == row, interpolation)
 
 
 def add_driver(
     owner: Any, path: str, index: int, expression: str, variables: Mapping[str, tuple[Any, str]]
 ) -> None:
     """Drive one value of the data-block `owner` by an expression of other data-blocks' properties.
-
     index: of the array element, -1 for a scalar; variables: name -> (data-block, data path).
     Expressions of at most 255 characters with arithmetic only are evaluated without Python, so they
-    work where scripts are not trusted.
-    """
+    work where scripts are not trusted."""
     curve = owner.driver_add(path, index)
     # A new driver has keyframes at 0 and 1, to which Blender snaps results closer than 1e-4.
     curve.keyframe_points.clear()

@@ -14,11 +14,10 @@ from ..export.ply import read_ply
 from ..training.run.folder import WORLD_FILE
 from . import tags
 from .arrays import evaluated_vertices
-from .blend_file import current_scene, go_to_frame, set_frames_per_second
 from .cameras import central, configure_scene, import_cameras
 from .compat import enable_nodes
 from .display.splat_object import hide_object, show_avatar, show_world_splats
-from .objects import COLLECTIONS, capture_root, show_kind
+from .objects import COLLECTIONS, capture_root, go_to_frame, set_frames_per_second, show_kind
 from .rig.head import import_head
 
 DISTANCE = 2.2
@@ -27,11 +26,8 @@ DISTANCE = 2.2
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
     """Let the 3D viewports look at the head from the side of `camera`, or from the front where it
-    is None.
-
-    They stay free to orbit. A viewport that looks through a camera stays so.
-    The dashed lines from cameras and bones to their parent are hidden.
-    """
+    is None. They stay free to orbit. A viewport that looks through a camera stays so. The dashed
+    lines from cameras and bones to their parent are hidden."""
     matrix = head.matrix_world
     vertices = evaluated_vertices(head)
     low, high = matrix @ Vector(vertices.min(0)), matrix @ Vector(vertices.max(0))
@@ -48,25 +44,9 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_location, region.view_distance = center, DISTANCE * radius
 
 
-def frame_alone(head: Any, scene: Any, frames_per_second: float) -> None:
-    """Prepare a scene with one capture to be opened: bones and cameras hidden, every viewport on
-    the head.
-
-    The world is white, the background of captures without one of their own.
-    """
-    set_frames_per_second(scene, frames_per_second)
-    scene.world = bpy.data.worlds.new("World")
-    enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
-    for kind in COLLECTIONS:
-        show_kind(head.parent, kind, scene.view_layers[0], False)
-    frame_head(head, scene.camera, bpy.data.screens)
-
-
 def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
-    """Open the sidebar of the 3D viewports at a tab; whether they show it.
-
-    Blender knows a sidebar's tabs only once it was drawn: call it again until it returns True.
-    """
+    """Open the sidebar of the 3D viewports at a tab; whether they show it. Blender knows a
+    sidebar's tabs only once it was drawn: call it again until it returns True."""
     is_shown = True
     for area in _viewports(screens):
         area.spaces.active.show_region_ui = True
@@ -91,21 +71,24 @@ def set_up_head(capture: Capture) -> Any:
     # so that Train works in the saved file
     head[tags.FLAME_MODEL] = "" if model is None else str(model.resolve())
     cameras = import_cameras(capture, capture_root(capture.root))
-    configure_scene(current_scene(), capture, central(cameras))
+    configure_scene(bpy.context.scene, capture, central(cameras))
     return head
 
 
 def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
-    """Show the avatar in place of the mesh, with every viewport on it; returns the splats.
-
-    link: the avatar's file, relative to the .blend file; fps: frames per second at which the scene
-    plays.
-    """
-    shown = show_avatar(avatar, head)
+    """Show the avatar in place of the mesh, with every viewport on it and a white world, the
+    background of captures without one of their own; bones and cameras are hidden. Returns the
+    splats. link: the avatar's file, relative to the .blend file; fps: of the scene."""
+    shown, scene = show_avatar(avatar, head), bpy.context.scene
     shown[tags.AVATAR] = link
-    hide_object(head, current_scene())
+    hide_object(head, scene)
     go_to_frame(head[tags.TIMESTEPS][0])
-    frame_alone(head, current_scene(), fps)
+    set_frames_per_second(scene, fps)
+    scene.world = bpy.data.worlds.new("World")
+    enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (1, 1, 1, 1)
+    for kind in COLLECTIONS:
+        show_kind(head.parent, kind, scene.view_layers[0], False)
+    frame_head(head, scene.camera, bpy.data.screens)
     return shown
 
 
@@ -114,14 +97,15 @@ def show_world(avatar_file: Path, head: Any) -> Any:
     hidden until they are wanted. Returns them; None where there are none, or the scene has them
     already. Raises StgaError."""
     path = avatar_file.with_name(WORLD_FILE).resolve()
-    known = [thing.get(tags.WORLD) for thing in current_scene().objects]
+    scene = bpy.context.scene
+    known = [thing.get(tags.WORLD) for thing in scene.objects]
     if not path.is_file() or str(path) in known:
         return None
     world = show_world_splats(read_ply(path), WORLD_NAME)
     world.parent = head.parent
     world.matrix_parent_inverse = head.matrix_parent_inverse
     world[tags.WORLD] = str(path)
-    for layer in current_scene().view_layers:
+    for layer in scene.view_layers:
         layer.update()  # which an object that was just made is not in yet
-    hide_object(world, current_scene())
+    hide_object(world, scene)
     return world

@@ -15,20 +15,10 @@ from ..capture.model import Capture, View
 from ..errors import StgaError
 from ..files import write_json
 from ..flame.quaternions import continuous, from_matrices
-from . import tags
-from .arrays import (
-    Z_UP_TO_Y_UP,
-    evaluated_vertices,
-    mesh_vertices,
-    write_curves,
-    write_triangle_curves,
-)
-from .blend_file import set_frames_per_second
-from .compat import action_curves
-from .objects import Warn, log_warning, place, remove
+from . import arrays, tags
+from .objects import Warn, log_warning, place, remove, set_frames_per_second
 
-UP = (0.0, 0.0, 1.0)
-"""Blender's scenes are z-up."""
+UP = (0.0, 0.0, 1.0)  # Blender's scenes are z-up
 ORTHOGRAPHIC_DISTANCE = 1000.0
 """An orthographic view is rendered in perspective from this many times its own width away."""
 
@@ -46,12 +36,9 @@ def render_camera(
     height: int,
     border: tuple[int, int, int, int] | None = None,
 ) -> Camera:
-    """The scene's camera for a final image of width × height pixels.
-
-    camera: the evaluated camera object. border: x, y, width and height in pixels of the render
-    region, from the bottom left; None: the whole image. Raises StgaError unless it is a perspective
-    camera.
-    """
+    """The scene's camera for a final image of width × height pixels. camera: the evaluated camera
+    object. border: x, y, width and height in pixels of the render region, from the bottom left;
+    None: the whole image. Raises StgaError unless it is a perspective camera."""
     if camera is None or camera.type != "CAMERA":
         raise StgaError("The scene has no camera to render through")
     if camera.data.type != "PERSP":
@@ -174,11 +161,8 @@ def central(cameras: list[Any]) -> Any:
 
 
 def set_intrinsics(data: Any, camera: Camera) -> None:
-    """Give a Blender camera's data the focal lengths and principal point of `camera`.
-
-    Blender's shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its
-    width.
-    """
+    """Give a Blender camera's data the focal lengths and principal point of `camera`. Blender's
+    shift is in image widths, right and up; a pixel's height is fl_x / fl_y times its width."""
     data.sensor_fit = "HORIZONTAL"
     data.sensor_width = SENSOR_WIDTH_MM
     data.lens = camera.fl_x * SENSOR_WIDTH_MM / camera.width
@@ -192,9 +176,9 @@ def _set_pose(camera: Any, views: list[View]) -> None:
     camera.matrix_basis = Matrix(poses[0].tolist())
     if np.abs(poses - poses[0]).max() <= POSE_TOLERANCE:
         return
-    curves, frames = action_curves(camera), [view.timestep for view in views]
-    write_curves(curves, "location", frames, poses[:, :3, 3])
-    write_curves(curves, "rotation_quaternion", frames, continuous(from_matrices(poses[:, :3, :3])))
+    frames, turns = [view.timestep for view in views], continuous(from_matrices(poses[:, :3, :3]))
+    arrays.write_curves(camera, "location", frames, poses[:, :3, 3])
+    arrays.write_curves(camera, "rotation_quaternion", frames, turns)
 
 
 def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
@@ -213,7 +197,7 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
         background.show_background_image = row == 0
     # Each is visible from its frame until the next one's; the first also before, the last after.
     paths = [f"background_images[{row}].show_background_image" for row in range(len(found))]
-    write_triangle_curves(data, paths, [view.timestep for view in found], "CONSTANT")
+    arrays.write_triangle_curves(data, paths, [view.timestep for view in found], "CONSTANT")
     data.show_background_images = True
 
 
@@ -233,7 +217,7 @@ def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
             raise StgaError(f"{thing.name}: is mirrored by a negative scale; apply the scale")
         size = thing.get(tags.IMAGE_SIZE) or image_size(depsgraph.scene.render)
         camera = render_camera(evaluated, depsgraph, int(size[0]), int(size[1]))
-        pose = Z_UP_TO_Y_UP @ camera.camera_to_world_gl
+        pose = arrays.Z_UP_TO_Y_UP @ camera.camera_to_world_gl
         entry = {"file_path": f"{thing.name}.png", "camera_id": thing.name}
         entry |= {"w": camera.width, "h": camera.height, "transform_matrix": pose.tolist()}
         entries.append(entry | {name: float(getattr(camera, name)) for name in INTRINSICS[2:]})
@@ -252,15 +236,13 @@ def scene_camera(depsgraph: Any) -> Camera:
 
 def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
     """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
-
     angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there
-    are none.
-    """
+    are none."""
     start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
     if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
-        middle = np.median(mesh_vertices(subject.data), axis=0)
+        middle = np.median(arrays.mesh_vertices(subject.data), axis=0)
     else:
-        vertices = evaluated_vertices(subject)
+        vertices = arrays.evaluated_vertices(subject)
         middle = (vertices.min(0) + vertices.max(0)) / 2
     center = matrix[:3, :3] @ middle + matrix[:3, 3]
     angles = (-angle / 2, angle / 2) if angle else (-np.pi, np.pi)

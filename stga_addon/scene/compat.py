@@ -9,6 +9,7 @@ import numpy as np
 SLOTTED_ACTIONS = bpy.app.version >= (4, 4, 0)
 MODIFIER_INPUT_PROPERTIES = bpy.app.version >= (5, 2, 0)
 NATIVE_SPLATS = hasattr(bpy.types, "GeometryNodePointsSetType")  # from 5.3 on
+APPENDED: list[Any] = getattr(bpy.app.handlers, "blend_import_post", [])  # from 4.3 on
 REC709 = "Linear Rec.709"
 """The scene-linear color space of new files, and of all before Blender 5.0."""
 # Options of a path property whose value may start with "//"; versions before 4.5 refuse this one.
@@ -21,10 +22,7 @@ PATH_OPTIONS = (
 
 def action_curves(owner: Any) -> Any:
     """The f-curve collection that animates the data-block `owner`; makes its action (and slot)
-    where it has none.
-
-    Call `.new(data_path, index=…)` on it, or `animation.write_curve`.
-    """
+    where it has none. Call `.new(data_path, index=…)` on it, or `animation.write_curve`."""
     animation = owner.animation_data or owner.animation_data_create()
     if animation.action is None:
         animation.action = bpy.data.actions.new(f"{owner.name} action")
@@ -40,10 +38,7 @@ def action_curves(owner: Any) -> Any:
 
 def copy_action(owner: Any, name: str) -> Any:
     """Give `owner` a copy of its action, or an empty one if it has none; the old one stays in the
-    file.
-
-    Returns the f-curve collection of the new action, as `action_curves`.
-    """
+    file. Returns the f-curve collection of the new action, as `action_curves`."""
     animation = owner.animation_data or owner.animation_data_create()
     old = animation.action
     if old is None:

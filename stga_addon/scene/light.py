@@ -22,10 +22,8 @@ from .display import splat_nodes
 from .display.splat_object import get_input
 from .layers import Relit
 
-PROPERTY = "stga_lighting"
-"""The scene's `LightingSettings`."""
-MODE_CHANGED: list[Callable[[Any], None]] = []
-"""What is called with a scene whose mode was chosen."""
+PROPERTY = "stga_lighting"  # the scene's `LightingSettings`
+MODE_CHANGED: list[Callable[[Any], None]] = []  # what is called with a scene whose mode was chosen
 
 
 def _mode_changed(settings: Any, context: Any) -> None:
@@ -103,10 +101,8 @@ def _surface_node(tree: Any) -> Any:
 
 
 def light_of(light: Any, matrix: Any) -> Light | None:
-    """A light (evaluated data of an object) at a world matrix; None for one without light.
-
-    Its node tree counts as far as it is one Emission node of constant color and strength.
-    """
+    """A light (evaluated data of an object) at a world matrix; None for one without light. Its node
+    tree counts as far as it is one Emission node of constant color and strength."""
     color, shader = light_strength(light), _surface_node(light_nodes(light))
     if shader is not None and shader.type == "EMISSION":
         emitted, strength = (shader.inputs[name] for name in ("Color", "Strength"))
@@ -168,11 +164,9 @@ def is_linked(light_object: Any, receivers: tuple[Any, ...]) -> bool:
 
 
 class WorldLight(NamedTuple):
-    """What a world's light depends on; equal where its light is.
-
-    color: scene-linear, with strength; of a texture, what its pixels are multiplied with.
-    rotation (9,): row by row, from directions of the world to those of the texture.
-    """
+    """What a world's light depends on; equal where its light is. color: scene-linear, with
+    strength; of a texture, what its pixels are multiplied with. rotation (9,): row by row, from
+    directions of the world to those of the texture."""
 
     color: tuple[float, ...]
     image: Any = None
@@ -232,11 +226,8 @@ class SceneLight:
         to_world: np.ndarray, visible: Sequence[tuple[Any, Any]], depsgraph: Any,
     ) -> Relit | None:  # fmt: skip
         """How the scene lights an avatar whose head has vertices (V, 3); None where its colors are
-        as recorded.
-
-        The same object as long as all is the same, `vertices` by identity. to_world (4, 4): from
-        the avatar's space. visible: objects and their matrices.
-        """
+        as recorded. The same object as long as all is the same, `vertices` by identity. to_world
+        (4, 4): from the avatar's space. visible: objects and their matrices."""
         # A change of the settings of a viewport does not evaluate its scene anew.
         is_viewport = depsgraph.mode == "VIEWPORT"
         settings = lighting_settings(depsgraph.scene if is_viewport else depsgraph.scene_eval)

@@ -1,13 +1,14 @@
-"""Creating, replacing and removing the objects of a capture."""
+"""The open .blend file, its scene and frames, and the objects of captures in it."""
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from math import radians
 from pathlib import Path
 from typing import Any
 
 import bpy
 
+from ..errors import StgaError
 from . import tags
 
 # Receives one sentence for the user; operators pass their own report.
@@ -17,12 +18,9 @@ log_warning: Warn = logging.getLogger(__name__).warning
 
 def capture_root(source: Path) -> Any:
     """The Empty that is the parent of all imported from the folder or file `source`; created where
-    there is none.
-
-    Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so that its
-    children keep the capture's own coordinates. It is in a collection of its own; both are called
-    like the source.
-    """
+    there is none. Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so
+    that its children keep the capture's own coordinates. It is in a collection of its own; both are
+    called like the source."""
     existing = tags.find(tags.ROOT, source)
     if existing:
         return existing[0]
@@ -67,12 +65,9 @@ def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
 
 
 def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> Any:
-    """An object of this kind under `root`, with new `data`; returns it.
-
-    An object that exists from an earlier import is kept and given the new data, so that modifiers,
-    parents and constraints which refer to it go on working; its old data, keyframes and drivers are
-    removed.
-    """
+    """An object of this kind under `root`, with new `data`; returns it. An object that exists from
+    an earlier import is kept and given the new data, so that modifiers, parents and constraints
+    which refer to it go on working; its old data, keyframes and drivers are removed."""
     obj = existing
     if obj is None:
         obj, collection = bpy.data.objects.new(name, data), collection_of(root, kind)
@@ -132,3 +127,70 @@ def _purge(datas: Iterable[Any], actions: Iterable[Any]) -> None:
         left += [background.image for background in getattr(data, "background_images", ())]
         bpy.data.batch_remove([data])
     bpy.data.batch_remove({block for block in left if block is not None and not block.users})
+
+
+def new_file() -> None:
+    """Start from an empty file with factory settings: no default cube, no user preferences."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def empty_file() -> None:
+    """Start from an empty file; preferences and add-ons stay."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+
+
+def save_file(path: Path) -> None:
+    """Save the open file. Raises StgaError where it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bpy.ops.wm.save_as_mainfile(filepath=str(path.resolve()), compress=True)
+    except (OSError, RuntimeError) as error:
+        raise StgaError(f"{path}: cannot be saved ({error})") from error
+
+
+def open_file(path: Path) -> None:
+    """Open a .blend file. Raises StgaError where it cannot be read."""
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path.resolve()))
+    except RuntimeError as error:
+        raise StgaError(f"{path}: cannot be opened ({error})") from error
+
+
+def object_named(name: str) -> Any:
+    """The object of that name in the open file. Raises StgaError where there is none."""
+    found = bpy.data.objects.get(name)
+    if found is None:
+        raise StgaError(f"{bpy.data.filepath}: has no object '{name}'")
+    return found
+
+
+def frames_per_second(scene: Any) -> float:
+    """At which the scene plays."""
+    return float(scene.render.fps / scene.render.fps_base)
+
+
+def set_frames_per_second(scene: Any, rate: float) -> None:
+    """Let the scene play at the rate, which Blender holds as an integer and a divisor."""
+    whole = max(1, round(rate))
+    scene.render.fps, scene.render.fps_base = whole, whole / rate
+
+
+def go_to_frame(frame: int) -> None:
+    """Move the open scene to a frame and evaluate it."""
+    bpy.context.scene.frame_set(frame)
+    bpy.context.view_layer.update()
+
+
+def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
+    """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
+    scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
+    frame, subframe = scene.frame_current, scene.frame_subframe
+    manager.progress_begin(0, max(len(numbers), 1))
+    try:
+        for index, number in enumerate(numbers):
+            scene.frame_set(number)
+            manager.progress_update(index)
+            yield number
+    finally:
+        manager.progress_end()
+        scene.frame_set(frame, subframe=subframe)

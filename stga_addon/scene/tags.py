@@ -62,10 +62,7 @@ def mark(obj: Any, kind: str, capture: Path) -> None:
 
 def find(kind: str, capture: Path) -> list[Any]:
     """All objects of a kind in the current scene that were made from the capture in folder
-    `capture`.
-
-    Objects linked from other files are left out: they cannot be edited here.
-    """
+    `capture`. Objects linked from other files are left out: they cannot be edited here."""
     folder = str(capture.resolve())
     return [
         obj

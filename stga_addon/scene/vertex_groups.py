@@ -1,4 +1,5 @@
-"""Per-frame selections as vertex groups, which an artist can view, paint and scrub through.
+"""Per-frame selections as vertex groups, which an artist can view, paint and scrub through; shares
+of selection, or errors of the avatar, by triangle as colors on the head.
 
 A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when
 all three of its vertices are in the group. Writing a selection and reading it back therefore keeps
@@ -9,23 +10,22 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bmesh
+import bpy
 import numpy as np
 
 from ..capture.meshes import SELECTED_WEIGHT
 from ..errors import StgaError
 from . import tags
-from .arrays import mesh_triangles, read_values
-from .display.splat_attributes import FACE
+from .arrays import flat_floats, mesh_triangles, read_values
+from .display.node_builder import Nodes, new_material, new_socket
+from .display.splat_attributes import FACE, with_alpha, write_attributes
 
 
 def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
     """Replace the head's selection groups by one vertex group `stga_<timestep>` per timestep,
-    weight 1 on its vertices.
-
-    selection: timestep -> (F,) bool. A timestep that selects nothing gets no group. Other vertex
-    groups stay. Raises StgaError where the head is in edit mode or a selection does not have one
-    entry per triangle.
-    """
+    weight 1 on its vertices. selection: timestep -> (F,) bool. A timestep that selects nothing gets
+    no group. Other vertex groups stay. Raises StgaError where the head is in edit mode or a
+    selection does not have one entry per triangle."""
     if head.mode == "EDIT":
         raise StgaError(f"{head.name}: is in edit mode; leave it before the selection is written")
     faces = mesh_triangles(head.data)
@@ -57,11 +57,9 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
 
 
 def read_selection(head: Any) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool of every timestep of the head, from its current selection groups.
-
-    A triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's
-    group; a timestep without a group selects nothing.
-    """
+    """timestep -> (F,) bool of every timestep of the head, from its current selection groups. A
+    triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's
+    group; a timestep without a group selects nothing."""
     head.update_from_editmode()
     groups = {
         timestep: group.index
@@ -91,11 +89,9 @@ def read_regions(head: Any, names: Sequence[str]) -> dict[str, np.ndarray]:
 def read_triangle_weights(head: Any, name: str) -> np.ndarray:
     """(F,) float32 weight of each triangle in a vertex group: the least of its corners'."""
     head.update_from_editmode()
-    index, weights = head.vertex_groups[name].index, np.zeros(len(head.data.vertices), np.float32)
-    for vertex in head.data.vertices:
-        for member in vertex.groups:
-            if member.group == index:
-                weights[vertex.index] = member.weight
+    index = head.vertex_groups[name].index
+    members = ({each.group: each.weight for each in v.groups} for v in head.data.vertices)
+    weights = np.array([groups.get(index, 0.0) for groups in members], np.float32)
     return np.asarray(weights[mesh_triangles(head.data)].min(1))
 
 
@@ -140,3 +136,70 @@ def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
     in_group = np.zeros((len(groups), len(members)), bool)
     in_group[rows[selected], vertices[selected]] = True
     return list(in_group[:, mesh_triangles(head.data)].all(2))
+
+
+SHARE = "stga_selected_share"  # on faces: fraction of the frames that select them
+RESIDUAL = "stga_residual"  # on faces: mean absolute error (0…1) of what their splats show
+HEAT = "stga_heat"  # on face corners: one of these as a color, relative to the largest
+MODIFIER = "STGA Heat Map"
+# Linear RGB from never to most often selected.
+STOPS = (0.0, 1e-9, 0.25, 0.5, 0.75, 1.0)
+COLORS = (
+    (0.1, 0.1, 0.1),
+    (0.02, 0.03, 0.3),
+    (0.05, 0.35, 0.6),
+    (0.15, 0.6, 0.1),
+    (0.95, 0.6, 0.02),
+    (0.9, 0.05, 0.01),
+)
+
+
+def show_heat_map(
+    head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None
+) -> None:
+    """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value). Its
+    own materials stay: a modifier assigns the heat map's. The colors are the active color
+    attribute, for solid shading, and a material, for EEVEE and Cycles. attribute: SHARE or
+    RESIDUAL, in which the values are stored."""
+    hide_heat_map(head)
+    whole = values.max(initial=0.0) if largest is None else largest
+    scaled = np.minimum(values / max(whole, 1e-9), 1.0)
+    channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
+    colors = flat_floats(np.repeat(with_alpha(np.column_stack(channels)), 3, axis=0))
+    write_attributes(head.data, {attribute: ("FLOAT", "value", flat_floats(values))}, "FACE")
+    write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", colors)}, "CORNER")
+    head.data.attributes.active_color_name = HEAT
+    tree = bpy.data.node_groups.get(MODIFIER)
+    if tree is None:  # it assigns the heat map's material
+        tree = bpy.data.node_groups.new(MODIFIER, "GeometryNodeTree")
+        tree.is_modifier = True
+        for side in ("INPUT", "OUTPUT"):
+            new_socket(tree, "Geometry", side, "Geometry")
+        nodes = Nodes(tree)
+        inputs = {"Geometry": nodes.out("NodeGroupInput")}
+        inputs["Material"] = new_material(MODIFIER, _unlit)
+        colored = nodes.out("GeometryNodeSetMaterial", inputs)
+        nodes.finish("NodeGroupOutput", {"Geometry": colored})
+    head.modifiers.new(MODIFIER, "NODES").node_group = tree
+
+
+def hide_heat_map(head: Any) -> None:
+    """Show the head as it was before `show_heat_map`."""
+    for modifier in [old for old in head.modifiers if old.name.startswith(MODIFIER)]:
+        head.modifiers.remove(modifier)
+    for name in (SHARE, RESIDUAL, HEAT):
+        if name in head.data.attributes:
+            head.data.attributes.remove(head.data.attributes[name])
+
+
+def has_heat_map(head: Any) -> bool:
+    return MODIFIER in head.modifiers
+
+
+def shows_residuals(head: Any) -> bool:
+    return has_heat_map(head) and RESIDUAL in head.data.attributes
+
+
+def _unlit(nodes: Nodes) -> Any:
+    color = nodes.add("ShaderNodeAttribute", attribute_name=HEAT).outputs["Color"]
+    return nodes.out("ShaderNodeEmission", {"Color": color})

@@ -30,6 +30,15 @@ OWN_VIEW_PRIOR = 6.0
 """Observations of all cameras beside a camera's own: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
 MAX_SAMPLES = 1 << 14  # Of an image at a time: OpenCV takes less than 2^15
+POINT_SHARE = 0.25  # Weight of a point in a view: neighboring points share pixels
+OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
+"""By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
+FLOW_LEVEL, FLOW_POINTS, FLOW_ITERATIONS = 1, 2, 4
+"""Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton
+steps."""
+FLOW_SHARE, FLOW_SCALE_PX = 0.3, 2.0
+"""Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
+MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
 MIN_OBSERVATIONS = 1.0
 """Sum of the weights of the views of a point, below which its texture is not known."""
 
@@ -41,6 +50,19 @@ class Level:
     camera: Camera
     channels: np.ndarray
     gradient: np.ndarray
+
+
+@dataclass(frozen=True)
+class PyramidView:
+    """One camera's image at a timestep: key and pose of the camera in the capture's world, and
+    pyramid."""
+
+    key: bytes
+    camera: Camera
+    levels: Sequence[Level]
+
+
+Views = Sequence[PyramidView]  # Of one timestep
 
 
 @dataclass(frozen=True)
@@ -79,9 +101,9 @@ def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level
         small = camera.scaled(min(1.0, max(pixel, 1e-9) / size))
         image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
         colors = cv2.GaussianBlur(image.astype(np.float32) @ COLORS.T, (0, 0), BLUR_PX)
-        luma = colors[..., 0]
-        detail = luma - cv2.GaussianBlur(luma, (0, 0), DETAIL_PX)
-        channels = np.stack([luma, detail, colors[..., 1]], axis=2)
+        brightness, redness = np.moveaxis(colors, 2, 0)
+        detail = brightness - cv2.GaussianBlur(brightness, (0, 0), DETAIL_PX)
+        channels = np.stack([brightness, detail, redness], axis=2)
         along = np.array([[-0.5, 0, 0.5]], np.float32)
         gradient = np.stack([cv2.filter2D(channels, -1, own) for own in (along, along.T)])
         levels.append(Level(small, channels, gradient))
@@ -102,6 +124,45 @@ def sampled(images: Sequence[np.ndarray], pixels: np.ndarray) -> list[np.ndarray
     return [
         np.concatenate([cv2.remap(image, *part, **border)[0] for part in parts]) for image in images
     ]
+
+
+def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the
+    camera."""
+    within = (pixels > 1) & (pixels < [camera.width - 1, camera.height - 1])
+    return np.asarray(within.all(1) & (depth > 0))
+
+
+def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(N, 2, 3): derivatives of the pixels of points (N, 3) by their positions."""
+    turn, at = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    x, y, z = (points @ turn.T + at).T
+    z = np.maximum(z, 1e-6)
+    of_x = (camera.fl_x / z)[:, None] * (turn[0] - (x / z)[:, None] * turn[2])
+    of_y = (camera.fl_y / z)[:, None] * (turn[1] - (y / z)[:, None] * turn[2])
+    return np.stack([of_x, of_y], axis=1)
+
+
+def flow_targets(at: np.ndarray, before: Views, now: Views) -> Any:
+    """(key, camera, pixels (M, 2) to which optical flow (DIS, Kroeger et al. 2016) moves points at
+    `at` (M, 3)) of each camera that saw both timesteps."""
+    import cv2
+
+    opencv: Any = cv2  # whose type stubs lack DIS
+    flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_FAST)
+    first = {view.key: view.levels[FLOW_LEVEL] for view in before}
+    for view in now:
+        level, old = view.levels[FLOW_LEVEL], first.get(view.key)
+        shape = level.channels.shape
+        if old is not None and old.channels.shape == shape and min(shape[:2]) >= MIN_FLOW_SIDE_PX:
+            pixels, _ = old.camera.project(at)
+            motion = flow.calc(luma(old), luma(level), None)
+            yield view.key, level.camera, pixels + sampled([motion], pixels)[0]
+
+
+def luma(level: Level) -> np.ndarray:
+    """(H, W) uint8 of an image."""
+    return np.clip(level.channels[..., 0], 0, 255).astype(np.uint8)
 
 
 def light_basis(normals: np.ndarray) -> np.ndarray:

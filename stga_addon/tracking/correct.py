@@ -47,29 +47,20 @@ def correct_capture(
     capture = open_capture(out, model)
     if capture.flame is None:
         raise StgaError(f"{out}: was not tracked with FLAME; only FLAME's pose can be corrected")
-    places, used = read_places(out / LANDMARKS_FOLDER / PLACES_FILE, len(capture.flame.model.faces))
     timesteps, solved = _solved(out, capture.flame)
     rows = _rows(out, timesteps, keys, solved.shape[1])
-    report_file = read_json(out / REPORT_FILE)
-    trust = _trust(out / REPORT_FILE, report_file, timesteps)
-    footage = open_footage(out)
-    by_name = tuple(sorted(footage.cameras, key=lambda camera: camera.name))
-    footage = replace(footage, cameras=by_name)
-    found = read_landmarks(footage, out / LANDMARKS_FOLDER)
-    check_count(found, places)
-    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
-        raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
+    trust = _trust(out / REPORT_FILE, read_json(out / REPORT_FILE), timesteps)
+    places, used, _, _ = _landmarks(out, capture)
     report("Solve", 0, 1)
     person = with_identity(capture.flame).model
-    chosen = SurfacePoints(places.face[used], places.barycentric[used])
-    heads = corrected(person, chosen, solved, trust, rows, span)
+    heads = corrected(person, places[used], solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"
         write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
         report("Heads", number + 1, len(timesteps))
     report("Contact sheet", 0, 1)
-    _report_errors(out, report_file, open_capture(out, model), footage, found, places, used)
+    report_errors(out, model)
 
 
 def corrected(
@@ -185,16 +176,11 @@ def _trust(path: Path, report: Any, timesteps: Sequence[int]) -> np.ndarray:
     return np.where(np.isin(timesteps, list(set(without))), 0.0, 1 - np.clip(worst, 0.0, 1.0))
 
 
-def _report_errors(
-    out: Path,
-    report: dict[str, Any],
-    capture: Capture,
-    footage: Footage,
-    found: Mapping[str, CameraLandmarks],
-    places: SurfacePoints,
-    used: np.ndarray,
-) -> None:
-    """Measure the reprojection errors of the corrected capture, and draw its contact sheet."""
+def report_errors(out: Path, model: Path | None) -> float:
+    """Measure the reprojection errors of a tracked capture whose parameters were replaced, and draw
+    its contact sheet. Returns the median, in pixels. Raises StgaError for damaged landmarks."""
+    capture = open_capture(out, model)
+    places, used, footage, found = _landmarks(out, capture)
     errors: dict[str, dict[int, float]] = {camera.name: {} for camera in footage.cameras}
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     for name, own in found.items():
@@ -205,8 +191,9 @@ def _report_errors(
                 head = places.on(capture.mesh(timestep), capture.faces)
                 distance = np.linalg.norm(cameras[name].project(head[use])[0] - pixels[use], axis=1)
                 errors[name][timestep] = float(np.median(distance))
-    every = [px for own in errors.values() for px in own.values()]
-    report["median_reprojection_px"] = round(float(np.median(every)), 3)
+    median = float(np.median([px for own in errors.values() for px in own.values()]))
+    report = read_json(out / REPORT_FILE)
+    report["median_reprojection_px"] = round(median, 3)
     report["reprojection_px"] = {
         name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()
     }
@@ -214,3 +201,20 @@ def _report_errors(
     misfit = _misfit(report)
     sheet = out / SHEET_FILE
     write_contact_sheet(sheet, footage, cameras, capture.mesh, capture.faces, errors, misfit)
+    return median
+
+
+def _landmarks(
+    out: Path, capture: Capture
+) -> tuple[SurfacePoints, np.ndarray, Footage, dict[str, CameraLandmarks]]:
+    """A tracked capture's places of landmarks, which of them are reliable, its cameras by name, and
+    what was detected. Raises StgaError where there is no face."""
+    places, used = read_places(out / LANDMARKS_FOLDER / PLACES_FILE, len(capture.faces))
+    footage = open_footage(out)
+    by_name = tuple(sorted(footage.cameras, key=lambda camera: camera.name))
+    footage = replace(footage, cameras=by_name)
+    found = read_landmarks(footage, out / LANDMARKS_FOLDER)
+    check_count(found, places)
+    if not any(own.confidence.any() and own.confidence[:, used].any() for own in found.values()):
+        raise StgaError(f"{out / LANDMARKS_FOLDER}: has no landmarks of a face")
+    return places, used, footage, found

@@ -7,27 +7,21 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.camera import Camera, look_at
+from ..capture.mesh_geometry import rasterize, vertex_normals
 from ..errors import StgaError
 from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
 from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
-from .fit import MIN_LANDMARKS
-from .mesh_image import SKIN_RGB, shaded_image
+from .fit import MIN_LANDMARKS, Triangulation, triangulate
 from .posed_points import SurfacePoints
 from .seen_surface import large_parts
-from .triangulation import Triangulation, triangulate
 
-DIRECTIONS_DEG = (
-    (0, 0),
-    (-25, 0),
-    (25, 0),
-    (-50, 0),
-    (50, 0),
-    (0, 20),
-    (0, -20),
-    (-30, 15),
-    (30, 15),
-)
+SKIN_RGB = np.array([0.78, 0.58, 0.48])
+BACKGROUND = 0.45
+KEY_LIGHT = np.array([0.35, 0.55, 0.75])
+"""Direction towards the light in camera axes: x right, y up, z towards the camera."""
+AMBIENT = 0.38
+VIEWS_DEG = (0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (0, 20), (0, -20), (-30, 15), (30, 15)
 """Azimuth and elevation of the pictures."""
 PICTURE_SIZE = 512
 PICTURE_DISTANCE, PICTURE_FOCAL = 3.5, 3.0
@@ -49,6 +43,25 @@ CANDIDATES = 48
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
 
 
+def shaded_image(
+    vertices: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray | None = None
+) -> np.ndarray:
+    """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3), 0 to 1; None: skin's."""
+    triangle, weights = rasterize(vertices, faces, camera)
+    seen = triangle >= 0
+    corners, inside = faces[triangle[seen]], weights[seen][..., None]
+    axes = camera.world_to_camera[:3, :3]
+    normal = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T * [1, -1, -1]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
+    lit = (1 - AMBIENT) * np.clip(normal @ light, 0, 1)
+    brightness = AMBIENT * (0.75 + 0.25 * normal[:, 1]) + lit
+    color = SKIN_RGB if colors is None else (colors[corners] * inside).sum(1)
+    image = np.full((camera.height, camera.width, 3), BACKGROUND)
+    image[seen] = np.clip(brightness[:, None], 0, 1) * color * 1.15
+    return np.asarray(255 * np.clip(image, 0, 1) ** (1 / 1.8) + 0.5, np.uint8)
+
+
 def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[SurfacePoints, np.ndarray]:
     """The detector's landmarks on the neutral head: their places, and (N,) bool which of them are
     reliable.
@@ -63,7 +76,7 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
     located, count = _located(neutral, faces, colors, detector)
     if located is None:
         raise StgaError(
-            f"{name}: shows a face in {count} of {len(DIRECTIONS_DEG)} pictures from the front, "
+            f"{name}: shows a face in {count} of {len(VIEWS_DEG)} pictures from the front, "
             f"expected at least {MIN_PICTURES}; it must look along +z with y up"
         )
     seen = [(neutral, located.position)]
@@ -77,18 +90,15 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
     places = SurfacePoints(skin[on.face], on.barycentric)
     distance = np.linalg.norm(places.on(neutral, faces) - located.position, axis=1)
     extent = float(np.ptp(neutral, axis=0).max())
-    reliable = (distance < MAX_SURFACE_DISTANCE * extent) & (
-        located.residual < MAX_RESIDUAL * extent
-    )
+    reliable = distance < MAX_SURFACE_DISTANCE * extent
+    reliable &= located.residual < MAX_RESIDUAL * extent
     if len(reliable) == MESH_POINTS:
         reliable[FIRST_IRIS_POINT:] = False
         places, pupils = _with_pupils(model, places, located.position)
         reliable[pupils] = True
     if reliable.sum() < MIN_LANDMARKS:
-        raise StgaError(
-            f"{name}: {reliable.sum()} of {len(reliable)} landmarks that are found in its pictures "
-            f"lie on its surface, expected at least {MIN_LANDMARKS}"
-        )
+        few = f"{reliable.sum()} of {len(reliable)} landmarks that are found in its pictures"
+        raise StgaError(f"{name}: {few} lie on its surface, expected at least {MIN_LANDMARKS}")
     return places, reliable
 
 
@@ -132,19 +142,17 @@ def _moved_heads(model: FlameModel) -> list[np.ndarray]:
 
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:
-    """Cameras in front of a head (V, 3), in DIRECTIONS_DEG."""
+    """Cameras in front of a head (V, 3), in VIEWS_DEG."""
     low, high = vertices.min(0), vertices.max(0)
     center, distance = (low + high) / 2, PICTURE_DISTANCE * float((high - low).max())
     cameras = []
-    for azimuth, elevation in DIRECTIONS_DEG:
+    for azimuth, elevation in VIEWS_DEG:
         turn, rise = math.radians(azimuth), math.radians(elevation)
-        direction = np.array(
-            [math.sin(turn) * math.cos(rise), math.sin(rise), math.cos(turn) * math.cos(rise)]
-        )
+        across = math.cos(rise)
+        direction = np.array([math.sin(turn) * across, math.sin(rise), math.cos(turn) * across])
+        focal = PICTURE_FOCAL * PICTURE_SIZE
         eye = center + distance * direction
-        cameras.append(
-            look_at(eye, center, PICTURE_SIZE, PICTURE_SIZE, PICTURE_FOCAL * PICTURE_SIZE)
-        )
+        cameras.append(look_at(eye, center, PICTURE_SIZE, PICTURE_SIZE, focal))
     return cameras
 
 
@@ -174,16 +182,12 @@ def nearest_points(
     third = np.clip((pb - pa + aa - ab) / np.maximum(aa - 2 * ab + bb, tiny), 0, 1)
     first, second = (np.clip(p / np.maximum(q, tiny), 0, 1) for p, q in ((pa, aa), (pb, bb)))
     # inside the triangle, or else on one of its edges
-    shares = np.stack(
-        [
-            np.stack([np.where(within, u, 0), first, np.zeros_like(u), 1 - third]),
-            np.stack([np.where(within, v, 0), np.zeros_like(u), second, third]),
-        ],
-        axis=-1,
-    )
-    distance = np.linalg.norm(
-        away - shares[..., :1] * one - shares[..., 1:] * other, axis=3
-    )  # (4, N, candidates)
+    none = np.zeros_like(u)
+    along = np.stack([np.where(within, u, 0), first, none, 1 - third])
+    across = np.stack([np.where(within, v, 0), none, second, third])
+    shares = np.stack([along, across], axis=-1)
+    inner = shares[..., :1] * one + shares[..., 1:] * other
+    distance = np.linalg.norm(away - inner, axis=3)  # (4, N, candidates)
     kind, rows = distance.argmin(0), np.arange(len(points))
     best = distance.min(0).argmin(1)
     share = shares[kind[rows, best], rows, best]

@@ -15,12 +15,19 @@ import numpy as np
 from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..worker.helpers import Helpers, Step
-from .appearance import Sample, Texture, average_texture, pyramid, robust
-from .dense_head import HELD_OUT_LEVEL, REGIONS, UPPER_FACE, DenseHead
-from .dense_terms import Misfit, PyramidView, flow_start, misfit, photo_term, samples
-from .fit import HeadFit, LandmarkVisibility, TimestepLandmarks, observed_landmarks, triangulated
+from .appearance import PyramidView, Sample, Texture, Views, average_texture, pyramid, robust
+from .dense_head import HELD_OUT_LEVEL, NO_TEXTURE, REGIONS, UPPER_FACE, DenseHead, Misfit
+from .fit import (
+    HeadFit,
+    LandmarkVisibility,
+    RecordedTake,
+    TimestepLandmarks,
+    excerpt,
+    observed_landmarks,
+    triangulated,
+)
 from .landmarks import Report
-from .seen_surface import RecordedTake, excerpt
+from .posed_points import split
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smooth_take
 
 MIN_TIMESTEPS = 6
@@ -83,10 +90,9 @@ class DenseFit:
 @dataclass(frozen=True)
 class _Shot:
     """What is known of a timestep: views, triangulated landmarks, where the fit so far is, and in
-    which regions of the
-    face (R,) landmarks are the better evidence."""
+    which regions of the face (R,) landmarks are the better evidence."""
 
-    views: Sequence[PyramidView]
+    views: Views
     landmarks: Observation
     start: np.ndarray
     by_landmarks: np.ndarray
@@ -135,26 +141,21 @@ def fit_dense(
         stage = "Refinement" if settled else "Dense tracking"
         return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
 
-    weights = np.maximum(
-        head.rest([head.reduced(fit.parameters[t]) for t in chosen]),
-        SETTLED_WEIGHT if settled else 0,
-    )
+    weights = head.rest([head.reduced(fit.parameters[t]) for t in chosen])
+    weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)
     some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
     rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
-    sampled = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
-    texture = average_texture([sample for part in sampled for sample in part])
-    coarse = np.concatenate(
-        in_parts(_started_part, [(part, texture) for part in some], len(chosen))
-    )
-    usual = np.quantile(coarse, USUAL_QUANTILE, axis=0)
+    seen = in_parts(_sampled_part, list(zip(some, rows, strict=True)), 0)
+    texture = average_texture([sample for part in seen for sample in part])
+    started = in_parts(_started_part, [(part, texture) for part in some], len(chosen))
+    usual = np.quantile(np.concatenate(started), USUAL_QUANTILE, axis=0)
     parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
     found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
     solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     terms = list(zip(solved["matrix"], solved["right"], strict=True))
     smooth = smooth_take(head.head, solved["values"], terms, fit.ordered)
-    moved = replace(
-        fit, parameters={t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)}
-    )
+    parameters = {t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)}
+    moved = replace(fit, parameters=parameters)
     landmarks = _agreeing(head, moved, take, solved["missed"], solved["better"])
     return DenseFit(moved, landmarks, dict(zip(timesteps, solved["misfit"], strict=True)))
 
@@ -166,9 +167,8 @@ def _sampled_part(
     solver, found = _Solver(fit, take), []
     for timestep, weight in zip(sorted(take.landmarks), weights, strict=True):
         shot = solver.shot(timestep)
-        found += samples(
-            solver.head, shot.views, shot.start, weight * solver.visible(shot, shot.start)
-        )
+        visible = solver.visible(shot, shot.start)
+        found += solver.head.samples(shot.views, shot.start, weight * visible)
         step()
     return found
 
@@ -176,12 +176,11 @@ def _sampled_part(
 def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
     """(T, R) how badly the regions are explained in coarse images from where the fit is, at the
     timesteps of a part."""
-    solver, found = _Solver(fit, take), []
+    solver, found = _Solver(fit, take, texture), []
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
-        found.append(
-            solver.started(shot, texture, shot.start, solver.visible(shot, shot.start))[1].regions
-        )
+        visible = solver.visible(shot, shot.start)
+        found.append(solver.started(shot, shot.start, visible)[1].regions)
         step()
     return np.stack(found)
 
@@ -191,32 +190,32 @@ def _solved_part(
 ) -> dict[str, np.ndarray]:
     """The timesteps of a part, solved one from the other; by name, T of what `_Solved` has of
     each."""
-    solver = _Solver(fit, take, SETTLED_GAIN if settled else 0.0)
+    solver = _Solver(fit, take, texture, SETTLED_GAIN if settled else 0.0)
     before: tuple[_Shot, _Solved] | None = None
-    solved: list[_Solved] = []
+    solved: list[dict[str, Any]] = []
     for timestep in sorted(take.landmarks, reverse=settled):
         shot = solver.shot(timestep)
-        solved.append(solver.solve(shot, texture, before, usual))
-        before = shot, solved[-1]
+        own = solver.solve(shot, before, usual)
+        before, (matrix, right) = (shot, own), own.terms
+        every = vars(own) | {"matrix": matrix, "right": right, "misfit": own.misfit.regions}
+        solved.append(every)
         step()
-    if settled:
-        solved.reverse()
-    return {
-        "values": np.stack([own.values for own in solved]),
-        "matrix": np.stack([own.terms[0] for own in solved]),
-        "right": np.stack([own.terms[1] for own in solved]),
-        "misfit": np.stack([own.misfit.regions for own in solved]),
-        "missed": np.stack([own.missed for own in solved]),
-        "better": np.array([own.better for own in solved]),
-    }
+    names, order = ("values", "matrix", "right", "misfit", "missed", "better"), -1 if settled else 1
+    return {name: np.stack([own[name] for own in solved[::order]]) for name in names}
 
 
 class _Solver:
     """Gauss–Newton at the timesteps of a take."""
 
-    def __init__(self, fit: HeadFit, take: RecordedTake, min_gain: float = 0.0) -> None:
-        self.head, self._min_gain = DenseHead(fit.head, take.places, take.reliable), min_gain
-        self._fit, self._take = fit, take
+    def __init__(
+        self,
+        fit: HeadFit,
+        take: RecordedTake,
+        texture: Texture = NO_TEXTURE,
+        min_gain: float = 0.0,
+    ) -> None:
+        self.head = DenseHead(fit.head, take.places, take.reliable, texture)
+        self._fit, self._take, self._min_gain = fit, take, min_gain
         self._visibility = LandmarkVisibility(fit.head, take.places)
 
     def shot(self, timestep: int) -> _Shot:
@@ -224,153 +223,119 @@ class _Solver:
         parameters, world = self._fit.parameters[timestep], self._fit.to_capture
         start = self.head.reduced(parameters)
         center, views = self.head.positions(start).mean(0), []
-        for camera, image in self._take.images(timestep, MAX_CAMERAS):
-            own = world.camera(camera)
-            views.append(
-                PyramidView(camera.world_to_camera.tobytes(), own, pyramid(own, image, center))
-            )
+        for recording, image in self._take.images(timestep, MAX_CAMERAS):
+            camera, key = world.camera(recording), recording.world_to_camera.tobytes()
+            views.append(PyramidView(key, camera, pyramid(camera, image, center)))
         model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
         seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
         found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
-        return _Shot(
-            views, observed_landmarks(found, world, reliable), start, np.zeros(len(REGIONS), bool)
-        )
+        landmarks = observed_landmarks(found, world, reliable)
+        return _Shot(views, landmarks, start, np.zeros(len(REGIONS), bool))
 
     def visible(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
         """Visibility (C, N) from the cameras of a timestep, of a head with these parameters."""
         return self.head.visibility(values, [view.camera for view in shot.views])
 
     def solve(
-        self, shot: _Shot, texture: Texture, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
+        self, shot: _Shot, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
     ) -> _Solved:
         """The parameters that explain a timestep best, or the start where none are better; before:
         another timestep and its result."""
         visible = self.visible(shot, shot.start)
-        best, error = self.started(shot, texture, shot.start, visible)
+        best, error = self.started(shot, shot.start, visible)
         if (error.regions > USUAL_FACTOR * usual).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
             if before is not None:
-                others.append(
-                    flow_start(
-                        self.head, before[0].views, before[1].visible, before[1].values, shot.views
-                    )
-                )
+                last, own = before
+                start = self.head.flow_start(last.views, own.visible, own.values, shot.views)
+                others.append(start)
             for other in others:
-                values, found = self.started(shot, texture, other, visible)
+                values, found = self.started(shot, other, visible)
                 if found.all < error.all:
                     best, error = values, found
-        best, visible = self._refined(shot, texture, best)
-        while (astray := self._astray(shot, texture, visible, best) & ~shot.by_landmarks).any():
+        best, visible = self._refined(shot, best)
+        while (astray := self._astray(shot, best, visible) & ~shot.by_landmarks).any():
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
-            best = self._descended(shot, texture, shot.start, visible, START_STEPS)
-            best, visible = self._refined(shot, texture, best)
+            best = self._descended(shot, shot.start, visible, START_STEPS)
+            best, visible = self._refined(shot, best)
         by_images = self._by_images(shot, visible)
-        old, new = (self._evidence(shot, texture, own, by_images) for own in (shot.start, best))
+        old, new = (self._evidence(shot, own, by_images) for own in (shot.start, best))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
-            terms = self._terms(shot, texture, best, visible, 0)[:2]
+            terms = self._terms(shot, best, visible, 0)[:2]
         else:
             best = shot.start
             stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
             terms = stiff, -prior_terms(self.head.head, best)[1]  # which the prior does not move
-        error, missed = (
-            self._evidence(shot, texture, best, visible),
-            self._missed(shot.landmarks, best),
-        )
-        return _Solved(best, visible, terms, error, missed, better)
+        missed = self._missed(shot.landmarks, best)
+        return _Solved(best, visible, terms, self._evidence(shot, best, visible), missed, better)
 
-    def _evidence(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
-    ) -> Misfit:
+    def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""
-        return misfit(
-            self.head, shot.views, visible, texture, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL
-        )
+        return self.head.misfit(shot.views, visible, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
 
     def _by_images(self, shot: _Shot, visible: np.ndarray) -> np.ndarray:
         """Visibility (C, N), 0 for points in regions where landmarks are the better evidence."""
         return np.where(shot.by_landmarks[self.head.region], 0.0, visible)
 
-    def _astray(
-        self, shot: _Shot, texture: Texture, visible: np.ndarray, values: np.ndarray
-    ) -> np.ndarray:
+    def _astray(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
         clearly better; and those of the upper face that went farther from them than it moves."""
-        old, new = (
-            self._evidence(shot, texture, own, visible).regions for own in (shot.start, values)
-        )
-        was, now = (self._missed(shot.landmarks, own) for own in (shot.start, values))
-        astray = np.zeros(len(REGIONS), bool)
+        both, astray = (shot.start, values), np.zeros(len(REGIONS), bool)
+        old, new = (self._evidence(shot, own, visible).regions for own in both)
+        missed = [self._missed(shot.landmarks, own) for own in both]
         for region in range(len(REGIONS)):
             use = (self.head.landmark_region == region) & (shot.landmarks.weight > 0)
-            before, after = (float(np.median(own[use])) if use.any() else 0.0 for own in (was, now))
+            before, after = (float(np.median(own[use])) if use.any() else 0.0 for own in missed)
             unproven = new[region] > (1 - MIN_REGION_GAIN) * old[region]
             astray[region] = unproven and after > MAX_GROWTH * before + SMALL_MISS_M
             astray[region] |= region >= UPPER_FACE and after > before + MAX_UPPER_MISS_M
         return astray
 
-    def _refined(
-        self, shot: _Shot, texture: Texture, values: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _refined(self, shot: _Shot, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters after the steps in fine images, and the visibility (C, N) of which they
         are."""
         visible = self.visible(shot, values)
-        values = self._descended(shot, texture, values, visible, FINE_STEPS)
+        values = self._descended(shot, values, visible, FINE_STEPS)
         for _ in range(LAST_ROUNDS):
             assumed, visible = visible, self.visible(shot, values)
             if np.array_equal(assumed, visible):
                 break
-            values = self._descended(shot, texture, values, visible, LAST_STEPS)
+            values = self._descended(shot, values, visible, LAST_STEPS)
         return values, visible
 
     def started(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray
+        self, shot: _Shot, values: np.ndarray, visible: np.ndarray
     ) -> tuple[np.ndarray, Misfit]:
         """Parameters after the steps in coarse images, and how badly these are explained."""
-        values = self._descended(shot, texture, values, visible, START_STEPS)
-        return values, misfit(
-            self.head, shot.views, visible, texture, values, START_LEVEL, START_LEVEL
-        )
+        values = self._descended(shot, values, visible, START_STEPS)
+        return values, self.head.misfit(shot.views, visible, values, START_LEVEL, START_LEVEL)
 
     def _descended(
-        self,
-        shot: _Shot,
-        texture: Texture,
-        values: np.ndarray,
-        visible: np.ndarray,
-        plan: Sequence[tuple[int, int]],
+        self, shot: _Shot, values: np.ndarray, visible: np.ndarray, plan: Sequence[tuple[int, int]]
     ) -> np.ndarray:
-        """Parameters after up to so many steps in each level of the plan."""
+        """Parameters after up to so many damped Gauss–Newton steps in each level of the plan."""
         for level, steps in plan:
             for _ in range(steps):
-                step, motion = self._step(shot, texture, values, visible, level)
+                matrix, right, jacobian = self._terms(shot, values, visible, level)
+                precision, pull = prior_terms(self.head.head, values)
+                matrix = matrix + np.diag(precision)
+                matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
+                step = np.linalg.solve(matrix, right + pull)
+                step = step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN)
                 values = values + step
-                if motion < CONVERGED_STEP_M:
+                if np.sqrt(3 * np.mean((jacobian @ step) ** 2)) < CONVERGED_STEP_M:
                     break
         return values
 
-    def _step(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
-    ) -> tuple[np.ndarray, float]:
-        """A damped Gauss–Newton step, and the root mean square in meters of what it moves the
-        points by."""
-        matrix, right, jacobian = self._terms(shot, texture, values, visible, level)
-        precision, pull = prior_terms(self.head.head, values)
-        matrix = matrix + np.diag(precision)
-        matrix[np.diag_indices(len(matrix))] *= 1 + DAMPING
-        step = np.linalg.solve(matrix, right + pull)
-        step = step / max(1.0, np.abs(step[-RIGID_SIZE:-3]).max() / MAX_TURN)
-        return step, float(np.sqrt(3 * np.mean((jacobian @ step) ** 2)))
-
     def _terms(
-        self, shot: _Shot, texture: Texture, values: np.ndarray, visible: np.ndarray, level: int
+        self, shot: _Shot, values: np.ndarray, visible: np.ndarray, level: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior, and
         derivatives (M, 3, K + 18) of the level's points."""
         _, jacobian = self.head.linearized(values, level)
-        curvature, slope = photo_term(
-            self.head, shot.views, self._by_images(shot, visible), texture, values, level
-        )
+        by_images = self._by_images(shot, visible)
+        curvature, slope = self.head.photo_term(shot.views, by_images, values, level)
         # a level weighs the same with fewer points
         share = len(self.head.rows[0]) / len(jacobian)
         flat = jacobian.reshape(-1, len(values))
@@ -388,11 +353,9 @@ class _Solver:
     def _missed(self, landmarks: Observation, values: np.ndarray) -> np.ndarray:
         """(L,) distance in meters of the landmarks from the head, as far as the cameras determine
         it."""
-        away = (
-            self.head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
-            - landmarks.position
-        )
-        return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", landmarks.root, away), axis=1))
+        at = self.head.landmarks.positions(*split(values))
+        away = np.einsum("nij,nj->ni", landmarks.root, at - landmarks.position)
+        return np.asarray(np.linalg.norm(away, axis=1))
 
 
 def _agreeing(
@@ -404,15 +367,14 @@ def _agreeing(
     missed (T, L), better (T,): of `_Solved` at the take's timesteps.
     """
     regions = [(head.landmark_region == number) & take.reliable for number in range(len(REGIONS))]
-    medians = [
-        np.median(missed[:, use], axis=1) if use.any() else np.zeros(len(missed)) for use in regions
-    ]
+    none = np.zeros(len(missed))
+    medians = [np.median(missed[:, use], axis=1) if use.any() else none for use in regions]
     by_region = np.stack(medians, axis=1)
     beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}
     for timestep, far in zip(sorted(take.landmarks), beyond, strict=True):
         own, values = take.landmarks[timestep], head.reduced(fit.parameters[timestep])
-        at = head.landmarks.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        at = head.landmarks.positions(*split(values))
         weight = robust(far, DISAGREEMENT_M)[head.landmark_region][:, None]
         seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
         moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)

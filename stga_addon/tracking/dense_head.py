@@ -1,8 +1,9 @@
-"""The points of a person's face that dense tracking compares with images: positions, normals,
-visibility, regions."""
+"""The points of a person's face that dense tracking compares with images, by their texture and by
+optical flow."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,39 @@ from ..capture.camera import Camera
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from .appearance import LEVELS_M, light_basis, robust
+from .appearance import (
+    CHANNEL_WEIGHTS,
+    FLOW_ITERATIONS,
+    FLOW_POINTS,
+    FLOW_SCALE_PX,
+    FLOW_SHARE,
+    LEVELS_M,
+    NOISE_LEVELS,
+    OUTLIER_SQUARED,
+    POINT_SHARE,
+    PyramidView,
+    Sample,
+    Texture,
+    Views,
+    fitted_light,
+    flow_targets,
+    inside,
+    light_basis,
+    projection_derivative,
+    robust,
+    sampled,
+    shading,
+)
 from .head_model import HeadModel
-from .photo_consistency import facing, in_sight
-from .posed_points import PosedPoints, SurfacePoints, head_rotation
-from .seen_surface import large_parts, surface_points
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
+from .seen_surface import (
+    VisiblePoints,
+    facing,
+    in_sight,
+    large_parts,
+    rounded_direction,
+    surface_points,
+)
 from .solve import prior_terms
 
 HEAD_POINTS = 5000
@@ -43,11 +72,31 @@ HELD_OUT_LEVEL = len(LEVELS_M)
 """Stands for the points that are not fitted, where a level is asked for."""
 
 
+NO_TEXTURE = Texture({}, {}, np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How badly points are explained, from 0 to 1: over all, and by region (R,); 0 where no point
+    is seen."""
+
+    all: float
+    regions: np.ndarray
+
+
 class DenseHead:
     """N points on a person's face. Parameters (K + 18,) are those of `HeadFit` without components
     that move nothing."""
 
-    def __init__(self, person: HeadModel, places: SurfacePoints, reliable: np.ndarray) -> None:
+    def __init__(
+        self,
+        person: HeadModel,
+        places: SurfacePoints,
+        reliable: np.ndarray,
+        texture: Texture = NO_TEXTURE,
+    ) -> None:
+        """texture: of the points, which `photo_term` and `misfit` compare with images."""
+        self._texture = texture
         model = person.model
         self.active = np.flatnonzero(np.abs(model.shapedirs).max(axis=(0, 1)) > 0)
         dirs = np.ascontiguousarray(model.shapedirs[:, :, self.active])
@@ -64,7 +113,7 @@ class DenseHead:
         self.points = _face_points(person, places, used if used.any() else reliable)
         held = np.arange(len(self.points)) % HELD_OUT == 0
         self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
-        self._posed = [PosedPoints(self.head.model, _some(self.points, rows)) for rows in self.rows]
+        self._posed = [PosedPoints(self.head.model, self.points[rows]) for rows in self.rows]
         self._all = PosedPoints(self.head.model, self.points)
         template, faces = self.head.model.v_template, self.head.model.faces
         height = places.on(template, faces)[:, 1]
@@ -75,9 +124,9 @@ class DenseHead:
         self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
         rest = np.zeros(len(self.active) + RIGID_SIZE)
-        smooth = _unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
+        smooth = unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
         self._bend = smooth - self._all.triangle_normals(*split(rest))
-        self._visible: dict[tuple[int, ...], np.ndarray] = {}
+        self._visible: VisiblePoints = {}
 
     def reduced(self, parameters: np.ndarray) -> np.ndarray:
         """The active ones of parameters (E + 18,) of a `HeadFit`."""
@@ -106,7 +155,7 @@ class DenseHead:
         rows = slice(None) if level is None else self.rows[level]
         posed = self._all if level is None else self._posed[level]
         bend = self._bend[rows] @ head_rotation(values).T
-        return light_basis(_unit(posed.triangle_normals(*split(values)) + bend))
+        return light_basis(unit(posed.triangle_normals(*split(values)) + bend))
 
     def visibility(self, values: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
         """(C, N) squared cosine at which each camera sees each point, 0 where the head hides it;
@@ -115,13 +164,11 @@ class DenseHead:
         opening = round(self.opening(values) / OPENING_STEP_M)
         seen, faces = [], self.head.model.faces
         for camera in cameras:
-            direction = (camera.position - at.mean(0)) @ turn
-            steps = np.round(DIRECTIONS * direction / np.linalg.norm(direction)).astype(int)
-            key = opening, *steps.tolist()
+            key = opening, *rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
             if key not in self._visible:
                 vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
                 normals = self.points.on(vertex_normals(vertices, faces), faces)
-                cosine = facing(camera, at, _unit(normals))
+                cosine = facing(camera, at, unit(normals))
                 share = min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height))
                 shown = in_sight(camera.scaled(share), vertices, faces, at)
                 self._visible[key] = np.where((cosine > MIN_COSINE) & shown, cosine**2, 0.0)
@@ -131,11 +178,8 @@ class DenseHead:
     def opening(self, values: np.ndarray) -> float:
         """Height in meters of the upper face above the chin."""
         height = (self.landmarks.positions(*split(values)) @ head_rotation(values))[:, 1]
-        return (
-            float(height[self._fixed].mean() - height[self._chin].mean())
-            if self._fixed.any()
-            else 0.0
-        )
+        apart = height[self._fixed].mean() - height[self._chin].mean() if self._fixed.any() else 0
+        return float(apart)
 
     def opened(self, values: np.ndarray, distance: float) -> np.ndarray:
         """Parameters whose chin lies so many meters lower, with the upper face where it is."""
@@ -152,24 +196,117 @@ class DenseHead:
     def rest(self, take: Sequence[np.ndarray]) -> np.ndarray:
         """(T, N) weights of the timesteps' parameters for a point's texture: 1 where its region is
         at rest, where detectors are mostly right, and low where it is moved far."""
-        moved = []
+        moved: Any = []
+        regions, of_region = np.unique(self.region, return_inverse=True)
         for values in take:
             still = values.copy()
             still[:-RIGID_SIZE], still[-RIGID_SIZE + 3 : -3] = 0, 0
             distance = ((self.positions(values) - self.positions(still)) ** 2).sum(1)
-            moved.append(
-                [
-                    np.sqrt(distance[self.region == number].mean())
-                    for number in np.unique(self.region)
-                ]
-            )
+            by_region = (distance[self.region == region] for region in regions)
+            moved.append([np.sqrt(own.mean()) for own in by_region])
         beyond = np.maximum(moved - np.quantile(moved, REST_QUANTILE, axis=0), 0)
-        return robust(beyond, REST_SCALE_M)[:, np.searchsorted(np.unique(self.region), self.region)]
+        return robust(beyond, REST_SCALE_M)[:, of_region]
 
+    def samples(self, views: Views, values: np.ndarray, weight: np.ndarray) -> list[Sample]:
+        """What the views show of the points; weight (C, N)."""
+        at, basis, found = self.positions(values), self.light_basis(values), []
+        for view, own in zip(views, weight, strict=True):
+            projected = [level.camera.project(at) for level in view.levels]
+            levels = [
+                sampled([level.channels], pixels)[0].astype(np.float64)
+                for level, (pixels, _) in zip(view.levels, projected, strict=True)
+            ]
+            shown = inside(view.levels[0].camera, *projected[0])
+            found.append(Sample(view.key, levels, basis, own * shown))
+        return found
 
-def split(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients, and pose with translation (18,)."""
-    return values[:-RIGID_SIZE], values[-RIGID_SIZE:]
+    def photo_term(
+        self, views: Views, visible: np.ndarray, values: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss–Newton terms of a level's points by their positions: H (M, 3, 3) and b (M, 3)."""
+        at = self.level_positions(values, level)
+        matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
+        basis, rows = self.light_basis(values, level), self.rows[level]
+        for view, seen in zip(views, visible, strict=True):
+            own = view.levels[level]
+            pixels, depth = own.camera.project(at)
+            weight = seen[rows] * self._texture.trust[rows] * inside(own.camera, pixels, depth)
+            near = np.flatnonzero(weight)
+            if not len(near):
+                continue
+            shown, *slopes = sampled([own.channels, *own.gradient], pixels[near])
+            lit = basis[near], weight[near], rows[near]
+            residual = self._residual(view, shown, *lit, level)
+            trust = 1 / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
+            used = POINT_SHARE * weight[near] * trust
+            by_x, by_y = (slope / NOISE_LEVELS for slope in slopes)
+            # The channels' slopes along x and y, multiplied and summed, before they become those by
+            # position.
+            pairs = (by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual)
+            sums = [(used * ((one * other) @ CHANNEL_WEIGHTS))[:, None] for one, other in pairs]
+            xx, xy, yy, x, y = sums
+            of_x, of_y = projection_derivative(own.camera, at[near]).swapaxes(0, 1)
+            along_x, along_y = xx * of_x + xy * of_y, xy * of_x + yy * of_y
+            matrix[near] += of_x[:, :, None] * along_x[:, None]
+            matrix[near] += of_y[:, :, None] * along_y[:, None]
+            right[near] -= x * of_x + y * of_y
+        return matrix, right
+
+    def misfit(
+        self, views: Views, visible: np.ndarray, values: np.ndarray, points: int, level: int
+    ) -> Misfit:
+        """How badly a level's images are explained at the points of a level."""
+        at, basis = self.level_positions(values, points), self.light_basis(values, points)
+        rows = self.rows[points]
+        total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
+        for view, seen in zip(views, visible, strict=True):
+            weight, own = seen[rows] * self._texture.trust[rows], view.levels[level]
+            pixels, depth = own.camera.project(at)
+            shown = inside(own.camera, pixels, depth)
+            (found,) = sampled([own.channels], pixels)
+            residual = self._residual(view, found, basis, weight * shown, rows, level)
+            squared = residual**2 @ CHANNEL_WEIGHTS
+            share = np.where(shown, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
+            total += np.bincount(self.region[rows], weight * share, len(REGIONS))
+            weights += np.bincount(self.region[rows], weight, len(REGIONS))
+        regions = total / np.maximum(weights, 1e-9)
+        return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), regions)
+
+    def _residual(
+        self,
+        view: PyramidView,
+        shown: np.ndarray,
+        basis: np.ndarray,
+        weight: np.ndarray,
+        rows: np.ndarray,
+        level: int,
+    ) -> np.ndarray:
+        """Channels (M, 3) that the view shows minus those of the lit texture, in NOISE_LEVELS."""
+        target = self._texture.values[view.key][level][rows]
+        light = fitted_light(shown, target, basis, weight, self._texture.lights[view.key])
+        return np.asarray((shown - target * shading(basis, light)) / NOISE_LEVELS)
+
+    def flow_start(
+        self, before: Views, visible: np.ndarray, values: np.ndarray, now: Views
+    ) -> np.ndarray:
+        """Parameters at a timestep to which optical flow carries the head of another one, of which
+        are `before`, visible (C, N) and values."""
+        targets = list(flow_targets(self.level_positions(values, FLOW_POINTS), before, now))
+        rows, moved = self.rows[FLOW_POINTS], values
+        weights = {view.key: own[rows] for view, own in zip(before, visible, strict=True)}
+        for _ in range(FLOW_ITERATIONS):
+            at, jacobian = self.linearized(moved, FLOW_POINTS)
+            precision, right = prior_terms(self.head, moved)
+            matrix = np.diag(precision)
+            for key, camera, target in targets:
+                miss = camera.project(at)[0] - target
+                trust = robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
+                weight = np.repeat(FLOW_SHARE * weights[key] * trust, 2)
+                flat = (projection_derivative(camera, at) @ jacobian).reshape(len(weight), -1)
+                matrix = matrix + (flat.T * weight) @ flat
+                right = right - flat.T @ (weight * miss.ravel())
+            moved = moved + np.linalg.solve(matrix, right)
+        return moved
 
 
 def _on_lids(model: FlameModel, places: SurfacePoints) -> np.ndarray:
@@ -188,18 +325,7 @@ def _face_points(head: HeadModel, places: SurfacePoints, used: np.ndarray) -> Su
     """Points near the landmarks, and those of the landmarks' places that are used."""
     from scipy.spatial import cKDTree
 
-    template, faces = head.model.v_template, head.model.faces
-    points, own = surface_points(head, HEAD_POINTS), _some(places, np.flatnonzero(used))
-    distance, _ = cKDTree(own.on(template, faces)).query(points.on(template, faces))
-    near = _some(points, np.flatnonzero(distance < FACE_RADIUS_M))
-    return SurfacePoints(
-        np.concatenate([near.face, own.face]), np.concatenate([near.barycentric, own.barycentric])
-    )
-
-
-def _some(points: SurfacePoints, rows: np.ndarray) -> SurfacePoints:
-    return SurfacePoints(points.face[rows], points.barycentric[rows])
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
+    model, points, own = head.model, surface_points(head, HEAD_POINTS), places[used]
+    centers = cKDTree(own.on(model.v_template, model.faces))
+    distance, _ = centers.query(points.on(model.v_template, model.faces))
+    return points[distance < FACE_RADIUS_M] + own

@@ -1,7 +1,7 @@
 """From landmarks of all cameras and timesteps to a head in meters: scale, identity, expression and
 pose."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,13 +9,24 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import Similarity, similarity, vertex_normals, weighted_procrustes
 from ..capture.model import evenly_spread
-from ..flame.forward import POSE_SIZE, RIGID_SIZE
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, flame_forward, frame_of
 from ..worker.helpers import Step
 from .head_model import HeadModel
-from .posed_points import PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import Observation, in_order, person, solve_identity, solve_take
-from .triangulation import Triangulation, rays, triangulate
 
+Pictures = Sequence[tuple[Camera, np.ndarray]]
+"""Cameras and their images (H, W, 3) or masks (H, W), uint8."""
+Images = Callable[..., Pictures]
+"""Pictures of a timestep, with cameras in the footage's world; a second argument: at most so many,
+spread over the rig."""
+
+ITERATIONS = 15
+OUTLIER_SCALE = 1.5
+"""Distances from a ray, in medians of the landmark's, at which its weight is a quarter."""
+MIN_DISTANCE_SHARE = 1e-5
+"""Of outliers' scale, as a share of the distance to the cameras; below is rounding."""
+RANK_GUARD = 1e-9
 IDENTITY_TIMESTEPS = 12  # Timesteps, spread over the take, that identity is solved from
 ROUNDS = 3
 MAX_HEAD_SCALE = 1.25
@@ -36,6 +47,73 @@ POSIT_ITERATIONS = 20
 
 
 @dataclass(frozen=True)
+class Triangulation:
+    """What one timestep's cameras say of N landmarks, in the units of the cameras' world.
+
+    position     (N, 3) the best point; for a single ray, one on that ray; without a ray, the center
+                 of the cameras
+    information  (N, 3, 3) weighted mean over the rays of I − d dᵀ: (x − position)ᵀ information (x −
+                 position) is the mean squared distance of x from the rays, up to a constant
+    residual     (N,) median distance of the rays from `position`, 0 where there is none
+    seen         (N,) bool: by two cameras at least, or by the only one
+    """
+
+    position: np.ndarray
+    information: np.ndarray
+    residual: np.ndarray
+    seen: np.ndarray
+
+
+def rays(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origin (3,) and unit directions (N, 3) in the world of pixels (N, 2)."""
+    flat = (points - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
+    local = np.column_stack([flat, np.ones(len(points))])
+    directions = local @ camera.world_to_camera[:3, :3]
+    return camera.position, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def triangulate(
+    cameras: Sequence[Camera], points: np.ndarray, confidence: np.ndarray
+) -> Triangulation:
+    """Landmarks (C, N, 2) pixels with confidence (C, N) ≥ 0, 0 for not seen, of C cameras at one
+    timestep.
+
+    Iteratively reweighted least squares with Geman-McClure weights; scale per landmark is its
+    median residual.
+    """
+    pairs = [rays(camera, pixels) for camera, pixels in zip(cameras, points, strict=True)]
+    origins, directions = map(np.stack, zip(*pairs, strict=True))
+    across = np.eye(3) - directions[..., :, None] * directions[..., None, :]  # (C, N, 3, 3)
+    offsets = np.einsum("cnij,cj->cni", across, origins)
+    guess = origins.mean(0) + (directions * confidence[..., None]).sum(0)
+    weights = confidence.astype(np.float64)
+    position, distance = guess, np.zeros(confidence.shape)
+    for _ in range(ITERATIONS):
+        total = weights.sum(0)
+        share = weights / np.where(total > 0, total, 1.0)
+        information = np.einsum("cn,cnij->nij", share, across)
+        right = np.einsum("cn,cni->ni", share, offsets)
+        guard = RANK_GUARD * np.eye(3)  # a single ray leaves the position along it open
+        position = np.linalg.solve(information + guard, (right + guess @ guard)[..., None])[..., 0]
+        to_point = position[None] - origins[:, None]
+        distance = np.linalg.norm(np.cross(to_point, directions), axis=2)
+        scale = OUTLIER_SCALE * _median(distance, confidence > 0)
+        floor = MIN_DISTANCE_SHARE * np.linalg.norm(to_point, axis=2)
+        # a point without a ray may lie in a camera, at distance 0 from its ray
+        usual = np.maximum(np.maximum(scale, floor), np.finfo(np.float64).tiny)
+        weights = confidence / (1 + (distance / usual) ** 2) ** 2
+    seen = (confidence > 0).sum(0) >= min(2, len(cameras))
+    return Triangulation(position, information, _median(distance, confidence > 0), seen)
+
+
+def _median(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Lower median (N,) of the valid ones of values (C, N); 0 where none is."""
+    ordered = np.sort(np.where(valid, values, np.inf), axis=0)
+    middle = np.maximum(valid.sum(0) - 1, 0) // 2
+    return np.where(valid.any(0), np.take_along_axis(ordered, middle[None], axis=0)[0], 0.0)
+
+
+@dataclass(frozen=True)
 class TimestepLandmarks:
     """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and
     confidence (C, N)."""
@@ -43,6 +121,24 @@ class TimestepLandmarks:
     cameras: tuple[Camera, ...]
     points: np.ndarray
     confidence: np.ndarray
+
+
+def no_pictures(*_: int | None) -> Pictures:
+    """The masks of footage without any."""
+    return ()
+
+
+@dataclass(frozen=True)
+class RecordedTake:
+    """What was recorded: places of landmarks on the head, which are reliable, landmarks by
+    timestep, images, masks, and whether the world of the cameras is in meters."""
+
+    places: SurfacePoints
+    reliable: np.ndarray
+    landmarks: Mapping[int, TimestepLandmarks]
+    images: Images = no_pictures
+    masks: Images = no_pictures
+    metric: bool = False
 
 
 @dataclass(frozen=True)
@@ -65,6 +161,21 @@ class HeadFit:
     ordered: bool = True
 
 
+def posed_mesh(
+    fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
+) -> np.ndarray:
+    """Vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
+    return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
+
+
+def excerpt(
+    fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]
+) -> tuple[HeadFit, RecordedTake]:
+    """The fit and the take at some timesteps."""
+    own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
+    return own, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
+
+
 def in_cameras_world(fit: HeadFit) -> HeadFit:
     """The same fit with the cameras where they are: only the scale of their world changes, about
     its origin.
@@ -75,10 +186,8 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
 
     model, world = fit.head.model, fit.to_capture
     expressions = model.shapedirs[:, :, model.n_identity :]
-    joint, joint_dirs = (
-        model.j_regressor[0] @ model.v_template,
-        np.einsum("v,vak->ak", model.j_regressor[0], expressions),
-    )
+    joint = model.j_regressor[0] @ model.v_template
+    joint_dirs = np.einsum("v,vak->ak", model.j_regressor[0], expressions)
     moved = {}
     for timestep, parameters in fit.parameters.items():
         root = joint + joint_dirs @ parameters[:-RIGID_SIZE]
@@ -87,15 +196,19 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
         rigid[:3] = Rotation.from_matrix(turned).as_rotvec()
         rigid[POSE_SIZE:] = (root + rigid[POSE_SIZE:] - world.translation) @ world.rotation - root
         moved[timestep] = np.concatenate([parameters[:-RIGID_SIZE], rigid])
-    return replace(
-        fit, parameters=moved, to_capture=Similarity(world.scale, np.eye(3), np.zeros(3))
-    )
+    kept = Similarity(world.scale, np.eye(3), np.zeros(3))
+    return replace(fit, parameters=moved, to_capture=kept)
 
 
 def is_face(pixels: np.ndarray) -> bool:
     """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one
     point."""
     return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
+
+
+def scaled_down(world: Similarity, factor: float) -> Similarity:
+    """The similarity to a world that is so many times smaller."""
+    return replace(world, scale=world.scale / factor, translation=world.translation / factor)
 
 
 def determines_pose(
@@ -113,21 +226,16 @@ def determines_pose(
     return use.sum() >= MIN_LANDMARKS and bool(np.ptp(neutral[use], axis=0).max() >= MIN_FACE_M)
 
 
-def fit_head(
-    head: HeadModel,
-    places: SurfacePoints,
-    reliable: np.ndarray,
-    take: Mapping[int, TimestepLandmarks],
-    metric: bool = False,
-    step: Step = lambda: None,
-) -> HeadFit:
-    """Fit the model to the landmarks of the timesteps of `take`, each of which `determines_pose`.
+def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None) -> HeadFit:
+    """Fit the model to the landmarks of a take's timesteps, each of which `determines_pose`.
 
     Rounds of triangulation, identity and scale from timesteps spread over the take, then all
     timesteps; from the second round on, a camera's landmarks count by the angle at which it sees
-    the surface. metric: the world of the cameras is in meters, and the size of the head is the
-    person's. step: follows each of ROUNDS.
+    the surface. Where the world of the cameras is metric, the size of the head is the person's.
+    step: follows each of ROUNDS.
     """
+    places, reliable, take = recorded.places, recorded.reliable, recorded.landmarks
+    metric = recorded.metric
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
     spread = evenly_spread(several or timesteps, IDENTITY_TIMESTEPS)
@@ -141,57 +249,39 @@ def fit_head(
     world = Similarity(size, u @ vt, -size * u @ vt @ np.median(centers, axis=0))
     seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
     solved, ordered = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE)), True
+    parameters: dict[int, np.ndarray] = {}
     for number in range(ROUNDS):
         at = places.on(subject.model.v_template, subject.model.faces)
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
         observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
         starts = np.stack([rigid_start(at, observed[t]) for t in spread])
         # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
-        identity = solve_identity(
-            head, places, [observed[t] for t in spread], starts, metric or not several
-        )
-        world = replace(
-            world,
-            scale=world.scale / identity.scale,
-            translation=world.translation / identity.scale,
-        )
+        known, sized = [observed[t] for t in spread], metric or not several
+        identity = solve_identity(head, places, known, starts, sized)
+        world = scaled_down(world, identity.scale)
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
-            solved[:, -RIGID_SIZE:] = [
-                rigid_start(at, observation) for observation in take_observed
-            ]
+            solved[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in take_observed]
             alone = solve_take(subject, places, take_observed, solved, ordered=False)
             ordered = in_order(subject, places, take_observed, alone)
         solved = solve_take(subject, places, take_observed, solved, ordered)
         visibility = LandmarkVisibility(subject, places)
-        seen = {
-            t: visibility.weighted(take[t], values, world)
-            for t, values in zip(timesteps, solved, strict=True)
-        }
+        parameters = dict(zip(timesteps, solved, strict=True))
+        seen = {t: visibility.weighted(take[t], own, world) for t, own in parameters.items()}
         step()
-    return HeadFit(
-        subject, shape, dict(zip(timesteps, solved, strict=True)), world, ordered=ordered
-    )
+    return HeadFit(subject, shape, parameters, world, ordered=ordered)
 
 
-def is_metric(
-    head: HeadModel,
-    places: SurfacePoints,
-    reliable: np.ndarray,
-    take: Mapping[int, TimestepLandmarks],
-) -> bool:
+def is_metric(head: HeadModel, take: RecordedTake) -> bool:
     """Whether the face is as large in the cameras' world as a person's in meters; True of one
     camera, which does not see size."""
-    several = [t for t in sorted(take) if len(take[t].cameras) > 1]
-    neutral = places.on(head.model.v_template, head.model.faces)
-    scales = [
-        _aligned(
-            triangulated(take[t], reliable, neutral, 1.0), neutral, reliable, metric=False
-        ).scale
-        for t in evenly_spread(several, IDENTITY_TIMESTEPS)
-    ]
+    several = [t for t in sorted(take.landmarks) if len(take.landmarks[t].cameras) > 1]
+    neutral, scales = take.places.on(head.model.v_template, head.model.faces), []
+    for t in evenly_spread(several, IDENTITY_TIMESTEPS):
+        found = triangulated(take.landmarks[t], take.reliable, neutral, 1.0)
+        scales.append(_aligned(found, neutral, take.reliable, metric=False).scale)
     return not scales or 1 / MAX_HEAD_SCALE <= float(np.median(scales)) <= MAX_HEAD_SCALE
 
 
@@ -243,12 +333,9 @@ def observed_landmarks(
     """The triangulation in the capture's world."""
     values, vectors = np.linalg.eigh(world.rotation @ found.information @ world.rotation.T)
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None, :]) @ vectors.swapaxes(1, 2)
-    certain = np.exp(
-        -(np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS) ** 2)
-    )
-    return Observation(
-        world.apply(found.position), root, np.where(found.seen & reliable, certain, 0.0)
-    )
+    residuals = np.minimum(found.residual * world.scale / RESIDUAL_SCALE_M, MAX_RESIDUALS)
+    weight = np.where(found.seen & reliable, np.exp(-(residuals**2)), 0.0)
+    return Observation(world.apply(found.position), root, weight)
 
 
 def _aligned(
@@ -267,9 +354,8 @@ def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     # no cameras agree: all of them, and the fit will show by how much they do not
     if use.sum() < MIN_LANDMARKS:
         use = observed.weight > 0
-    rotation, translation = weighted_procrustes(
-        neutral[use], observed.position[use], np.ones(use.sum())
-    )
+    pairs = neutral[use], observed.position[use]
+    rotation, translation = weighted_procrustes(*pairs, np.ones(use.sum()))
     rigid = np.zeros(RIGID_SIZE)
     rigid[:3] = Rotation.from_matrix(rotation).as_rotvec()
     rigid[POSE_SIZE:] = translation
@@ -289,16 +375,15 @@ class LandmarkVisibility:
     ) -> TimestepLandmarks:
         """Confidence falls with the angle at which a camera sees the surface, to MIN_VISIBILITY
         where it faces away."""
-        _, squared = self.seen(
-            parameters, np.stack([world.apply(camera.position) for camera in landmarks.cameras])
-        )
+        eyes = np.stack([world.apply(camera.position) for camera in landmarks.cameras])
+        _, squared = self.seen(parameters, eyes)
         return replace(landmarks, confidence=landmarks.confidence * (squared + MIN_VISIBILITY))
 
     def seen(self, parameters: np.ndarray, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) of the landmarks, and squared cosines (C, N) of the angles between their
         normals and cameras at `eyes` (C, 3), in the head's world; 0 where the surface faces
         away."""
-        at = self._points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+        at = self._points.positions(*split(parameters))
         normals, towards = self._normals @ head_rotation(parameters).T, eyes[:, None] - at
         length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
         return at, np.clip((normals * towards).sum(2) / length, 0, 1) ** 2

@@ -12,6 +12,7 @@ from ..flame.forward import RIGID_SIZE
 from .fit import (
     HeadFit,
     LandmarkVisibility,
+    RecordedTake,
     TimestepLandmarks,
     observed_landmarks,
     rigid_start,
@@ -20,7 +21,7 @@ from .fit import (
 from .footage.model import Footage
 from .head_model import HeadModel
 from .landmarks import CameraLandmarks
-from .posed_points import PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
 CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
@@ -50,12 +51,7 @@ HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 """The head is fitted in the camera's own world, in meters."""
 
 
-def solved_focal(
-    head: HeadModel,
-    places: SurfacePoints,
-    reliable: np.ndarray,
-    take: Mapping[int, TimestepLandmarks],
-) -> float | None:
+def solved_focal(head: HeadModel, take: RecordedTake) -> float | None:
     """Focal length in pixels of the only camera of `take`, whose own is that of a phone
     (`open.usual_focal`).
 
@@ -63,14 +59,13 @@ def solved_focal(
     camera's own. None where the head turns too little, or where landmarks say less of it than the
     prior.
     """
-    rows = np.array(evenly_spread(np.flatnonzero(reliable).tolist(), LANDMARKS))
+    rows = np.array(evenly_spread(np.flatnonzero(take.reliable).tolist(), LANDMARKS))
     seen = {
         t: replace(own, points=own.points[:, rows], confidence=own.confidence[:, rows])
-        for t, own in take.items()
+        for t, own in take.landmarks.items()
         if (own.confidence[:, rows] > 0).all()
     }
-    chosen = SurfacePoints(places.face[rows], places.barycentric[rows])
-    own_head, own_places = _with_own_places(head, chosen)
+    own_head, own_places = _with_own_places(head, take.places[rows])
     timesteps = _turned(own_head, own_places, seen)
     if not timesteps:
         return None
@@ -168,7 +163,7 @@ def _slope(
     points, total = PosedPoints(subject.model, places), 0.0
     rotation = camera.world_to_camera[:3, :3]
     for view, own, values in zip(views, observed, frames, strict=True):
-        at = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+        at = points.positions(*split(values))
         residual = np.einsum("nij,nj->ni", own.root, at - own.position) / LANDMARK_SIGMA_M
         _, depth = camera.project(at)
         flat = (view.points[0] - [camera.cx, camera.cy]) / [camera.fl_x, camera.fl_y]
@@ -180,15 +175,11 @@ def _slope(
 
 
 def scale_warnings(
-    fit: HeadFit,
-    places: SurfacePoints,
-    used: np.ndarray,
-    footage: Footage,
-    found: Mapping[str, CameraLandmarks],
+    fit: HeadFit, take: RecordedTake, footage: Footage, found: Mapping[str, CameraLandmarks]
 ) -> tuple[str, ...]:
     """One sentence for each camera whose landmarks are of another size than the fitted head is
     there: the sign of a wrong focal length. Faces seen from the side do not count."""
-    visibility = LandmarkVisibility(fit.head, places)
+    visibility, used = LandmarkVisibility(fit.head, take.places), take.reliable
     cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
     timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]
     scales: dict[str, dict[int, float]] = {}

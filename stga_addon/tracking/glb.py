@@ -21,10 +21,9 @@ promise as many zeros as they like, and nodes repeat meshes; sparse morph target
 reach 4 a byte."""
 PRIMITIVE_NUMBERS = 100
 """That each primitive counts for besides its own: it takes time even where it is small."""
-UNREADABLE = (
-    LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError,
-)  # fmt: skip
+UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
 """What a damaged document leads to."""
+Json = dict[str, Any]
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 
 
@@ -54,9 +53,8 @@ def read_glb(path: Path) -> MorphMesh:
                 names = ", ".join(sorted(map(str, unknown)))
                 raise StgaError(f"{path}: needs {names}; export it without compression")
             if any("uri" in buffer for buffer in document.get("buffers", ())):
-                raise StgaError(
-                    f"{path}: refers to other files; export a GLB that holds its buffers"
-                )
+                other = "refers to other files; export a GLB that holds its buffers"
+                raise StgaError(f"{path}: {other}")
             nodes = list(_mesh_nodes(document))
             _require_bounded(path, document, nodes, len(content))
             parts = [own for each in nodes for own in _placed(document, data, *each)]
@@ -69,7 +67,7 @@ def read_glb(path: Path) -> MorphMesh:
 
 
 def _require_bounded(
-    path: Path, document: dict[str, Any], nodes: list[tuple[dict[str, Any], np.ndarray]], size: int
+    path: Path, document: Json, nodes: list[tuple[Json, np.ndarray]], size: int
 ) -> None:
     """Raise StgaError where the joined mesh would hold more numbers than such a file may."""
     allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
@@ -81,15 +79,13 @@ def _require_bounded(
         names.update(name for name, _ in targets)
         numbers = 3 * vertices * (1 + len(names)) + corners
         if numbers > allowed:
-            raise StgaError(
-                f"{path}: its meshes hold {numbers} numbers, more than the {allowed} allowed to a "
-                "file of this size"
-            )
+            limit = f"more than the {allowed} allowed to a file of this size"
+            raise StgaError(f"{path}: its meshes hold {numbers} numbers, {limit}")
 
 
 def _primitives(
-    document: dict[str, Any], node: dict[str, Any]
-) -> Iterator[tuple[dict[str, Any], list[tuple[str, dict[str, int]]]]]:
+    document: Json, node: Json
+) -> Iterator[tuple[Json, list[tuple[str, dict[str, int]]]]]:
     """Triangle primitives of a node's mesh, with the names of their morph targets and these."""
     mesh = document["meshes"][node["mesh"]]
     extras = mesh.get("extras")
@@ -102,7 +98,7 @@ def _primitives(
             yield primitive, [(str(names[k]), target) for k, target in enumerate(targets)]
 
 
-def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
     """Nodes of the scene that have a mesh, and their transforms (4, 4)."""
     nodes, scene = document.get("nodes", []), document["scenes"][document.get("scene", 0)]
     waiting = [(int(row), np.eye(4)) for row in scene.get("nodes", ())]
@@ -124,9 +120,7 @@ def _mesh_nodes(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.n
             yield node, np.eye(4) if "skin" in node else matrix
 
 
-def _placed(
-    document: dict[str, Any], data: bytes, node: dict[str, Any], matrix: np.ndarray
-) -> list[MorphMesh]:
+def _placed(document: Json, data: bytes, node: Json, matrix: np.ndarray) -> list[MorphMesh]:
     """The triangle primitives of a node's mesh, in the scene's axes."""
     parts = []
     for primitive, morphs in _primitives(document, node):
@@ -148,7 +142,7 @@ def _placed(
     return parts
 
 
-def _count(accessor: dict[str, Any]) -> int:
+def _count(accessor: Json) -> int:
     count = accessor["count"]
     if type(count) is not int or count < 1:
         raise ValueError(f"an accessor of {shorten(count)} elements")
@@ -156,7 +150,7 @@ def _count(accessor: dict[str, Any]) -> int:
 
 
 def _accessor(
-    document: dict[str, Any], data: bytes, number: int, expected: int | None = None, width: int = 3
+    document: Json, data: bytes, number: int, expected: int | None = None, width: int = 3
 ) -> np.ndarray:
     """Values (N, width) of an accessor, sparse ones applied; N is `expected` where given."""
     accessor = document["accessors"][number]
@@ -178,11 +172,7 @@ def _accessor(
 
 
 def _view(
-    document: dict[str, Any],
-    data: bytes,
-    source: dict[str, Any],
-    component: int,
-    shape: tuple[int, int],
+    document: Json, data: bytes, source: Json, component: int, shape: tuple[int, int]
 ) -> np.ndarray:
     """A buffer view's values, as float64 copies of this shape."""
     view, dtype = document["bufferViews"][source["bufferView"]], np.dtype(COMPONENTS[component])
@@ -199,14 +189,15 @@ def _view(
 def _joined(parts: list[MorphMesh]) -> MorphMesh:
     """One mesh of all parts; a part without a target of some name is not moved by it."""
     names = tuple(dict.fromkeys(name for part in parts for name in part.names))
-    columns = {name: column for column, name in enumerate(names)}
-    starts = np.cumsum([0, *(len(part.positions) for part in parts)])
+    starts = np.cumsum([0, *(len(part.positions) for part in parts)]).tolist()
     targets = np.zeros((starts[-1], 3, len(names)))
-    for start, end, part in zip(starts, starts[1:], parts, strict=False):
+    for start, part in zip(starts, parts, strict=False):
         for own, name in enumerate(part.names):
-            targets[start:end, :, columns[name]] += part.targets[:, :, own]
-    faces = np.concatenate([part.faces + start for start, part in zip(starts, parts, strict=False)])
-    return MorphMesh(np.concatenate([part.positions for part in parts]), faces, names, targets)
+            rows = slice(start, start + len(part.positions))
+            targets[rows, :, names.index(name)] += part.targets[:, :, own]
+    faces = [part.faces + start for start, part in zip(starts, parts, strict=False)]
+    positions = np.concatenate([part.positions for part in parts])
+    return MorphMesh(positions, np.concatenate(faces), names, targets)
 
 
 def _merged(mesh: MorphMesh) -> MorphMesh:

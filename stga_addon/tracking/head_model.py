@@ -1,7 +1,7 @@
 """Head models that can be tracked: FLAME, any linear model in an npz, or a GLB with morph
 targets."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,14 +56,14 @@ def read_head_model(path: Path | None) -> HeadModel:
     """
     if path is None:
         return HeadModel(flame_model(None), "flame")
-    if path.suffix.lower() == ".glb":
+    suffix, arrays = path.suffix.lower(), dict[str, np.ndarray]()
+    if suffix == ".glb":
         mesh = read_glb(path)
         arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)
-        return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
-    if path.suffix.lower() == ".npz":
+    elif suffix == ".npz":
         arrays = read_npz(path)
-        if "mean" in arrays:
-            return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
+    if "mean" in arrays:
+        return checked(path, HeadModel(linear_model(path, arrays), "mesh"))
     return checked(path, HeadModel(flame_model(path), "flame"))
 
 
@@ -85,13 +85,8 @@ def write_linear_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a linear model as an npz. Raises StgaError where it is none that `read_head_model`
     would take."""
     checked(path, HeadModel(linear_model(path, arrays), "mesh"))
-    write_npz(
-        path,
-        {
-            name: array.astype(np.float32) if array.dtype.kind == "f" else array
-            for name, array in arrays.items()
-        },
-    )
+    small = {name: own.astype(np.float32) for name, own in arrays.items() if own.dtype.kind == "f"}
+    write_npz(path, {**arrays, **small})
 
 
 def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
@@ -100,35 +95,29 @@ def linear_model(path: Path, arrays: dict[str, np.ndarray]) -> FlameModel:
     for key in LINEAR_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a linear head model needs")
-    mean = _floats(path, arrays, "mean", (None, 3))
+    mean = _finite(path, arrays, "mean", (None, 3))
     count = len(mean)
-    bases = [
-        _floats(path, arrays, key, (count, 3, None)) if key in arrays else np.zeros((count, 3, 0))
-        for key in ("identity", "expression")
-    ]
+    none = dict.fromkeys(("identity", "expression"), np.zeros((count, 3, 0)))
+    bases = [_finite(path, {**none, **arrays}, key, (count, 3, None)) for key in none]
     if not sum(base.shape[2] for base in bases):
         raise StgaError(
             f"{path}: has neither identity nor expression, components that a head is fitted with"
         )
     faces = arrays["faces"]
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not len(faces):
-        raise StgaError(
-            f"{path}: faces is {faces.dtype} of shape {faces.shape}, "
-            "expected whole numbers (any, 3)"
-        )
+        found = f"{faces.dtype} of shape {faces.shape}"
+        raise StgaError(f"{path}: faces is {found}, expected whole numbers (any, 3)")
     if faces.min() < 0 or faces.max() >= count:
-        raise StgaError(
-            f"{path}: faces names vertices {faces.min()} to {faces.max()}, "
-            f"expected 0 to {count - 1}"
-        )
+        found = f"{faces.min()} to {faces.max()}"
+        raise StgaError(f"{path}: faces names vertices {found}, expected 0 to {count - 1}")
     given = [key for key in ("J_regressor", "weights") if key in arrays]
     if len(given) == 1:
         raise StgaError(f"{path}: has {given[0]} alone; joints need both J_regressor and weights")
     weights = np.eye(len(JOINTS))[np.zeros(count, int)]
     regressor = np.full((len(JOINTS), count), 1 / count)
     if given:
-        regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), count))
-        weights = _floats(path, arrays, "weights", (count, len(JOINTS)))
+        regressor = _finite(path, arrays, "J_regressor", (len(JOINTS), count))
+        weights = _finite(path, arrays, "weights", (count, len(JOINTS)))
     return FlameModel(
         v_template=mean,
         shapedirs=np.concatenate(bases, axis=2),
@@ -162,27 +151,37 @@ def checked(path: Path, head: HeadModel) -> HeadModel:
             raise StgaError(f"{path}: {name} reaches {largest:.3g}, expected at most {limit:.0f}")
     extent = float(np.ptp(model.v_template, axis=0).max())
     if not MIN_EXTENT_M <= extent <= MAX_EXTENT_M:
-        raise StgaError(
-            f"{path}: the head measures {extent:.3g}, "
-            f"expected {MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
-        )
+        expected = f"{MIN_EXTENT_M} to {MAX_EXTENT_M} meters"
+        raise StgaError(f"{path}: the head measures {extent:.3g}, expected {expected}")
     return head
 
 
-def _floats(
-    path: Path, arrays: dict[str, np.ndarray], key: str, expected: tuple[int | None, ...]
+def floats(
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    key: str,
+    expected: tuple[int | None, ...],
+    kinds: str = "iuf",
+    numbers: str = "numbers",
 ) -> np.ndarray:
-    array = arrays[key]
-    fits = array.ndim == len(expected) and all(
-        want in (None, size) for size, want in zip(array.shape, expected, strict=True)
-    )
-    if not fits or not array.shape[0]:
+    """An array of a file as float64, finite or not. Raises StgaError where it is missing, has not
+    the expected shape (None: any size), or is of no dtype of these kinds, which are `numbers`."""
+    if key not in arrays:
+        raise StgaError(f"{path}: has no {key}")
+    array, sizes = arrays[key], zip(expected, arrays[key].shape, strict=False)
+    if array.ndim != len(expected) or any(want not in (None, size) for want, size in sizes):
         wanted = ", ".join("any" if size is None else str(size) for size in expected)
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
-    if array.dtype.kind not in "iuf":
-        raise StgaError(f"{path}: {key} holds {array.dtype}, expected numbers")
+    if array.dtype.kind not in kinds:
+        raise StgaError(f"{path}: {key} holds {array.dtype}, expected {numbers}")
     with np.errstate(over="ignore"):
-        values = np.ascontiguousarray(array, np.float64)
+        return np.ascontiguousarray(array, np.float64)
+
+
+def _finite(
+    path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]
+) -> np.ndarray:
+    values = floats(path, arrays, key, expected)
     if not np.isfinite(values).all():
         raise StgaError(f"{path}: {key} holds values that are not finite")
     return values

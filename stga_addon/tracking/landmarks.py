@@ -16,6 +16,7 @@ from .face_networks import Detector
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
+from .head_model import floats
 from .posed_points import SurfacePoints
 
 MIN_BARYCENTRIC, MAX_SUM_ERROR = -1e-3, 1e-3
@@ -73,10 +74,10 @@ def detect_landmarks(
         if not path.exists():
             limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
-            detected = helpers.map(_detect, parts, partial(_count, report, done, total))
-            write_camera(
-                path, _of_one_person(camera, [faces for part in detected for faces in part])
-            )
+            count = partial(counted, report, "Landmarks", done, total)
+            detected = helpers.map(_detect, parts, count)
+            seen = [faces for part in detected for faces in part]
+            write_camera(path, _of_one_person(camera, seen))
         # in the file's precision, whether it was detected now or before
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
@@ -88,16 +89,11 @@ def read_landmarks(footage: Footage, folder: Path) -> dict[str, CameraLandmarks]
     """Landmarks by camera from files of any detector; cameras without a file are not used. Raises
     StgaError."""
     files = {camera.name: landmark_file(folder, camera.name) for camera in footage.cameras}
-    found = {
-        camera.name: read_camera(files[camera.name], camera)
-        for camera in footage.cameras
-        if files[camera.name].exists()
-    }
+    written = [camera for camera in footage.cameras if files[camera.name].exists()]
+    found = {camera.name: read_camera(files[camera.name], camera) for camera in written}
     if not found:
-        first = next(iter(files.values()))
-        raise StgaError(
-            f"{folder}: has landmarks of no camera; expected files such as {first.name}"
-        )
+        first = next(iter(files.values())).name
+        raise StgaError(f"{folder}: has landmarks of no camera; expected files such as {first}")
     counts = {name: landmarks.points.shape[1] for name, landmarks in found.items()}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{files[name].name} {count}" for name, count in counts.items())
@@ -108,51 +104,28 @@ def read_landmarks(footage: Footage, folder: Path) -> dict[str, CameraLandmarks]
 def read_camera(path: Path, camera: FootageCamera) -> CameraLandmarks:
     """One camera's file. Raises StgaError naming the file and the field."""
     arrays = read_npz(path)
-    for key in ("timesteps", "points"):
-        if key not in arrays:
-            raise StgaError(f"{path}: has no {key}")
+    if "timesteps" not in arrays:
+        raise StgaError(f"{path}: has no timesteps")
     timesteps = arrays["timesteps"]
     listed = timesteps.tolist() if timesteps.ndim == 1 and timesteps.dtype.kind in "iu" else [None]
     if not set(listed) <= set(camera.timesteps) or len(set(listed)) < len(listed):
         expected = f"timesteps of camera {camera.name}, each once, whole numbers (any,)"
         raise StgaError(f"{path}: timesteps: expected {expected}")
-    points = _pixels(path, arrays["points"], len(timesteps))
-    confidence = _confidence(
-        path, arrays.get("confidence", np.isfinite(points).all(2)), points.shape[:2]
-    )
+    shape = len(timesteps), None, 2
+    points = floats(path, arrays, "points", shape, "f", "floating-point numbers")
+    arrays = {"confidence": np.isfinite(points).all(2), **arrays}
+    confidence = floats(path, arrays, "confidence", points.shape[:2], "biuf")
+    # also where it is not a number
+    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():
+        raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
     seen = points[confidence > 0]
     if not np.isfinite(seen).all():
         raise StgaError(f"{path}: points: expected finite pixels where confidence is not 0")
     if not (np.abs(seen) <= MAX_PIXELS).all():
-        raise StgaError(
-            f"{path}: points: expected pixels of at most {MAX_PIXELS:.0f}, "
-            "as far as no image reaches"
-        )
-    return CameraLandmarks(
-        timesteps.astype(np.int64), np.where(confidence[..., None] > 0, points, 0.0), confidence
-    )
-
-
-def _pixels(path: Path, points: np.ndarray, count: int) -> np.ndarray:
-    """(T, N, 2) float64 of `count` timesteps, finite or not."""
-    if points.dtype.kind != "f":
-        raise StgaError(f"{path}: points holds {points.dtype}, expected floating-point numbers")
-    if points.ndim != 3 or points.shape[::2] != (count, 2):
-        raise StgaError(f"{path}: points has shape {points.shape}, expected ({count}, any, 2)")
-    with np.errstate(over="ignore"):
-        return points.astype(np.float64)
-
-
-def _confidence(path: Path, confidence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """(T, N) float64."""
-    if confidence.shape != shape:
-        raise StgaError(f"{path}: confidence has shape {confidence.shape}, expected {shape}")
-    if confidence.dtype.kind not in "biuf":
-        raise StgaError(f"{path}: confidence holds {confidence.dtype}, expected numbers")
-    # also where it is not a number
-    if not ((confidence >= 0) & (confidence <= MAX_CONFIDENCE)).all():
-        raise StgaError(f"{path}: confidence: expected numbers from 0 to {MAX_CONFIDENCE:g}")
-    return confidence.astype(np.float64)
+        far = f"at most {MAX_PIXELS:.0f}, as far as no image reaches"
+        raise StgaError(f"{path}: points: expected pixels of {far}")
+    known = np.where(confidence[..., None] > 0, points, 0.0)
+    return CameraLandmarks(timesteps.astype(np.int64), known, confidence)
 
 
 def write_camera(path: Path, landmarks: CameraLandmarks) -> None:
@@ -171,26 +144,26 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     Returns the places and (N,) bool which are used. Raises StgaError naming the file and the field.
     """
     arrays = read_npz(path)
-    for key in ("face", "barycentric"):
-        if key not in arrays:
-            raise StgaError(f"{path}: has no {key}")
-    face, barycentric = arrays["face"], arrays["barycentric"]
-    if (
-        face.ndim != 1
-        or face.dtype.kind not in "iu"
-        or not ((face >= -1) & (face < triangles)).all()
-    ):
-        raise StgaError(
-            f"{path}: face: expected triangles from 0 to {triangles - 1}, or -1, of shape (any,)"
-        )
+    if "face" not in arrays:
+        raise StgaError(f"{path}: has no face")
+    face, expected = arrays["face"], f"triangles from 0 to {triangles - 1}, or -1, of shape (any,)"
+    is_row = face.ndim == 1 and face.dtype.kind in "iu"
+    if not is_row or not ((face >= -1) & (face < triangles)).all():
+        raise StgaError(f"{path}: face: expected {expected}")
     used = face >= 0
     if used.sum() < MIN_LANDMARKS:
-        raise StgaError(
-            f"{path}: face: uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}"
-        )
-    return SurfacePoints(
-        np.maximum(face, 0).astype(np.int64), _barycentric(path, barycentric, used)
-    ), used
+        few = f"uses {used.sum()} landmarks, expected at least {MIN_LANDMARKS}"
+        raise StgaError(f"{path}: face: {few}")
+    barycentric = floats(path, arrays, "barycentric", (len(face), 3), "biuf")
+    if not np.isfinite(barycentric).all():
+        raise StgaError(f"{path}: barycentric: expected finite numbers")
+    shares = np.where(used[:, None], barycentric, 1 / 3)
+    if not (shares >= MIN_BARYCENTRIC).all():
+        raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
+    with np.errstate(over="ignore"):
+        if not (np.abs(shares.sum(1) - 1) <= MAX_SUM_ERROR).all():
+            raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
+    return SurfacePoints(np.maximum(face, 0).astype(np.int64), shares), used
 
 
 def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> None:
@@ -199,29 +172,8 @@ def check_count(found: Mapping[str, CameraLandmarks], places: SurfacePoints) -> 
     for name, camera in found.items():
         count = camera.points.shape[1]
         if camera.confidence.any() and count != len(places):
-            raise StgaError(
-                f"camera {name}: has {count} landmarks, but the head model's file has {len(places)}"
-            )
-
-
-def _barycentric(path: Path, barycentric: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """(N, 3) float64; thirds where a landmark is not used."""
-    if barycentric.shape != (len(used), 3):
-        raise StgaError(
-            f"{path}: barycentric has shape {barycentric.shape}, expected ({len(used)}, 3)"
-        )
-    if barycentric.dtype.kind not in "biuf":
-        raise StgaError(f"{path}: barycentric holds {barycentric.dtype}, expected numbers")
-    if not np.isfinite(barycentric).all():
-        raise StgaError(f"{path}: barycentric: expected finite numbers")
-    with np.errstate(over="ignore"):
-        shares = np.where(used[:, None], barycentric, 1 / 3).astype(np.float64)
-        sums = shares.sum(1)
-    if not (shares >= MIN_BARYCENTRIC).all():
-        raise StgaError(f"{path}: barycentric: expected numbers from 0 up")
-    if not (np.abs(sums - 1) <= MAX_SUM_ERROR).all():
-        raise StgaError(f"{path}: barycentric: expected rows that add up to 1")
-    return shares
+            other = f"the head model's file has {len(places)}"
+            raise StgaError(f"camera {name}: has {count} landmarks, but {other}")
 
 
 def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
@@ -237,8 +189,9 @@ def write_landmarks(
     write_places(folder / PLACES_FILE, places, used)
 
 
-def _count(report: Report, done: int, total: int, number: int) -> None:
-    report("Landmarks", done + number, total)
+def counted(report: Report, stage: str, before: int, total: int, done: int) -> None:
+    """Report steps of a part of a stage."""
+    report(stage, before + done, total)
 
 
 def _detect(
@@ -256,9 +209,7 @@ def _detect(
 
 def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> CameraLandmarks:
     """Raises StgaError where too many of the timesteps show several faces."""
-    several = [
-        timestep for timestep, faces in zip(camera.timesteps, seen, strict=True) if len(faces) > 1
-    ]
+    several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
     faces = [own[0] if len(own) == 1 else None for own in seen]
     if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
         raise StgaError(

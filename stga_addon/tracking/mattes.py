@@ -23,7 +23,7 @@ from ..worker.helpers import Helpers, Step
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
-from .landmarks import Report
+from .landmarks import Report, counted
 
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
@@ -72,8 +72,7 @@ def with_mattes(
     path, total, done = out / MATTES_FILE, len(list(footage.views())), 0
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
-    unseen: list[str] = []
-    cameras = []
+    unseen, cameras = list[str](), []
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}
         kept = {t: file for t, file in files.items() if continues and file.exists()}
@@ -81,7 +80,8 @@ def with_mattes(
         parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
         work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        found = helpers.map(_write_mattes, work, partial(_count, report, done, total))
+        count = partial(counted, report, "Mattes", done, total)
+        found = helpers.map(_write_mattes, work, count)
         done += len(left)
         report("Mattes", done, total)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
@@ -89,15 +89,9 @@ def with_mattes(
         mattes = {t: file for t, file in files.items() if t in kept or t in known}
         cameras.append(replace(camera, mattes=mattes))
     listed = ", ".join(unseen[:6]) + (", …" if len(unseen) > 6 else "")
-    warning = (
-        f"no person was recognized in {len(unseen)} frames, "
-        f"whose mattes follow the head alone: {listed}"
-    )
+    warning = f"no person was recognized in {len(unseen)} frames"
+    warning += f", whose mattes follow the head alone: {listed}"
     return replace(footage, cameras=tuple(cameras)), (warning,) if unseen else ()
-
-
-def _count(report: Report, done: int, total: int, number: int) -> None:
-    report("Mattes", done + number, total)
 
 
 def _write_mattes(
@@ -108,9 +102,7 @@ def _write_mattes(
     for timestep, file in files.items():
         if camera.mask(timestep) is None:
             image, head = camera.image(timestep), head_pixels(timestep, camera)
-            is_person = (
-                network.probability(image) if plate is None else probability_by_plate(image, plate)
-            )
+            is_person = network.probability(image) if plate is None else by_plate(image, plate)
             seen = float(np.median(is_person[head])) if head.any() else 1.0
             recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
             with replacing(file) as new:
@@ -137,7 +129,7 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     return _soft_edge(cv2, image, person, size)
 
 
-def probability_by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
+def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
     """Probability (H, W) float32 of a person: the difference from a clean plate (H, W, 3) uint8."""
     import cv2
 

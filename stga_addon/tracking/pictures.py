@@ -16,11 +16,10 @@ from ..capture.model import evenly_spread
 from ..errors import StgaError
 from ..files import replacing
 from .face_networks import FaceNetworks
-from .fit import HeadFit, TimestepLandmarks, determines_pose, fit_head
+from .fit import HeadFit, RecordedTake, TimestepLandmarks, determines_pose, fit_head, posed_mesh
 from .footage.model import Footage
 from .head_model import HeadModel
 from .posed_points import SurfacePoints
-from .write_capture import posed_mesh
 
 SIZE = 256  # Width and height of a picture in pixels: Blender's icons are square
 FIRST_CAMERAS, SHOWN_FRAMES = 3, 4
@@ -64,7 +63,8 @@ def picture_of_first_frame(
     if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
         return None
     with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
-        return picture_of_fit(fit_head(head, places, reliable, {timestep: seen}), footage)
+        take = RecordedTake(places, reliable, {timestep: seen})
+        return picture_of_fit(fit_head(head, take), footage)
     return None
 
 

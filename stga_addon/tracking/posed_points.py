@@ -25,6 +25,13 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.face)
 
+    def __getitem__(self, rows: np.ndarray) -> "SurfacePoints":
+        return SurfacePoints(self.face[rows], self.barycentric[rows])
+
+    def __add__(self, other: "SurfacePoints") -> "SurfacePoints":
+        both = zip((self.face, self.barycentric), (other.face, other.barycentric), strict=True)
+        return SurfacePoints(*map(np.concatenate, both))
+
     def on(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices
         (V, …)."""
@@ -34,6 +41,11 @@ class SurfacePoints:
 def head_rotation(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) of the root joint in (E + 18,) parameters."""
     return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
+
+
+def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (K,), and pose with translation (18,), of parameters (K + 18,)."""
+    return parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:]
 
 
 def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
@@ -58,10 +70,13 @@ class PosedPoints:
         self.posedirs = model.posedirs[rows] if model.posedirs.any() else None
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.tensordot(model.j_regressor, model.shapedirs, 1)
-        self._below = _below(self.parents)
-        self._corner_weights = (self.weights * self.barycentric.reshape(-1, 1)).T.reshape(
-            len(self.parents), -1, 3
-        )
+        # (J, J): 1 where a joint (column) is one (row) or is carried by it
+        self._below = np.eye(len(self.parents))
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                self._below[:, joint] += self._below[:, parent]
+        weights = self.weights * self.barycentric.reshape(-1, 1)
+        self._corner_weights = weights.T.reshape(len(self.parents), -1, 3)
         self._last: tuple[bytes, _Posed] | None = None
 
     def positions(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
@@ -71,10 +86,7 @@ class PosedPoints:
     def triangle_normals(self, coefficients: np.ndarray, rigid: np.ndarray) -> np.ndarray:
         """(N, 3) unit normals of the posed triangles that the points lie on."""
         a, b, c = self._posed(coefficients, rigid).corners.reshape(-1, 3, 3).swapaxes(0, 1)
-        normals = np.cross(b - a, c - a)
-        return np.asarray(
-            normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-        )
+        return unit(np.cross(b - a, c - a), 1e-20)
 
     def linearized(
         self, coefficients: np.ndarray, rigid: np.ndarray
@@ -86,12 +98,10 @@ class PosedPoints:
         found = np.empty((count, 3, first + RIGID_SIZE))
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
-        moved = _moves(
-            posed.rotations, self._placed(posed.rotations, self.joint_dirs), self.joint_dirs
-        )
-        found[..., :first] = skin @ self.dirs.reshape(count, 9, first) + np.tensordot(
-            share.T, moved, 1
-        )
+        moved: np.ndarray = self._placed(posed.rotations, self.joint_dirs)
+        moved = moved - posed.rotations @ self.joint_dirs
+        found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
+        found[..., :first] += np.tensordot(share.T, moved, 1)
         found[..., first:-TRANSLATION_SIZE] = self._by_joints(posed, turns)
         if self.posedirs is not None:
             bent = self._corrective_dirs(self.posedirs, posed, turns).reshape(count, 9, -1)
@@ -100,30 +110,28 @@ class PosedPoints:
         return posed.positions, found
 
     def _posed(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
-        """The last one is kept: positions, normals and derivatives are mostly asked for
-        together."""
+        # positions, normals and derivatives are mostly asked for together
         key = np.concatenate([coefficients, rigid]).tobytes()
-        if self._last is None or self._last[0] != key:
-            self._last = key, self._posed_now(coefficients, rigid)
-        return self._last[1]
-
-    def _posed_now(self, coefficients: np.ndarray, rigid: np.ndarray) -> "_Posed":
-        local = axis_angle_matrices(rigid[:POSE_SIZE].reshape(-1, 3))
+        if self._last is not None and self._last[0] == key:
+            return self._last[1]
+        angles = rigid[:POSE_SIZE].reshape(-1, 3)
+        local = axis_angle_matrices(angles)
         rotations = local.copy()
         for joint, parent in enumerate(self.parents):
             if parent >= 0:
                 rotations[joint] = rotations[parent] @ rotations[joint]
         joints = self.joints + self.joint_dirs @ coefficients
         places = self._placed(rotations, joints[..., None])[..., 0]
-        moved = _moves(rotations, places[..., None], joints[..., None])[..., 0]
+        moved = places - (rotations @ joints[..., None])[..., 0]
         corrected = self.template + self.dirs @ coefficients
         if self.posedirs is not None:
             corrected += self.posedirs @ (local[1:] - np.eye(3)).ravel()
         skin = (self.weights @ rotations.reshape(-1, 9)).reshape(-1, 3, 3)
         posed = np.einsum("nij,nj->ni", skin, corrected) + self.weights @ moved
         positions = self._weighted(posed).sum(1) + rigid[POSE_SIZE:]
-        angles = rigid[:POSE_SIZE].reshape(-1, 3)
-        return _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
+        found = _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
+        self._last = key, found
+        return found
 
     @staticmethod
     def _corrective_dirs(
@@ -150,9 +158,8 @@ class PosedPoints:
         share = self._below @ self._corner_weights.sum(2)
         arms = np.tensordot(self._below, carried, 1) - share[..., None] * posed.places[:, None]
         parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
-        across = np.einsum(
-            "yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ np.stack(turns)
-        ).reshape(-1, 3, 9)
+        rates = parents @ np.stack(turns)
+        across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), rates).reshape(-1, 3, 9)
         by_joint = (arms @ across).reshape(*arms.shape, 3)
         return np.asarray(by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE))
 
@@ -177,8 +184,8 @@ class PosedPoints:
 @dataclass(frozen=True)
 class _Posed:
     """One evaluation: positions (N, 3); of J joints axis-angles (J, 3), local and world rotations
-    (J, 3, 3), places in the world (J, 3) and `_moves` (J, 3); of the 3 N corners, corrected
-    positions, blended rotations (3 N, 3, 3) and positions."""
+    (J, 3, 3), places in the world (J, 3), and shifts (J, 3) after rotating about the origin; of the
+    3 N corners, corrected positions, blended rotations (3 N, 3, 3) and positions."""
 
     positions: np.ndarray
     angles: np.ndarray
@@ -189,17 +196,3 @@ class _Posed:
     corrected: np.ndarray
     skin: np.ndarray
     corners: np.ndarray
-
-
-def _moves(rotations: np.ndarray, places: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """(J, 3, K) by which each joint moves what it carries after rotating it about the origin."""
-    return np.asarray(places - rotations @ joints)
-
-
-def _below(parents: list[int]) -> np.ndarray:
-    """(J, J): 1 where a joint (column) is one (row) or is carried by it."""
-    found = np.eye(len(parents))
-    for joint, parent in enumerate(parents):
-        if parent >= 0:
-            found[:, joint] += found[:, parent]
-    return found

@@ -1,28 +1,33 @@
 """Where images and masks show the surface of a fitted head."""
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import connected_parts, rasterize, vertex_normals
 from ..flame.model import FlameModel
-from .fit import HeadFit, TimestepLandmarks
+from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
 from .head_model import HeadModel
-from .photo_consistency import Sweep, facing, gray_view, in_sight, surface_offsets
-from .posed_points import SurfacePoints, head_rotation
-from .write_capture import posed_mesh
+from .posed_points import SurfacePoints, head_rotation, unit
 
+PATCH_SAMPLES = 9  # Samples along each side of a patch
+MAX_CAMERAS = 6  # Cameras that a patch is compared in: those that see it most squarely
+MIN_COSINE = 0.35
+"""Of the angle between normal and camera: beyond 70°, a patch is too foreshortened."""
+MIN_CORRELATION = 0.5
+NOISE_LEVELS = 2.0
+"""Standard deviation of image noise, of 255: patches of less contrast do not correlate."""
+OCCLUSION_M = 0.004  # A point this far behind the nearest surface is hidden
+DEPTH_IMAGE_SIDE = 300
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 POINT_SHARE = 0.25
 """Weight of a surface point: patches of neighboring points share most of their pixels."""
 DIRECTIONS = 6
-"""Steps of a direction's coordinates, about 10°: in one step, a head hides the same of itself."""
+"""Steps of a direction's coordinates, about 10°."""
 MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
-
 MAX_OUTLINE_DISTANCE_M = 0.0005
 """Median distance of the masks' outlines from the surface in the images, beyond which they are not
 those of the skin: mattes are often a pixel or two too wide, and hair hangs over faces."""
@@ -39,22 +44,131 @@ MAX_REACH_PX = 40.0
 """Pixels on either side of a point in which an edge is looked for; a close camera's are many."""
 
 
-class Images(Protocol):
-    """Gives, of a timestep, cameras in the footage's world and their images (H, W, 3) or masks (H,
-    W), uint8; at most so many, spread over the rig."""
+@dataclass(frozen=True)
+class Sweep:
+    """Offsets in meters, −reach to +reach, a step apart; a patch's samples are `spacing` apart."""
 
-    def __call__(
-        self, timestep: int, most: int | None = None
-    ) -> Sequence[tuple[Camera, np.ndarray]]: ...
+    reach: float
+    step: float
+    spacing: float
+
+    @property
+    def offsets(self) -> np.ndarray:
+        count = round(self.reach / self.step)
+        return self.step * np.arange(-count, count + 1)
+
+
+def gray_view(
+    camera: Camera, image: np.ndarray, center: np.ndarray, spacing: float
+) -> tuple[Camera, np.ndarray]:
+    """Camera and luma (H, W) float32, 0 to 255, of an image (H, W, 3) uint8, reduced as far as its
+    pixels at `center` (3,) stay smaller than `spacing` meters."""
+    pixel = float(camera.project(center[None])[1][0]) / camera.fl_x
+    factor = int(np.clip(spacing / max(pixel, 1e-9), 1, min(image.shape[:2])))
+    height, width = (side // factor for side in image.shape[:2])
+    gray = image[: height * factor, : width * factor].astype(np.float32) @ LUMA
+    small = gray.reshape(height, factor, width, factor).mean((1, 3))
+    intrinsics = {name: getattr(camera, name) / factor for name in ("fl_x", "fl_y", "cx", "cy")}
+    return replace(camera, width=width, height=height, **intrinsics), small
+
+
+def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Cosine (N,) of the angle between unit normals (N, 3) and the direction to the camera."""
+    towards = camera.position - points
+    return np.asarray((towards * normals).sum(1) / np.linalg.norm(towards, axis=1))
+
+
+def in_sight(
+    camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(N,) bool: points (N, 3) that the mesh does not hide, by a depth image of reduced size."""
+    small = camera.scaled(min(1.0, DEPTH_IMAGE_SIDE / max(camera.width, camera.height)))
+    triangle, inside = rasterize(vertices, faces, small)
+    covered = triangle >= 0
+    closeness, corners = np.zeros(triangle.shape), faces[triangle[covered]]
+    closeness[covered] = (inside[covered] / small.project(vertices)[1][corners]).sum(1)
+    flat, depth = small.project(points)
+    x, y = np.clip(np.nan_to_num(flat), -1, [small.width, small.height]).astype(np.int64).T
+    within = (flat >= 0).all(1) & (x < small.width) & (y < small.height) & (depth > 0)
+    seen = np.zeros(len(points), bool)
+    seen[within] = closeness[y[within], x[within]] * (depth[within] - OCCLUSION_M) < 1
+    return seen
+
+
+def surface_offsets(
+    views: Pictures,
+    cosines: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    sweep: Sweep,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Offset (N,) in meters along the normals at which the images agree best, and their correlation
+    (N,) there.
+
+    views: of `gray_view`; points, normals (N, 3); cosines (C, N): `facing`, 0 for what a camera
+    does not see. The correlation is 0 where fewer than two cameras see a point, where they agree
+    too little, and where no offset is a maximum.
+    """
+    usable = np.where(cosines > MIN_COSINE, cosines, 0.0)
+    worst = np.zeros(len(points))
+    if len(views) > MAX_CAMERAS:
+        worst = -np.sort(-usable, axis=0)[: MAX_CAMERAS + 1][-1]
+    usable = np.where(usable > worst, usable, 0.0)
+    # samples (N, P, 3) in the tangent planes; weights (P,), largest at the center
+    axis = np.where(np.abs(normals[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    across = unit(np.cross(axis, normals))
+    steps = np.arange(PATCH_SAMPLES) - (PATCH_SAMPLES - 1) / 2
+    u, v = (part.ravel() for part in np.meshgrid(steps, steps, indexing="ij"))
+    away = u[:, None] * across[:, None] + v[:, None] * np.cross(normals, across)[:, None]
+    patches = points[:, None] + sweep.spacing * away
+    window = np.exp(-(u**2 + v**2) / (2 * (0.3 * PATCH_SAMPLES) ** 2))
+    window = (window / window.sum()).astype(np.float32)
+    offsets = sweep.offsets.astype(np.float32)
+    total = np.zeros((len(points), len(offsets), len(window)), np.float32)
+    own = np.zeros(total.shape[:2], np.float32)  # what patches add by agreeing with themselves
+    for view, cosine in zip(views, usable, strict=True):
+        rows = np.flatnonzero(cosine)
+        if len(rows):
+            weight = cosine[rows, None].astype(np.float32)
+            patch = _patch_levels(*view, patches[rows], normals[rows], offsets)
+            patch = (patch - (patch @ window)[..., None]) * np.sqrt(window)
+            patch = patch / np.sqrt((patch**2).sum(-1, keepdims=True) + NOISE_LEVELS**2)
+            total[rows] += weight[..., None] * patch
+            own[rows] += weight**2 * (patch**2).sum(2)
+    pairs = np.maximum(usable.sum(0) ** 2 - (usable**2).sum(0), 1e-6)
+    # the mean of all pairs of patches, weighted by the cosines of both cameras
+    correlation, rows = ((total**2).sum(2) - own) / pairs[:, None], np.arange(len(points))
+    best = correlation.argmax(1)
+    middle = np.clip(best, 1, len(offsets) - 2)
+    before, at, after = (correlation[rows, middle + shift] for shift in (-1, 0, 1))
+    bend = np.maximum(2 * at - before - after, 1e-6)
+    peak = np.clip((after - before) / (2 * bend), -0.5, 0.5)
+    vertex = sweep.offsets[middle] + sweep.step * peak
+    return vertex, np.where((best == middle) & (at > MIN_CORRELATION), at, 0.0)
+
+
+def _patch_levels(
+    camera: Camera, image: np.ndarray, patches: np.ndarray, normals: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Levels (M, D, P) of patches (M, P, 3) moved along their normals by offsets (D,)."""
+    import cv2
+
+    turn = camera.world_to_camera[:3, :3]
+    local = (patches @ turn.T + camera.world_to_camera[:3, 3]).astype(np.float32)
+    moved = offsets[None, :, None] * (normals @ turn.T).astype(np.float32)[:, None, :]  # (M, D, 3)
+    x, y, depth = (local[:, None, :, axis] + moved[..., axis : axis + 1] for axis in range(3))
+    x = x / depth * np.float32(camera.fl_x) + np.float32(camera.cx - 0.5)
+    y = y / depth * np.float32(camera.fl_y) + np.float32(camera.cy - 0.5)
+    found = np.empty(x.shape, np.float32)
+    # Coordinates apart, unlike `appearance.sampled`: to pair them takes five times as long as to
+    # look them up.
+    for row in range(len(x)):
+        cv2.remap(image, x[row], y[row], cv2.INTER_LINEAR, found[row], cv2.BORDER_REPLICATE)
+    return found
 
 
 VisiblePoints = dict[tuple[int, ...], np.ndarray]
 """Direction from the head, rounded -> (N,) bool: points that are not hidden from there."""
-
-
-def no_masks(timestep: int, most: int | None = None) -> Sequence[tuple[Camera, np.ndarray]]:
-    """The masks of footage without any."""
-    return ()
 
 
 @dataclass(frozen=True)
@@ -65,27 +179,6 @@ class SeenSurface:
     position: np.ndarray
     normal: np.ndarray
     weight: np.ndarray
-
-
-@dataclass(frozen=True)
-class RecordedTake:
-    """What was recorded: places of landmarks on the head, which are reliable, landmarks by
-    timestep, images, masks, and whether the world of the cameras is in meters."""
-
-    places: SurfacePoints
-    reliable: np.ndarray
-    landmarks: Mapping[int, TimestepLandmarks]
-    images: Images
-    masks: Images = no_masks
-    metric: bool = False
-
-
-def excerpt(
-    fit: HeadFit, take: RecordedTake, timesteps: Sequence[int]
-) -> tuple[HeadFit, RecordedTake]:
-    """The fit and the take at some timesteps."""
-    own = replace(fit, parameters={t: fit.parameters[t] for t in timesteps})
-    return own, replace(take, landmarks={t: take.landmarks[t] for t in timesteps})
 
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
@@ -111,7 +204,7 @@ def seen_surface(
     fit: HeadFit,
     timestep: int,
     points: SurfacePoints,
-    images: Sequence[tuple[Camera, np.ndarray]],
+    images: Pictures,
     sweep: Sweep,
     visible: VisiblePoints,
 ) -> SeenSurface:
@@ -121,22 +214,31 @@ def seen_surface(
     `visible` is filled with what is in sight from where, and read for directions that are in it
     already.
     """
-    faces = fit.head.model.faces
-    vertices = posed_mesh(fit, fit.parameters[timestep])
-    at, normals = points.on(vertices, faces), points.on(vertex_normals(vertices, faces), faces)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    cameras = [fit.to_capture.camera(camera) for camera, _ in images]
+    vertices, at, normals = _posed(fit, timestep, points)
     turn, cosines, views = head_rotation(fit.parameters[timestep]), [], []
-    for camera, (_, image) in zip(cameras, images, strict=True):
+    for recording, image in images:
+        camera = fit.to_capture.camera(recording)
         views.append(gray_view(camera, image, at.mean(0), sweep.spacing))
-        direction = (camera.position - at.mean(0)) @ turn
-        rounded = np.round(DIRECTIONS * direction / np.linalg.norm(direction))
-        key = tuple(rounded.astype(int).tolist())
+        key = rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
         if key not in visible:
-            visible[key] = in_sight(camera, vertices, faces, at)
+            visible[key] = in_sight(camera, vertices, fit.head.model.faces, at)
         cosines.append(facing(camera, at, normals) * visible[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
     return SeenSurface(at + offset[:, None] * normals, normals, POINT_SHARE * correlation)
+
+
+def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
+    """A direction (3,) in so many steps: within one, a head hides the same of itself."""
+    return tuple(np.round(steps * direction / np.linalg.norm(direction)).astype(int).tolist())
+
+
+def _posed(
+    fit: HeadFit, timestep: int, points: SurfacePoints
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3) at a timestep; of the points positions and unit normals (N, 3)."""
+    vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
+    normals = unit(points.on(vertex_normals(vertices, faces), faces))
+    return vertices, points.on(vertices, faces), normals
 
 
 def with_outlines(
@@ -144,7 +246,7 @@ def with_outlines(
     fit: HeadFit,
     timestep: int,
     points: SurfacePoints,
-    masks: Sequence[tuple[Camera, np.ndarray]],
+    masks: Pictures,
     near: np.ndarray,
     reach: float,
 ) -> SeenSurface:
@@ -152,10 +254,10 @@ def with_outlines(
     vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
     at = points.on(vertices, faces)
     total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
-    for camera, mask in masks:
-        posed = fit.to_capture.camera(camera)
-        places = at[near], seen.normal[near]
-        offset, known = outline_offsets(posed, mask, vertices, faces, *places, reach)
+    places = at[near], seen.normal[near]
+    for recording, mask in masks:
+        camera = fit.to_capture.camera(recording)
+        offset, known = outline_offsets(camera, mask, vertices, faces, *places, reach)
         total[near] += POINT_SHARE * known
         moved[near] += POINT_SHARE * offset
     mean = moved / np.maximum(total, 1e-9)
@@ -166,15 +268,12 @@ def outlines_agree(
     fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, reach: float
 ) -> bool:
     """Whether masks, if any, end where the surface in the images does; reach: meters searched."""
-    model, distances = fit.head.model, [np.zeros(0)]
-    for timestep, parameters in fit.parameters.items():
-        vertices = posed_mesh(fit, parameters)
-        both = vertices, vertex_normals(vertices, model.faces)
-        at, normals = (points.on(values, model.faces)[near] for values in both)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        for camera, mask in take.masks(timestep):
-            posed = fit.to_capture.camera(camera)
-            offset, known = outline_offsets(posed, mask, vertices, model.faces, at, normals, reach)
+    distances, faces, chosen = [np.zeros(0)], fit.head.model.faces, points[near]
+    for timestep in fit.parameters:
+        vertices, at, normals = _posed(fit, timestep, chosen)
+        for recording, mask in take.masks(timestep):
+            camera = fit.to_capture.camera(recording)
+            offset, known = outline_offsets(camera, mask, vertices, faces, at, normals, reach)
             distances.append(np.abs(offset[known]))
     every = np.concatenate(distances)
     return len(every) >= MIN_OUTLINE_POINTS and float(np.median(every)) < MAX_OUTLINE_DISTANCE_M
@@ -218,8 +317,14 @@ def outline_offsets(
     factor = int(np.clip(PICTURE_SIDE / max(camera.width, camera.height), 1, MAX_ENLARGEMENT))
     rim = _rim(camera, vertices, faces, begin, pixels)
     drawn = (rasterize(vertices, rim, camera.scaled(factor))[0] >= 0).astype(np.float32)
-    wanted, own = _edge(mask / np.float32(255), at, steps), _last_edge(drawn, factor * at, steps)
-    move = (wanted - own) / length
+    # the mask's edge, where there is one; the last one of the drawn mesh, which has holes
+    level, own = _sampled(mask / np.float32(255), at), _sampled(drawn, factor * at)
+    crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
+    once = (crossings.sum(1) == 1) & (level[:, 0] > 0)
+    leaves = (own[:, :-1] > 0) & (own[:, 1:] <= 0)
+    last = leaves.shape[1] - 1 - leaves[:, ::-1].argmax(1)
+    move = _crossed(level, crossings.argmax(1), steps, once)
+    move = (move - _crossed(own, last, steps, leaves.any(1) & (own[:, -1] <= 0))) / length
     inside = np.abs(np.nan_to_num(move, nan=np.inf)) <= reach
     found[rows[inside]], known[rows[inside]] = move[inside], True
     return found, known
@@ -232,29 +337,13 @@ def _rim(
     from scipy.spatial import cKDTree
 
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+    normal = unit(np.cross(b - a, c - a), 1e-20)
     rows = np.flatnonzero(np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE)
     corners = camera.project(vertices)[0][faces[rows]]
     center = corners.mean(1)
     radius = np.linalg.norm(corners - center[:, None], axis=2).max(1)
     distance, _ = cKDTree(around).query(np.nan_to_num(center, nan=1e9))
     return np.asarray(faces[rows[distance < pixels + radius]])
-
-
-def _edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Step (N,) at which lines `at` (N, S, 2) leave a mask (H, W), 0 to 1, once; else NaN."""
-    level = _sampled(mask, at)
-    crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
-    return _crossed(level, crossings.argmax(1), steps, (crossings.sum(1) == 1) & (level[:, 0] > 0))
-
-
-def _last_edge(mask: np.ndarray, at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """As `_edge`, of a mask with holes: the last step; NaN where a line ends inside."""
-    level = _sampled(mask, at)
-    leaves = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
-    last = leaves.shape[1] - 1 - leaves[:, ::-1].argmax(1)
-    return _crossed(level, last, steps, leaves.any(1) & (level[:, -1] <= 0))
 
 
 def _sampled(mask: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -136,12 +136,11 @@ def solve_take(
     observations.
     """
     points = PosedPoints(head.model, places)
-    return _solve_windows(
-        head,
-        lambda row, values: normal_equations(points, values, observations[row]),
-        start,
-        ordered,
-    )
+
+    def terms(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return normal_equations(points, values, observations[row])
+
+    return _solve_windows(head, terms, start, _stiffness(head, ordered))
 
 
 def in_order(
@@ -198,7 +197,18 @@ def smooth_take(
         matrix, right = terms[row]
         return matrix.copy(), right - matrix @ (values - start[row])
 
-    return _solve_windows(head, linear, start, ordered)
+    return _solve_windows(head, linear, start, _stiffness(head, ordered))
+
+
+def smoothed(start: np.ndarray, information: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+    """Parameters (T, P) of consecutive timesteps that are known up to their information (T, P, P),
+    an inverse covariance, with second differences over time of inverse variances stiffness (P,),
+    but for jumps, such as cuts."""
+
+    def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return information[row], information[row] @ (start[row] - values)
+
+    return _solve_windows(None, linear, start, stiffness)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
@@ -225,11 +235,18 @@ def normal_equations(
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
 
 
-def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray, ordered: bool) -> np.ndarray:
+def _stiffness(head: HeadModel, ordered: bool) -> np.ndarray | None:
+    return acceleration_precision(head.model) if ordered else None
+
+
+def _solve_windows(
+    head: HeadModel | None, terms: Terms, start: np.ndarray, stiffness: np.ndarray | None
+) -> np.ndarray:
+    """Parameters (T, P). head: whose prior they have; stiffness (P,): of second differences."""
     solved = start.copy()
     for first in range(0, len(start), WINDOW - OVERLAP):
         window = slice(first, min(first + WINDOW, len(start)))
-        found = _solve_window(head, terms, first, solved[window], ordered)
+        found = _solve_window(head, terms, first, solved[window], stiffness)
         kept = 0 if first == 0 else OVERLAP // 2
         solved[first + kept : window.stop] = found[kept:]
         if window.stop == len(start):
@@ -238,18 +255,22 @@ def _solve_windows(head: HeadModel, terms: Terms, start: np.ndarray, ordered: bo
 
 
 def _solve_window(
-    head: HeadModel, terms: Terms, first: int, start: np.ndarray, ordered: bool
+    head: HeadModel | None,
+    terms: Terms,
+    first: int,
+    start: np.ndarray,
+    stiffness: np.ndarray | None,
 ) -> np.ndarray:
-    stiffness = acceleration_precision(head.model)
     state, size = start.copy(), start.shape[1]
     blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
     for _ in range(TAKE_ITERATIONS):
         for number, values in enumerate(state):
             blocks[number], right[number] = terms(first + number, values)
-        precision, pull = prior_terms(head, state)
-        blocks[:, np.arange(size), np.arange(size)] += precision
-        right += pull
-        if ordered and len(state) > 2:
+        if head is not None:
+            precision, pull = prior_terms(head, state)
+            blocks[:, np.arange(size), np.arange(size)] += precision
+            right += pull
+        if stiffness is not None and len(state) > 2:
             step = _smooth_step(blocks, right, state, stiffness)
         else:
             step = np.linalg.solve(blocks, right[..., None])[..., 0]

@@ -3,6 +3,7 @@ own offsets."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,26 +12,32 @@ from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import faces_within
 from ..worker.helpers import Helpers, Step
-from .fit import HeadFit, LandmarkVisibility, observed_landmarks, rigid_start, triangulated
+from .fit import (
+    HeadFit,
+    LandmarkVisibility,
+    RecordedTake,
+    excerpt,
+    no_pictures,
+    observed_landmarks,
+    posed_mesh,
+    rigid_start,
+    scaled_down,
+    triangulated,
+)
 from .head_model import HeadModel
 from .landmarks import Report
-from .photo_consistency import Sweep
-from .posed_points import PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .seen_surface import (
-    RecordedTake,
     SeenSurface,
+    Sweep,
     VisiblePoints,
-    excerpt,
     near_landmarks,
-    no_masks,
     outlines_agree,
     seen_surface,
     surface_points,
     with_outlines,
 )
-from .smooth_offsets import SURFACE_SIGMA_M, smooth_offsets
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
-from .write_capture import posed_mesh
 
 IDENTITY_SWEEPS = (
     Sweep(0.010, 0.001, 0.0015),
@@ -64,6 +71,14 @@ PART_TIMESTEPS = 24  # At most, of the parts of a take that are searched at once
 FEW_CAMERAS = 3
 """Median over the timesteps of the cameras that see a face, up to which expressions and poses of
 dense tracking are nearer to the truth than those of the surface (docs/experiments.md)."""
+OFFSET_DENSITY = 1.5e10
+"""Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
+SMOOTHING_M = 0.009  # Length over which offsets are smoothed
+OFFSET_SIGMA_M = 0.03
+"""Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
+OFFSET_ITERATIONS = 5
+MAX_COTANGENT = 5.0  # Of an angle, 11°: those of needles would outweigh all others
+SURFACE_SIGMA_M = 0.0005
 MAX_OUTLINE_CAMERAS = 8  # Cameras whose masks are compared at every timestep
 
 
@@ -101,65 +116,56 @@ def fit_surface(
     steps = early + len(timesteps)
     points = surface_points(head, SURFACE_POINTS)
     near = near_landmarks(head, points, take)
-    start, without = (
-        replace(fit, parameters={t: fit.parameters[t] for t in chosen}),
-        replace(take, masks=no_masks),
-    )
 
     def search(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
         results = helpers.map(work, parts, lambda done: report("Surface", before + done, steps))
         return [one for result in results for one in result]
 
-    solved = _identity(head, start, without, points, near, IDENTITY_SWEEPS, search, 0)
+    def identity(
+        found: HeadFit, take: RecordedTake, sweeps: Sequence[Sweep], before: int
+    ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
+        """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they
+        were solved from; None where the images do not show enough of the surface."""
+        offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
+        for number, sweep in enumerate(sweeps):
+            parts = [(*excerpt(found, take, [t]), points, near, sweep) for t in found.parameters]
+            surfaces = search(_seen_part, parts, before + number * len(parts))
+            seen = dict(zip(found.parameters, surfaces, strict=True))
+            if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
+                return None
+            found, seen = _solved(with_offset(head, offset), found, take, points, seen)
+            if number:
+                offset = offset + _offsets(found, points, seen)
+                subject = person(with_offset(head, offset), found.shape)
+                found = replace(found, head=subject, static_offset=offset)
+        return found, seen
+
+    start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
+    without = replace(take, masks=no_pictures)
+    solved = identity(start, without, IDENTITY_SWEEPS, 0)
     if solved is None:
         return fit
     if outlines_agree(solved[0], take, points, near, OUTLINE_SWEEPS[0].reach):
         start, begin = replace(solved[0], static_offset=None), len(IDENTITY_SWEEPS) * len(chosen)
-        solved = _identity(head, start, take, points, near, OUTLINE_SWEEPS, search, begin) or solved
+        solved = identity(start, take, OUTLINE_SWEEPS, begin) or solved
     else:
         take = without
-    if dense:
-        observed = _fitted_landmarks(solved[0], fit, take)
-        if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
-            return _posed_alike(solved[0], fit, take, observed)
+    found, seen = solved
+    if not dense:
+        observed = {t: _landmarks(found, t, take) for t in timesteps}
     else:
-        observed = {t: _landmarks(solved[0], t, take) for t in timesteps}
-    often = [_often_seen(points, solved[1], count) for _, count in TAKE_SWEEPS]
+        observed = _fitted_landmarks(found, fit, take)
+        if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
+            # the landmarks where they are on `fit`, whose own parameters are of another identity
+            poses = np.stack([fit.parameters[t] for t in observed])
+            poses = solve_take(found.head, take.places, list(observed.values()), poses, fit.ordered)
+            return replace(found, parameters=dict(zip(observed, poses, strict=True)))
+    often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
+    rows = np.flatnonzero(often)
+    some = [points[rows[:: 1 + len(rows) // count]] for _, count in TAKE_SWEEPS]
     return _whole_take(
-        solved[0], fit, take, observed, often, lambda work, parts: search(work, parts, early)
+        found, fit, take, observed, some, lambda work, parts: search(work, parts, early)
     )
-
-
-def _identity(
-    head: HeadModel,
-    found: HeadFit,
-    take: RecordedTake,
-    points: SurfacePoints,
-    near: np.ndarray,
-    sweeps: Sequence[Sweep],
-    search: Callable[..., list],
-    before: int,
-) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
-    """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they were
-    solved from.
-
-    near: as of `with_outlines`. search(work, parts, steps before it): results of the helping
-    processes. None where the images do not show enough of the surface.
-    """
-    offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
-    for number, sweep in enumerate(sweeps):
-        parts = [(*excerpt(found, take, [t]), points, near, sweep) for t in found.parameters]
-        surfaces = search(_seen_part, parts, before + number * len(parts))
-        seen = dict(zip(found.parameters, surfaces, strict=True))
-        if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
-            return None
-        found, seen = _solved(with_offset(head, offset), found, take, points, seen)
-        if number:
-            offset = offset + _offsets(found, points, seen)
-            found = replace(
-                found, head=person(with_offset(head, offset), found.shape), static_offset=offset
-            )
-    return found, seen
 
 
 def _seen_part(
@@ -196,63 +202,30 @@ def _solved(
     share = _landmark_shares(base, take.places)
     together = [_joined(_landmarks(fit, t, take), share, own) for t, own in seen.items()]
     starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
-    identity = solve_identity(base, _both(take.places, points), together, starts, take.metric)
-    world = fit.to_capture
+    identity = solve_identity(base, take.places + points, together, starts, take.metric)
     moved = replace(
         fit,
         head=person(base, identity.shape),
         shape=identity.shape,
         parameters=dict(zip(seen, identity.frames, strict=True)),
-        to_capture=replace(
-            world,
-            scale=world.scale / identity.scale,
-            translation=world.translation / identity.scale,
-        ),
+        to_capture=scaled_down(fit.to_capture, identity.scale),
     )
-    return moved, {
-        t: replace(own, position=own.position / identity.scale) for t, own in seen.items()
-    }
+    rescaled = {t: replace(own, position=own.position / identity.scale) for t, own in seen.items()}
+    return moved, rescaled
 
 
 def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> np.ndarray:
     """(V, 3) along the normals of the person's template, from what is left between it and the
     surfaces."""
-    model = fit.head.model
-    missing = [
-        (
-            (own.position - points.on(posed_mesh(fit, fit.parameters[t]), model.faces)) * own.normal
-        ).sum(1)
-        for t, own in seen.items()
-    ]
-    repeated = SurfacePoints(
-        np.tile(points.face, len(seen)), np.tile(points.barycentric, (len(seen), 1))
-    )
+    model, missing = fit.head.model, []
+    for t, own in seen.items():
+        at = points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
+        missing.append(((own.position - at) * own.normal).sum(1))
+    repeated = points[np.tile(np.arange(len(points)), len(seen))]
     weight = np.concatenate([own.weight for own in seen.values()]) / len(seen)
-    values = smooth_offsets(
-        model.v_template, model.faces, repeated, np.concatenate(missing), weight
-    )
+    residual = np.concatenate(missing)
+    values = smooth_offsets(model.v_template, model.faces, repeated, residual, weight)
     return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
-
-
-def _often_seen(
-    points: SurfacePoints, seen: Mapping[int, SeenSurface], count: int
-) -> SurfacePoints:
-    """Up to `count` of the points that are found at most timesteps."""
-    often = np.flatnonzero(
-        np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
-    )
-    rows = often[:: 1 + len(often) // count]
-    return SurfacePoints(points.face[rows], points.barycentric[rows])
-
-
-def _posed_alike(
-    fit: HeadFit, first: HeadFit, take: RecordedTake, observed: Mapping[int, Observation]
-) -> HeadFit:
-    """The fit with its landmarks where they are on `first`. The parameters of `first` itself would
-    put them elsewhere, because its identity is another."""
-    start = np.stack([first.parameters[t] for t in observed])
-    solved = solve_take(fit.head, take.places, list(observed.values()), start, fit.ordered)
-    return replace(fit, parameters=dict(zip(observed, solved, strict=True)))
 
 
 def _whole_take(
@@ -270,16 +243,19 @@ def _whole_take(
     taken off.
     """
     timesteps, model = list(observed), fit.head.model
-    bias = _landmark_bias(fit, take.places, observed)
+    missed = [
+        (observed[t].position - take.places.on(posed_mesh(fit, values), model.faces))
+        @ head_rotation(values)
+        for t, values in fit.parameters.items()
+    ]
+    bias = np.median(missed, axis=0)  # (N, 3) in the turned head's axes
     corrected = {
         t: replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T)
         for t, own in observed.items()
     }
-    landmarks = list(corrected.values())
+    landmarks, at = list(corrected.values()), take.places.on(model.v_template, model.faces)
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
-    start[:, -RIGID_SIZE:] = [
-        rigid_start(take.places.on(model.v_template, model.faces), own) for own in landmarks
-    ]
+    start[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
     near = [near_landmarks(fit.head, on, take) for on in points]
@@ -291,9 +267,8 @@ def _whole_take(
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
-    solved = solve_take(
-        fit.head, _both(take.places, points[-1]), together, np.stack(found), fit.ordered
-    )
+    every = take.places + points[-1]
+    solved = solve_take(fit.head, every, together, np.stack(found), fit.ordered)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 
 
@@ -317,46 +292,26 @@ def _found_part(
             seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
             seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
             joined = _joined(own, share, seen)
-            here = solve_take(
-                fit.head, _both(take.places, on), [joined], here[None], ordered=False
-            )[0]
+            (here,) = solve_take(fit.head, take.places + on, [joined], here[None], ordered=False)
         results.append((here, joined))
         step()
     return results
 
 
-def _landmark_bias(
-    fit: HeadFit, places: SurfacePoints, observed: Mapping[int, Observation]
-) -> np.ndarray:
-    """(N, 3) in the turned head's axes: median distance of the landmarks from their places over the
-    timesteps."""
-    missed = [
-        (observed[t].position - places.on(posed_mesh(fit, values), fit.head.model.faces))
-        @ head_rotation(values)
-        for t, values in fit.parameters.items()
-    ]
-    return np.asarray(np.median(missed, axis=0))
-
-
 def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
     """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
-    points, scale = (
-        PosedPoints(first.head.model, take.places),
-        fit.to_capture.scale / first.to_capture.scale,
-    )
-    count, found = len(take.reliable), {}
-    for timestep in sorted(take.landmarks):
-        parameters = first.parameters[timestep]
-        at = scale * points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
-        found[timestep] = Observation(at, np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
+    points, count = PosedPoints(first.head.model, take.places), len(take.reliable)
+    scale, found = fit.to_capture.scale / first.to_capture.scale, {}
+    for t in sorted(take.landmarks):
+        at = scale * points.positions(*split(first.parameters[t]))
+        found[t] = Observation(at, np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
     return found
 
 
 def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:
     world, at = fit.to_capture, take.places.on(fit.head.model.v_template, fit.head.model.faces)
-    return observed_landmarks(
-        triangulated(take.landmarks[timestep], take.reliable, at, world.scale), world, take.reliable
-    )
+    found = triangulated(take.landmarks[timestep], take.reliable, at, world.scale)
+    return observed_landmarks(found, world, take.reliable)
 
 
 def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
@@ -369,9 +324,8 @@ def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:
 def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> Observation:
     """Both as one observation, landmarks at shares (N,) of their weight; the surface counts along
     its normal."""
-    root = (
-        LANDMARK_SIGMA_M / SURFACE_SIGMA_M * surface.normal[:, :, None] * surface.normal[:, None, :]
-    )
+    along = surface.normal[:, :, None] * surface.normal[:, None, :]
+    root = LANDMARK_SIGMA_M / SURFACE_SIGMA_M * along
     return Observation(
         np.concatenate([landmarks.position, surface.position]),
         np.concatenate([landmarks.root, root]),
@@ -379,7 +333,56 @@ def _joined(landmarks: Observation, share: np.ndarray, surface: SeenSurface) -> 
     )
 
 
-def _both(a: SurfacePoints, b: SurfacePoints) -> SurfacePoints:
-    return SurfacePoints(
-        np.concatenate([a.face, b.face]), np.concatenate([a.barycentric, b.barycentric])
-    )
+def smooth_offsets(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    points: SurfacePoints,
+    residual: np.ndarray,
+    weight: np.ndarray,
+) -> np.ndarray:
+    """Smooth values (V,) of the vertices that take the values `residual` (N,) meters at the points,
+    robustly.
+
+    weight (N,). Least squares with the squared Laplacian as prior; values vanish where no point is
+    near.
+    """
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import spsolve
+
+    count = len(vertices)
+    rows = np.repeat(np.arange(len(points)), 3)
+    places = rows, faces[points.face].ravel()
+    at = coo_array((points.barycentric.ravel(), places), shape=(len(points), count)).tocsr()
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    share = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    area = np.bincount(faces.ravel(), np.repeat(share, 3), count)
+    laplacian = _laplacian(vertices, faces, area)
+    smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
+    small = diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
+    prior = OFFSET_DENSITY * (smooth + small)
+    values, trust = np.zeros(count), weight / SURFACE_SIGMA_M**2
+    for _ in range(OFFSET_ITERATIONS):
+        miss = (residual - at @ values) / (2 * SURFACE_SIGMA_M)
+        robust = trust / (1 + miss**2) ** 2 if values.any() else trust / np.sqrt(1 + miss**2)
+        matrix = (at.T @ diags_array(robust) @ at + prior).tocsc()
+        values = spsolve(matrix, at.T @ (robust * residual))
+    return np.asarray(values)
+
+
+def _laplacian(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> Any:
+    """Sparse (V, V), in 1/m²: the cotangent Laplacian (Pinkall and Polthier 1993), which depends on
+    the surface alone, not on its triangles; 0 at the mesh's edge. area (V,) of the vertices."""
+    from scipy.sparse import coo_array, diags_array
+
+    size, corners = (len(vertices),) * 2, vertices[faces]
+    ends = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
+    sine = np.linalg.norm(np.cross(*ends), axis=2)
+    cotangent = (ends[0] * ends[1]).sum(2) / np.maximum(sine, 1e-20)
+    weight = np.clip(cotangent, -MAX_COTANGENT, MAX_COTANGENT) / 2
+    across = np.stack([faces[:, [1, 2, 0]].ravel(), faces[:, [2, 0, 1]].ravel()])  # from its angle
+    half = coo_array((weight.ravel(), across), shape=size).tocsr()
+    around = half + half.T
+    edges, count = np.unique(np.sort(across, axis=0), axis=1, return_counts=True)
+    inner = ~np.isin(np.arange(len(vertices)), edges[:, count == 1])
+    difference = around - diags_array(around.sum(axis=1))
+    return (diags_array(inner / np.maximum(area, 1e-9)) @ difference).tocsr()

@@ -18,15 +18,18 @@ from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
 from ..worker.helpers import Helpers, Step
-from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, robust, sampled
-from .dense_terms import (
+from .appearance import (
+    CHANNEL_WEIGHTS,
     FLOW_ITERATIONS,
     FLOW_SCALE_PX,
     FLOW_SHARE,
+    NOISE_LEVELS,
     OUTLIER_SQUARED,
     POINT_SHARE,
     flow_targets,
     projection_derivative,
+    robust,
+    sampled,
 )
 from .fit import HeadFit
 from .folder import TorsoMotion, TorsoPoints
@@ -134,8 +137,7 @@ def follow_torso(
     if motion == "head":
         return FollowedTorso(fit, unchanged, motion=decided)
     name = own if motion == "own" else motion
-    points = TorsoPoints(middle, deep[name].at)
-    bending = None
+    points, bending = TorsoPoints(middle, deep[name].at), None
     if bends and name == "shifted":
         bending = found_bending(take, motions[name], points, some, walk)
     return replace(_followed(fit, take, motions[name], bending, decided), points=points)
@@ -154,13 +156,11 @@ def _followed(
         shift_mm=1000 * float(max(shifts, default=0.0)),
         bend_mm=1000 * max((float(np.linalg.norm(b, axis=1).max()) for b in bends), default=0.0),
     )
-    shifted = {
-        t: take.with_offset(own, 0.0 if bending is None else bending.at(t))
-        for t, own in posed.items()
-        if own.shift is not None
-    }
-    heads = {t: shifted[t][0] if t in shifted else own.parameters for t, own in posed.items()}
-    offsets = {t: offset for t, (_, offset) in shifted.items()}
+    heads, offsets = {t: own.parameters for t, own in posed.items()}, dict[int, np.ndarray]()
+    for t, own in posed.items():
+        if own.shift is not None:
+            bend = 0.0 if bending is None else bending.at(t)
+            heads[t], offsets[t] = take.with_offset(own, bend)
     if bending is not None:
         static = bending.drape + (0 if fit.static_offset is None else fit.static_offset)
         fit = replace(fit, head=with_offset(fit.head, bending.drape), static_offset=static)

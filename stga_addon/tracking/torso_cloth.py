@@ -19,8 +19,15 @@ import numpy as np
 from ..capture.mesh_geometry import rasterize
 from ..flame.model import FlameModel, torso_faces
 from ..worker.helpers import Step
-from .appearance import NOISE_LEVELS, sampled
-from .dense_terms import MIN_FLOW_SIDE_PX, inside, projection_derivative
+from .appearance import (
+    MIN_FLOW_SIDE_PX,
+    NOISE_LEVELS,
+    inside,
+    luma,
+    projection_derivative,
+    sampled,
+)
+from .fit import posed_mesh
 from .folder import TorsoPoints
 from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake
@@ -259,7 +266,7 @@ class _Cloth:
 
     def _reference(self, shot: TorsoShot, number: int) -> _Reference:
         model, sheet, camera = self._take.model, self._sheet, shot.views[number].levels[0].camera
-        mesh = self._take.mesh(self._motion[self._first].parameters)
+        mesh = posed_mesh(self._take.fit, self._motion[self._first].parameters)
         mesh[sheet.vertices] = self._positions(self._first, np.zeros_like(self._drape))
         triangle, barycentric = rasterize(mesh, model.faces, camera)
         shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
@@ -270,8 +277,9 @@ class _Cloth:
         visible = self._visible(shot, number, at)
         shown[rows, columns] = visible
         fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
-        luma, points = _luma(shot, number), (corners[visible], weights[visible])
-        return _Reference(shown, luma, *points, fitted[visible])
+        shown_luma = luma(shot.views[number].levels[0])
+        chosen = corners[visible], weights[visible], fitted[visible]
+        return _Reference(shown, shown_luma, *chosen)
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
@@ -293,10 +301,10 @@ class _Cloth:
         corners = self._positions(timestep, bend)[reference.corners]
         at = np.einsum("pk,pki->pi", reference.barycentric, corners)
         source, _ = shot.views[number].levels[0].camera.project(at)
-        luma = reference.luma.copy()
-        values = sampled([_luma(shot, number).astype(np.float32)], source)[0]
-        luma[reference.pixels] = values.astype(np.uint8)
-        return _Returned(luma, at, source, self._visible(shot, number, at))
+        returned = reference.luma.copy()
+        values = sampled([luma(shot.views[number].levels[0]).astype(np.float32)], source)[0]
+        returned[reference.pixels] = values.astype(np.uint8)
+        return _Returned(returned, at, source, self._visible(shot, number, at))
 
     def _moved(self, timestep: int, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
         """The offsets after a Gauss–Newton step."""
@@ -356,8 +364,3 @@ def _missed(reference: _Reference, now: _Returned) -> tuple[np.ndarray, np.ndarr
     far = np.linalg.norm(miss, axis=1) / FLOW_OUTLIER_PX
     changed = (found[:, 2] - reference.luma[rows, columns]) / CHANGE_OUTLIER_LEVELS
     return miss, weight * (1 / ((1 + far**2) * (1 + changed**2)))
-
-
-def _luma(shot: TorsoShot, number: int) -> np.ndarray:
-    """(H, W) uint8 of a camera's finest image."""
-    return np.clip(shot.views[number].levels[0].channels[..., 0], 0, 255).astype(np.uint8)

@@ -16,13 +16,19 @@ from ..flame.forward import RIGID_SIZE, axis_angle_matrices
 from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..worker.helpers import Helpers
-from .appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
-from .dense_terms import OUTLIER_SQUARED, PyramidView, inside
-from .fit import HeadFit
+from .appearance import (
+    CHANNEL_WEIGHTS,
+    NOISE_LEVELS,
+    OUTLIER_SQUARED,
+    PyramidView,
+    inside,
+    pyramid,
+    sampled,
+)
+from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
 from .landmarks import Report
-from .posed_points import PosedPoints, SurfacePoints, head_rotation, unit
-from .write_capture import posed_mesh
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
 HEAD_MARGIN = 0.03
@@ -52,7 +58,6 @@ class PosedTorso:
     shift: np.ndarray | None = None
 
 
-Heads = Mapping[int, np.ndarray]  # Timestep -> parameters (E + 18,)
 Motion = Mapping[int, PosedTorso]  # By timestep
 Motions = Mapping[str, Motion]
 Rows = dict[str, np.ndarray]
@@ -88,10 +93,14 @@ class TorsoTake:
     triangles (F,) bool are given."""
 
     def __init__(
-        self, fit: HeadFit, parameters: Heads, cameras: Sequence[FootageCamera], torso: np.ndarray
+        self,
+        fit: HeadFit,
+        parameters: Mapping[int, np.ndarray],
+        cameras: Sequence[FootageCamera],
+        torso: np.ndarray,
     ) -> None:
         self.model, self.parameters = fit.head.model, parameters
-        self.cameras, self.torso, self._fit = cameras, torso, fit
+        self.cameras, self.torso, self.fit = cameras, torso, fit
         regressor = self.model.j_regressor[[ROOT, NECK]]
         self._joints = regressor @ self.model.v_template
         self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
@@ -104,7 +113,7 @@ class TorsoTake:
         turned = with_root(parameters, pose.turn, neck - root)
         return PosedTorso(turned, pose.shift if rigid else None)
 
-    def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> dict[int, PosedTorso]:
+    def motion(self, poses: Mapping[int, TorsoPose], rigid: bool) -> Motion:
         """The torso posed at each timestep."""
         return {t: self.with_torso(t, pose, rigid) for t, pose in poses.items()}
 
@@ -126,7 +135,7 @@ class TorsoTake:
         offset = np.zeros_like(model.v_template)
         share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
         moved = np.flatnonzero(share)
-        before = posed_mesh(self._fit, parameters)[moved]
+        before = posed_mesh(self.fit, parameters)[moved]
         wanted = before + share[moved, None] * (self.rigid(torso, moved) - before)
         wanted += np.broadcast_to(bend, offset.shape)[moved] @ head_rotation(parameters).T
         turns = joint_turns(parameters)
@@ -134,7 +143,7 @@ class TorsoTake:
             turns[joint] = turns[parent] @ turns[joint] if parent >= 0 else turns[joint]
         skin = np.einsum("vj,jab->vab", model.weights[moved], turns)
         for _ in range(OFFSET_STEPS):
-            missed = wanted - posed_mesh(self._fit, parameters, offset)[moved]
+            missed = wanted - posed_mesh(self.fit, parameters, offset)[moved]
             offset[moved] += np.linalg.solve(skin, missed[..., None])[..., 0]
             root, neck = model.j_regressor[[ROOT, NECK]] @ offset
             by_offset = root + turns[ROOT] @ (neck - root) - turns[NECK] @ neck
@@ -151,13 +160,9 @@ class TorsoTake:
         """(2, 3) root, inside the base of the neck, and neck, before posing."""
         return np.asarray(self._joints + self._joint_dirs @ parameters[:-RIGID_SIZE])
 
-    def mesh(self, parameters: np.ndarray) -> np.ndarray:
-        """(V, 3) of the head with these parameters."""
-        return posed_mesh(self._fit, parameters)
-
     def shot(self, timestep: int) -> TorsoShot:
         """Read a timestep; images are of constant size, as optical flow needs them."""
-        mesh = self.mesh(self.parameters[timestep])
+        mesh = posed_mesh(self.fit, self.parameters[timestep])
         views, masks, heads = {}, {}, {}
         for number, source in enumerate(self.cameras):
             mask = source.mask(timestep) if timestep in source.timesteps else None
@@ -166,7 +171,7 @@ class TorsoTake:
                 share = mask[edge][:, None].astype(np.float32) / 255
                 image[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
                 image[mask == 0] = PLAIN_LEVEL
-                camera = self._fit.to_capture.camera(source.camera)
+                camera = self.fit.to_capture.camera(source.camera)
                 levels = pyramid(camera, image, self._center)
                 views[number], masks[number] = PyramidView(bytes([number]), camera, levels), mask
                 heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
@@ -194,16 +199,13 @@ class BothWays:
         def count(number: int) -> None:
             self._report("Torso", done + number, self._total)
 
-        found, results = self._helpers.map(follow, every, count, keep=True), []
+        found = self._helpers.map(follow, every, count, keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)
-        for both in zip(found[::2], found[1::2], strict=True):
-            rows = {
-                t: {name: array[row] for name, array in own.items()}
-                for way, own in zip((later, earlier), both, strict=True)
-                for row, t in enumerate(way)
-            }
-            results.append(dict(sorted(rows.items())))
-        return results
+        results: list[dict[int, Rows]] = [{} for _ in who]
+        for number, ((_, way), own) in enumerate(zip(every, found, strict=True)):
+            for row, t in enumerate(way):
+                results[number // 2][t] = {name: array[row] for name, array in own.items()}
+        return [dict(sorted(own.items())) for own in results]
 
 
 def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
@@ -290,7 +292,7 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
-    shot, mesh = take.shot(timestep), take.mesh(take.parameters[timestep])
+    shot, mesh = take.shot(timestep), posed_mesh(take.fit, take.parameters[timestep])
     none, dark = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
     found = [(none, none, np.zeros(0, bool), *(dark for _ in OUTLIER_SQUARED))]
     rows_of, count = {}, 0
@@ -325,7 +327,7 @@ class Carrier:
         from scipy.spatial import cKDTree
 
         candidates = np.flatnonzero(take.torso)
-        centers = take.mesh(first.parameters)[take.model.faces[candidates]].mean(1)
+        centers = posed_mesh(take.fit, first.parameters)[take.model.faces[candidates]].mean(1)
         used, self._face = np.unique(candidates[cKDTree(centers).query(at)[1]], return_inverse=True)
         corners = SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1)))
         self._corners = PosedPoints(take.model, corners)
@@ -345,7 +347,7 @@ class Carrier:
     def _frames(self, torso: PosedTorso) -> FaceFrames:
         values = torso.parameters
         if torso.shift is None:
-            corners = self._corners.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
+            corners = self._corners.positions(*split(values))
         else:
             corners = self._take.rigid(torso, self._vertices)
         return face_frames(corners, self._triangles, self._neutral)

@@ -12,13 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..capture.open import BUNDLED_MODEL
 from ..errors import StgaError
 from ..files import read_json, replacing, write_json
-from ..flame.forward import RIGID_SIZE
 from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
@@ -31,12 +29,15 @@ from .fit import (
     MIN_FACE_M,
     ROUNDS,
     HeadFit,
+    Pictures,
+    RecordedTake,
     TimestepLandmarks,
     determines_pose,
     fit_head,
     in_cameras_world,
     is_face,
     is_metric,
+    posed_mesh,
 )
 from .focal_length import scale_warnings, solved_focal
 from .folder import (
@@ -65,11 +66,10 @@ from .landmarks import (
 )
 from .mattes import with_mattes
 from .pictures import Show, picture_of_first_frame, picture_of_fit, write_contact_sheet
-from .posed_points import PosedPoints, SurfacePoints
-from .seen_surface import RecordedTake
+from .posed_points import PosedPoints, SurfacePoints, split
 from .surface import fit_surface
 from .torso import follow_torso
-from .write_capture import posed_mesh, write_capture
+from .write_capture import write_capture
 
 OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the others,
@@ -167,41 +167,38 @@ def track(
                 "in one point of the head model; expected a face"
             )
         take = _take(footage, seen, neutral)
-        if not take:
-            raise StgaError(
-                f"{footage.root}: shows too few landmarks of a face in each of its frames"
-            )
+        if not take.landmarks:
+            few = "shows too few landmarks of a face in each of its frames"
+            raise StgaError(f"{footage.root}: {few}")
         if footage.focal == "usual":  # of one camera
             report("Focal length", 0, 1)
-            pixels = solved_focal(head, seen.places, seen.reliable, take)
+            pixels = solved_focal(head, take)
             if pixels is not None:
                 (camera,) = footage.cameras
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal="solved")
             take = _take(footage, seen, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
-        metric = keep and is_metric(head, seen.places, seen.reliable, take)
-        part = head, seen.places, seen.reliable, take, metric
+        take = replace(take, metric=keep and is_metric(head, take))
         report("Fit", 0, ROUNDS)
 
         def count(rounds: int) -> None:
             report("Fit", rounds, ROUNDS)
 
         fit: HeadFit = (
-            helpers.map(fit_head, [part], count)[0]
-            if len(take) < LONG_TAKE
-            else helpers.run(fit_head, part, count)
+            helpers.map(fit_head, [(head, take)], count)[0]
+            if len(take.landmarks) < LONG_TAKE
+            else helpers.run(fit_head, (head, take), count)
         )
-        errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
+        errors = reprojection_errors(fit, take, footage, seen.found)
         _check_cameras(footage, errors)
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
-        images, masks = partial(_images, footage), partial(_masks, footage)
-        recorded = RecordedTake(seen.places, seen.reliable, take, images, masks, metric)
-        fit, misfits = by_images(head, fit, recorded, helpers, report, person is not None)
+        take = replace(take, images=partial(_images, footage), masks=partial(_masks, footage))
+        fit, misfits = by_images(head, fit, take, helpers, report, person is not None)
         if person is not None:
             fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
         fit = in_cameras_world(fit) if keep else fit
-        errors = reprojection_errors(fit, seen.places, seen.reliable, take, footage, seen.found)
+        errors = reprojection_errors(fit, take, footage, seen.found)
         shares = [share for own in misfits.values() for share in own.values()]
         quality = {"error_px": _median_px(errors)}
         quality |= {"unexplained": float(np.mean(shares))} if shares else {}
@@ -211,7 +208,7 @@ def track(
         if mattes:
             plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
             source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
-            head_pixels = _HeadPixels(fit, parameters)
+            head_pixels = partial(_head_pixels, fit, parameters)
             footage, matte_warnings = with_mattes(
                 footage, head_pixels, out, source, helpers, report
             )
@@ -220,8 +217,8 @@ def track(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, seen.found, fit, keep and not metric)
-        + scale_warnings(fit, seen.places, seen.reliable, footage, seen.found)
+        _warnings(footage, seen.found, fit, keep and not take.metric)
+        + scale_warnings(fit, take, footage, seen.found)
         + matte_warnings,
         misfits,
         torso.motion,
@@ -234,6 +231,7 @@ def track(
             "median_reprojection_px": round(result.median_px, 3),
             "meters_per_unit": result.scale,
             "interpolated": list(result.interpolated),
+            "in_order": fit.ordered,
             "warnings": list(result.warnings),
             "reprojection_px": _rounded(result.reprojection_px),
             "image_misfit": _rounded(result.image_misfit),
@@ -310,16 +308,12 @@ def _detected(
     return _Seen(places, reliable, detected)
 
 
-@dataclass(frozen=True)
-class _HeadPixels:
+def _head_pixels(
+    fit: HeadFit, parameters: Mapping[int, np.ndarray], timestep: int, camera: FootageCamera
+) -> np.ndarray:
     """The pixels of the tracked head in a camera's frame; see `mattes.HeadPixels`."""
-
-    fit: HeadFit
-    parameters: Mapping[int, np.ndarray]
-
-    def __call__(self, timestep: int, camera: FootageCamera) -> np.ndarray:
-        mesh, faces = posed_mesh(self.fit, self.parameters[timestep]), self.fit.head.model.faces
-        return silhouette(mesh, faces, self.fit.to_capture.camera(camera.camera))
+    mesh, faces = posed_mesh(fit, parameters[timestep]), fit.head.model.faces
+    return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
 
 
 def by_images(
@@ -341,11 +335,8 @@ def by_images(
         fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
         dense = fit_dense(fit, take, helpers, True, report)
         assert dense is not None
-    misfits = {
-        name: {t: float(own[row]) for t, own in dense.misfit.items()}
-        for row, name in enumerate(REGIONS)
-    }
-    return dense.fit, misfits
+    misfits = {t: dict(zip(REGIONS, own.tolist(), strict=True)) for t, own in dense.misfit.items()}
+    return dense.fit, {name: {t: own[name] for t, own in misfits.items()} for name in REGIONS}
 
 
 def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) -> float:
@@ -365,26 +356,20 @@ def interpolated(
 
 
 def reprojection_errors(
-    fit: HeadFit,
-    places: SurfacePoints,
-    reliable: np.ndarray,
-    take: Mapping[int, TimestepLandmarks],
-    footage: Footage,
-    found: Mapping[str, CameraLandmarks],
+    fit: HeadFit, take: RecordedTake, footage: Footage, found: Mapping[str, CameraLandmarks]
 ) -> dict[str, dict[int, tuple[float, float]]]:
     """Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
-    points = PosedPoints(fit.head.model, places)
+    points = PosedPoints(fit.head.model, take.places)
     errors: dict[str, dict[int, tuple[float, float]]]
     errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
-        head = points.positions(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
-        cameras = [name for name, own in found.items() if _row(own, timestep) is not None]
-        own = take[timestep]
+        head, own = points.positions(*split(parameters)), take.landmarks[timestep]
+        cameras = [name for name, seen in found.items() if _row(seen, timestep) is not None]
         seen = zip(cameras, own.cameras, own.points, own.confidence, strict=True)
         for name, camera, pixels, confidence in seen:
-            use = reliable & (confidence > 0)
-            projected, _ = fit.to_capture.camera(camera).project(head[use])
-            distance = float(np.median(np.linalg.norm(projected - pixels[use], axis=1)))
+            use = take.reliable & (confidence > 0)
+            away = fit.to_capture.camera(camera).project(head[use])[0] - pixels[use]
+            distance = float(np.median(np.linalg.norm(away, axis=1)))
             size = float(np.linalg.norm(np.ptp(pixels[use], axis=0)))
             errors[name][timestep] = distance, distance / max(size, 1e-9)
     return errors
@@ -409,9 +394,8 @@ def _begin(out: Path, source: dict[str, Any]) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError for other footage's."""
     path = out / LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
-        raise StgaError(
-            f"{out}: holds landmarks of other footage; give another --out, or delete it"
-        )
+        other = "holds landmarks of other footage; give another --out, or delete it"
+        raise StgaError(f"{out}: {other}")
     write_json(path, source)
 
 
@@ -452,7 +436,7 @@ def _row(camera: CameraLandmarks, timestep: int) -> int | None:
     return int(rows[0])
 
 
-def _take(footage: Footage, seen: _Seen, neutral: np.ndarray) -> dict[int, TimestepLandmarks]:
+def _take(footage: Footage, seen: _Seen, neutral: np.ndarray) -> RecordedTake:
     """The timesteps that the head is fitted to. neutral (N, 3): landmarks on the neutral head."""
     cameras = {camera.name: camera.camera for camera in footage.cameras}
     take = {}
@@ -468,21 +452,17 @@ def _take(footage: Footage, seen: _Seen, neutral: np.ndarray) -> dict[int, Times
         )
         if determines_pose(own, seen.reliable, neutral):
             take[timestep] = own
-    return take
+    return RecordedTake(seen.places, seen.reliable, take)
 
 
-def _images(
-    footage: Footage, timestep: int, most: int | None = None
-) -> list[tuple[Camera, np.ndarray]]:
+def _images(footage: Footage, timestep: int, most: int | None = None) -> Pictures:
     cameras = _recording_at(footage, timestep, most)
     with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
         images = list(pool.map(lambda camera: camera.image(timestep), cameras))
     return [(camera.camera, image) for camera, image in zip(cameras, images, strict=True)]
 
 
-def _masks(
-    footage: Footage, timestep: int, most: int | None = None
-) -> list[tuple[Camera, np.ndarray]]:
+def _masks(footage: Footage, timestep: int, most: int | None = None) -> Pictures:
     cameras = _recording_at(footage, timestep, most)
     found = [(camera.camera, camera.mask(timestep)) for camera in cameras]
     return [(camera, mask) for camera, mask in found if mask is not None]
@@ -505,16 +485,15 @@ def _check_cameras(
     footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]
 ) -> None:
     """Raise StgaError for a camera that does not fit what others see, or where none fits."""
-    shares = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
-    share = {name: float(np.median(own)) for name, own in shares.items()}
+    seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
+    share = {name: float(np.median(own)) for name, own in seen.items()}
 
     def at_worst(name: str) -> str:
-        worst = max(errors[name], key=lambda timestep: errors[name][timestep][1])
-        pixels = errors[name][worst][0]
+        worst, (pixels, _) = max(errors[name].items(), key=lambda error: error[1][1])
         return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
 
     for name, value in share.items():
-        others = [other for other_name, other in share.items() if other_name != name] or [value]
+        others = [share[other] for other in share if other != name] or [value]
         if value > max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(others))):
             raise StgaError(
                 f"{at_worst(name)}, far more than those of the other cameras; "
@@ -532,35 +511,22 @@ def _warnings(
 ) -> tuple[str, ...]:
     missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
     blind = [name for name, own in found.items() if not own.confidence.any()]
-    warnings = list(footage.warnings)
-    if missing:
-        share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
-        listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
-        warnings.append(f"no face at {share}, interpolated: {listed}")
-    if blind:
-        warnings.append(f"no face in any frame of: {', '.join(blind)}")
-    if len(footage.cameras) == 1:
-        warnings.append(
-            "one camera: size and distance of the head, and its depth, are those of the average "
-            "head"
-        )
-    elif fit.static_offset is None:
-        warnings.append(
-            "the images do not show the skin's surface sharply enough: the head is fitted to "
-            "landmarks alone"
-        )
-    if is_scaled:
-        warnings.append(
-            "the cameras' world is kept but for its scale: in meters, the head would be more than "
-            f"{MAX_HEAD_SCALE - 1:.0%} off people's; "
-            f"positions are multiplied by {fit.to_capture.scale:.4g}"
-        )
-    if footage.focal == "usual":
-        warnings.append(
-            "the focal length is a guess, as the head turns too little to tell; "
-            "give it if it is known"
-        )
-    return tuple(warnings)
+    listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
+    share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
+    single, scale = len(footage.cameras) == 1, f"{fit.to_capture.scale:.4g}"
+    own = {
+        f"no face at {share}, interpolated: {listed}": bool(missing),
+        f"no face in any frame of: {', '.join(blind)}": bool(blind),
+        "one camera: size and distance of the head, and its depth, are those of the average "
+        "head": single,
+        "the images do not show the skin's surface sharply enough: the head is fitted to "
+        "landmarks alone": not single and fit.static_offset is None,
+        "the cameras' world is kept but for its scale: in meters, the head would be more than "
+        f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {scale}": is_scaled,
+        "the focal length is a guess, as the head turns too little to tell; "
+        "give it if it is known": footage.focal == "usual",
+    }
+    return *footage.warnings, *(text for text, holds in own.items() if holds)
 
 
 def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:

@@ -12,9 +12,9 @@ from ..capture.camera import Camera
 from ..capture.open import CANONICAL_NAME, PARAMETERS
 from ..capture.transforms import camera_entry
 from ..files import replacing, write_json, write_npz
-from ..flame.forward import flame_forward, frame_of
+from ..flame.forward import frame_of
 from ..flame.sequence import FRAME_FIELDS
-from .fit import HeadFit
+from .fit import HeadFit, posed_mesh
 from .folder import SPLIT_FILES, image_name, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
@@ -81,13 +81,6 @@ def write_capture(
     # train last: see is_written
     for name, entries in reversed(list(zip(SPLIT_FILES, splits.values(), strict=True))):
         write_json(out / name, {**top, "frames": entries})
-
-
-def posed_mesh(
-    fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
-) -> np.ndarray:
-    """Vertices (V, 3) in the capture's world, in meters; offset (V, 3): of this timestep."""
-    return flame_forward(fit.head.model, np.zeros(0), frame_of(parameters, offset))
 
 
 def write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -1,21 +1,23 @@
-"""Catalog of effects: what each costs, and the settings that switch it."""
+"""Catalog of effects: what each costs, the settings that switch it, and what was decided about it
+in a run (`effects.plan` decides)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..errors import StgaError
+from ..schema import setting
+
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect: its name, as in `--effect NAME=on`, its cost while it is on, and the settings that
-    switch it.
+    """An effect: its name, as in `--effect NAME=on`, and its cost while it is on.
 
-    title        what it gives, in two or three words for everybody
-    price        of it for everybody: one of "free", "slower" and "larger"
-    on, off      changes to `TrainingSettings`
-    offset       the driven offset (`avatar.offsets.table`) that it trains, if any
-    added_later  whether a continuation may switch it on in a run that went without: only where it
-                 adds coefficients, which leave the splats as they were while they are zero
+    title, price  for everybody: two or three words, and one of "free", "slower" and "larger"
+    on, off       changes to `TrainingSettings`
+    offset        the driven offset (`avatar.offsets.table`) that it trains, if any
+    added_later   whether a continuation may switch it on in a run that went without: only where it
+                  adds coefficients, which leave the splats as they were while they are zero
     """
 
     name: str
@@ -36,11 +38,11 @@ WORLD = "world"
 
 
 def _effect(
-    name: str, title: str, price: str, cost: str, setting: str = "", **values: Any
+    name: str, title: str, price: str, cost: str, switch: str = "", **values: Any
 ) -> Effect:
-    """An effect; setting: that is true where it is on, and false where it is off."""
-    switches = [{setting: on} if setting else {} for on in (True, False)]
-    return Effect(name, title, price, cost, **{"on": switches[0], "off": switches[1], **values})
+    """An effect; switch: the setting that is true where it is on, and false where it is off."""
+    on, off = ({switch: each} if switch else {} for each in (True, False))
+    return Effect(name, title, price, cost, **{"on": on, "off": off, **values})
 
 
 _SHAPES = "shape keys and drivers in Blender"
@@ -140,3 +142,30 @@ _EFFECTS = (
 )
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
 """By name, in display order."""
+CHOICES = ("auto", "on", "off")
+
+
+@dataclass(frozen=True)
+class EffectDecision:
+    """The decision about one of EFFECTS: the user's choice, whether it is on, the reason with the
+    figure that it rests on, and its cost while it is on."""
+
+    effect: str
+    choice: str = setting(choices=CHOICES)
+    on: bool = setting()
+    reason: str = setting()
+    cost: str = setting()
+
+    def __str__(self) -> str:
+        asked, cost = "" if self.choice == "auto" else ", as asked", f" [{self.cost}]"
+        return f"{'on' if self.on else 'off'}{asked}: {self.reason}{cost if self.on else ''}"
+
+
+def parse_choice(text: str) -> tuple[str, str]:
+    """Effect and choice, from a text such as "jaw=off". Raises StgaError for anything else."""
+    name, _, choice = text.partition("=")
+    if name not in EFFECTS or choice not in CHOICES:
+        raise StgaError(
+            f"'{text}' is not NAME=on, NAME=off or NAME=auto with one of {', '.join(EFFECTS)}"
+        )
+    return name, choice

@@ -7,9 +7,8 @@ from time import perf_counter
 
 import numpy as np
 
-from ..capture.images import read_view
-from ..capture.loader import LoadedView
-from ..capture.model import Capture, View
+from ..capture.loader import ViewLoader
+from ..capture.model import Capture
 from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
@@ -77,8 +76,17 @@ def seconds_per_iteration(
     trainer = Trainer(capture, settings, selection, device=device)
     order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
-    scales = {image_scale(settings, 0.0), settings.scale}
-    loaded = {s: cycle([_load(capture, view, s, settings) for view in views]) for s in scales}
+    scales = image_scale(settings, 0.0), settings.scale
+    red, green, blue = (round(255 * c) for c in settings.background)
+    loader = ViewLoader(
+        [*views, *views],
+        lambda position: scales[position // len(views)],
+        (red, green, blue),
+        prepare=image_preparation(capture, settings),
+        mesh=capture.mesh,
+    )
+    with loader:
+        loaded = {scale: cycle([*islice(loader, len(views))]) for scale in scales}
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
@@ -86,18 +94,7 @@ def seconds_per_iteration(
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)
-    return float(np.mean(times[WARM_UP_ITERATIONS:]))
-
-
-def _load(capture: Capture, view: View, scale: float, settings: TrainingSettings) -> LoadedView:
-    """A view as the loader yields it: with read-only arrays, for which the kernels are compiled."""
-    red, green, blue = (round(255 * c) for c in settings.background)
-    small, image, mask = read_view(view, scale, (red, green, blue))
-    prepare = image_preparation(capture, settings)
-    if prepare is not None:
-        image, mask = prepare(small, image, mask)
-    loaded = LoadedView(small, image, mask, capture.mesh(view.timestep))
-    for array in (loaded.image, loaded.mask):
-        if array is not None:
-            array.setflags(write=False)
-    return loaded
+    # Each stands for the share of the schedule that it takes here: cheap ones are as many as they
+    # are quick.
+    measured = times[WARM_UP_ITERATIONS:]
+    return float(np.average(measured, weights=measured))

@@ -12,9 +12,7 @@ from ..errors import StgaError
 from ..options import duration, option
 from ..schema import MAX_COUNT, complaint, setting, validate
 from ..selection import SelectionOptions
-from .backdrop import BACKDROPS
-from .effect_catalog import EFFECTS
-from .effect_decisions import CHOICES, parse_choice
+from .effect_catalog import CHOICES, EFFECTS, parse_choice
 
 STRATEGIES = {
     "global": "every iteration trains all splats; most accurate on the captures measured so far",
@@ -24,6 +22,10 @@ STRATEGIES = {
 CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
 SCHEDULES = ("default", "paper")
+BACKDROPS = ("plain", "masked", "mesh")
+"""plain: one color, that of the settings' background; masked: anything, replaced by that color
+outside the masks; mesh: the same, and images without a mask have the tracked mesh's silhouette for
+one."""
 GLOBAL_UNITS = ("iteration", "frame")
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
@@ -78,9 +80,9 @@ class Preset:
 
 
 PRESETS = {
-    "draft": Preset("a first look", 800, 0.5, {"lattice": 1}),
-    "standard": Preset("everyday work", 3000, 2.0, {}),
-    "final": Preset("the best quality of the three", 9000, 6.0, {"growth": 0.6}),
+    "draft": Preset("a first look", 500, 0.3, {"lattice": 1}),
+    "standard": Preset("everyday work", 1900, 1.3, {}),
+    "final": Preset("the best quality of the three", 5600, 3.8, {"growth": 0.6}),
 }
 """Fewer splats are ahead in the first seconds, more of them in the end."""
 
@@ -114,6 +116,8 @@ class TrainingSettings:
                          points
     unseen_opacity_weight  of the mean of opacity times unseen share (`TrainState`): hull points
                    that few cameras see fade, unless nothing else explains what these cameras see
+    adam_beta2     decay of Adam's second moment: at 0.999 it is an average over more iterations
+                   than a detail takes to be learned
     adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
                    that hardly show in an image, and whose gradients are below it, hardly move
     ema_share      share of the latest step in each splat's exponential moving average, which the
@@ -128,12 +132,13 @@ class TrainingSettings:
     hull_points    add hull points for what the mesh does not cover
     density_interval  iterations between density control, 0 never; it works during `density_span` of
                       the budget
+    split_share    largest share of the splats that one round of density control splits
     growth         most splats that density control may add, as a share of the initial number
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration,
                        so that splats
                    of the background's color cannot hide in it and alpha is learned
-    backdrop       what is behind the head in the images, one of `backdrop.BACKDROPS`: but for
+    backdrop       what is behind the head in the images, one of BACKDROPS: but for
                    "plain", training and evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
                           first `coarse_share` of the budget half of that
@@ -187,6 +192,7 @@ class TrainingSettings:
     unseen_opacity_weight: float = setting(0.06, 0, MAX_WEIGHT)
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
+    adam_beta2: float = setting(0.99, 0.5, 0.9999)
     adam_epsilon: float = setting(0.003, maximum=1.0, above=0)
     ema_share: float = setting(0.015, 0, 1)
     stray_reset_interval: int = setting(200, 0, MAX_COUNT)
@@ -195,14 +201,15 @@ class TrainingSettings:
     sh_degree: int = setting(3, 0, MAX_SH_DEGREE)
     sh_steps: tuple[float, ...] = setting((0.3, 0.5, 0.7), 0)
     hull_points: bool = True
-    density_interval: int = setting(200, 0, MAX_COUNT)
+    density_interval: int = setting(100, 0, MAX_COUNT)
     density_span: tuple[float, float] = setting((0.1, 0.6), 0)
+    split_share: float = setting(0.2, 0, 1)
     growth: float = setting(0.25, 0, MAX_GROWTH)
     background: tuple[float, float, float] = setting((1.0, 1.0, 1.0), 0, 1)
     random_background: bool = True
     backdrop: str = setting("plain", choices=BACKDROPS)
     scale: float = setting(1.0, 0.05, 1)
-    coarse_share: float = setting(0.0, 0, 1)
+    coarse_share: float = setting(0.35, 0, 1)
     target_psnr: float | None = option(
         "stop when the held-out views reach it", None, maximum=200, above=0, metavar="DB"
     )
@@ -264,9 +271,18 @@ class TrainingSettings:
                 raise StgaError(f"--effect cannot be combined with --{name} {value}")
 
 
-INRIA_ADAM_EPSILON = 1e-9
-"""3D Gaussian Splatting's ε of 1e-15, at an image of 600 by 550."""
+_PUBLISHED = {
+    "adam_beta2": 0.999,
+    "adam_epsilon": 1e-9,  # 3D Gaussian Splatting's 1e-15, at an image of 600 by 550
+    "ema_share": 1.0,
+    "hull_points": False,
+    "random_background": False,
+    "density_interval": 200,
+    "split_share": 0.02,
+    "coarse_share": 0.0,
+}
 PAPER_SETTINGS = {
+    **_PUBLISHED,
     "views_per_visit": 0,
     "global_interval": 20,
     "warm_up_share": 0.0,
@@ -274,27 +290,20 @@ PAPER_SETTINGS = {
     "scale_limit": 1.0,
     "stray_limit": 1.0,
     "stray_reset_share": 0.0,
-    "adam_epsilon": INRIA_ADAM_EPSILON,
-    "ema_share": 1.0,
     "lattice": 4,
-    "hull_points": False,
-    "random_background": False,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
 """The paper's settings where they differ from the defaults, which measured best
 (docs/results.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
+    **_PUBLISHED,
     "convention": "gaussian_avatars",
     "lattice": 0,
     "rates": Rates(5e-3, 1e-3, 1.7e-2, 5e-2, 2.5e-3, 1.25e-4, position_end=0.01, end=1.0),
     "scale_limit": 0.6,
     "distance_weight": 0.01,
     "stray_reset_interval": 0,
-    "adam_epsilon": INRIA_ADAM_EPSILON,
-    "ema_share": 1.0,
-    "hull_points": False,
-    "random_background": False,
     "growth": 8.0,
 }
 """GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
+from ..files import naming
 from .lock import is_locked
 from .status import CANCEL_FILE, LOG_FILE, STATUS_FILE, refuse_running_worker, remove_status_folder
 from .training_python import own_python
@@ -21,7 +22,7 @@ KERNELS, BUNDLED, BYTECODE, CHARTS = "kernels", "bundled kernels", "bytecode", "
 """Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with
 its own (`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
-"""Held in it by the process that compiles ahead of a training (`jobs.preparation`)."""
+"""Held in it by the process that compiles ahead of a training (`jobs.perform`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS, BACKGROUND_NICENESS = 5, 15
@@ -55,13 +56,11 @@ def prepare_status_folder(folder: Path) -> None:
     """Create the status folder, or empty it. Raises StgaError while a worker is running in it, or
     it cannot be written."""
     refuse_running_worker(folder)
-    try:
+    with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (STATUS_FILE, CANCEL_FILE, LOG_FILE):
             (folder / name).unlink(missing_ok=True)
         (folder / LOG_FILE).open("xb").close()
-    except OSError as error:
-        raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
 
 
 def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -72,10 +71,8 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     the folder.
     """
     path, nothing = folder / LOG_FILE, subprocess.DEVNULL
-    try:
+    with naming(path):
         log = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
     streams: dict[str, Any] = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
     try:
         process = start_python(python, arguments, cwd=folder, **streams, **_DETACHED)

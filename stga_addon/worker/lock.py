@@ -45,6 +45,24 @@ def hold_lock(path: Path, leased: bool = False) -> Iterator[SoftFileLease | None
 
 
 @contextmanager
+def hold_folder(
+    folder: Path, name: str, holder: str, leased: bool = False
+) -> Iterator[SoftFileLease | None]:
+    """Make the folder and hold its lock file for this process (`hold_lock`). Raises StgaError while
+    another process, `holder`, holds it, and where it cannot be written."""
+    with ExitStack() as held:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lease = held.enter_context(hold_lock(folder / name, leased))
+        except BlockingIOError as error:
+            problem = f"another {holder} (process {lock_owner(folder / name)})"
+            raise StgaError(f"{folder}: {problem}") from error
+        except OSError as error:
+            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        yield lease
+
+
+@contextmanager
 def _hold_file_lock(path: Path) -> Iterator[None]:
     lock = _file_lock(path, ACQUIRE_TIMEOUT_S)
     try:

@@ -15,15 +15,15 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
-from ..files import RENAME_PATIENCE_S, file_size, read_json, write_json
-from .lock import hold_lock, is_locked, lock_owner
+from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json
+from .lock import hold_folder, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
 STATUS_INTERVAL_S = 0.5  # Least time between two writes of status.json with the same message
@@ -171,11 +171,8 @@ def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
 def request_cancel(folder: Path) -> None:
     """Ask the worker to stop and to keep what it has. Raises StgaError."""
     path = folder / CANCEL_FILE
-    try:
-        with suppress(FileExistsError):
-            os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be written ({error.strerror or error})") from error
+    with naming(path), suppress(FileExistsError):
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
 
 
 def refuse_running_worker(folder: Path) -> None:
@@ -189,15 +186,11 @@ def remove_status_folder(folder: Path, other_files: Iterable[str] = ()) -> None:
     """Remove a worker's status and `other_files`, and the folder where nothing else is in it.
     Raises StgaError while the worker is running, or a file stays."""
     refuse_running_worker(folder)
-    try:
+    with naming(folder, "removed"), suppress(NotADirectoryError):
         for name in (STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE, *other_files):
             (folder / name).unlink(missing_ok=True)
         with suppress(OSError):  # files of others are in it, or it is gone
             folder.rmdir()
-    except NotADirectoryError:
-        pass
-    except OSError as error:
-        raise StgaError(f"{folder}: cannot be removed ({error.strerror or error})") from error
 
 
 # Writing, by the worker
@@ -247,15 +240,7 @@ def status_writer(folder: Path) -> Iterator[StatusWriter]:
     Raises what the block raises, and StgaError where another worker is in the folder or it cannot
     be written.
     """
-    with ExitStack() as lock:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(hold_lock(folder / LOCK_FILE))
-        except BlockingIOError:
-            refuse_running_worker(folder)
-            raise StgaError(f"{folder}: another worker was running here; try again") from None
-        except OSError as error:
-            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    with hold_folder(folder, LOCK_FILE, "worker is running here"):
         writer = StatusWriter(folder)
         try:
             yield writer

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stga_addon.batch.folder import hold_folder
+from stga_addon.batch.folder import hold_batch
 from stga_addon.batch.plan import Ended, Engine, Job, Plan, make_plan
 from stga_addon.batch.run import Batch, run_batch
 from stga_addon.jobs.perform import perform_in_folder
@@ -17,7 +17,7 @@ def finished(job: Job) -> tuple[WorkerState | None, str]:
     return WorkerState.FINISHED, ""
 
 
-class SimulatedEngine:
+class SimulatedEngine(Engine):
     """Ends each job at the next question, with the state and error of `outcome`; None: its worker
     was killed."""
 
@@ -53,12 +53,6 @@ class SimulatedEngine:
             StatusWriter(job.request_folder).finish(state, error)
         return Ended(inspect_worker(job.request_folder), state is None)
 
-    def withdraw(self) -> Sequence[str]:
-        return ()
-
-    def close(self) -> None:
-        """Nothing is held."""
-
 
 class InProcessEngine(SimulatedEngine):
     """Carries each job out in this process."""
@@ -85,7 +79,7 @@ def empty_jobs(base: Path, count: int, again: bool = False, **jobs: Any) -> Plan
 def carry_out(plan: Plan, engine: Engine) -> tuple[Batch, list[str]]:
     """The batch after its end, and what was said."""
     said: list[str] = []
-    with hold_folder(plan.out) as lease:
+    with hold_batch(plan.out) as lease:
         batch = Batch(plan)
         run_batch(batch, engine, lease, lambda batch: None, said.append)
     return batch, said

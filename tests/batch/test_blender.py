@@ -13,12 +13,10 @@ import pytest
 
 pytest.importorskip("numba")
 
-from capture.factory import write_mesh_capture
+from capture.factory import write_avatar_of, write_mesh_capture
 from PIL import Image
 
-from stga_addon.avatar.file import Avatar, write_avatar
-from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.batch.engines.local import LocalEngine
+from stga_addon.batch.engines import LocalEngine
 from stga_addon.batch.plan import read_plan
 from stga_addon.batch.run import JobState
 from stga_addon.capture.open import open_capture
@@ -74,11 +72,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             "--command", "extension", "install-file", "--repo", "user_default", "--enable", archive
         )
         capture = open_capture(write_mesh_capture(folder / "capture", (0, 1, 3, 4), range(4)))
-        faces = capture.faces.astype(np.int32)
-        splats = lattice_splats(capture.neutral, faces, order=0)
-        write_avatar(
-            folder / "avatar.npz", Avatar(splats, "stga", capture.neutral.astype(np.float32), faces)
-        )
+        write_avatar_of(capture, folder / "avatar.npz")
         (folder / "make.py").write_text(MAKE.format(folder=str(folder)))
         blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
         names = folder / "whole/######"

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
-from stga_addon.batch.engines.local import LocalEngine
+from stga_addon.batch.engines import LocalEngine
 from stga_addon.batch.plan import read_plan
 from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
@@ -114,10 +114,8 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     assert main(["batch", capture, "--out", out, *options]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
-    settings = run.settings
-    assert (run.principal_point, settings.iterations, settings.seed, run.device) == (
-        "opencv", 2, 5, "cpu",
-    )  # fmt: skip
+    found = run.principal_point, run.settings.iterations, run.settings.seed, run.device
+    assert found == ("opencv", 2, 5, "cpu")
     assert main(["batch", capture, "--preset", "draft"]) == 2
     assert "--out: is missing" in capsys.readouterr().err
     assert main(["batch", capture, "--out", out]) == 2

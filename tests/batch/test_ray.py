@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
+from stga_addon.batch import ray as ray_engine
 from stga_addon.batch.engines import make_engine
-from stga_addon.batch.engines import ray as ray_engine
 from stga_addon.errors import StgaError
 
 from .conftest import TrainedHere
@@ -109,16 +109,11 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     seeds, iterations = max(1, KILLS // 2), max(ITERATIONS, 200 * KILLS)
-    variables = {
-        "RAY_AUTH_MODE": "token",
-        "RAY_AUTH_TOKEN": secrets.token_hex(32),
-        "STGA_CHECKPOINT_S": "0.3",
-    }
+    variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    variables["STGA_CHECKPOINT_S"] = "0.3"
     killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
-    names = sorted(
-        f"{table}-seed{seed}" for table in ("evaluate", "train") for seed in range(seeds)
-    )
-    assert states == str([(name, "finished", "") for name in names])
+    names = [f"{table}-seed{n}" for table in ("evaluate", "train") for n in range(seeds)]
+    assert states == str([(name, "finished", "") for name in sorted(names)])
     print(killed)
     assert int(killed.split()[0]) >= KILLS // 2
     assert int(killed.split()[3]) > 0

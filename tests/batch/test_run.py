@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch.engines import local
-from stga_addon.batch.engines.local import LocalEngine
-from stga_addon.batch.folder import LOCK, hold_folder, is_done, prepare, read_record
+from stga_addon.batch import engines
+from stga_addon.batch.engines import LocalEngine
+from stga_addon.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
 from stga_addon.batch.plan import Ended, Job, Resources, make_plan
 from stga_addon.batch.report import plan_lines, table_lines
 from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
@@ -28,11 +28,8 @@ from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, in
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
-LAST = {
-    "request": "analyze",
-    "capture": "capture",
-    "after": [f"again-{number:05d}" for number in range(3)],
-}
+AFTER = [f"again-{number:05d}" for number in range(3)]
+LAST = {"request": "analyze", "capture": "capture", "after": AFTER}
 
 
 def states(batch: Batch) -> dict[str, JobState]:
@@ -76,11 +73,8 @@ def test_a_batch_that_writes_into_what_it_reads(tmp_path: Path) -> None:
 
     (tmp_path / "capture").mkdir()
     look = {"request": "analyze", "capture": "capture"}
-    face = {
-        "request": "convert-motion",
-        "source": "capture",
-        "output": str(tmp_path / "capture/face.csv"),
-    }
+    face = {"request": "convert-motion", "source": "capture"}
+    face["output"] = str(tmp_path / "capture/face.csv")
     plan = make_plan({"out": "capture/runs", "job": {"look": look, "face": face}}, tmp_path, "plan")
     for submitted in (["look", "face"], [], ["look", "face"]):
         if not submitted:
@@ -104,10 +98,7 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
     (tmp_path / "shot.blend").touch()
     both = ["film-1", "film-3"]
     film = {"request": "render-blend", "blend": "shot.blend"}
-    jobs = {
-        name: {**film, "frames": frames}
-        for name, frames in zip(both, ([1, 2], [3, 4]), strict=True)
-    }
+    jobs = {"film-1": {**film, "frames": [1, 2]}, "film-3": {**film, "frames": [3, 4]}}
     plan = make_plan({"out": "runs", "job": jobs}, tmp_path, "plan")
     for gone, submitted in ((None, both), ("film-3/000004.png", both[1:])):
         if gone is not None:
@@ -155,11 +146,8 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
     assert states(batch)["look-00000"] == JobState.FINISHED
     assert states(batch)["look-00001"] == JobState.FAILED
     assert "Worker exited unexpectedly" in batch.entries["look-00001"].error
-    assert Counter(engine.submitted) == {
-        "look-00000": 3,
-        "look-00001": 1 + MAX_RETRIES,
-        "look-00002": 1,
-    }
+    tries = Counter(engine.submitted)
+    assert tries == {"look-00000": 3, "look-00001": 1 + MAX_RETRIES, "look-00002": 1}
 
 
 @pytest.mark.parametrize("takes_all", [False, True])
@@ -243,11 +231,8 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     engine = LocalEngine(cores=4, memory_gb=8.0)
 
     def job(name: str, **needs: float) -> Job:
-        found = empty_jobs(tmp_path, 1).jobs[0]
-        return Job(
-            name, "look", found.request, tmp_path / name,
-            resources=Resources(**{"threads": 1, **needs}),
-        )  # fmt: skip
+        found, resources = empty_jobs(tmp_path, 1).jobs[0], Resources(**{"threads": 1, **needs})
+        return Job(name, found.request, tmp_path / name, resources=resources)
 
     assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
     engine.adopt(job("a", threads=2, memory_gb=3.0, gpu=True))
@@ -269,7 +254,7 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
 def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, ending, is_lost):
     """Catches a killed worker that is not tried again on Windows, where a kill is an exit status
     like others."""
-    monkeypatch.setattr(local, "IS_WINDOWS", windows)
+    monkeypatch.setattr(engines, "IS_WINDOWS", windows)
     python = tmp_path / "python"
     python.write_text(f"#!/bin/sh\n{ending}\n")
     python.chmod(0o755)
@@ -293,19 +278,13 @@ def test_tables(tmp_path: Path) -> None:
     )
     entries = list(batch.entries.values())
     for number, entry in enumerate(entries):
-        entry.state = (
-            JobState.FINISHED
-            if number < 20
-            else JobState.RUNNING
-            if number < 24
-            else JobState.FAILED
-        )
+        entry.state = JobState.FINISHED if number < 20 else JobState.FAILED
         entry.status = WorkerStatus(seconds=10.0)
-    running = entries[20]
-    running.machine = "node7"
-    running.status = WorkerStatus(
-        progress=0.25, message="Training", figures={"psnr": 31.25}, seconds=30.0
-    )
+    for entry in entries[20:24]:
+        entry.state = JobState.RUNNING
+    figures = {"psnr": 31.25}
+    entries[20].machine = "node7"
+    entries[20].status = WorkerStatus("working", 0.25, "Training", figures=figures, seconds=30.0)
     lines = table_lines(batch)
     assert lines[0].startswith("20 of 30 jobs finished, 4 running, 6 failed; about 90 s left")
     assert "node7" in lines[1]
@@ -320,7 +299,7 @@ LEASE = f"{LOCK}.lease"
 
 
 def _hold(folder: str, held: Any) -> None:
-    with hold_folder(Path(folder)):
+    with hold_batch(Path(folder)):
         held.set()
         time.sleep(120)
 
@@ -343,17 +322,13 @@ def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
     other.start()
     try:
         assert held.wait(30)
-        with (
-            pytest.raises(
-                StgaError, match=r"another batch is working in this folder \(process \d+"
-            ),
-            hold_folder(tmp_path),
-        ):
+        expected = r"another batch is working in this folder \(process \d+"
+        with pytest.raises(StgaError, match=expected), hold_batch(tmp_path):
             pass
         other.kill()  # which leaves the lease behind
         other.join()
         assert (tmp_path / LEASE).exists()
-        with hold_folder(tmp_path) as lease:
+        with hold_batch(tmp_path) as lease:
             assert lease.compromise is None
     finally:
         other.kill()
@@ -408,18 +383,11 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
     tests, few = Path(__file__).resolve().parents[1], JOBS // 8
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(tests.parent), str(tests)]),
-        "TMPDIR": str(tmp_path),
-    }
+    path = os.pathsep.join([str(tests.parent), str(tests)])
+    environment = os.environ | {"PYTHONPATH": path, "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", COST, str(few), str(JOBS)]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    (small_s, small_kb), (large_s, large_kb) = (
-        map(float, line.split()) for line in run.stdout.splitlines()
-    )
-    print(
-        f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB; "
-        f"{large_s / small_s:.2f}"
-    )
+    small_s, small_kb, large_s, large_kb = map(float, run.stdout.split())
+    print(f"{JOBS} jobs: {JOBS * large_s:.1f} s of processor time, {large_kb / 1024:.0f} MB")
     assert large_s < 1.8 * small_s
     assert large_kb - small_kb < 30 * (JOBS - few)

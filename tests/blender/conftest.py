@@ -30,6 +30,21 @@ def empty_scene(_factory_settings):
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
+@pytest.fixture
+def lighting(empty_scene):
+    """The scene's settings of light, whether or not the extension is registered, too."""
+    import bpy
+
+    from stga_addon.scene import light
+
+    registered = light.lighting_settings(bpy.context.scene) is not None
+    if not registered:
+        light.register()
+    yield light.lighting_settings(bpy.context.scene)
+    if not registered:
+        light.unregister()
+
+
 @pytest.fixture(scope="session")
 def extension():
     """The checkout as a package of its own, as Blender imports an extension: only relative imports

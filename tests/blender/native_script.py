@@ -21,8 +21,8 @@ if not compat.NATIVE_SPLATS:
     compat.NATIVE_SPLATS, compat.native_splats = True, lambda tree, points: points
 
 from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.display_modes import NATIVE
 from stga_addon.scene.display.splat_attributes import RELIT_COLOR
+from stga_addon.scene.display.splat_nodes import NATIVE
 from stga_addon.scene.display.splat_object import set_input, show_avatar
 
 AVATAR, HEAD, OUT = sys.argv[sys.argv.index("--") + 1 :]

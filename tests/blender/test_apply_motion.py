@@ -20,7 +20,7 @@ from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.sequence import read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.head import rig_of  # noqa: E402
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking  # noqa: E402
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking  # noqa: E402
 

@@ -134,7 +134,7 @@ def answer(extension, tmp_path, selection) -> str:
     given = tmp_path / "given"
     given.mkdir(exist_ok=True)
     jobs = extension.stga_addon.jobs
-    jobs.folder.write_result(given, jobs.results.Selected(selection))
+    jobs.perform.write_result(given, jobs.train.Selected(selection))
     return f"shutil.copytree({str(given)!r}, FOLDER, dirs_exist_ok=True)\nend('finished')"
 
 

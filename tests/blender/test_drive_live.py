@@ -21,7 +21,7 @@ from stga_addon.driving.read_performance import read_performance  # noqa: E402
 from stga_addon.flame.forward import flame_forward  # noqa: E402
 from stga_addon.flame.sequence import FlameSequence, read_motion  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.head import rig_of  # noqa: E402
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 2e-5

@@ -23,9 +23,8 @@ def test_unsupported_cameras_are_refused(kind):
     """Catches a perspective image from a camera of another type."""
     if kind is not None:
         camera_at(type=kind)
-    with pytest.raises(
-        RuntimeError, match="no camera" if kind is None else "camera: is not a perspective camera"
-    ):
+    message = "no camera" if kind is None else "camera: is not a perspective camera"
+    with pytest.raises(RuntimeError, match=message):
         bpy.ops.render.render()
 
 
@@ -46,33 +45,16 @@ def test_a_head_in_edit_mode_is_named():
     _, head = show(avatar_of("stga", 10))
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(
-        StgaError, match="head: is in Edit Mode; head splats is drawn again when you leave it"
-    ):
+    message = "head: is in Edit Mode; head splats is drawn again when you leave it"
+    with pytest.raises(StgaError, match=message):
         visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
     bpy.ops.object.mode_set(mode="OBJECT")
     assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
 
 
-@pytest.mark.parametrize(
-    ("stage", "raised", "message"),
-    [
-        ("visible_layers", StgaError("head: is broken"), "^Error: head: is broken$"),
-        (
-            "visible_layers",
-            ValueError("of bones"),
-            r"Unexpected error \(ValueError: of bones\); see the console",
-        ),
-        (
-            "combined",
-            MemoryError("of pixels"),
-            r"Unexpected error \(MemoryError: of pixels\); see the console",
-        ),
-    ],
-)
-def test_failed_render_is_an_error_and_an_empty_image(
-    stage, raised, message, tmp_path, monkeypatch
-):
+@pytest.mark.parametrize("stage", ["visible_layers", "combined"])
+@pytest.mark.parametrize("raised", [StgaError("head: is broken"), MemoryError("of pixels")])
+def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, monkeypatch):
     """Catches an image without passes, and a failure saved as an image."""
 
     def fail(*_: object) -> None:
@@ -82,6 +64,9 @@ def test_failed_render_is_an_error_and_an_empty_image(
     scene.render.filepath = str(tmp_path / "failed.png")
     camera_at()
     monkeypatch.setattr(engine, stage, fail)
+    message = "^Error: head: is broken$"
+    if isinstance(raised, MemoryError):
+        message = r"Unexpected error \(MemoryError: of pixels\); see the console"
     with pytest.raises(RuntimeError, match=message) as reported:
         bpy.ops.render.render(write_still=True)
     assert str(reported.value).count(str(raised)) == 1
@@ -97,14 +82,11 @@ def test_failed_render_is_an_error_and_an_empty_image(
 def test_panels_drop_the_engine_on_unregister():
     """Catches panels that still list the engine after it was unregistered."""
 
-    def panels() -> list[str]:
+    def panels() -> list[type]:
         every = bpy.types.Panel.__subclasses__()
-        return [
-            panel.__name__
-            for panel in every
-            if engine.ENGINE in getattr(panel, "COMPAT_ENGINES", ())
-        ]
+        return [each for each in every if engine.ENGINE in getattr(each, "COMPAT_ENGINES", ())]
 
+    assert panels()
     engine.unregister()
     assert not panels()
     engine.register(no_python)

@@ -17,7 +17,7 @@ from stga_addon.capture.open import open_capture  # noqa: E402
 from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
 from stga_addon.flame.model import JOINTS  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.flame_rig import rig_of  # noqa: E402
+from stga_addon.scene.rig.head import rig_of  # noqa: E402
 
 BLENDER_TOLERANCE_M = 1e-5
 """Float32 skinning in Blender, steps of the file's blend shapes and weights."""

@@ -13,8 +13,13 @@ from stga_addon.development.demo.capture import unpack_capture  # noqa: E402
 from stga_addon.export.ply import write_ply  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.avatar_scene import frame_head  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, LIMITS, POINTS, QUADS  # noqa: E402
-from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
+from stga_addon.scene.display.splat_nodes import (  # noqa: E402
+    AS_TRAINED,
+    DISPLAY,
+    LIMITS,
+    POINTS,
+    QUADS,
+)
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier  # noqa: E402
 from stga_addon.scene.objects import layers_of  # noqa: E402
 

@@ -52,27 +52,22 @@ def linked_collection(path: Path):
     return target.collections[0]
 
 
-def test_linked_heads_are_followed(library):
-    """Catches linked splats that are missing, stand still, or need their own file."""
+@pytest.mark.parametrize("is_instance", [False, True])
+def test_linked_heads_are_followed(library, is_instance):
+    """Catches linked or instanced splats that are missing, stand still, need their own file, or are
+    at the place of the collection."""
     path, expected = library
-    bpy.context.scene.collection.children.link(linked_collection(path))
-    cache = SplatCache()
-    for frame, positions_there in zip(FRAMES, expected, strict=True):
-        np.testing.assert_allclose(shown_at(frame, cache), positions_there, atol=1e-6)
-
-
-def test_instances_of_linked_heads_are_followed(library):
-    """Catches instances that are not drawn, or at the place of the collection."""
-    path, expected = library
-    instance = bpy.data.objects.new("anna", None)
-    instance.instance_type, instance.instance_collection = "COLLECTION", linked_collection(path)
-    instance.location, instance.scale = (1, 2, 3), (2, 2, 2)
-    bpy.context.scene.collection.objects.link(instance)
-    cache = SplatCache()
-    for frame, positions_there in zip(FRAMES, expected, strict=True):
-        np.testing.assert_allclose(
-            shown_at(frame, cache), 2 * positions_there + [1, 2, 3], atol=1e-5
-        )
+    scene, cache, linked = bpy.context.scene, SplatCache(), linked_collection(path)
+    if is_instance:
+        instance = bpy.data.objects.new("anna", None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", linked
+        instance.location, instance.scale = (1, 2, 3), (2, 2, 2)
+        scene.collection.objects.link(instance)
+    else:
+        scene.collection.children.link(linked)
+    for frame, there in zip(FRAMES, expected, strict=True):
+        placed = 2 * there + [1, 2, 3] if is_instance else there
+        np.testing.assert_allclose(shown_at(frame, cache), placed, atol=1e-5)
 
 
 def test_overridden_heads_are_followed(library):
@@ -84,11 +79,8 @@ def test_overridden_heads_are_followed(library):
     linked.override_hierarchy_create(scene, bpy.context.view_layer)
     if linked.name in scene.collection.children:
         scene.collection.children.unlink(linked)
-    own = {
-        thing.name: thing
-        for thing in bpy.context.view_layer.objects
-        if thing.override_library is not None
-    }
+    things = bpy.context.view_layer.objects
+    own = {thing.name: thing for thing in things if thing.override_library is not None}
     assert set(own) == {"root", "head", "head splats"}
     cache = SplatCache()
     for frame, positions_there in zip(FRAMES, expected, strict=True):

@@ -21,15 +21,9 @@ from stga_addon.scene.layers import FROZEN_COLOR
 from .test_splat_object import avatar_of, same_rotation
 
 SCRIPT = Path(__file__).with_name("native_script.py")
-BLENDERS = [
-    shlex.split(command)
-    for command in os.environ.get("STGA_BLENDER", "").split(" ; ")
-    if command.strip()
-]
-COMMANDS = [
-    [sys.executable],
-    *([*command, "--background", "--python-exit-code", "1", "--python"] for command in BLENDERS),
-]
+BLENDERS = filter(None, map(shlex.split, os.environ.get("STGA_BLENDER", "").split(" ; ")))
+OPTIONS = ["--background", "--python-exit-code", "1", "--python"]
+COMMANDS = [[sys.executable], *([*command, *OPTIONS] for command in BLENDERS)]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: Path(command[0]).name)
@@ -45,15 +39,13 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
         strain_color=rng.normal(0, 0.2, (400, 3, 3)).astype(np.float32),
     )
     avatar = replace(avatar, splats=splats)
-    posed = avatar.neutral @ [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]] + rng.normal(
-        0, 0.004, avatar.neutral.shape
-    )
+    turn = [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]
+    posed = avatar.neutral @ turn + rng.normal(0, 0.004, avatar.neutral.shape)
     write_avatar(tmp_path / "a.npz", avatar)
     np.save(tmp_path / "head.npy", posed)
-    arguments = [tmp_path / "a.npz", tmp_path / "head.npy", tmp_path / "found.npz"]
-    done = subprocess.run(
-        [*command, SCRIPT, "--", *arguments], capture_output=True, text=True, check=False
-    )
+    files = (tmp_path / name for name in ("a.npz", "head.npy", "found.npz"))
+    command = [*command, SCRIPT, "--", *files]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     found = np.load(tmp_path / "found.npz")
     assert found["recorded/type"] in ("", "GAUSSIAN_SPLAT")
@@ -66,9 +58,8 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     flat = {"gray": np.array(FROZEN_COLOR[:3]), "relit": relit}
     for case in ("recorded", "constant", *flat):
         base = (linear_to_srgb(flat[case]) - 0.5) / SH_C0 if case in flat else wanted.sh[:, 0]
-        np.testing.assert_allclose(
-            found[f"{case}/radiance:base"][:, :3], np.broadcast_to(base, (400, 3)), atol=5e-5
-        )
+        expected = np.broadcast_to(base, (400, 3))
+        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, :3], expected, atol=5e-5)
         np.testing.assert_allclose(found[f"{case}/radiance:base"][:, 3], opacity, atol=1e-6)
         names = [name for name in found if name.startswith(f"{case}/radiance:sh_")]
         assert sorted(names) == sorted(f"{case}/radiance:sh_{index}" for index in range(15))

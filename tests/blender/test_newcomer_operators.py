@@ -16,7 +16,7 @@ from light.scenes import lit_avatar  # noqa: E402
 from stga_addon.scene import tags  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, show_avatar  # noqa: E402
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
 from stga_addon.training.effect_catalog import EFFECTS  # noqa: E402
@@ -30,7 +30,7 @@ LACKS = (
     "edition of the add-on, or choose a Python that has them in its preferences or by STGA_PYTHON"
 )
 BUTTONS = {
-    LACKS: "Choose a Python in Preferences",
+    LACKS: "Choose a Python",
     "run folder: //run is relative to the .blend file, which has not been saved yet": "Save the "
     "File",
     "/captures/anna: was tracked with FLAME and needs a FLAME model": "Choose It",
@@ -174,3 +174,17 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     lighting.mode = "recorded"
     lighting.mode = "scene"
     assert lighting.exposure == 1.5
+
+
+def test_appended_and_deleted_heads(head, tmp_path):
+    """Catches a panel that does not know an appended head, or works on one that is deleted."""
+    file, name = str(tmp_path / "head.blend"), head.name
+    bpy.ops.wm.save_as_mainfile(filepath=file)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.append(directory=f"{file}/Object/", filename=name)
+    scene = bpy.context.scene
+    assert scene.stga.head == bpy.data.objects[name]
+    for collection in scene.stga.head.users_collection:
+        collection.objects.unlink(scene.stga.head)
+    bpy.context.view_layer.update()
+    assert scene.stga.head is None

@@ -27,7 +27,7 @@ from stga_addon.export.ply import read_ply, read_vertices, write_ply  # noqa: E4
 from stga_addon.jobs.track import Track  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import POINTS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import evaluated_splats, set_input  # noqa: E402
 from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402

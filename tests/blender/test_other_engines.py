@@ -14,19 +14,24 @@ from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.capture.color import linear_to_srgb, srgb_to_linear  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
+from stga_addon.light.relight import Relighter  # noqa: E402
 from stga_addon.raster.cpu.compose import compose  # noqa: E402
 from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
 from stga_addon.scene.cameras import render_camera  # noqa: E402
 from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import QUADS  # noqa: E402
-from stga_addon.scene.display.splat_nodes import DISPLAY  # noqa: E402
+from stga_addon.scene.display.splat_nodes import DISPLAY, QUADS  # noqa: E402
 from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
 from stga_addon.scene.gpu.renderer import has_gpu_context  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
+from stga_addon.scene.render.scene_splats import (  # noqa: E402
+    SplatCache,
+    forget_frame,
+    relight_frame,
+    visible_layers,
+)
 
 from .test_engine import camera_at, show, textured, with_light  # noqa: E402
 from .test_panel import draw  # noqa: E402
-from .test_splat_object import avatar_of  # noqa: E402
+from .test_splat_object import active_camera, avatar_of, displayed_colors  # noqa: E402
 
 SIZE_PX = 64
 SAMPLES = 4
@@ -35,9 +40,7 @@ MIN_PSNR_DB = 33.0
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
 EEVEE_MARKS = (
     pytest.mark.slow,  # compiling its shaders takes most of a minute
-    pytest.mark.skipif(
-        not has_gpu_context(), reason="Blender gets no GPU context here: EGL has no driver"
-    ),
+    pytest.mark.skipif(not has_gpu_context(), reason="Blender gets no GPU context: no EGL driver"),
 )
 
 
@@ -62,14 +65,8 @@ def overlapping_splats() -> Splats:
 def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
     """(3, H, W) sRGB over black as both engines blend: rasterized with linear colors."""
     linear = srgb_to_linear(np.clip(0.5 + SH_C0 * splats.sh.astype(np.float64), 0, 1))
-    image = compose(
-        [
-            PosedSplats(
-                replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32)), WORLD, np.eye(4)
-            )
-        ],
-        view,
-    )
+    splats = replace(splats, sh=((linear - 0.5) / SH_C0).astype(np.float32))
+    image = compose([PosedSplats(splats, WORLD, np.eye(4))], view)
     return np.asarray(linear_to_srgb(np.clip(image.rgb, 0, 1)))
 
 
@@ -80,10 +77,8 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     scene = bpy.context.scene
     splats = overlapping_splats()
     set_input(show_world_splats(splats, "ball"), DISPLAY, QUADS)
-    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    camera.data.lens, camera.location = 80, (0, 0, 0.6)
-    scene.collection.objects.link(camera)
-    scene.camera, scene.world = camera, bpy.data.worlds.new("black")
+    camera = active_camera((0, 0, 0.6))
+    camera.data.lens, scene.world = 80, bpy.data.worlds.new("black")
     enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
     render = scene.render
     render.engine, render.filepath = engine, str(tmp_path / "image.png")
@@ -97,9 +92,7 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     bpy.ops.render.render(write_still=True)
     found = np.asarray(Image.open(tmp_path / "image.png"), np.float32).transpose(2, 0, 1) / 255
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    view = render_camera(
-        camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX, (0, 0, SIZE_PX, SIZE_PX)
-    )
+    view = render_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE_PX, SIZE_PX)
     expected = blended_in_linear_light(splats, view)
     psnr_db = -10 * np.log10(np.mean((found - expected) ** 2))
     print(f"{engine}: {psnr_db:.1f} dB")
@@ -143,45 +136,22 @@ def test_images_of_recorded_light_say_so(
     assert cast not in said()
 
 
-def test_relit_color_of_a_frame(tmp_path: Path) -> None:
+def test_relit_color_of_a_frame(lighting) -> None:
     """Catches relit colors that do not reach the nodes, or stay when taken back."""
-    from stga_addon.light.relight import Relighter
-    from stga_addon.scene import light as settings
-    from stga_addon.scene.display.display_modes import DISPLAY_COLOR
-    from stga_addon.scene.render.scene_splats import forget_frame, relight_frame
-
-    def node_colors() -> np.ndarray:
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        (cloud,) = [
-            each.object for each in depsgraph.object_instances if each.object.type == "POINTCLOUD"
-        ]
-        colors = np.empty(4 * len(avatar.splats), np.float32)
-        cloud.data.attributes[DISPLAY_COLOR].data.foreach_get("color", colors)
-        return colors.reshape(-1, 4)[:, :3]
-
-    registered = settings.lighting_settings(bpy.context.scene) is not None
-    if not registered:
-        settings.register()
-    try:
-        avatar = with_light(textured(avatar_of("stga")))
-        shown, _ = show(avatar)
-        camera = camera_at()
-        set_input(shown, DISPLAY, "Points")
-        before = node_colors()
-        sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-        sun.data.energy, sun.rotation_euler = 3.0, (1.2, 0.0, 0.4)
-        bpy.context.scene.collection.objects.link(sun)
-        with pytest.raises(StgaError, match="as recorded"):
-            relight_frame(shown, bpy.context.scene)
-        settings.lighting_settings(bpy.context.scene).mode = "scene"
+    avatar = with_light(textured(avatar_of("stga")))
+    shown, _ = show(avatar)
+    camera, before = camera_at(), displayed_colors(shown)
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.rotation_euler = 3.0, (1.2, 0.0, 0.4)
+    bpy.context.scene.collection.objects.link(sun)
+    with pytest.raises(StgaError, match="as recorded"):
         relight_frame(shown, bpy.context.scene)
-        (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
-        eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])
-        relit = Relighter(avatar).radiance(layer.relit.mesh, eye, layer.relit.lighting)
-        np.testing.assert_allclose(node_colors(), np.maximum(relit, 0), atol=2e-3)
-        assert np.abs(node_colors() - before).mean() > 0.05
-        assert forget_frame(shown)
-        np.testing.assert_array_equal(node_colors(), before)
-    finally:
-        if not registered:
-            settings.unregister()
+    lighting.mode = "scene"
+    relight_frame(shown, bpy.context.scene)
+    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    eye = layer.eye_in_avatar(np.array(camera.matrix_world)[:3, 3])
+    relit = Relighter(avatar).radiance(layer.relit.mesh, eye, layer.relit.lighting)
+    np.testing.assert_allclose(displayed_colors(shown), np.maximum(relit, 0), atol=2e-3)
+    assert np.abs(displayed_colors(shown) - before).mean() > 0.05
+    assert forget_frame(shown)
+    np.testing.assert_array_equal(displayed_colors(shown), before)

@@ -69,9 +69,9 @@ def trained(extension, tmp_path, monkeypatch):
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.select(threshold=0.0005)
     run, jobs, monitor = tmp_path / "run", extension.stga_addon.jobs, extension.operators.monitor
-    folder = jobs.folder.request_folder(run)
+    folder = jobs.perform.request_folder(run)
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-    jobs.folder.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
+    jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
     with extension.stga_addon.worker.status.status_writer(folder) as writer:
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer.update(0.5, "Training")

@@ -12,8 +12,11 @@ from capture.factory import ball, write_mesh_capture  # noqa: E402
 from stga_addon.avatar.file import Avatar, write_avatar  # noqa: E402
 from stga_addon.avatar.lattice import lattice_splats  # noqa: E402
 from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.scene.display.heat_map import HEAT, SHARE  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection  # noqa: E402
+from stga_addon.scene.vertex_groups import (  # noqa: E402
+    HEAT,
+    SHARE,
+    read_selection,
+)
 from stga_addon.selection import SelectionOptions, select_capture  # noqa: E402
 
 from .captures import closure  # noqa: E402

@@ -38,7 +38,7 @@ def asked(extension, take, out):
     """Ask for the tracking of the take, without a worker."""
     jobs = extension.stga_addon.jobs
     wanted = jobs.track.Track(take / "footage", take / "head.npz", out, landmarks=take / "points")
-    jobs.folder.write_request(jobs.folder.request_folder(out), wanted)
+    jobs.perform.write_request(jobs.perform.request_folder(out), wanted)
 
 
 def mesh_at(frame):
@@ -84,7 +84,7 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     before = {frame: mesh_at(frame) for frame in range(5)}
 
     scene.frame_set(1)
-    rig = extension.stga_addon.scene.rig.flame_rig.rig_of(head)
+    rig = extension.stga_addon.scene.rig.head.rig_of(head)
     bone = rig.pose.bones["jaw"]
     bone.rotation_quaternion = bone.rotation_quaternion @ Quaternion((1, 0, 0), radians(12))
     head.data.shape_keys.key_blocks["expr_001"].value += 0.5

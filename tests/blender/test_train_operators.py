@@ -38,8 +38,8 @@ def worker(extension, head, tmp_path):
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-        folder = jobs.folder.request_folder(run)
-        jobs.folder.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
+        folder = jobs.perform.request_folder(run)
+        jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
         writer.update(0.25, "Training")

@@ -74,11 +74,10 @@ def sheet(color: np.ndarray | None = None) -> None:
     rng, count = np.random.default_rng(8), 600
     skin = rng.uniform(0.3, 0.75, (count, 1)) * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
     colors = skin if color is None else np.tile(color, (count, 1))
+    xyz = np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)])
     splats = replace(
         random_splats(1, count, degree=0),
-        xyz=np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)]).astype(
-            np.float32
-        ),
+        xyz=xyz.astype(np.float32),
         log_scale=np.full((count, 3), -3.2, np.float32),
         opacity=np.full(count, 3, np.float32),
         sh=((colors - 0.5) / SH_C0).astype(np.float32).reshape(count, 1, 3),
@@ -107,26 +106,27 @@ def saved_picture(folder: Path, **view: object) -> np.ndarray:
 
 
 def test_standard_view_transform_shows_trained_colors(tmp_path):
-    """Catches colors that differ from the trained ones under the Standard view transform."""
-    trained = np.array([0.8, 0.5, 0.1])
+    """Catches colors that differ from the trained ones under the Standard view transform, and a
+    table where none is needed."""
+    trained, scene = np.array([0.8, 0.5, 0.1]), bpy.context.scene
     sheet(trained)
+    for name, needed in (("Standard", False), ("Raw", False), ("AgX", True)):
+        scene.view_settings.view_transform = name
+        assert view_transform.needs_inverse(scene) == needed
     middle = saved_picture(tmp_path, view_transform="Standard")[HEIGHT // 2, WIDTH // 2]
     np.testing.assert_allclose(middle[:3], 255 * trained, atol=0.6)
     assert middle[3] > 0.99 * 255
+
+
+CONTRAST = {"look": "AgX - Medium High Contrast", "exposure": 0.5, "gamma": 1.1}
 
 
 @pytest.mark.parametrize("transparent", [True, False])
 @pytest.mark.parametrize(
     "view",
     [
-        {"view_transform": "AgX"},
         {"view_transform": "Filmic"},
-        {
-            "view_transform": "AgX",
-            "look": "AgX - Medium High Contrast",
-            "exposure": 0.5,
-            "gamma": 1.1,
-        },
+        {"view_transform": "AgX", **CONTRAST},
         {"view_transform": "Standard", "exposure": -0.5},
     ],
 )
@@ -144,13 +144,3 @@ def test_view_transforms_show_trained_colors(view, transparent, tmp_path):
     difference = np.abs(shown - trained)[covered]
     assert difference.mean() <= 1.5
     assert np.percentile(difference, 99) <= 6
-
-
-def test_standard_needs_no_table():
-    """Catches a table where the view transform needs none."""
-    scene = bpy.context.scene
-    for name in ("Standard", "Raw"):
-        scene.view_settings.view_transform = name
-        assert not view_transform.needs_inverse(scene)
-    scene.view_settings.view_transform = "AgX"
-    assert view_transform.needs_inverse(scene)

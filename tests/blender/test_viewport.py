@@ -1,4 +1,4 @@
-"""The viewport's render thread and redraw timer, without a GPU; views as calibrated cameras."""
+"""The viewport's render thread and redraw timer, without a GPU."""
 
 import gc
 import threading
@@ -13,7 +13,6 @@ bpy = pytest.importorskip("bpy")
 
 from stga_addon.capture.camera import Camera  # noqa: E402
 from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.cameras import camera_of, viewport_camera  # noqa: E402
 from stga_addon.scene.render import engine as engine_viewport  # noqa: E402
 from stga_addon.scene.render.engine import RenderRequest, ViewportRenderer  # noqa: E402
 
@@ -193,35 +192,3 @@ def test_stopping_ends_timer_and_threads():
     assert not recorder.renderer.is_busy()
     assert len(recorder.rendered) == 1
     assert engine.threads == []
-
-
-def test_orthographic_views():
-    """Catches an orthographic view whose points fall elsewhere than where Blender draws them."""
-    from mathutils import Matrix
-
-    class Region:
-        is_perspective = False
-        view_matrix = Matrix.Translation((0.02, 0.05, -3)) @ Matrix.Rotation(0.4, 4, "X")
-        window_matrix = Matrix(((2.5, 0, 0, 0.1), (0, 3.3, 0, -0.2), (0, 0, -0.1, 0), (0, 0, 0, 1)))
-
-    camera = viewport_camera(Region, 800, 600)
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.normal(0, 0.1, (50, 3)), np.ones(50)])
-    clip = points @ np.array(Region.view_matrix).T @ np.array(Region.window_matrix).T
-    expected = np.stack([(clip[:, 0] + 1) * 400, (1 - clip[:, 1]) * 300], -1)
-    seen = points @ camera.world_to_camera.T
-    x = camera.fl_x * seen[:, 0] / seen[:, 2] + camera.cx
-    y = camera.fl_y * seen[:, 1] / seen[:, 2] + camera.cy
-    np.testing.assert_allclose(np.stack([x, y], -1), expected, atol=2.0)
-
-
-def test_perspective_views():
-    """Catches a principal point on the wrong side."""
-    projection = np.array([[2.0, 0, 0.1, 0], [0, 3.0, -0.2, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]])
-    camera = camera_of(np.eye(4), projection, 800, 600)
-    point = np.array([0.1, -0.2, -1.5, 1])
-    clip = projection @ point
-    expected = (clip[0] / clip[3] + 1) * 400, (1 - clip[1] / clip[3]) * 300
-    seen = camera.world_to_camera @ point
-    assert camera.fl_x * seen[0] / seen[2] + camera.cx == pytest.approx(expected[0])
-    assert camera.fl_y * seen[1] / seen[2] + camera.cy == pytest.approx(expected[1])

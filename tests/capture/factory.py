@@ -9,6 +9,10 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from stga_addon.avatar.file import Avatar, write_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.capture.model import Capture
+
 WIDTH, HEIGHT, FOCAL = 40, 60, 200.0
 CX, CY = 19.0, 36.0  # OpenCV; the files hold HEIGHT − CY
 RADIUS = 0.1
@@ -209,6 +213,16 @@ def write_release(
         del entry["timestep_index"]
     (root / "transforms_train.json").write_text(json.dumps({"frames": frames}))
     return root
+
+
+def write_avatar_of(capture: Capture, path: Path, is_colored: bool = False, **lattice: Any) -> Path:
+    """An avatar of a capture's head; is_colored: each splat has a color of its own."""
+    splats = lattice_splats(capture.neutral, capture.faces, **{"order": 0, **lattice})
+    if is_colored:
+        splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
+    neutral, faces = capture.neutral.astype(np.float32), capture.faces.astype(np.int32)
+    write_avatar(path, Avatar(splats, "stga", neutral, faces))
+    return path
 
 
 def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -62,42 +62,21 @@ def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
 def test_obj_dialects(tmp_path: Path) -> None:
     """Catches what exporters really write: colors, texture corners, several materials and objects,
     quads, negative indices, Windows line ends, continued lines. trimesh would regroup the triangles
-    by material.
+    by material. And kept triangles that ignore how many vertices stand before a line that counts
+    backwards.
     """
-    lines = [
-        "mtllib x.mtl",
-        "o a",
-        *(f"v {i} {i * i} 0 1 0 0" for i in range(5)),
-        "vt 0 0",
-        "vn 0 0 1",
-        "usemtl b",
-    ]
-    lines += [
-        "f 4/1 2/1 1/1",
-        "usemtl a",
-        "f 1//1 2//1 3//1 4//1",
-        "o b",
-        "f -1 -2\\",
-        " -3",
-        "f 1/1/1 3/1/1 5/1/1",
-    ]
+    points = [f"v {i} {i * i} 0 1 0 0" for i in range(5)]
+    lines = ["mtllib x.mtl", "o a", *points, "vt 0 0", "vn 0 0 1", "usemtl b", "f 4/1 2/1 1/1"]
+    lines += ["usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]
     path = tmp_path / "x.obj"
     path.write_bytes("\r\n".join(lines).encode())
     vertices, faces = read_mesh(path)
     np.testing.assert_array_equal(vertices, [[i, i * i, 0] for i in range(5)])
     np.testing.assert_array_equal(faces, [[3, 1, 0], [0, 1, 2], [0, 2, 3], [4, 3, 2], [0, 2, 4]])
-
-
-def test_obj_files_with_the_same_face_lines(tmp_path: Path) -> None:
-    """Catches kept triangles that ignore how many vertices stand before a line that counts
-    backwards."""
-    path = tmp_path / "x.obj"
-    for vertices, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
-        path.write_text(vertices + OK + "f -3 -2 -1\n")
+    three = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n"
+    for before, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
+        path.write_text(before + three)
         np.testing.assert_array_equal(read_mesh(path)[1], [expected])
-
-
-OK = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
@@ -180,80 +159,50 @@ def test_procrustes_as_scipy_has_it() -> None:
     """Catches a reflection, a transposed rotation or ignored weights, against scipy's
     align_vectors."""
     random = np.random.default_rng(1)
-    source, target, weights = (
-        random.normal(size=(30, 3)), random.normal(size=(30, 3)), random.random(30),
-    )  # fmt: skip
+    (source, target), weights = random.normal(size=(2, 30, 3)), random.random(30)
     rotation, translation = weighted_procrustes(source, target, weights)
-    centers = np.average(source, 0, weights), np.average(target, 0, weights)
-    expected = Rotation.align_vectors(target - centers[1], source - centers[0], weights)[
-        0
-    ].as_matrix()
-    np.testing.assert_allclose(rotation, expected, atol=1e-9)
-    np.testing.assert_allclose(rotation @ centers[0] + translation, centers[1], atol=1e-12)
+    a, b = np.average(source, 0, weights), np.average(target, 0, weights)
+    expected, _ = Rotation.align_vectors(target - b, source - a, weights)
+    np.testing.assert_allclose(rotation, expected.as_matrix(), atol=1e-9)
+    np.testing.assert_allclose(rotation @ a + translation, b, atol=1e-12)
 
 
 def test_moving_jaw_does_not_drag_the_head() -> None:
     """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the
-    skull by mm."""
-    random = np.random.default_rng(2)
-    neutral = random.normal(size=(2000, 3)) * 0.08
+    skull by mm; and a fit that stops early, or divides by a residual of zero."""
+    neutral = np.random.default_rng(2).normal(size=(2000, 3)) * 0.08
     jaw = neutral[:, 1] < np.quantile(neutral[:, 1], 0.4)
     opened = neutral - np.where(jaw[:, None], [[0.0, 0.02, 0.005]], 0.0)
-    rotation = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_matrix()
-    fitted = without_head_motion(opened @ rotation.T + [0.1, 0.2, -0.3], neutral)
-    np.testing.assert_allclose(fitted, opened, atol=1e-5)
+    for turn, moved, atol in (([0.3, -0.5, 0.1], opened, 1e-5), ([0, np.pi, 0], neutral, 1e-9)):
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        fitted = without_head_motion(moved @ rotation.T + [0.1, 0.2, -0.3], neutral)
+        np.testing.assert_allclose(fitted, moved, atol=atol)
+    np.testing.assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)
     plain = weighted_procrustes(opened, neutral, np.ones(len(neutral)))
     assert np.abs(opened @ plain[0].T + plain[1] - opened).max() > 1e-3
 
 
-def test_pure_head_motion_vanishes() -> None:
-    """Catches a fit that stops early, or divides by a residual of zero."""
-    neutral, _ = factory.ball()
-    rotation = Rotation.from_rotvec([0, np.pi, 0]).as_matrix()
-    moved = neutral @ rotation.T + [1, 2, 3]
-    np.testing.assert_allclose(without_head_motion(moved, neutral), neutral, atol=1e-9)
-    np.testing.assert_allclose(without_head_motion(neutral, neutral), neutral, atol=1e-12)
-
-
 def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
-    """Catches a region of other triangles than those painted."""
+    """Catches a region of other triangles than those painted, weights of another mesh taken for
+    this one's, and a refinement that would train nothing and say so nowhere."""
     np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
-    weights = np.linspace(0, 1, len(toy.faces))
-    write_npz(tmp_path / "painted.npz", {"weights": weights})
-    np.testing.assert_array_equal(find_region(toy, str(tmp_path / "painted.npz")), weights >= 0.5)
+    path, weights = tmp_path / "painted.npz", np.linspace(0, 1, len(toy.faces))
+    write_npz(path, {"weights": weights})
+    np.testing.assert_array_equal(find_region(toy, str(path)), weights >= 0.5)
     triangle = toy.faces[7]
     (tmp_path / "regions.json").write_text(json.dumps({"one": triangle.tolist()}))
     found = find_region(toy, str(tmp_path / "regions.json"))
     assert found[7]
     np.testing.assert_array_equal(found, np.isin(toy.faces, triangle).all(1))
-
-
-@pytest.mark.parametrize(
-    ("weights", "sentence"),
-    [
-        (
-            np.ones(3, np.float32),
-            r"expected 'weights', one number from 0 to 1 per triangle .* found float32 \(3,\)",
-        ),
-        (np.ones(3, np.int64), "found int64"),
-        (None, "found no such array"),
-    ],
-)
-def test_files_that_do_not_fit(
-    toy: Capture, tmp_path: Path, weights: np.ndarray | None, sentence: str
-) -> None:
-    """Catches weights of another mesh taken for this one's."""
-    path = tmp_path / "painted.npz"
-    np.savez(path, **({"other": np.ones(2)} if weights is None else {"weights": weights}))
-    with pytest.raises(StgaError, match=sentence):
-        find_region(toy, str(path))
-
-
-def test_an_empty_region_is_refused(toy: Capture, tmp_path: Path) -> None:
-    """Catches a refinement that would train nothing and say so nowhere."""
-    write_npz(tmp_path / "nothing.npz", {"weights": np.zeros(len(toy.faces))})
-    with pytest.raises(StgaError, match="holds no triangle"):
-        find_region(toy, str(tmp_path / "nothing.npz"))
+    for arrays, sentence in (
+        ({"weights": np.ones(3, np.float32)}, r"one number from 0 to 1 .* found float32 \(3,\)"),
+        ({"weights": np.ones(3, np.int64)}, "expected 'weights', .*found int64"),
+        ({"other": np.ones(2)}, "found no such array"),
+        ({"weights": np.zeros(len(toy.faces))}, "holds no triangle"),
+    ):
+        write_npz(path, arrays)
+        with pytest.raises(StgaError, match=sentence):
+            find_region(toy, str(path))
 
 
 def by_equations(

@@ -23,35 +23,25 @@ ORIENTATIONS = {
 
 
 def view_of(image, width=WIDTH, height=HEIGHT, mask=None):
-    return View(
-        0,
-        0,
-        camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2),
-        image.name,
-        image,
-        mask,
-    )
+    camera = camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2)
+    return View(0, 0, camera, image.name, image, mask)
 
 
 def corners(image):
     """Letters of the four quarters, row by row."""
     height, width = image.shape[:2]
-    gray = image.reshape(height, width, -1)[
-        height // 4 :: height // 2, width // 4 :: width // 2, 0
-    ].astype(int)
+    gray = image.reshape(height, width, -1)[..., 0].astype(int)
+    gray = gray[height // 4 :: height // 2, width // 4 :: width // 2]
     names = np.array(list("abcd"))[np.abs(gray[..., None] - list(LEVELS.values())).argmin(-1)]
     return " ".join("".join(row) for row in names)
 
 
 def write_turned(path, orientation):
-    gray = np.kron(
-        [[LEVELS["a"], LEVELS["b"]], [LEVELS["c"], LEVELS["d"]]], np.ones((HEIGHT // 2, WIDTH // 2))
-    )
+    quarters = np.reshape(list(LEVELS.values()), (2, 2, 1)).astype(np.uint8)
+    pixels = quarters.repeat(HEIGHT // 2, 0).repeat(WIDTH // 2, 1).repeat(3, 2)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(np.repeat(gray.astype(np.uint8)[..., None], 3, axis=2)).save(
-        path, exif=exif, quality=95
-    )
+    Image.fromarray(pixels).save(path, exif=exif, quality=95)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif", ".png"])
@@ -76,9 +66,8 @@ def test_camera_of_the_stored_pixels(tmp_path):
     path = tmp_path / "x.jpg"
     write_turned(path, 6)
     assert corners(read_image(view_of(path, WIDTH, HEIGHT))) == "ab cd"
-    with pytest.raises(
-        StgaError, match=r"x.jpg: the image has 32 x 48 pixels, but the camera of x.jpg has 40 x 40"
-    ):
+    sentence = r"x.jpg: the image has 32 x 48 pixels, but the camera of x.jpg has 40 x 40"
+    with pytest.raises(StgaError, match=sentence):
         read_image(view_of(path, 40, 40))
 
 
@@ -90,17 +79,12 @@ def profile(colorants, gamma, name):
         return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(65536 * value) for value in values))
 
     text = name.encode() + b"\0"
+    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma))
     tags = {
         b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(78),
         b"wtpt": xyz((0.9642, 1.0, 0.8249)),
-        **{
-            tag: xyz(values)
-            for tag, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colorants, strict=True)
-        },
-        **{
-            tag: b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma))
-            for tag in (b"rTRC", b"gTRC", b"bTRC")
-        },
+        **dict(zip((b"rXYZ", b"gXYZ", b"bXYZ"), map(xyz, colorants), strict=True)),
+        **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve),
         b"cprt": b"text\0\0\0\0none\0",
     }
     tags = {tag: data + bytes(-len(data) % 4) for tag, data in tags.items()}
@@ -109,20 +93,13 @@ def profile(colorants, gamma, name):
         table += tag + struct.pack(">2I", at + len(body), len(data))
         body += data
     size = 128 + len(table) + len(body)
-    head = (
-        struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02100000, b"mntr", b"RGB ", b"XYZ ")
-        + bytes(12)
-        + b"acsp"
-    )
-    head += bytes(28) + struct.pack(">3i", 63190, 65536, 54061)
+    head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head += bytes(12) + b"acsp" + bytes(28) + struct.pack(">3i", 63190, 65536, 54061)
     return head.ljust(128, b"\0") + table + body
 
 
-DISPLAY_P3 = profile(
-    [(0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)],
-    2.2,
-    "P3",
-)
+P3 = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
+DISPLAY_P3 = profile(P3, 2.2, "P3")
 """Colorants as published with Apple's profile."""
 
 
@@ -150,14 +127,14 @@ STORED = {
     "sRGB's profile": (
         RED_IN_P3,
         [icc(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())],
-        RED_IN_P3,
+        RED_IN_P3
     ),
     "damaged profile": (RED_IN_P3, [icc(DISPLAY_P3[:140])], RED_IN_P3),
     "cICP of Display P3": (RED_IN_P3, [chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
     "cICP of sRGB before a profile": (
         RED_IN_P3,
         [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)],
-        RED_IN_P3,
+        RED_IN_P3
     ),
     "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
     "linear gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 100000))], (128, 128, 128)),
@@ -165,7 +142,7 @@ STORED = {
     "gAMA beside sRGB": (
         (55, 55, 55),
         [chunk(b"gAMA", struct.pack(">I", 100000)), chunk(b"sRGB", b"\0")],
-        (55, 55, 55),
+        (55, 55, 55)
     ),
 }  # fmt: skip
 
@@ -190,7 +167,6 @@ def test_profile_beside_transparency_and_in_jpeg(tmp_path):
     png(path, (*RED_IN_P3, 128), icc(DISPLAY_P3), mode="RGBA")
     np.testing.assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
     assert read_mask(view_of(path))[5, 5] == 128
-    Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3).save(
-        tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3
-    )
+    red = Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3)
+    red.save(tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3)
     np.testing.assert_allclose(read_image(view_of(tmp_path / "x.jpg"))[5, 5], (255, 0, 0), atol=8)

@@ -6,15 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, first_timesteps, join_takes
 from stga_addon.errors import StgaError
 
 
 def moved(capture: Capture, offset: float) -> Capture:
     """Another take: the same head, elsewhere."""
-    return replace(
-        capture, root=Path("other"), mesh=lambda timestep: capture.mesh(timestep) + offset
-    )
+    mesh = capture.mesh
+    return replace(capture, root=Path("other"), mesh=lambda timestep: mesh(timestep) + offset)
+
+
+def turned(camera: Camera) -> Camera:
+    """Another camera, upside down."""
+    upside_down = np.diag([-1.0, -1.0, 1.0, 1.0])
+    return replace(camera, world_to_camera=upside_down @ camera.world_to_camera)
 
 
 def test_timesteps_follow_each_other(toy: Capture) -> None:
@@ -34,20 +40,16 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
         both = joined.views[split]
         assert both[: len(views)] == views
         assert [view.image for view in both[len(views) :]] == [view.image for view in views]
-        assert [view.timestep - start for view in both[len(views) :]] == [
-            view.timestep for view in views
-        ]
+        timesteps = [view.timestep - start for view in both[len(views) :]]
+        assert timesteps == [view.timestep for view in views]
 
 
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
     """Catches exposure of one camera corrected in the images of another that merely has its
     number."""
-    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     views = tuple(
-        replace(v, camera=replace(v.camera, world_to_camera=turned @ v.camera.world_to_camera))
-        if v.camera_index == 1
-        else v
-        for v in toy.views["train"]
+        replace(view, camera=turned(view.camera)) if view.camera_index == 1 else view
+        for view in toy.views["train"]
     )
     joined = join_takes([toy, replace(toy, views={"train": views})])
     new = joined.views["train"][len(views) :]
@@ -62,13 +64,8 @@ def test_cameras_of_different_takes_have_different_indices(toy: Capture) -> None
     numbers."""
     start = max(toy.timesteps) + 1
     (view,) = (view for view in toy.views["train"] if (view.timestep, view.camera_index) == (0, 0))
-    away = replace(
-        view.camera, world_to_camera=np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.camera.world_to_camera
-    )
-    second, third = (
-        replace(toy, views={"train": (replace(view, camera=away, camera_index=index),)})
-        for index in (start, 0)
-    )
+    away = [replace(view, camera=turned(view.camera), camera_index=n) for n in (start, 0)]
+    second, third = (replace(toy, views={"train": (only,)}) for only in away)
     joined = join_takes([toy, second, third])
     indices = [found.camera_index for found in joined.views["train"][-2:]]
     assert len({*indices, *(found.camera_index for found in toy.views["train"])}) == 2 + 3

@@ -54,14 +54,8 @@ def test_one_summary_at_the_end(made):
     """Catches a step that is not reported, or reported twice."""
     _, lines = made
     summary = lines[lines.index("") + 1 :]
-    for begin in (
-        "footage: cameras 5, timesteps 5",
-        "tracking: ",
-        "report: ",
-        "avatar: ",
-        "blender: ",
-        "time: ",
-    ):
+    begins = "footage: cameras 5, timesteps 5", "tracking: ", "report: ", "avatar: ", "blender: "
+    for begin in (*begins, "time: "):
         assert sum(line.startswith(begin) for line in summary) == 1, begin
     assert "interpolated: 2" in summary[0]
 
@@ -86,10 +80,9 @@ def test_a_finished_avatar_is_not_made_again(made, take):
     that noted less."""
     out, _ = made
     inputs = read_json(out / "inputs.json")
-    write_json(
-        out / "inputs.json",
-        {name: inputs[name] for name in inputs if name not in ("sync", "world", "meshes")},
-    )
+    for name in ("sync", "world", "meshes"):
+        del inputs[name]
+    write_json(out / "inputs.json", inputs)
     files = [out / "capture/transforms_train.json", out / "run/checkpoint.npz"]
     before = [path.stat().st_mtime_ns for path in files]
     assert make(take, out, "--no-blend") == 0
@@ -132,10 +125,8 @@ def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
     """Catches a run or capture of the user's that is taken for a part of this avatar."""
     (tmp_path / "out/run").mkdir(parents=True)
     assert make(take, tmp_path / "out") == 2
-    assert (
-        "holds something else (inputs.json is missing); give another --out"
-        in capsys.readouterr().err
-    )
+    said = "holds something else (inputs.json is missing); give another --out"
+    assert said in capsys.readouterr().err
     assert not (tmp_path / "out/capture").exists()
 
 

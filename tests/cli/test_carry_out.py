@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from stga_addon.cli.carry_out import ProgressBar
+from stga_addon.cli.commands import ProgressBar
 from stga_addon.progress import Progress
 
 

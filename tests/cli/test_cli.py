@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from time import process_time
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from command_line import stga
 from PIL import Image
 
 from stga_addon import __version__
-from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
@@ -122,31 +121,8 @@ def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
     # white.
     dark = (drawn < 230).any(axis=2)
     assert np.mean(dark == factory.silhouette()) > 0.9
-    assert np.average(np.arange(60), weights=dark.sum(axis=1)) == pytest.approx(
-        factory.CY - 0.5, abs=1.5
-    )
-
-
-@pytest.mark.needs("adapter")
-def test_render_on_a_gpu(trained, root, tmp_path, monkeypatch):
-    """Catches a device that renders something else, or is not asked."""
-    from stga_addon.raster.gpu import compose as gpu
-
-    rendered = Mock(side_effect=gpu.compose)
-    monkeypatch.setattr(gpu, "compose", rendered)
-    cameras = root / "transforms_val.json"
-    for device in ("cpu", "gpu"):
-        out = tmp_path / device
-        assert stga("render", trained, "--cameras", cameras, "--out", out, "--device", device) == 0
-    names = sorted(path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.png"))
-    assert rendered.call_count == len(names) > 0
-    for name in names:
-        one, other = (
-            np.asarray(Image.open(tmp_path / device / name)).astype(int)
-            for device in ("cpu", "gpu")
-        )
-        assert np.abs(one - other).max() <= 1
-        assert one.std() > 5
+    middle = np.average(np.arange(60), weights=dark.sum(axis=1))
+    assert middle == pytest.approx(factory.CY - 0.5, abs=1.5)
 
 
 def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
@@ -162,20 +138,15 @@ def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -
     assert stga("export", trained, "--format ply --timestep 1 --out", ply) == 0
     assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
     for name in ("00000_02.png", "00001_02.png"):
-        np.testing.assert_array_equal(
-            pixels(tmp_path / "run" / name), pixels(tmp_path / "avatar" / name)
-        )
+        drawn = [pixels(tmp_path / kind / name) for kind in ("run", "avatar")]
+        np.testing.assert_array_equal(*drawn)
     right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
 
 
 def test_names_of_a_long_capture() -> None:
     """Catches minutes before the first image of thousands, and two images with one name."""
-    paths = [
-        f"images/{timestep:05d}_{camera:02d}.png"
-        for timestep in range(1000)
-        for camera in range(16)
-    ]
+    paths = [f"images/{n:05d}_{camera:02d}.png" for n in range(1000) for camera in range(16)]
     begin = process_time()
     assert unique_names(paths) == [Path(path).name for path in paths]
     assert process_time() - begin < 5
@@ -192,18 +163,13 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
         out = tmp_path / f"{timestep}.ply"
         chosen = [] if timestep is None else ["--timestep", str(timestep)]
         assert main(["export", str(trained), "--format", "ply", "--out", str(out), *chosen]) == 0
-        expected = to_world(
-            avatar.splats, face_frames(mesh, avatar.faces, avatar.neutral, avatar.convention)
-        )
+        expected = to_world(avatar.splats, avatar.frames(mesh))
         again = read_ply(out)
         np.testing.assert_allclose(again.xyz, expected.xyz, atol=1e-6)
         np.testing.assert_allclose(again.log_scale, expected.log_scale, atol=1e-5)
-    assert (
-        np.abs(read_ply(tmp_path / "3.ply").xyz - read_ply(tmp_path / "None.ply").xyz).max() > 0.002
-    )
-    assert np.linalg.norm(read_ply(tmp_path / "None.ply").xyz, axis=1).mean() == pytest.approx(
-        0.1, abs=0.01
-    )
+    posed, neutral = (read_ply(tmp_path / f"{name}.ply").xyz for name in ("3", "None"))
+    assert np.abs(posed - neutral).max() > 0.002
+    assert np.linalg.norm(neutral, axis=1).mean() == pytest.approx(0.1, abs=0.01)
 
 
 def test_export_says_which_frames_there_are(trained, tmp_path, capsys):
@@ -212,9 +178,8 @@ def test_export_says_which_frames_there_are(trained, tmp_path, capsys):
     sequence = ["export", str(trained), "--format", "ply-sequence"]
     for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
         assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0
-        assert (
-            f"--frames {span}: the capture has timesteps 0 to 3\n" in capsys.readouterr().out
-        ) == said
+        message = f"--frames {span}: the capture has timesteps 0 to 3\n"
+        assert (message in capsys.readouterr().out) == said
     files = sorted((tmp_path / "3").glob("*.ply"))
     assert [path.name for path in files] == ["00000.ply", "00001.ply", "00003.ply"]
     low = [read_ply(path).xyz[:, 1].min() for path in files]
@@ -226,9 +191,8 @@ def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
     """Catches a range that fills the disk."""
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     out = tmp_path / ("o.html" if format == "web" else "o")
-    assert "1.0 kB are free there" in refused(
-        capsys, "export", trained, "--format", format, "--out", out
-    )
+    message = refused(capsys, "export", trained, "--format", format, "--out", out)
+    assert "1.0 kB are free there" in message
     assert list(tmp_path.iterdir()) == []
 
 
@@ -251,20 +215,16 @@ def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[st
 def test_eval_with_a_capture_that_has_moved(trained, root, tmp_path, capsys):
     """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on
     another capture."""
-    run, moved = (
-        Path(shutil.copytree(trained, tmp_path / "run")),
-        Path(shutil.copytree(root, tmp_path / "moved")),
-    )
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    moved = Path(shutil.copytree(root, tmp_path / "moved"))
     factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
     assert "gone" in refused(capsys, "eval", run)
     assert main(["eval", str(run), "--capture", str(moved)]) == 0
     assert main(["eval", str(trained)]) == 0
-    assert json.loads((run / "quality_val.json").read_text()) == json.loads(
-        (trained / "quality_val.json").read_text()
-    )
-    factory.edit(
-        moved / "transforms_val.json", lambda document: document["frames"][0].update(fl_x=300.0)
-    )
+    qualities = [(path / "quality_val.json").read_text() for path in (run, trained)]
+    assert qualities[0] == qualities[1]
+    val = moved / "transforms_val.json"
+    factory.edit(val, lambda document: document["frames"][0].update(fl_x=300.0))
     assert "other camera poses or intrinsics" in refused(capsys, "eval", run, "--capture", moved)
 
 
@@ -349,19 +309,15 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
     exported = [
         "export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply"),
     ]  # fmt: skip
+    known = "162 vertices, 320 triangles", "40 x 60", "view-color"
     for missing, arguments, says in (
-        (
-            "torch numba wgpu",
-            ["info", str(root)],
-            ("162 vertices, 320 triangles", "40 x 60", "view-color"),
-        ),
+        ("torch numba wgpu", ["info", str(root)], known),
         (NUMPY_ALONE, ["select", str(flame), "--flame", str(model)], ("320 triangles",)),
         (NUMPY_ALONE, exported, ()),
     ):
         command = [sys.executable, "-c", WITHOUT, missing, *arguments]
-        done = subprocess.run(
-            command, capture_output=True, text=True, cwd=Path(__file__).parents[2]
-        )
+        here = Path(__file__).parents[2]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=here)
         assert (done.returncode, done.stderr) == (0, "")
         assert all(part in done.stdout for part in says)
     assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
@@ -434,10 +390,8 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_extend(trained, root, tmp_path, capsys):
     """Catches an extended run that cannot be evaluated, rendered or extended again, and one that
     does not say what it learned and forgot."""
-    runs, take = (
-        Path(shutil.copytree(trained, tmp_path / "anna")),
-        Path(shutil.copytree(root, tmp_path / "smile")),
-    )
+    runs = Path(shutil.copytree(trained, tmp_path / "anna"))
+    take = Path(shutil.copytree(root, tmp_path / "smile"))
     assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
     printed = capsys.readouterr().out
     assert "take 1: " in printed

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from capture.factory import edit, write_flame_capture, write_mesh_capture
+from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
 from command_line import stga
 from export.web.web_data import read_web_data
 
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 
@@ -18,10 +16,7 @@ from stga_addon.cli.main import main
 def avatar_file(tmp_path: Path) -> Path:
     """An avatar of the mesh capture in the folder `capture` beside it."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture"))
-    neutral = capture.neutral.astype(np.float32)
-    splats = lattice_splats(neutral, capture.faces, sh_degree=1, convention="stga")
-    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
-    return tmp_path / "anna.npz"
+    return write_avatar_of(capture, tmp_path / "anna.npz", order=2, sh_degree=1)
 
 
 def test_frames_cameras_and_selection_of_a_capture(avatar_file, tmp_path):
@@ -58,9 +53,8 @@ def test_a_run_brings_its_capture(tmp_path):
     assert main(["export", str(run), "--format", "web", "--out", str(tmp_path / "a.stga")]) == 0
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert header["title"] == "anna"
-    assert len(header["views"]) == len(
-        {view.camera_index for views in capture.views.values() for view in views}
-    )
+    views = [view for split in capture.views.values() for view in split]
+    assert len(header["views"]) == len({view.camera_index for view in views})
     assert len(arrays["pose"]) == len(arrays["selection"]) == len(capture.timesteps)
     assert len(arrays["xyz"]) == len(read_avatar(run / "avatar.npz").splats)
 
@@ -77,23 +71,14 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
     """Catches an export without FLAME's rig that does not say that its triangles and meshes are in
     the page."""
     root, model = write_flame_capture(tmp_path / "flame")
-    capture = open_capture(root, model)
-    neutral = capture.neutral.astype(np.float32)
-    splats = lattice_splats(neutral, capture.faces, sh_degree=1, convention="stga")
-    write_avatar(tmp_path / "anna.npz", Avatar(splats, "stga", neutral, capture.faces))
-    words = [
-        "export", str(tmp_path / "anna.npz"), "--format", "web", "--capture", str(root), "--flame",
-        str(model),
-    ]  # fmt: skip
-    assert main([*words, "--motion-only", "--out", str(tmp_path / "a.stga")]) == 0
-    assert (
-        "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence"
-        in capsys.readouterr().out
-    )
-    assert main([*words, "--out", str(tmp_path / "a.stga")]) == 0
-    assert (
-        "--motion-only leaves them out, but not the meshes of the take." in capsys.readouterr().out
-    )
+    avatar = write_avatar_of(open_capture(root, model), tmp_path / "anna.npz", sh_degree=1)
+    words = "export", avatar, "--format web --capture", root, "--flame", model
+    assert stga(*words, "--motion-only --out", tmp_path / "a.stga") == 0
+    said = "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence"
+    assert said in capsys.readouterr().out
+    assert stga(*words, "--out", tmp_path / "a.stga") == 0
+    said = "--motion-only leaves them out, but not the meshes of the take."
+    assert said in capsys.readouterr().out
 
 
 def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):

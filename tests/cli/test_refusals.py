@@ -52,7 +52,7 @@ REFUSALS = [
     *((f"{command} {{none}} {option} --resume",
        f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with "
        f"--resume, which "
-       "continues the run in RUN as it began")
+       "continues RUN as it began")
       for command, option in (
         ("refine", "--region mouth"), ("refine", "--frames 1-3"), ("refine", "--growth 0.5"),
          ("refine", "--budget 1m"),
@@ -75,7 +75,7 @@ REFUSALS = [
     ("export {run} --format gaussian-avatars --out {o}",
      "needs the FLAME parameters of a FLAME capture"),
     # Runs and avatars that are missing, broken, or there already
-    ("train {root} --out {run} --iterations 3", "already holds a run; give --resume"),
+    ("train {root} --out {run} --iterations 3", "already holds a run; resume it"),
     ("refine {run} --region mouth --out {run}", "already holds a run"),
     ("train {root} --out {none} --resume", "holds no run"),
     ("train {root} --out {file} --iterations 3", "cannot be written"),

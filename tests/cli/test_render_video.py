@@ -8,9 +8,9 @@ import pytest
 from capture import factory
 from PIL import Image
 
-from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
-from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.capture.camera import orbited
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.camera import Camera, orbited
+from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.export.ply import write_ply
@@ -24,14 +24,8 @@ def parts(tmp_path: Path) -> dict[str, Path]:
     """A capture with three timesteps and three cameras, and an avatar whose every splat has its own
     color."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 3), range(3))
-    capture = open_capture(root)
-    splats = lattice_splats(capture.neutral, capture.faces, order=0)
-    splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
-    write_avatar(
-        tmp_path / "a.npz",
-        Avatar(splats, "stga", capture.neutral.astype(np.float32), capture.faces),
-    )
-    return {"avatar": tmp_path / "a.npz", "capture": root}
+    avatar = factory.write_avatar_of(open_capture(root), tmp_path / "a.npz", is_colored=True)
+    return {"avatar": avatar, "capture": root}
 
 
 def render(parts: dict[str, Path], *more: object) -> int:
@@ -47,15 +41,18 @@ def decoded(path: Path) -> tuple[float, list[np.ndarray]]:
         ]
 
 
+def camera_of(capture: Capture, index: int) -> Camera:
+    views = [view for split in capture.views.values() for view in split]
+    return next(view.camera for view in views if view.camera_index == index)
+
+
 def test_video_of_the_motion(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches a video of another camera, or with timesteps missing, doubled or out of order."""
     assert render(parts, "--video", tmp_path / "v.mp4", "--camera", 2, "--fps", 10) == 0
     rate, images = decoded(tmp_path / "v.mp4")
     assert (rate, len(images)) == (10, 3)
     avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
-    camera = next(
-        view.camera for views in capture.views.values() for view in views if view.camera_index == 2
-    )
+    camera = camera_of(capture, 2)
     for image, timestep in zip(images, (0, 1, 3), strict=True):
         errors = {
             other: np.abs(
@@ -86,31 +83,16 @@ def test_a_range_of_frames(parts, tmp_path, capsys):
     assert "--frames: has no effect with --turntable" in capsys.readouterr().err
 
 
-def test_video_at_the_rate_of_the_footage(parts: dict[str, Path], tmp_path: Path) -> None:
-    """Catches footage of 60 frames a second that plays 2.4 times too slowly."""
-    assert render(parts, "--video", tmp_path / "unknown.mp4") == 0
-    factory.edit(
-        parts["capture"] / "transforms_train.json", lambda document: document.update(fps=60)
-    )
-    assert render(parts, "--video", tmp_path / "known.mp4") == 0
-    assert [decoded(tmp_path / name)[0] for name in ("unknown.mp4", "known.mp4")] == [25, 60]
-
-
 def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches a turn about another point, one that leaves out a part of the circle, and motion that
     does not play."""
     out = tmp_path / "turn"
-    assert (
-        render(parts, "--turntable", 360, "--out", out, "--seconds", 2, "--fps", 4, "--camera", 0)
-        == 0
-    )
+    options = "--seconds", 2, "--fps", 4, "--camera", 0
+    assert render(parts, "--turntable", 360, "--out", out, *options) == 0
     pictures = sorted(out.glob("*.png"))
     assert [path.name for path in pictures] == [f"{index:04d}.png" for index in range(1, 9)]
     avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
-    start = next(
-        view.camera for views in capture.views.values() for view in views if view.camera_index == 0
-    )
-    first = capture.mesh(0)
+    start, first = camera_of(capture, 0), capture.mesh(0)
     center = (first.min(0) + first.max(0)) / 2
     for index, timestep in ((0, 0), (2, 3), (3, 1), (5, 1)):
         camera = orbited(start, center, (0, 1, 0), np.radians(45 * index))
@@ -135,17 +117,10 @@ def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
         (["--video", "v.mp4", "--camera", "7"], "there are only 0, 1, 2"),
         (["--video", "v.mp4", "--fps", "0"], "frame rate (--fps) must be from 0.01"),
         (["--out", "pictures"], "needs --cameras"),
-        (
-            ["--out", "pictures", "--camera", "1"],
-            "--camera: has no effect without --video or --turntable",
-        ),
+        (["--out", "o", "--camera", "1"], "--camera: has no effect without --video or --turntable"),
         (
             ["--out", "pictures", "--turntable", "--seconds", "1e9"],
             "--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000",
-        ),
-        (
-            ["--video", "v.mp4", "--turntable", "--seconds", "1", "--fps", "1e6"],
-            "is 1000000 images at 1e+06 frames",
         ),
     ],
 )

@@ -11,13 +11,7 @@ from pathlib import Path
 import pytest
 
 from stga_addon.development.editions import SMALL, Edition, complete, edition_manifest
-from stga_addon.development.package import (
-    ROOT,
-    build_zip,
-    main,
-    read_manifest,
-    wheel_folder,
-)
+from stga_addon.development.package import ROOT, build_zip, main, read_manifest, wheel_folder
 from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
 from stga_addon.errors import StgaError
 from stga_addon.worker.training_python import REQUIREMENTS

@@ -26,7 +26,7 @@ from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.jobs.track import MAX_MISFIT
 from stga_addon.render.video import video_writer
 from stga_addon.tracking.folder import AVATAR_MISFIT, REPORT_FILE
-from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.run.folder import AVATAR, Run, avatar_version, write_run
 from stga_addon.training.settings import TrainingSettings
 
 pytestmark = pytest.mark.slow
@@ -134,6 +134,7 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
         np.savez(path, **values, **other)
     run.mkdir()
     write_run(run, Run(root, files["flame.npz"], "vhap", TrainingSettings(iterations=1)))
+    (run / AVATAR).touch()
     with video_writer(video, 25) as append:
         for _ in range(20):
             append(np.full((64, 64, 3), 100, np.uint8))
@@ -141,7 +142,11 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     def tracked(request, report, say):
         steps.append(request.step)
         shutil.copytree(root, request.out)
-        write_json(request.out / REPORT_FILE, {"image_misfit": {AVATAR_MISFIT: {"0": misfit}}})
+        write_report(request.out, misfit, avatar_version(run))
+
+    def write_report(folder, misfit, version):
+        found = {"avatar": version, "image_misfit": {AVATAR_MISFIT: {"0": misfit}}}
+        write_json(folder / REPORT_FILE, found)
 
     def watched(path, report):
         return Performance(np.arange(2) / 25, np.full((2, 52), 0.5), np.zeros((2, 3)), 25)
@@ -149,6 +154,8 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     monkeypatch.setattr("stga_addon.jobs.convert_motion.track", tracked)
     monkeypatch.setattr("stga_addon.driving.face_video.watched_performance", watched)
     drive = ["drive", video, "--avatar", run, "--out"]
+    shutil.copytree(root, tmp_path / "a.npz.check")  # left by a cancelled one, of another avatar
+    write_report(tmp_path / "a.npz.check", 1 - misfit, [])
     assert stga(*drive, tmp_path / "a.npz", "--fps", 2 * DEFAULT_FPS) == 0
     assert stga(*drive, tmp_path / "a.csv") == 0
     motion, head = read_motion(tmp_path / "a.npz", model), read_performance(tmp_path / "a.csv").head

@@ -40,13 +40,12 @@ def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) how much each vertex follows the jaw: 1 at chin and lower lip, 0 above the lips, as
     smooth as possible."""
     x, y, z = vertices.T
-    inner = np.isin(np.arange(len(vertices)), open_edges(faces))
+    inner = np.isin(np.arange(len(vertices)), np.unique(open_edges(faces)))
     fixed = (y > -0.036) | (z < 0) | (y < -0.11)
     moved = ((y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)) | (
         inner & (z > 0.03) & (y < -0.053)
     )
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.concatenate([edges, edges[:, ::-1]])
+    edges = np.concatenate([edges_of(faces), edges_of(faces)[:, ::-1]])
     adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2).tocsr()
     laplacian = diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
     free = ~(fixed | moved)
@@ -57,15 +56,15 @@ def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.clip(weights, 0, 1)
 
 
-def open_edges(faces: np.ndarray) -> np.ndarray:
-    """Vertices (n,) of the edges (directed) that one triangle has alone."""
-    edges = [
-        tuple(edge)
-        for face in faces.tolist()
-        for edge in zip(face, face[1:] + face[:1], strict=True)
-    ]
-    known = set(edges)
-    return np.unique([edge for edge in edges if edge[::-1] not in known])
+def open_edges(faces: np.ndarray) -> list[tuple[int, int]]:
+    """The directed edges that one triangle has alone."""
+    edges = set(map(tuple, edges_of(faces).tolist()))
+    return [(a, b) for a, b in edges if (b, a) not in edges]
+
+
+def edges_of(faces: np.ndarray) -> np.ndarray:
+    """(3F, 2) the directed edges of triangles."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def jaw_opened(model: FlameModel, degrees: float, shape: np.ndarray | None = None) -> np.ndarray:
@@ -82,18 +81,12 @@ def crossings(vertices: np.ndarray, skin: np.ndarray, teeth: np.ndarray) -> int:
 
 
 def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> int:
-    edges = np.unique(
-        np.sort(np.concatenate([edged[:, [0, 1]], edged[:, [1, 2]], edged[:, [2, 0]]]), axis=1),
-        axis=0,
-    )
+    edges = np.unique(np.sort(edges_of(edged), axis=1), axis=0)
     ends, corners = vertices[edges], vertices[pierced]
     ends, corners = _near(ends, corners), _near(corners, ends)
     start, direction = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]
-    origin, u, v = (
-        corners[None, :, 0],
-        (corners[:, 1] - corners[:, 0])[None],
-        (corners[:, 2] - corners[:, 0])[None],
-    )
+    origin, u, v = corners.transpose(1, 0, 2)[:, None]
+    u, v = u - origin, v - origin
     across = np.cross(direction, v)
     determinant = (across * u).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -118,15 +111,13 @@ def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarra
     a, b, c = corners[None, :, 0], corners[None, :, 1], corners[None, :, 2]
 
     def twice_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
-            r[..., 0] - p[..., 0]
-        )
+        first, second = q - p, r - p
+        return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
     at = points[:, None]
     parts = np.stack([twice_area(at, b, c), twice_area(at, c, a), twice_area(at, a, b)], axis=-1)
     inside = (parts > 0).all(-1) | (parts < 0).all(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (parts * np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)).sum(-1) / parts.sum(
-            -1
-        )
+        heights = np.stack([a[..., 2], b[..., 2], c[..., 2]], axis=-1)
+        depth = (parts * heights).sum(-1) / parts.sum(-1)
     return (inside & (depth > at[..., 2])).any(1)

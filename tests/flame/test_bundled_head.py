@@ -13,7 +13,7 @@ from stga_addon.development.bundled_head import collapsed
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import arkit_weights
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
-from stga_addon.flame.forward import FlameFrame, flame_forward, joint_positions, neutral_frame
+from stga_addon.flame.forward import flame_forward, joint_positions, neutral_frame
 from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, key_regions, torso_faces
 from stga_addon.flame.sequence import FlameSequence
 from stga_addon.flame.teeth import flame_model, lip_pairs
@@ -29,17 +29,7 @@ def head():
 
 
 def posed(head, **changed):
-    zero = np.zeros(3)
-    frame = neutral_frame(head)
-    values = {
-        "rotation": zero,
-        "neck_pose": zero,
-        "eyes_pose": np.zeros(6),
-        "expr": frame.expr,
-    } | changed
-    frame = FlameFrame(
-        values["expr"], values["rotation"], values["neck_pose"], zero, zero, values["eyes_pose"]
-    )
+    frame = replace(neutral_frame(head), **changed)
     return flame_forward(head, np.zeros(head.n_identity), frame)
 
 
@@ -65,9 +55,9 @@ def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
     """Catches thinning that moves vertices, and shapes of other vertices, another scale, order or
     side."""
     with np.load(shared_data / "ict_facekit.npz") as source:
-        distance, of = cKDTree(METERS_PER_UNIT * source["neutral"].astype(np.float64)).query(
-            head.v_template + [0, 0, SETBACK_M] * (head.weights[:, 3:].max(1) == 1)[:, None]
-        )
+        neutral = cKDTree(METERS_PER_UNIT * source["neutral"].astype(np.float64))
+        is_ball = head.weights[:, 3:].max(1) == 1
+        distance, of = neutral.query(head.v_template + [0, 0, SETBACK_M] * is_ball[:, None])
         assert distance.max() < 1e-7
         row = {str(name): number for number, name in enumerate(source["expression_names"])}
         expressions = [
@@ -76,7 +66,7 @@ def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
         ]
         wanted = np.concatenate([source["identity"], expressions])[:, of].astype(np.float64)
     missed = np.abs(np.moveaxis(head.shapedirs, 2, 0) - METERS_PER_UNIT * wanted)
-    missed[:, head.weights[:, 3:].max(1) == 1] = 0  # pushed back by lids
+    missed[:, is_ball] = 0  # pushed back by lids
     assert np.quantile(missed, 0.999) <= SHAPE_STEP_M / 2 + 1e-9  # some vertices coincide
 
 
@@ -93,10 +83,8 @@ def test_eyeballs_turn_in_their_lids(head):
         assert np.ptp(radius[0]) < 0.0025  # a ball with a cornea
         front = eyeball[straight[eyeball, 2].argmax()]
         assert looking[front, 0] > straight[front, 0] + 0.003  # about +y, towards the person's left
-    skin = np.setdiff1d(
-        np.arange(len(straight)),
-        np.concatenate([head.masks[f"{s}_eyeball"] for s in ("left", "right")]),
-    )
+    eyeballs = np.concatenate([head.masks[f"{side}_eyeball"] for side in ("left", "right")])
+    skin = np.setdiff1d(np.arange(len(straight)), eyeballs)
     np.testing.assert_array_equal(looking[skin], straight[skin])
 
 
@@ -125,13 +113,8 @@ def test_lids_close_before_the_eyeballs(head):
     average, rng = np.zeros(head.n_identity), np.random.default_rng(0)
     people = [average, *rng.normal(size=(4, head.n_identity))]
     looking_down = {"eyeLookDownLeft": 1.0, "eyeBlinkLeft": 1 - LID_SHAPES["eyeLookDown"]}
-    for weights in (
-        {"eyeBlinkLeft": 0.5},
-        {"eyeBlinkLeft": 1.0},
-        {"eyeLookDownLeft": 0.5},
-        {"eyeLookDownLeft": 1.0},
-        looking_down,
-    ):
+    ways = [{name: w} for name in ("eyeBlinkLeft", "eyeLookDownLeft") for w in (0.5, 1.0)]
+    for weights in (*ways, looking_down):
         assert max(seen_eyeball(head, person, **weights)[1] for person in people) < 5
     opening = seen_eyeball(head, average)[0]
     assert opening > 150
@@ -147,10 +130,8 @@ def test_neck_turns_the_skull_alone(head):
     skull = np.flatnonzero(head.weights[:, JOINTS.index("neck")] == 1)
     assert np.isin(head.masks["teeth"], skull).all()
     assert np.isin(head.masks["nose"], skull).all()
-    before, after = (mesh[skull] - mesh[skull].mean(0) for mesh in (straight, turned))
-    np.testing.assert_allclose(
-        np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1), atol=1e-9
-    )
+    both = (mesh[skull] - mesh[skull].mean(0) for mesh in (straight, turned))
+    np.testing.assert_allclose(*(np.linalg.norm(mesh, axis=1) for mesh in both), atol=1e-9)
     torso = np.unique(head.faces[torso_faces(head)])
     assert np.linalg.norm(turned[torso] - straight[torso], axis=1).max() < 0.012
     bottom = torso[straight[torso, 1] < -0.15]
@@ -161,10 +142,8 @@ def test_lips_part_when_the_jaw_opens(head):
     """Catches pairs on one lip, or of lips that are apart already."""
     upper, lower = lip_pairs(head)
     assert len(upper) > 10
-    gaps = [
-        np.linalg.norm(mesh[upper] - mesh[lower], axis=1)
-        for mesh in (posed(head), posed(head, expr=expression(head, jawOpen=1.0)))
-    ]
+    meshes = posed(head), posed(head, expr=expression(head, jawOpen=1.0))
+    gaps = [np.linalg.norm(mesh[upper] - mesh[lower], axis=1) for mesh in meshes]
     assert gaps[0].max() < 0.002
     assert gaps[1].max() > 0.02
 
@@ -174,17 +153,12 @@ def test_arkits_weights_are_its_coefficients(head):
     not come back."""
     sequence = FlameSequence(head, np.zeros(head.n_identity), None, (), {}.__getitem__)
     weights = np.zeros((2, COUNT))
-    weights[0, [COLUMN["jawOpen"], COLUMN["mouthSmileLeft"], COLUMN["eyeLookOutLeft"]]] = (
-        0.7, 0.4, 1.0,
-    )  # fmt: skip
+    given = {"jawOpen": 0.7, "mouthSmileLeft": 0.4, "eyeLookOutLeft": 1.0}
+    weights[0, [COLUMN[name] for name in given]] = list(given.values())
     weights[1, COLUMN["browInnerUp"]] = 0.9
     found = head_map(sequence, "bundled")
     frames = found.frames(Performance(np.arange(2.0), weights, None, 1.0))
-    np.testing.assert_allclose(
-        frames[0].expr,
-        expression(head, jawOpen=0.7, mouthSmileLeft=0.4, eyeLookOutLeft=1.0),
-        atol=1e-12,
-    )
+    np.testing.assert_allclose(frames[0].expr, expression(head, **given), atol=1e-12)
     assert frames[0].eyes_pose[1] > 0.5  # the left eye looks to the person's left
     assert not np.any([frame.jaw_pose for frame in frames])
     np.testing.assert_allclose(arkit_weights(frames, found, sequence), weights, atol=1e-12)
@@ -197,12 +171,8 @@ def test_thinning_keeps_shape_and_topology():
     x, y = (grid.ravel() / 24.0 for grid in np.meshgrid(side, side))
     vertices = np.stack([x, y, 0.05 * np.sin(6 * x) * np.sin(6 * y)], axis=1)
     first = (side[:-1, None] + 25 * side[:-1]).ravel()
-    triangles = np.concatenate(
-        [
-            np.stack([first, first + 1, first + 25], 1),
-            np.stack([first + 1, first + 26, first + 25], 1),
-        ]
-    )
+    corners = [[0, 1, 25], [1, 26, 25]]
+    triangles = np.concatenate([first[:, None] + offsets for offsets in corners])
     left = collapsed(vertices, triangles, np.where(x < 0.5, 100.0, 1.0), 300)
     assert 290 <= len(left) <= 301
     corners = vertices[left]

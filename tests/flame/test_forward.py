@@ -31,15 +31,11 @@ def _torch_vertices(
     def tensor(values):
         return torch.as_tensor(np.asarray(values), dtype=torch.float64)
 
-    vertices = torch_forward(
-        flame_tensors(model, torch.float64),
-        tensor(shape),
-        tensor([frame.expr for frame in frames]),
-        tensor([frame.pose for frame in frames]),
-        tensor([frame.translation for frame in frames]),
-        None if offset is None else tensor(offset),
-    )
-    return vertices.numpy()
+    fields = ("expr", "pose", "translation")
+    moving = [tensor([getattr(frame, name) for frame in frames]) for name in fields]
+    offset = None if offset is None else tensor(offset)
+    tensors = flame_tensors(model, torch.float64)
+    return torch_forward(tensors, tensor(shape), *moving, offset).numpy()
 
 
 def test_torch_equals_numpy_over_a_batch(tiny_flame: FlameModel) -> None:
@@ -57,11 +53,7 @@ def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame: FlameModel) 
     # rotations as witness.
     model, frame, shape = tiny_flame, random_frame(5, 4), np.random.default_rng(6).normal(size=8)
     offset = np.random.default_rng(7).normal(0, 0.01, (40, 3))
-    shaped = (
-        model.v_template
-        + np.einsum("vck,k->vc", model.shapedirs, np.r_[shape, frame.expr])
-        + offset
-    )
+    shaped = model.v_template + model.shapedirs @ np.r_[shape, frame.expr] + offset
     joints = model.j_regressor @ shaped
     turns = Rotation.from_rotvec(frame.pose).as_matrix()
     local = np.tile(np.eye(4), (5, 1, 1))
@@ -86,12 +78,10 @@ def test_dynamic_offset_adds_to_the_static_one(tiny_flame: FlameModel) -> None:
     # Catches a dynamic offset that is dropped or replaces the static one.
     offsets = np.random.default_rng(8).normal(0, 0.01, (2, 40, 3))
     frame = replace(random_frame(9, 4), dynamic_offset=offsets[1])
-    expected = flame_forward(
-        tiny_flame, np.zeros(8), replace(frame, dynamic_offset=None), offsets.sum(0)
-    )
-    np.testing.assert_allclose(
-        flame_forward(tiny_flame, np.zeros(8), frame, offsets[0]), expected, atol=1e-14
-    )
+    still = replace(frame, dynamic_offset=None)
+    expected = flame_forward(tiny_flame, np.zeros(8), still, offsets.sum(0))
+    found = flame_forward(tiny_flame, np.zeros(8), frame, offsets[0])
+    np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
 def test_equals_smplx(tmp_path: Path) -> None:

@@ -1,9 +1,8 @@
 """Generated arguments of each command about the files of a case, with some nonsense in them."""
 
 import random
-from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from stga_addon.jobs import table as ask
 
@@ -22,27 +21,18 @@ def generate_arguments(rng: random.Random, case: Path) -> tuple[list[str], dict[
     """A command line about the files of the case, with some nonsense in it, and environment
     variables."""
     command = rng.choices(list(COMMANDS), [weight for weight, _ in COMMANDS.values()])[0]
-    arguments = [command, *COMMANDS[command][1](rng, case)]
+    arguments = [command, *filled(rng, case, COMMANDS[command][1])]
     if rng.random() < 0.04 and len(arguments) > 1:
         arguments.pop(rng.randrange(1, len(arguments)))
     if rng.random() < 0.1:
-        arguments.insert(
-            rng.randrange(len(arguments) + 1),
-            rng.choice([*TEXTS, *NUMBERS, "--bogus", "--help", "--out"]),
-        )
-    variables = {}
-    if rng.random() < 0.1:
-        variables["STGA_HEAD"] = rng.choice(
-            [str(case / "head")] * 3 + [str(case), "a" * 5000, ".", str(case / "none")]
-        )
-    if rng.random() < 0.05:
-        variables["STGA_LPIPS"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
-    if rng.random() < 0.05:
-        variables["STGA_PYTHON"] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
-    variables = {
-        name: value.encode("utf-8", "replace").decode() for name, value in variables.items()
-    }
-    return arguments, variables
+        nonsense = rng.choice([*TEXTS, *NUMBERS, "--bogus", "--help", "--out"])
+        arguments.insert(rng.randrange(len(arguments) + 1), nonsense)
+    heads = [str(case / "head")] * 3 + [str(case), "a" * 5000, ".", str(case / "none")]
+    chosen = {"STGA_HEAD": rng.choice(heads)} if rng.random() < 0.1 else {}
+    for name in ("STGA_LPIPS", "STGA_PYTHON"):
+        if rng.random() < 0.05:
+            chosen[name] = rng.choice([some_path(rng, case), "a" * 5000]).replace("\0", "")
+    return arguments, {n: v.encode("utf-8", "replace").decode() for n, v in chosen.items()}
 
 
 def some_path(rng: random.Random, case: Path, *likely: str) -> str:
@@ -56,258 +46,42 @@ def some_path(rng: random.Random, case: Path, *likely: str) -> str:
     return rng.choice([*TEXTS, str(case / "none"), f"{case}/" + "a" * 300])
 
 
-def output(rng: random.Random, case: Path, name: str) -> list[str]:
-    return ["--out", str(case / name) if rng.random() < 0.8 else some_path(rng, case)]
+def filled(rng: random.Random, case: Path, rows: list[Any]) -> list[str]:
+    """Arguments of rows: a value by position; a tuple, an option that is there with a probability,
+    its first value more often than the others; a list, one of several lists of rows; a function
+    that makes some. "@a b": a path, mostly that of `a` or `b` in the case."""
 
+    def of(value: str) -> str:
+        return some_path(rng, case, *value[1:].split()) if value.startswith("@") else value
 
-def option(rng: random.Random, share: float, name: str, *values: str) -> list[str]:
-    """Sometimes the option, its first value more often than the others."""
-    return (
-        [name, values[0] if rng.random() < 0.5 else rng.choice(values)]
-        if rng.random() < share
-        else []
-    )
-
-
-def capture_arguments(rng: random.Random, case: Path) -> list[str]:
-    kind = rng.choice(["mesh", "mesh", "flame", "release", "mesh/meshes", "motion.npz"])
-    share = 0.9 if kind in ("flame", "motion.npz") else 0.05
-    arguments = [
-        some_path(rng, case, kind),
-        *option(rng, share, "--flame", some_path(rng, case, "flame/model.npz")),
-    ]
-    return [*arguments, *option(rng, 0.2, "--principal-point", "vhap", "opencv", "center", *TEXTS)]
-
-
-def effects_and_device(rng: random.Random) -> list[str]:
-    choices = [
-        f"{name}={choice}"
-        for name in ("jaw", "teeth", "tracking", "exposure")
-        for choice in ("on", "off", "auto")
-    ]
-    effects = option(rng, 0.2, "--effect", *choices, *TEXTS, "jaw=", "=on", "a" * 5000)
-    return [*effects, *option(rng, 0.2, "--device", "cpu", "auto", "tpu")]
-
-
-def train(rng: random.Random, case: Path) -> list[str]:
-    options = [
-        *option(rng, 0.2, "--seed", "5", *NUMBERS),
-        *option(rng, 0.2, "--threshold", "0.001", *NUMBERS),
-    ]
-    options += [
-        *option(rng, 0.2, "--target-psnr", "30", *NUMBERS),
-        *option(rng, 0.3, "--schedule", "paper", "default"),
-    ]
-    options += option(rng, 0.3, "--strategy", "global", "selective", "gaussian-avatars", "x")
-    options += ["--stop-when-flat"] if rng.random() < 0.1 else []
-    if rng.random() < 0.6:
-        run, capture = rng.choice(
-            [("run", "mesh"), ("unfinished", "mesh"), ("tracked", "flame"), ("run", "flame")]
-        )
-        arguments = [some_path(rng, case, capture), "--out", some_path(rng, case, run), "--resume"]
-        return [
-            *arguments,
-            *(options if rng.random() < 0.2 else []),
-            *option(rng, 0.2, "--flame", f"{case}/flame/model.npz"),
-        ]
-    budget = rng.choice(
-        [["--iterations", rng.choice(["1", "2"])]] * 4
-        + [["--budget", rng.choice(["0.01s", *NUMBERS[:9]])]]
-    )
-    return [
-        *capture_arguments(rng, case),
-        *output(rng, case, "new"),
-        *budget,
-        *effects_and_device(rng),
-        *options,
-    ]
-
-
-def render(rng: random.Random, case: Path) -> list[str]:
-    source = some_path(rng, case, "run", "tracked", "run/avatar.npz", "splats.ply", "unfinished")
-    cameras = some_path(rng, case, "mesh/transforms_val.json", "flame/transforms_test.json")
-    arguments = [source, *option(rng, 0.8, "--cameras", cameras)]
-    arguments += option(rng, 0.2, "--turntable", "90", "360", *NUMBERS)
-    arguments += option(rng, 0.2, "--camera", "0", "2", *NUMBERS)
-    # A turntable always has few images: each takes as long as one of any other render.
-    arguments += [
-        "--seconds",
-        rng.choice(["0", "0.1"]),
-        *option(rng, 0.1, "--fps", "10", "0", "-1", "nan"),
-    ]
-    arguments += option(rng, 0.2, "--frames", "0:3", "2-2", "9:12", *TEXTS)
-    arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
-    arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
-    arguments += option(
-        rng, 0.2, "--motion", some_path(rng, case, "motion.npz", "flame", "take.csv")
-    )
-    arguments += option(
-        rng, 0.2, "--background", "black", "0,0.5,1", "nan,0,0", "1,2", "1e400,0,0", *TEXTS
-    )
-    arguments += option(rng, 0.1, "--principal-point", "vhap", "opencv", *TEXTS)
-    if rng.random() < 0.2:
-        return [*arguments, "--video", some_path(rng, case, "new.mp4", "new.avi")]
-    return [*arguments, *output(rng, case, "pictures")]
-
-
-def export(rng: random.Random, case: Path) -> list[str]:
-    arguments = [
-        some_path(rng, case, "run", "tracked", "run/avatar.npz", "tracked/avatar.npz", "unfinished")
-    ]
-    format = rng.choice(
-        ["ply", "ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj"]
-    )
-    arguments += ["--format", format]
-    arguments += option(rng, 0.3, "--capture", some_path(rng, case, "mesh", "flame"))
-    arguments += option(rng, 0.2, "--flame", some_path(rng, case, "flame/model.npz"))
-    arguments += option(rng, 0.3, "--timestep", "1", *NUMBERS)
-    arguments += option(rng, 0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS)
-    arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
-    suffix = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}.get(format, "")
-    return [*arguments, *output(rng, case, "exported" + suffix)]
-
-
-def select(rng: random.Random, case: Path) -> list[str]:
-    options = [
-        *option(rng, 0.3, "--threshold", "0.001", *NUMBERS),
-        *option(rng, 0.2, "--zero-pose", "head", "all", "x"),
-    ]
-    return [
-        *capture_arguments(rng, case),
-        *options,
-        *option(rng, 0.3, "--out", some_path(rng, case, "new.npz")),
-    ]
-
-
-def info(rng: random.Random, case: Path) -> list[str]:
-    flags = [flag for flag in ("--json", "--presets") if rng.random() < 0.3]
-    return [*capture_arguments(rng, case), *effects_and_device(rng), *flags]
-
-
-def evaluate(rng: random.Random, case: Path) -> list[str]:
-    return [
-        some_path(rng, case, "run", "tracked", "unfinished"),
-        *option(rng, 0.5, "--split", "train", "test", "x"),
-    ]
-
-
-def benchmark(rng: random.Random, case: Path) -> list[str]:
-    arguments = [*capture_arguments(rng, case), *option(rng, 0.3, "--seeds", *NUMBERS)]
-    return [
-        *arguments,
-        *option(rng, 0.3, "--budget", *NUMBERS),
-        *option(rng, 0.3, "--only", "draft", "x", *TEXTS),
-    ]
-
-
-def demo(rng: random.Random, case: Path) -> list[str]:
-    return [
-        *option(rng, 0.5, "--budget", *NUMBERS),
-        *option(rng, 0.5, "--out", some_path(rng, case)),
-    ]
-
-
-def refine(rng: random.Random, case: Path) -> list[str]:
-    region = option(
-        rng,
-        0.9,
-        "--region",
-        "mouth",
-        some_path(rng, case, "mesh/regions.json", "motion.npz"),
-        *TEXTS,
-    )
-    frames = option(rng, 0.2, "--frames", "0-1", "1-0", "7-9", *NUMBERS)
-    return [some_path(rng, case, "splats", "run"), *region, *frames, *continuing(rng, case)]
-
-
-def extend(rng: random.Random, case: Path) -> list[str]:
-    takes = [
-        some_path(rng, case, "take", "mesh", "flame") for _ in range(rng.choice([1, 1, 1, 2, 0]))
-    ]
-    only = option(rng, 0.3, "--select-only", some_path(rng, case, "new.npz"))
-    return [
-        some_path(rng, case, "splats", "run"),
-        *takes,
-        *only,
-        *([] if only else continuing(rng, case)),
-    ]
-
-
-def relight(rng: random.Random, case: Path) -> list[str]:
-    light = option(rng, 0.3, "--light", some_path(rng, case, "mesh", "motion.npz"))
-    return [
-        some_path(rng, case, "splats", "run"),
-        *light,
-        *option(rng, 0.3, "--gray-card", "0.5,0.5,0.4", *TEXTS),
-    ]
-
-
-def continuing(rng: random.Random, case: Path) -> list[str]:
-    """Options that `refine` and `extend` share; each training has an iteration or two."""
-    arguments = ["--iterations", rng.choice(["1", "1", "2", "0", "x"]), *output(rng, case, "new")]
-    arguments += [
-        *option(rng, 0.2, "--growth", "0.5", *NUMBERS),
-        *option(rng, 0.2, "--seed", "5", *NUMBERS),
-    ]
-    arguments += ["--resume"] if rng.random() < 0.05 else []
-    return [*arguments, *option(rng, 0.2, "--device", "cpu", "auto", "tpu")]
+    found: list[str] = []
+    for row in rows:
+        if isinstance(row, str):
+            found.append(of(row))
+        elif isinstance(row, list):
+            found += filled(rng, case, rng.choice(row))
+        elif callable(row):
+            found += row(rng, case)
+        elif rng.random() < row[0]:
+            _, name, *values = row
+            value = [] if not values else [values[0] if rng.random() < 0.5 else rng.choice(values)]
+            found += [name, *map(of, value)]
+    return found
 
 
 def tracked_footage(case: Path) -> list[str]:
     """What `stga track` is given to track the footage of the case from its landmark files."""
-    footage = case / "footage"
-    return [
-        str(footage / "footage"),
-        "--model",
-        str(footage / "head.npz"),
-        "--landmarks",
-        str(footage / "points"),
-    ]
+    at = case / "footage"
+    return [str(at / "footage"), "--model", str(at / "head.npz"), "--landmarks", str(at / "points")]
 
 
-def track(rng: random.Random, case: Path) -> list[str]:
+def begun_avatar(rng: random.Random, case: Path) -> list[str]:
+    """As if a first call had been interrupted, sometimes."""
     if rng.random() < 0.4:
-        return [
-            *tracked_footage(case),
-            *output(rng, case, "new"),
-            *option(rng, 0.2, "--focal", "900", *NUMBERS),
-        ]
-    arguments = [
-        some_path(rng, case, "mesh", "flame", "mesh/images"),
-        "--model",
-        some_path(rng, case, "flame/model.npz"),
-    ]
-    for name in ("--landmarks", "--cameras"):
-        arguments += option(rng, 0.3, name, some_path(rng, case, "mesh", "mesh/transforms.json"))
-    for name in ("--start", "--stop", "--step", "--focal"):
-        arguments += option(rng, 0.2, name, "1", *NUMBERS)
-    arguments += option(rng, 0.2, "--sync", "auto", "motion", *TEXTS) + option(
-        rng, 0.2, "--world", "keep", *TEXTS
-    )
-    return [*arguments, *option(rng, 0.2, "--offset", "0=1", *TEXTS), *output(rng, case, "new")]
-
-
-def avatar(rng: random.Random, case: Path) -> list[str]:
-    begun = case / "new" / "inputs.json"  # as if a first call had been interrupted
-    if rng.random() < 0.4:
-        begun.parent.mkdir(parents=True, exist_ok=True)
-        begun.write_text(
-            rng.choice(["{}", "[]", '{"model": 1}', '{"model": "x", "footage": null}', "x"])
-        )
-    iterations = ["--iterations", rng.choice(["2", "0", "x"])]
-    return [*track(rng, case), *iterations, *(["--no-blend"] if rng.random() < 0.8 else [])]
-
-
-def drive(rng: random.Random, case: Path) -> list[str]:
-    arguments = [some_path(rng, case, "take.csv", "motion.npz", "flame")]
-    arguments += ["--out", some_path(rng, case, "new.csv", "new.npz")]
-    arguments += option(rng, 0.7, "--flame", some_path(rng, case, "flame/model.npz"))
-    arguments += option(rng, 0.2, "--head", some_path(rng, case, "flame", "mesh"))
-    arguments += option(rng, 0.2, "--fps", "25", *NUMBERS)
-    arguments += option(rng, 0.2, "--neutral", "quiet", "first", *TEXTS)
-    arguments += option(rng, 0.2, "--strength", "2", *NUMBERS)
-    arguments += option(rng, 0.2, "--smooth", "0.1", *NUMBERS)
-    return arguments + option(rng, 0.2, "--gain", "jaw=2", "x=1", "jaw=nan", *TEXTS)
+        (case / "new").mkdir(parents=True, exist_ok=True)
+        texts = ["{}", "[]", '{"model": 1}', '{"model": "x", "footage": null}', "x"]
+        (case / "new" / "inputs.json").write_text(rng.choice(texts))
+    return []
 
 
 BATCH_PLANS = (
@@ -318,33 +92,110 @@ BATCH_PLANS = (
     '[job.a]\nrequest = "track"\nminutes = {value}\n',
     "[job.a]\nrequest = {value}\nafter = [{value}]\n",
     "{value}",
-)
+)  # fmt: skip
 
 
-def batch(rng: random.Random, case: Path) -> list[str]:
-    """Plans, shown or prepared: jobs themselves are requests, which `perform` is tried with."""
+def batch_plan(rng: random.Random, case: Path) -> list[str]:
     value = rng.choice(['"val"', "1", "-1", "nan", "1e400", "[]", '"../x"', '""', "true"])
-    new = some_path(rng, case, "new")
-    plan = rng.choice(BATCH_PLANS).format(new=new, value=value)
+    plan = rng.choice(BATCH_PLANS).format(new=some_path(rng, case, "new"), value=value)
     (case / "plan.toml").write_bytes(plan.encode("utf-8", "surrogatepass"))
-    arguments = ["--dry-run"] if rng.random() < 0.7 else ["--commands"]
-    if rng.random() < 0.6:
-        return [str(case / "plan.toml"), *arguments, *option(rng, 0.3, "--threads", *NUMBERS)]
-    arguments += [
-        "--iterations",
-        rng.choice(["3", *NUMBERS]),
-        *option(rng, 0.3, "--seed", *NUMBERS),
-    ]
-    return [some_path(rng, case, "mesh", "flame"), *arguments, *option(rng, 0.8, "--out", new)]
+    return [str(case / "plan.toml")]
 
 
-COMMANDS: dict[str, tuple[float, Callable[[random.Random, Path], list[str]]]] = {
-    "info": (3, info), "select": (3, select), "export": (3, export), "drive": (1, drive),
-    "render": (3, render), "eval": (2, evaluate), "train": (1, train), "refine": (0.5, refine),
-    "extend": (0.5, extend),
-    "relight": (0.5, relight), "track": (1, track), "avatar": (0.5, avatar),
-    "perform": (1.5, lambda rng, case: [some_path(rng, case, *(f"jobs/{n}" for n in REQUESTS))]),
-    "batch": (1, batch), "presets": (0.5, lambda rng, case: capture_arguments(rng, case)),
-    "benchmark": (0.5, benchmark), "demo": (0.2, demo),
-    "x": (0.1, lambda rng, case: []),
+FLAME, MODEL = (0.2, "--flame", "@flame/model.npz"), "@flame/model.npz"
+POINT = (0.2, "--principal-point", "vhap", "opencv", "center", *TEXTS)
+BARE = ["@mesh mesh release mesh/meshes", (0.05, "--flame", MODEL)]
+CAPTURE: list[Any] = [[BARE, BARE, ["@flame motion.npz", (0.9, "--flame", MODEL)]], POINT]
+CHOICES = [f"{e}={c}" for e in ("jaw", "teeth", "tracking", "exposure") for c in ("on", "off")]
+EFFECT = (0.2, "--effect", *CHOICES, "jaw=auto", *TEXTS, "jaw=", "=on", "a" * 5000)
+DEVICE = (0.2, "--device", "cpu", "auto", "tpu")
+SEED, THRESHOLD = (0.2, "--seed", "5", *NUMBERS), (0.2, "--threshold", "0.001", *NUMBERS)
+OUT, FPS = (1, "--out", "@new"), (0.2, "--fps", "25", *NUMBERS)
+TRAIN: list[Any] = [
+    SEED, THRESHOLD, (0.2, "--target-psnr", "30", *NUMBERS), (0.1, "--stop-when-flat"),
+    (0.3, "--schedule", "paper", "default"),
+    (0.3, "--strategy", "global", "selective", "gaussian-avatars", "x"),
+]  # fmt: skip
+RESUMED = [["@mesh", (1, "--out", "@run unfinished")], ["@flame", (1, "--out", "@tracked run")]]
+RESUME: list[Any] = [RESUMED, (1, "--resume"), FLAME, [[], [], [], [], TRAIN]]
+ITERATIONS = (1, "--iterations", "1", "2")
+BUDGET = [[ITERATIONS], [ITERATIONS], [ITERATIONS], [(1, "--budget", "0.01s", *NUMBERS[:9])]]
+CONTINUE: list[Any] = [
+    (1, "--iterations", "1", "2", "0", "x"), OUT, (0.2, "--growth", "0.5", *NUMBERS), SEED,
+    (0.05, "--resume"), DEVICE,
+]  # fmt: skip
+TAKE = "@take mesh flame"
+TRACK: list[Any] = [[
+    [lambda _, case: tracked_footage(case), OUT, (0.2, "--focal", "900", *NUMBERS)],
+    [
+        "@mesh flame mesh/images", (1, "--model", MODEL), OUT,
+        *((0.3, name, "@mesh mesh/transforms.json") for name in ("--landmarks", "--cameras")),
+        *((0.2, f"--{name}", "1", *NUMBERS) for name in ("start", "stop", "step", "focal")),
+        (0.2, "--sync", "auto", "motion", *TEXTS), (0.2, "--world", "keep", *TEXTS),
+        (0.2, "--offset", "0=1", *TEXTS),
+    ],
+]]  # fmt: skip
+FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
+SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}
+COMMANDS: dict[str, tuple[float, list[Any]]] = {
+    "info": (3, [*CAPTURE, EFFECT, DEVICE, (0.3, "--json"), (0.3, "--presets")]),
+    "select": (3, [
+        *CAPTURE, THRESHOLD, (0.2, "--zero-pose", "head", "all", "x"), (0.3, "--out", "@new.npz"),
+    ]),
+    "export": (3, [
+        "@run tracked run/avatar.npz tracked/avatar.npz unfinished",
+        [[(1, "--format", f), (1, "--out", f"@exported{SUFFIXES.get(f, '')}")] for f in FORMATS],
+        (0.3, "--capture", "@mesh flame"), FLAME, (0.3, "--timestep", "1", *NUMBERS), FPS,
+        (0.2, "--frames", "0:1", "1:0", "7:9", *NUMBERS),
+    ]),
+    "drive": (1, [
+        "@take.csv motion.npz flame", (1, "--out", "@new.csv new.npz"), (0.7, "--flame", MODEL),
+        (0.2, "--head", "@flame mesh"), FPS, (0.2, "--neutral", "quiet", "first", *TEXTS),
+        (0.2, "--strength", "2", *NUMBERS), (0.2, "--smooth", "0.1", *NUMBERS),
+        (0.2, "--gain", "jaw=2", "x=1", "jaw=nan", *TEXTS),
+    ]),
+    # a turntable always has few images: each takes as long as one of any other render
+    "render": (3, [
+        "@run tracked run/avatar.npz splats.ply unfinished", FLAME, POINT,
+        (0.8, "--cameras", "@mesh/transforms_val.json flame/transforms_test.json"),
+        (0.2, "--turntable", "90", "360", *NUMBERS), (0.2, "--camera", "0", "2", *NUMBERS),
+        (1, "--seconds", "0", "0.1"), (0.1, "--fps", "10", "0", "-1", "nan"),
+        (0.2, "--frames", "0:3", "2-2", "9:12", *TEXTS), (0.3, "--capture", "@mesh flame"),
+        (0.2, "--motion", "@motion.npz flame take.csv"),
+        (0.2, "--background", "black", "0,0.5,1", "nan,0,0", "1,2", "1e400,0,0", *TEXTS),
+        [[(1, "--video", "@new.mp4 new.avi")], *[[(1, "--out", "@pictures")]] * 4],
+    ]),
+    "eval": (2, ["@run tracked unfinished", (0.5, "--split", "train", "test", "x")]),
+    "train": (1, [[RESUME, RESUME, [*CAPTURE, OUT, BUDGET, EFFECT, DEVICE, *TRAIN]]]),
+    "refine": (0.5, [
+        "@splats run", (0.2, "--frames", "0-1", "1-0", "7-9", *NUMBERS), *CONTINUE,
+        (0.9, "--region", "mouth", "@mesh/regions.json motion.npz", *TEXTS),
+    ]),
+    "extend": (0.5, [
+        "@splats run", [[TAKE], [TAKE], [TAKE], [TAKE, TAKE], []],
+        [[(1, "--select-only", "@new.npz")], CONTINUE, CONTINUE],
+    ]),
+    "relight": (0.5, [
+        "@splats run", (0.3, "--light", "@mesh motion.npz"),
+        (0.3, "--gray-card", "0.5,0.5,0.4", *TEXTS),
+    ]),
+    "track": (1, TRACK),
+    "avatar": (
+        0.5, [begun_avatar, *TRACK, (1, "--iterations", "2", "0", "x"), (0.8, "--no-blend")],
+    ),
+    "perform": (1.5, [f"@{' '.join(f'jobs/{name}' for name in REQUESTS)}"]),
+    # plans, shown or prepared: jobs themselves are requests, which `perform` is tried with
+    "batch": (1, [
+        [[(1, "--dry-run")], [(1, "--dry-run")], [(1, "--commands")]],
+        [
+            [batch_plan, (0.3, "--threads", *NUMBERS)],
+            ["@mesh flame", (1, "--iterations", "3", *NUMBERS), SEED, (0.8, "--out", "@new")],
+        ],
+    ]),
+    "presets": (0.5, CAPTURE),
+    "benchmark": (0.5, [
+        *CAPTURE, (0.3, "--seeds", *NUMBERS), (0.3, "--budget", *NUMBERS),
+        (0.3, "--only", "draft", "x", *TEXTS),
+    ]),
+    "demo": (0.2, [(0.5, "--budget", *NUMBERS), (0.5, "--out", "@")]), "x": (0.1, []),
 }  # fmt: skip

@@ -17,48 +17,11 @@ from PIL import Image
 from .arguments import TEXTS
 
 JSON_VALUES: list[Any] = [
-    *(
-        None,
-        True,
-        False,
-        0,
-        1,
-        -1,
-        2.5,
-        10**30,
-        -(10**400),
-        1e308,
-        1e-320,
-        float("nan"),
-        float("inf"),
-        -float("inf"),
-    ),
-    *(
-        "1",
-        "nan",
-        *TEXTS,
-        "/",
-        "//",
-        "a" * 5000,
-        "vhap",
-        "opencv",
-        "../x",
-        "/dev/null",
-        "images",
-        "images/00000_00.png",
-    ),
-    *(
-        [],
-        {},
-        [[]],
-        [None],
-        [0] * 1000,
-        {"": {}},
-        [[0, 0, 0, 0]] * 4,
-        [1e300] * 3,
-        {"a": [1, {"b": None}]},
-    ),
-]
+    None, True, False, 0, 1, -1, 2.5, 10**30, -(10**400), 1e308, 1e-320, float("nan"),
+    float("inf"), -float("inf"), "1", "nan", *TEXTS, "a" * 5000, "vhap", "opencv", "../x",
+    "/dev/null", "images", "images/00000_00.png", [], {}, [[]], [None], [0] * 1000, {"": {}},
+    [[0, 0, 0, 0]] * 4, [1e300] * 3, {"a": [1, {"b": None}]},
+]  # fmt: skip
 ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
     lambda a: a[:-1] if a.ndim else a.reshape(1), lambda a: a[None], lambda a: a.astype(np.float16),
     lambda a: np.zeros(0, a.dtype), lambda a: np.zeros((0, *a.shape[1:]), a.dtype),
@@ -70,8 +33,8 @@ ARRAYS: list[Callable[[np.ndarray], np.ndarray]] = [
     lambda a: a.astype(bool), lambda a: a.T, lambda a: np.concatenate([a, a]) if a.ndim else a,
 ]  # fmt: skip
 BYTES = [
-    b"\xff" * 8, b"\0" * 8, b"-1", b"1e999", b"NaN", b"[", b"]", b'"', b"{}", b"\n", b".", b"\x80",
-    b"99999999999",
+    b"\xff" * 8, b"\x7f\xff\xff\xff", b"\0" * 8, b"-1", b"1e999", b"99999999999", b"NaN", b"[",
+    b"]", b'"', b"\xff\xfe", b"../", b"null", b"{}", b"true", b"\n", b".", b"\x80",
 ]  # fmt: skip
 
 
@@ -79,38 +42,41 @@ def damage(rng: random.Random, case: Path, arguments: list[str]) -> str:
     """Change one file of the case, mostly one that the arguments name; returns what was done to
     it."""
     files = sorted(path for path in case.rglob("*") if path.is_file() and not path.is_symlink())
-    named = [
-        path
-        for path in files
-        if any(str(path).startswith(a) for a in arguments if a.startswith(f"{case}/"))
-    ]
+    given = tuple(argument for argument in arguments if argument.startswith(f"{case}/"))
+    named = [path for path in files if str(path).startswith(given)]
     small = [path for path in named if path.suffix in (".json", ".npz", ".ply", ".jsonl", ".obj")]
     path = rng.choice(rng.choice([small, small, named, files]) or files)
-    special = {
-        ".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture,
-    }  # fmt: skip
-    kind = rng.choice(
-        [special.get(path.suffix, mutate_bytes)] * 6 + [mutate_bytes] * 2 + [replace_file]
-    )
-    return f"{path.relative_to(case)}: {kind.__name__} {kind(rng, path)}"
+    done = replace_file(rng, path) if rng.random() < 0.1 else damage_content(rng, path)
+    return f"{path.relative_to(case)}: {done}"
+
+
+def damage_content(rng: random.Random, path: Path) -> str:
+    """Change what a file holds, its bytes or the values in it; returns what was done."""
+    change = MUTATIONS.get(path.suffix, mutate_bytes) if rng.random() < 0.7 else mutate_bytes
+    return f"{change.__name__} {change(rng, path)}"
 
 
 def mutate_bytes(rng: random.Random, path: Path) -> str:
-    content = path.read_bytes()
-    at, length = rng.randrange(len(content) + 1), rng.choice([0, 1, 4, 40])
-    piece = rng.choice([*BYTES, rng.randbytes(4), content[at : at + length] * 2, b""])
+    path.write_bytes(mutated(rng, path.read_bytes()))
+    return ""
+
+
+def mutated(rng: random.Random, content: bytes) -> bytes:
+    """A replacement, insertion, deletion, repetition or another bit, and sometimes an early end."""
+    at, length = rng.randrange(len(content) + 1), rng.choice([0, 1, 2, 4, 8, 40])
+    part = content[at : at + length]
+    flipped = bytes(byte ^ 1 << rng.randrange(8) for byte in part)
+    piece = rng.choice([rng.choice(BYTES), rng.randbytes(4), part * 2, part * 50, b"", flipped])
     content = content[:at] + piece + content[at + length :]
-    path.write_bytes(content if rng.random() < 0.8 else content[:at])
-    return f"at {at}"
+    return content if rng.random() < 0.85 else content[: rng.randrange(len(content) + 1)]
 
 
 def mutate_json(rng: random.Random, path: Path) -> str:
     """Replace, delete, add or copy one value, at any depth."""
     try:
         text = path.read_text(encoding="utf-8")
-        document = [
-            json.loads(line) for line in (text.splitlines() if path.suffix == ".jsonl" else [text])
-        ]
+        lines = text.splitlines() if path.suffix == ".jsonl" else [text]
+        document = [json.loads(line) for line in lines]
     except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
     node: Any = document
@@ -121,11 +87,8 @@ def mutate_json(rng: random.Random, path: Path) -> str:
             return "nothing"
         key = rng.choice(keys)
         trail.append(key)
-        if (
-            not isinstance(node[key], (dict, list))
-            or not node[key]
-            or rng.random() < 0.15 * (len(trail) > 1)
-        ):
+        is_leaf = not isinstance(node[key], (dict, list)) or not node[key]
+        if is_leaf or rng.random() < 0.15 * (len(trail) > 1):
             break
         node = node[key]
     kind = rng.choice(["replace"] * 6 + ["delete", "copy", "scale"])
@@ -137,33 +100,38 @@ def mutate_json(rng: random.Random, path: Path) -> str:
         node[key] = copy.deepcopy(rng.choice([node[k] for k in keys]))
     elif isinstance(node, dict) or len(trail) > 1:
         del node[key]
-    texts = [json.dumps(value) for value in document]
-    path.write_text("\n".join(texts))
+    path.write_text("\n".join(json.dumps(value) for value in document))
     return f"{kind} {trail}"
 
 
 def mutate_npz(rng: random.Random, path: Path) -> str:
-    """Change, remove or rename one array of an intact archive."""
+    """Change, remove or rename one array of an intact archive, or damage its bytes: otherwise the
+    archive's checksums detect nearly all damage."""
     try:
         with np.load(path) as data:
             arrays = dict(data)
+        with zipfile.ZipFile(path) as archive:
+            stored = {entry: archive.read(entry) for entry in archive.namelist()}
     except Exception:  # an earlier damage
         return mutate_bytes(rng, path)
     if not arrays:
         return "nothing"
-    name = rng.choice(list(arrays))
-    chance = rng.random()
+    name, chance = rng.choice(list(arrays)), rng.random()
+    if chance > 0.7:
+        stored[f"{name}.npy"] = mutated(rng, stored[f"{name}.npy"])
+        with zipfile.ZipFile(path, "w") as archive:
+            for entry, content in stored.items():
+                archive.writestr(entry, content)
+        return f"{name} damaged"
     if chance < 0.1:
         del arrays[name]
     elif chance < 0.2:
         arrays[rng.choice(["x", "../x", "0", f"{name}/"])] = arrays.pop(name)
     elif chance < 0.4 and arrays[name].size and arrays[name].dtype.kind in "if":
         flat = arrays[name] = arrays[name].copy()
-        worst = (
-            [np.nan, np.inf, -1e30, 1e6]
-            if flat.dtype.kind == "f"
-            else [-1, np.iinfo(flat.dtype).max]
-        )
+        worst: list[float] = [np.nan, np.inf, -1e30, 1e6]
+        if flat.dtype.kind == "i":
+            worst = [-1, np.iinfo(flat.dtype).max]
         flat.reshape(-1)[rng.randrange(flat.size)] = rng.choice(worst)
     else:
         with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -191,9 +159,7 @@ def mutate_picture(rng: random.Random, path: Path) -> str:
 def replace_file(rng: random.Random, path: Path) -> str:
     """Nothing, an empty file, a folder, a link to itself, a pipe or another file in its place."""
     kind = rng.choice(["missing", "empty", "folder", "link", "pipe", "other"])
-    content = rng.choice(
-        sorted(other for other in path.parent.iterdir() if other.is_file())
-    ).read_bytes()
+    content = rng.choice(sorted(p for p in path.parent.iterdir() if p.is_file())).read_bytes()
     path.unlink()
     if kind == "empty":
         path.touch()
@@ -206,3 +172,8 @@ def replace_file(rng: random.Random, path: Path) -> str:
     elif kind == "other":
         path.write_bytes(content)
     return kind
+
+
+MUTATIONS: dict[str, Callable[[random.Random, Path], str]] = {
+    ".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture,
+}  # fmt: skip

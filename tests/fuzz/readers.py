@@ -32,14 +32,13 @@ from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
 from stga_addon.tracking.footage.calibrations import read_nerfstudio
 from stga_addon.tracking.footage.colmap import read_colmap
-from stga_addon.tracking.footage.lens import undistortion
 from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
 from stga_addon.tracking.footage.photogrammetry import (
     read_metashape,
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.shots import Shot
+from stga_addon.tracking.footage.shots import Shot, undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_camera, read_places
@@ -192,23 +191,23 @@ TARGETS = {name: Target(*row) for name, row in {
     "metashape": (
         "cameras.xml",
         lambda p: test_metashape.write_export(p, RIG, NAMES, intrinsics=test_metashape.INTRINSICS),
-        lambda p: undistorted(read_metashape(p)[0]),
+        lambda p: undistorted(read_metashape(p)[0])
     ),
     "realitycapture csv": (
         "cameras.csv",
         lambda p: p.write_text("\n".join([test_realitycapture.HEADER, *map(ROW.format, NAMES)])),
-        lambda p: undistorted(read_realitycapture_csv(p, size_of)),
+        lambda p: undistorted(read_realitycapture_csv(p, size_of))
     ),
     "realitycapture xmp": (
         "a.xmp", lambda p: test_realitycapture.write_xmp(p, RIG[0]),
-        lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0]),
+        lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0])
     ),
     "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p))),
     "landmarks": ("cam0.npz", landmarks, lambda p: read_camera(p, LANDMARK_CAMERA)),
     "places": ("head_model.npz", places, lambda p: read_places(p, 4)),
     "head model npz": ("head.npz", linear_head, read_head_model),
     "head model glb": (
-        "head.glb", lambda p: p.write_bytes(test_head_model.simple()), read_head_model,
+        "head.glb", lambda p: p.write_bytes(test_head_model.simple()), read_head_model
     ),
     "avatar": ("a.npz", avatar, read_avatar),
     "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_ply),
@@ -219,35 +218,35 @@ TARGETS = {name: Target(*row) for name, row in {
     "flame masks": (
         "a.pkl",
         lambda p: p.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 2)),
-        read_pickled_arrays,
+        read_pickled_arrays
     ),
     "flame frame": (
-        "a.npz", flame_frame, lambda p: (read_frame(p, MODEL), read_identity(p, MODEL)),
+        "a.npz", flame_frame, lambda p: (read_frame(p, MODEL), read_identity(p, MODEL))
     ),
     "flame motion": ("a.npz", flame_motion, lambda p: read_motion(p, MODEL)),
     "transforms": ("transforms.json", transforms, read_transforms),
     "regions": (
         "r.json", lambda p: p.write_text('{"nose": [0, 1, 2], "lips": []}'),
-        lambda p: read_regions(p, FACES, 12),
+        lambda p: read_regions(p, FACES, 12)
     ),
     "soup": (
         "a.json",
         lambda p: p.write_text(json.dumps({"triangles": [{"Vertices": np.eye(3).tolist()}] * 3})),
-        read_soup,
+        read_soup
     ),
     "face ids": ("a.npy", lambda p: np.save(p, np.arange(4)), lambda p: read_face_ids(p, 5)),
     "run": (
         "run.json", lambda p: run_folder.write_run(p.parent, make_run()),
-        lambda p: run_folder.read_run(p.parent),
+        lambda p: run_folder.read_run(p.parent)
     ),
     "checkpoint": (
         "checkpoint.npz", lambda p: checkpoints.write_checkpoint(p.parent, make_checkpoint()),
-        lambda p: checkpoints.read_checkpoint(p.parent),
+        lambda p: checkpoints.read_checkpoint(p.parent)
     ),
     "selection": (
         "selection.npz",
         lambda p: checkpoints.write_selection(p.parent, {7: np.ones(5, bool)}, "a"),
-        lambda p: checkpoints.read_selection(p.parent, 5),
+        lambda p: checkpoints.read_selection(p.parent, 5)
     ),
     "metrics": ("metrics.jsonl", metrics, lambda p: metrics_log.read_metrics(p.parent)),
 }.items()}  # fmt: skip

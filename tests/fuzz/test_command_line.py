@@ -6,7 +6,6 @@ every run.
 """
 
 import io
-import itertools
 import json
 import os
 import random
@@ -15,7 +14,6 @@ import signal
 import tempfile
 import traceback
 import warnings
-from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +31,7 @@ from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
 from stga_addon.jobs import table as ask
 from stga_addon.jobs.avatar_source import Played
-from stga_addon.jobs.folder import write_request
+from stga_addon.jobs.perform import write_request
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.training import preset_timing
 from stga_addon.training.run.folder import read_run
@@ -68,11 +66,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert call(["train", *options, *strategy, "--out", case / name])[0] == 0
     shutil.copytree(case / "run", case / "unfinished")
     (case / "unfinished/avatar.npz").unlink()
-    splats = [
-        "--iterations", 2, "--device", "cpu", "--effect", "hull-points=off", "--out",
-        case / "splats",
-    ]  # fmt: skip
-    assert call(["train", capture, *splats])[0] == 0
+    splats = ["--effect", "hull-points=off", "--out", case / "splats"]
+    assert call(["train", capture, "--iterations", 2, "--device", "cpu", *splats])[0] == 0
     factory.write_mesh_capture(case / "take", (0, 1), range(2))
     record(case / "footage", HeadModel(small_head(0), "flame"))
     assert call(["track", *tracked_footage(case), "--out", case / "footage/out"])[0] == 0
@@ -99,9 +94,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
-    capture, run, footage, once = (
-        case / "mesh", case / "splats", case / "footage", {"iterations": 1, "device": "cpu"},
-    )  # fmt: skip
+    capture, run, footage = case / "mesh", case / "splats", case / "footage"
+    once: dict[str, Any] = {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(small_head(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
@@ -205,11 +199,8 @@ def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
     except BaseException as unexpected:
         if isinstance(unexpected, KeyboardInterrupt):
             raise
-        place = [
-            line
-            for line in traceback.extract_tb(unexpected.__traceback__)
-            if "stga_addon" in line.filename
-        ][-1]
+        places = traceback.extract_tb(unexpected.__traceback__)
+        place = [line for line in places if "stga_addon" in line.filename][-1]
         where = f"{Path(place.filename).name}:{place.lineno} {place.name}"
         return f"{type(unexpected).__name__} in {where}: {ascii(str(unexpected))[:150]}"
     finally:
@@ -224,21 +215,8 @@ def find_problem(arguments: list[str], folders: list[Path]) -> str | None:
         return "exit code 2 without a message"
     numeric = [warning for warning in warned if issubclass(warning.category, RuntimeWarning)]
     if numeric:
-        return (
-            f"warning in {Path(numeric[0].filename).name}:{numeric[0].lineno}: {numeric[0].message}"
-        )
-    left = [
-        path.name
-        for path in itertools.chain.from_iterable(map(files_in, folders))
-        if is_temporary(path, folders)
-    ]
-    return f"left behind: {left[0]}" if left else None
-
-
-def files_in(folder: Path) -> Iterator[Path]:
-    for parent, _, names in os.walk(folder):
-        yield from (Path(parent) / name for name in names)
-
-
-def is_temporary(path: Path, folders: list[Path]) -> bool:
-    return path.name.endswith(".partial") or path.is_relative_to(folders[-1])
+        place = f"{Path(numeric[0].filename).name}:{numeric[0].lineno}"
+        return f"warning in {place}: {numeric[0].message}"
+    files = [path for folder in folders for path in folder.rglob("*") if not path.is_dir()]
+    left = [p for p in files if p.name.endswith(".partial") or p.is_relative_to(folders[-1])]
+    return f"left behind: {left[0].name}" if left else None

@@ -8,10 +8,7 @@ was seen (result.json).
 
 import contextlib
 import io
-import json
-import subprocess
 import sys
-import traceback
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -21,8 +18,12 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).resolve().parents[2])]
+
+import in_window  # noqa: E402
+from in_window import in_viewport, seen, viewport  # noqa: E402
+
+FOLDER = Path(in_window.ARGUMENTS[0])
 sys.path.append(str(FOLDER / "packages"))
 
 from stga_addon.avatar.file import read_avatar  # noqa: E402
@@ -30,7 +31,7 @@ from stga_addon.errors import StgaError  # noqa: E402
 from stga_addon.scene import light as lighting  # noqa: E402
 from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.display_modes import AS_TRAINED, POINTS  # noqa: E402
+from stga_addon.scene.display.splat_nodes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
 from stga_addon.scene.gpu.renderer import SplatRenderer, _pixels  # noqa: E402
 from stga_addon.scene.render import engine, viewport_display  # noqa: E402
@@ -39,19 +40,14 @@ from stga_addon.scene.render.viewport_display import display, region_view  # noq
 
 RENDER_PATIENCE_S = 60.0
 
-bpy.context.preferences.view.show_splash = False
-seen: dict[str, Any] = {"version": bpy.app.version_string, "pictures": {}}
+REGIONS_S = 0.3
+"""Between two steps, for regions to get their places."""
+seen["pictures"] = {}
 views: dict[str, np.ndarray] = {}
 
 
 def no_python() -> str:
     raise StgaError("no training Python")
-
-
-def viewport() -> tuple[Any, Any, Any]:
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
-    return window, area, next(region for region in area.regions if region.type == "WINDOW")
 
 
 def set_up() -> Any:
@@ -93,7 +89,7 @@ def redraw(times: int = 2) -> float:
 def picture(name: str) -> None:
     """A screenshot, where the viewport is in it, and its view."""
     took = redraw()
-    subprocess.run(["import", "-window", "root", str(FOLDER / f"{name}.png")], check=True)
+    in_window.picture(FOLDER / f"{name}.png")
     window, area, region = viewport()
     camera = region_view(area.spaces.active.region_3d, region.width, region.height)[0].camera
     views[name] = np.array(
@@ -156,10 +152,12 @@ def bones_in_front(shown: Any) -> None:
     bpy.context.scene.collection.objects.link(rig)
     rig.show_in_front = True
     bpy.context.view_layer.objects.active = rig
-    in_viewport(bpy.ops.object.mode_set, mode="EDIT")
+    with in_viewport():
+        bpy.ops.object.mode_set(mode="EDIT")
     bone = data.edit_bones.new("bone")
     bone.head, bone.tail = (0.0, 0.0, -0.04), (0.0, 0.0, 0.08)
-    in_viewport(bpy.ops.object.mode_set, mode="OBJECT")
+    with in_viewport():
+        bpy.ops.object.mode_set(mode="OBJECT")
     overlay = viewport()[1].spaces.active.overlay
     overlay.show_overlays = True
     overlay.show_floor = overlay.show_axis_x = overlay.show_axis_y = overlay.show_cursor = (
@@ -197,21 +195,17 @@ def shadows() -> None:
         bpy.data.objects.remove(lamp)
 
 
-def in_viewport(operator: Any, *how: str, **settings: Any) -> None:
-    window, area, region = viewport()
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        operator(*how, **settings)
-
-
 def parts_of_the_view(area: Any) -> None:
     """Local view of the quad alone, and a clipping region of the world's x > 0."""
     quad = bpy.data.objects["quad"]
     for candidate in bpy.context.view_layer.objects:
         candidate.select_set(candidate == quad)
     bpy.context.view_layer.objects.active = quad
-    in_viewport(bpy.ops.view3d.localview, frame_selected=False)
+    with in_viewport():
+        bpy.ops.view3d.localview(frame_selected=False)
     picture("local view")
-    in_viewport(bpy.ops.view3d.localview, frame_selected=False)
+    with in_viewport():
+        bpy.ops.view3d.localview(frame_selected=False)
     quad.hide_set(True)
     view = area.spaces.active.region_3d
     view.clip_planes = [(1.0, 0.0, 0.0, 0.0)] + [(0.0, 0.0, 0.0, 1.0)] * 5
@@ -327,64 +321,41 @@ def start_render() -> None:
     bpy.app.handlers.render_complete.append(
         lambda *_: seen.update(rendered=inverse_view(scene) is not None)
     )
-    in_viewport(bpy.ops.render.render, "INVOKE_DEFAULT")
-
-
-def finish() -> None:
-    np.savez(FOLDER / "views.npz", **views)
-    seen["device"] = gpu.platform.backend_type_get()
-    seen["points"] = POINTS
-    (FOLDER / "result.json").write_text(json.dumps(seen))
-    bpy.ops.wm.quit_blender()
-
-
-def fill_screen() -> None:
-    """Without a title bar, so that pixels of the window are pixels of the screenshot."""
-    with bpy.context.temp_override(window=viewport()[0]):
-        bpy.ops.wm.window_fullscreen_toggle()
+    with in_viewport():
+        bpy.ops.render.render("INVOKE_DEFAULT")
 
 
 def steps() -> Any:
-    fill_screen()
-    yield
+    with in_viewport():  # without a title bar: pixels of the window are those of the screenshot
+        bpy.ops.wm.window_fullscreen_toggle()
+    yield REGIONS_S
     viewport_display.register()
     engine.register(no_python)
     lighting.register()
     shown = set_up()
-    yield
+    yield REGIONS_S
     pictures(shown)
     bones_in_front(shown)
     shadows()
     memory(shown)
-    in_viewport(bpy.ops.screen.region_quadview)
-    yield  # regions get their places between two steps
+    with in_viewport():
+        bpy.ops.screen.region_quadview()
+    yield REGIONS_S
     picture("four views")
-    in_viewport(bpy.ops.screen.region_quadview)
-    yield
+    with in_viewport():
+        bpy.ops.screen.region_quadview()
+    yield REGIONS_S
     failure()
-    yield
-    yield
+    yield 2 * REGIONS_S
     after_failure()
-    yield
+    yield REGIONS_S
     after_load()
-    yield
+    yield REGIONS_S
     start_render()
     end = perf_counter() + RENDER_PATIENCE_S
-    while "rendered" not in seen and perf_counter() < end:
-        yield
+    yield lambda: "rendered" in seen or perf_counter() > end
+    np.savez(FOLDER / "views.npz", **views)
+    seen["device"], seen["points"] = gpu.platform.backend_type_get(), POINTS
 
 
-def play() -> float | None:
-    try:
-        next(running)
-        return 0.3
-    except StopIteration:
-        pass
-    except Exception:
-        seen["traceback"] = traceback.format_exc()
-    finish()
-    return None
-
-
-running = steps()
-bpy.app.timers.register(play, first_interval=0.5, persistent=True)
+in_window.play(steps(), FOLDER / "result.json")

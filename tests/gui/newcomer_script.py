@@ -1,293 +1,506 @@
 """Runs inside a Blender with a window and the complete edition, started by test_newcomer.py: the
 first hour.
 
-`blender --python newcomer_script.py -- FOLDER`: writes FOLDER/result.json with times, and a picture
-of each step.
+`blender --python newcomer_script.py -- FOLDER [STEP...]`: reads FOLDER/flame.npz and
+FOLDER/own.npz, a head of FLAME; writes FOLDER/result.json with what was seen, and pictures.
 """
 
-import json
+import socket
+import struct
 import subprocess
 import sys
+import threading
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from mathutils import Quaternion, Vector
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
-STEP_S, PATIENCE_S = 0.2, 600.0
-WORKERS = (
-    "train", "refine", "extend", "analyze_capture", "estimate_light", "render_video", "drive_live",
-    "drive_video", "avatar_from_video", "track_footage", "solve_again", "select_extension",
-)  # fmt: skip
-"""Operators that start what goes on after them."""
-LOOK_S = 10.0
-"""For which a newcomer looks at the head before Train is clicked."""
-NECK_ANGLE, MOUTH, VIDEO_S = 0.3, 0.6, 2.0
+sys.path.insert(0, str(Path(__file__).parent))
+
+import drawn_panels
+import in_window
+from in_window import ARGUMENTS, chosen, extension, in_viewport, module, play, seen, viewport
+
+FOLDER = Path(ARGUMENTS[0])
+FIRST = FOLDER / "first.blend"
+NECK_ANGLE, MOUTH, PORT = 0.3, 0.6, 21112
+DRIVEN_S, RATE, PACKETS = 5.0, 60, 10_000
+IMAGE_PX, SAMPLES = 160, 8
+OUTSIDE = ("wm.path_open", "wm.save_mainfile")
+"""Buttons that leave Blender, or the file."""
 STARTED = time.monotonic()
-seen: dict[str, Any] = {"version": bpy.app.version_string}
-extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-ids = sys.modules[f"{extension}.operators.ids"]
-monitor = sys.modules[f"{extension}.operators.monitor"]
-bpy.context.preferences.view.show_splash = False
+monitor = module("operators.monitor")
+kinds = module("stga_addon.jobs.table").Kind
+for name in ("pressed", "clicks", "messages", "undo", "cut", "texts", "images", "seconds"):
+    seen[name] = {}
 
 
-def chosen() -> Any:
-    return bpy.context.scene.stga
+def shot(name: str) -> None:
+    in_window.picture(FOLDER / f"{name}.png")
 
 
-def viewport() -> Any:
-    """What an operator called from the sidebar of the viewport has as its context."""
-    window = bpy.context.window_manager.windows[0]
-    region = next(region for region in area().regions if region.type == "WINDOW")
-    return bpy.context.temp_override(window=window, area=area(), region=region)
+def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -> Any:
+    """Do what a click does, and draw the window; notes for how long both hold Blender up, in
+    seconds of processor time of its thread, without what a window costs in which nothing changes,
+    and by the clock."""
+    begin, cpu = time.perf_counter(), time.thread_time()
+    try:
+        with in_viewport():
+            return action(*how, **options)
+    finally:
+        done = time.thread_time()
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+        shown, wall = time.thread_time(), time.perf_counter() - begin
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+        drawing = max(0.0, 2 * shown - done - time.thread_time())
+        seen["clicks"][name] = [round(value, 3) for value in (done - cpu, drawing, wall)]
 
 
-def area() -> Any:
-    screen = bpy.context.window_manager.windows[0].screen
-    return next(area for area in screen.areas if area.type == "VIEW_3D")
+def opened(file: Path) -> float:
+    """Open it in the window as it is; seconds to wait."""
+    bpy.ops.wm.open_mainfile(filepath=str(file), load_ui=False)
+    return 0.3
 
 
-def picture(name: str) -> None:
-    bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=2)
-    subprocess.run(["import", "-window", "root", str(FOLDER / f"{name}.png")], check=False)
+def show_only(root: str = "") -> None:
+    """Let the sidebar show one panel with those below it, or all of them, none folded."""
+    panels = module("ui.panel").CLASSES
+    for panel in reversed(panels):
+        if panel.is_registered:
+            bpy.utils.unregister_class(panel)
+    for panel in panels:
+        if "DEFAULT_CLOSED" in getattr(panel, "bl_options", ()):
+            panel.bl_options = panel.bl_options - {"DEFAULT_CLOSED"}
+        family = panel.bl_idname, getattr(panel, "bl_parent_id", ""), ""
+        if root in family or not issubclass(panel, bpy.types.Panel):
+            bpy.utils.register_class(panel)
 
 
-def sidebar() -> Any:
-    return next(region for region in area().regions if region.type == "UI")
+def panels_unfolded(state: str) -> Iterator[Any]:
+    """A picture of each panel, and the texts that do not fit."""
+    open_sidebar = module("stga_addon.scene.avatar_scene").open_sidebar
+    show_only()
+    yield lambda: open_sidebar("STGA", [viewport()[0].screen])
+    for panel in module("ui.panel").CLASSES:
+        if hasattr(panel, "bl_category") and not hasattr(panel, "bl_parent_id"):
+            show_only(panel.bl_idname)
+            yield 0.3
+            shot(f"{state} {panel.bl_label}")
+    show_only()
+    yield 0.3
+    seen["cut"] |= {f"{state}, {what}": widths for what, widths in drawn_panels.cut_texts().items()}
+    for name, layout in drawn_panels.drawn().items():
+        leaves = [leaf for leaf in layout.leaves if leaf.kind != "label"]
+        seen["texts"] |= {f"{name}: {leaf.text}": leaf.kind for leaf in leaves}
 
 
-def write() -> None:
-    (FOLDER / "result.json").write_text(json.dumps(seen, indent=1))
+def digest() -> dict[str, Any]:
+    """What undo is to bring back."""
+    scene = bpy.context.scene
+    found: dict[str, Any] = {"frame": scene.frame_current, "engine": scene.render.engine}
+    for owner in (chosen(), scene.stga_lighting):
+        names = {*owner.bl_rna.properties.keys()} - {"rna_type", "name"}
+        found |= {name: getattr(owner, name) for name in names}
+    plain = bool | int | float | str
+    found = {name: what for name, what in found.items() if isinstance(what, plain)}
+    for thing in scene.objects:
+        keys = getattr(thing.data, "shape_keys", None)
+        found[thing.name] = str(
+            [
+                (thing.hide_get(), thing.hide_render, thing.mode, len(thing.vertex_groups)),
+                [*map(tuple, thing.matrix_world)],
+                [round(key.value, 5) for key in keys.key_blocks] if keys else [],
+                getattr(getattr(thing.animation_data, "action", None), "name", ""),
+            ]
+        )
+    return found
 
 
-class Clock:
-    """Seconds from its making, noted under a name."""
-
-    def __init__(self) -> None:
-        self.begin = time.monotonic()
-
-    def note(self, name: str) -> None:
-        seen[name] = round(time.monotonic() - self.begin, 2)
-        write()
+def running() -> list[Any]:
+    return [kind for kind in kinds if monitor.state_of(bpy.context.scene, kind).is_running]
 
 
-def install() -> Iterator[Callable[[], bool]]:
-    bpy.context.preferences.extensions.use_online_access_handled = True
-    bpy.ops.screen.userpref_show(section="EXTENSIONS")
-    yield lambda: True
-    preferences = bpy.context.window_manager.windows[-1]
-    bpy.context.window_manager.extension_search = "STGA"
-    yield lambda: True
-    picture("install")
-    with bpy.context.temp_override(window=preferences):
-        bpy.ops.wm.window_close()
+def browser() -> Any:
+    """The window and area of a file browser that is open."""
+    windows = bpy.context.window_manager.windows
+    found = [(window, area) for window in windows for area in window.screen.areas]
+    return next((pair for pair in found if pair[1].type == "FILE_BROWSER"), None)
 
 
-def open_demo() -> Iterator[Callable[[], bool]]:
-    clock = Clock()
-    with viewport():
-        bpy.ops.stga.open_demo()
-    clock.note("open_demo_s")
-    yield lambda: sidebar().active_panel_category == "STGA"
-    picture("demo")
-
-
-def misunderstand() -> Iterator[Callable[[], bool]]:
-    """Train into a folder that a file never saved does not have."""
-    with viewport():
+def press(state: str) -> Iterator[Any]:
+    """Press every button that is to be seen: what opens is closed, a worker is cancelled, and the
+    rest is undone."""
+    for what, (name, options) in drawn_panels.buttons().items():
+        group, function = name.split(".")
+        operator, label = getattr(getattr(bpy.ops, group), function), f"{state}, {what}"
+        with in_viewport():
+            if name in OUTSIDE or not operator.poll():
+                seen["pressed"].setdefault(what, "gray")
+                continue
+            bpy.ops.ed.undo_push(message="before")
+        before = digest()
         try:
-            bpy.ops.stga.train(directory="//run")
+            how = click(label, operator, "INVOKE_DEFAULT", True, **options)
+            seen["pressed"][what] = sorted(how)[0]
         except RuntimeError as error:
-            seen["error"] = str(error).strip().removeprefix("Error: ")
+            seen["messages"][what] = str(error).strip().removeprefix("Error: ")
+            seen["pressed"][what] = "message"
+        yield 0.2
+        if browser():
+            seen["pressed"][what] = "browser"
+            window, area = browser()
+            seen.setdefault("proposed", {})[what] = area.spaces.active.params.filename
+            with bpy.context.temp_override(window=window, area=area, region=area.regions[0]):
+                bpy.ops.file.cancel()
+            yield lambda: browser() is None
+        elif name == "preferences.addon_show":
+            with bpy.context.temp_override(window=bpy.context.window_manager.windows[-1]):
+                bpy.ops.wm.window_close()
+        elif running():
+            seen["pressed"][what] = "worker"
+            yield from stop_workers()
+        elif seen["pressed"][what] == "RUNNING_MODAL":
+            shot(f"{state} dialog {what.replace(': ', ' ').replace('/', ' ')}")
+            subprocess.run(["xdotool", "key", "Escape"], check=True)
+        else:
+            if name == "stga.drive_live":
+                click(f"{state}, Stop", bpy.ops.stga.stop_live)
+            with in_viewport():
+                if "UNDO" not in operator.bl_options:
+                    bpy.ops.ed.undo_push(message="after")
+                bpy.ops.ed.undo()
+            after = digest()
+            changed = [name for name in before if before[name] != after.get(name)]
+            if changed or len(after) != len(before):
+                seen["undo"][label] = [[name, before[name], after.get(name)] for name in changed]
+        yield 0.2
+
+
+def stop_workers() -> Iterator[Any]:
+    for kind in running():
+        state = lambda kind=kind: monitor.state_of(bpy.context.scene, kind)  # noqa: E731
+        with in_viewport():
+            bpy.ops.stga.cancel(request=kind)
+        yield lambda state=state: not state().is_running and state().loading is None
+        if state().can_be_dismissed:
+            with in_viewport():
+                bpy.ops.stga.dismiss(request=kind)
+
+
+def fresh() -> Iterator[Any]:
+    """Every panel and every button in a file without a head."""
+    yield from panels_unfolded("fresh")
+    yield from press("fresh")
+
+
+def open_demo() -> Iterator[Any]:
+    click("Open Demo Capture", bpy.ops.stga.open_demo, "INVOKE_DEFAULT", True)
+    yield lambda: viewport("UI")[2].active_panel_category == "STGA"
+    shot("demo")
+
+
+def misunderstand() -> Iterator[Any]:
+    """Train into a folder that a file never saved does not have."""
+    try:
+        click("Train without a folder", bpy.ops.stga.train, directory="//run")
+    except RuntimeError as error:
+        seen["messages"]["Train without a folder"] = str(error).strip().removeprefix("Error: ")
     seen["error in the panel"] = bpy.context.window_manager.stga_message
-    yield lambda: True
-    picture("error")
+    yield 0.2
+    shot("error")
 
 
-def train() -> Iterator[Callable[[], bool]]:
-    clock = Clock()
-    yield lambda: time.monotonic() > clock.begin + LOOK_S
-    seen["clicked_after_start_s"] = round(time.monotonic() - STARTED, 2)
-    clock = Clock()
-    with viewport():
-        bpy.ops.stga.train(directory=chosen().run_folder, minutes=chosen().minutes)
-    job = Path(chosen().run_folder) / "job"
-    yield lambda: (job / "preview.npz").exists()
-    clock.note("preview_written_s")
+def train() -> Iterator[Any]:
+    begin = time.monotonic()
+    settings = {"directory": chosen().run_folder, "minutes": chosen().minutes}
+    click("Train", bpy.ops.stga.train, **settings)
     yield lambda: chosen().splats is not None
-    clock.note("preview_s")
-    picture("preview")
+    seen["seconds"]["to the preview"] = round(time.monotonic() - begin, 2)
+    shot("preview")
     yield lambda: chosen().result_shown
-    clock.note("trained_s")
-    picture("trained")
+    seen["seconds"]["to the avatar"] = round(time.monotonic() - begin, 2)
+    shot("trained")
 
 
-def pose() -> Iterator[Callable[[], bool]]:
-    with viewport():
-        bpy.ops.stga.pose_head()
-    yield lambda: True
+def pose() -> Iterator[Any]:
+    click("Pose the Head", bpy.ops.stga.pose_head)
+    yield 0.2
     neck = bpy.context.view_layer.objects.active.pose.bones["neck"]
     side = neck.bone.matrix_local.to_3x3().inverted() @ Vector((1.0, 0.0, 0.0))
     neck.rotation_quaternion = Quaternion(side, NECK_ANGLE)
-    chosen().head.data.shape_keys.key_blocks["jawOpen"].value = MOUTH
-    yield lambda: True
-    picture("posed")
-    with viewport():
-        bpy.ops.stga.pose_head()
+    mouth = chosen().head.data.shape_keys.key_blocks["jawOpen"]
+    click("Open Mouth", setattr, mouth, "value", MOUTH)
+    yield 0.2
+    shot("posed")
+    click("Done Posing", bpy.ops.stga.pose_head)
+    mouth.value = 0.0
 
 
-def turntable() -> Iterator[Callable[[], bool]]:
-    clock = Clock()
-    with viewport():
-        bpy.ops.stga.render_video(filepath=str(FOLDER / "turntable.mp4"), seconds=VIDEO_S)
-    video = monitor.Kind("video")
-    yield lambda: not monitor.state_of(bpy.context.scene, video).is_running
-    clock.note("video_s")
-    seen["video"] = str(monitor.state_of(bpy.context.scene, video).snapshot.state)
-    picture("turntable")
+def packet(number: int, opening: float) -> bytes:
+    """What a phone sends with Live Link Face: a mouth that opens, 0 to 1, and a smile."""
+    values = {"jawOpen": opening, "mouthSmileLeft": 0.5, "mouthSmileRight": 0.5}
+    names = module("stga_addon.driving.live.decoders").PACKET_SHAPES
+    row = [values.get(name, 0.0) for name in names] + [0.0] * 9
+    text = b"".join(struct.pack(">i", len(part)) + part for part in (b"DEVICE", b"phone"))
+    end = struct.pack(">ifii", number, 0.0, 60, 1) + struct.pack(">B61f", 61, *row)
+    return b"\x06" + text + end
 
 
-def page() -> Iterator[Callable[[], bool]]:
-    clock = Clock()
-    with viewport():
-        bpy.ops.stga.export_avatar(
-            "EXEC_DEFAULT", filepath=str(FOLDER / "avatar.html"), format="web"
-        )
-    yield (FOLDER / "avatar.html").exists
-    clock.note("page_s")
+def corners() -> np.ndarray:
+    """(V, 3) vertices of the head as it is posed."""
+    return np.array(module("stga_addon.scene.arrays").evaluated_vertices(chosen().head))
 
 
-def display() -> Iterator[Callable[[], bool]]:
-    shading, lighting = area().spaces.active.shading, bpy.context.scene.stga_lighting
+def drive(head: str) -> Iterator[Any]:
+    """Drive the head by a phone, press the button that there is meanwhile, and stop by Esc."""
+    resting, ended, counted = corners(), threading.Event(), {"poses": 0, "draws": 0}
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
+            for number in range(PACKETS):
+                phone.sendto(packet(number, number % RATE / RATE), ("127.0.0.1", PORT))
+                if ended.wait(1 / RATE):
+                    return
+
+    def count(what: str, *_: Any) -> None:
+        counted[what] += 1
+
+    chosen().drive.port = PORT
+    click(f"Drive Live, {head}", bpy.ops.stga.drive_live)
+    session, space = module("operators.live_session").session(), bpy.types.SpaceView3D
+    show = session._show
+    session._show = lambda *packet: (count("poses"), show(*packet))
+    handle = space.draw_handler_add(count, ("draws",), "WINDOW", "POST_PIXEL")
+    threading.Thread(target=send, daemon=True).start()
+    begin = time.monotonic()
+    yield lambda: counted["poses"] > 2 and time.monotonic() - begin > DRIVEN_S
+    rates = [number / (time.monotonic() - begin) for number in counted.values()]
+    moved = float(np.abs(corners() - resting).max())
+    space.draw_handler_remove(handle, "WINDOW")
+    ended.set()
+    click(f"Set Neutral, {head}", bpy.ops.stga.calibrate_live)
+    shot(f"driven {head}")
+    window, _, region = viewport()
+    x, y = region.x + region.width // 2, window.height - region.y - region.height // 2
+    subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
+    yield 0.5
+    subprocess.run(["xdotool", "key", "Escape"], check=True)
+    yield lambda: module("operators.live_session").session() is None
+    left = float(np.abs(corners() - resting).max())
+    seen.setdefault("driven", {})[head] = [moved, left, *rates]
+
+
+def live() -> Iterator[Any]:
+    """Drive the demo's head, and one of FLAME, by a phone."""
+    yield from drive("demo")
+    bpy.ops.wm.save_as_mainfile(filepath=str(FIRST))
+    bpy.ops.wm.read_homefile(app_template="")
+    yield 0.3
+    files = {name: str(FOLDER / f"{name}.npz") for name in ("own", "flame")}
+    click("FLAME Motion", bpy.ops.stga.import_motion, filepath=files["own"], flame=files["flame"])
+    yield 1.0
+    yield from drive("FLAME")
+    yield opened(FIRST)
+
+
+def export() -> Iterator[Any]:
+    """Every format; then what can be opened again."""
+    seen["exported"] = {}
+    for name, format in module("stga_addon.export.formats").FORMATS.items():
+        path = FOLDER / f"avatar_{name}{next(iter(format.suffixes), '')}"
+        click(f"Export {name}", bpy.ops.stga.export_avatar, filepath=str(path), format=name)
+        files = [path, *path.rglob("*")] if path.is_dir() else [path]
+        seen["exported"][name] = sum(each.stat().st_size for each in files)
+        yield 0.1
+    count, file = len(chosen().splats.data.vertices), str(FOLDER / "avatar_ply.ply")
+    click("Import PLY", bpy.ops.stga.import_ply, filepath=file)
+    shown = bpy.context.view_layer.objects.active
+    seen["opened again"] = [count, len(shown.data.vertices)]
+    yield 0.2
+    shot("opened again")
+    bpy.data.objects.remove(shown)
+    click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
+
+
+def display() -> Iterator[Any]:
+    shading, lighting = viewport()[1].spaces.active.shading, bpy.context.scene.stga_lighting
+    seen["shading"] = {}
+    modes = bpy.ops.stga.choose_display.get_rna_type().properties["display"].enum_items
+    for mode in sorted(modes.keys(), key=lambda mode: mode == "As Trained"):
+        shading.type = "SOLID"
+        click(f"Display {mode}", bpy.ops.stga.choose_display, display=mode)
+        seen["shading"][mode] = shading.type
+        yield 0.2
+        shot(f"display {mode}")
     shading.type = "SOLID"
-    with viewport():
-        bpy.ops.stga.choose_display(display="Points")
-    seen["shading of points"] = shading.type
-    yield lambda: True
-    picture("points")
-    with viewport():
-        bpy.ops.stga.choose_display(display="As Trained")
-    shading.type = "SOLID"
-    clock = Clock()
-    lighting.mode = "scene"
-    clock.note("scene_light_s")
-    seen["exposure"] = lighting.exposure
-    yield lambda: True
-    picture("lit")
-    lighting.mode = "recorded"
+    for mode in ("scene", "mix", "recorded"):
+        click(f"Lighting {mode}", setattr, lighting, "mode", mode)
+        seen["exposure"] = lighting.exposure
+        yield 0.2
+        shot(f"light {mode}")
 
 
-def select() -> Iterator[Callable[[], bool]]:
-    with viewport():
-        bpy.ops.stga.select()
-    chosen().selected_row = 2
+def select() -> Iterator[Any]:
+    click("Select Triangles", bpy.ops.stga.select)
+    click("Row", setattr, chosen(), "selected_row", 2)
     seen["frame of row"] = [bpy.context.scene.frame_current, chosen().selected_frames[2].frame]
-    yield lambda: True
-    picture("selected")
+    yield 0.2
+    shot("selected")
 
 
-def press() -> Iterator[Callable[[], bool]]:
-    """Call every operator that can be called here as its button does, and undo it."""
-    bpy.ops.wm.open_mainfile(filepath=str(FOLDER / "first.blend"))
-    seen["pressed"], seen["messages"] = [], {}
-    names = {name for name in vars(ids).values() if str(name).startswith("stga.")}
-    for name in sorted(names - {f"stga.{each}" for each in WORKERS}):
-        operator = getattr(bpy.ops.stga, name.removeprefix("stga."))
-        with viewport():
+def reopen() -> Iterator[Any]:
+    """Save and open again."""
+    run = Path(chosen().run_folder)
+    click("Save", bpy.ops.wm.save_as_mainfile, filepath=str(FIRST))
+    click("Open", bpy.ops.wm.open_mainfile, filepath=str(FIRST))
+    yield 0.3
+    seen["run found"] = Path(bpy.path.abspath(chosen().run_folder)) == run
+    shot("reopened")
+
+
+def pressed() -> Iterator[Any]:
+    """Every panel and every button in the demo's file."""
+    yield opened(FIRST)
+    yield from panels_unfolded("demo")
+    yield from press("demo")
+    seen["left"] = chosen().splats is not None
+
+
+def select_only(*things: Any) -> None:
+    for thing in bpy.context.selected_objects:
+        thing.select_set(False)
+    for thing in things:
+        thing.hide_set(False)
+        thing.select_set(True)
+        bpy.context.view_layer.objects.active = thing
+
+
+def duplicate() -> Iterator[Any]:
+    """Duplicate the splats, and the whole avatar; move the copy aside, and undo."""
+    yield opened(FIRST)
+    seen["duplicates undone"] = {}
+    names = {*bpy.data.objects.keys()}
+    for what, things in (("splats", ()), ("avatar", (chosen().head, chosen().head.parent))):
+        with in_viewport():
+            select_only(*things, chosen().splats)
             bpy.ops.ed.undo_push(message="before")
-            if not operator.poll():
-                continue
-            try:
-                operator("EXEC_DEFAULT", True)
-                seen["pressed"].append(name)
-            except RuntimeError as error:
-                seen["messages"][name] = str(error).strip().removeprefix("Error: ")
+        click(f"Duplicate {what}", bpy.ops.object.duplicate)
+        for made in {*bpy.data.objects.keys()} - names:
+            if bpy.data.objects[made].parent in (None, chosen().head.parent):
+                bpy.data.objects[made].location.x += 0.3
+        yield 0.3
+        shot(f"duplicate {what}")
+        with in_viewport():
             bpy.ops.ed.undo_push(message="after")
             bpy.ops.ed.undo()
-        yield lambda: True
-    seen["left"] = chosen().splats is not None
-    picture("pressed")
+            bpy.ops.ed.undo()
+        seen["duplicates undone"][what] = {*bpy.data.objects.keys()} == names
+        yield 0.2
 
 
-def reopen() -> Iterator[Callable[[], bool]]:
-    """Save, open again, duplicate the splats, undo, and append them to another file."""
-    run, file = Path(chosen().run_folder), FOLDER / "first.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(file))
-    bpy.ops.wm.open_mainfile(filepath=str(file))
-    yield lambda: True
-    seen["run found"] = Path(bpy.path.abspath(chosen().run_folder)) == run
-    shown = chosen().splats
-    with viewport():
-        for thing in bpy.context.selected_objects:
-            thing.select_set(False)
-        bpy.context.view_layer.objects.active = shown
-        shown.select_set(True)
-        bpy.ops.ed.undo_push(message="before")
-        bpy.ops.object.duplicate()
-    yield lambda: True
-    count = len(bpy.data.objects)
-    with viewport():
-        bpy.ops.ed.undo()
-    seen["undone"] = count - len(bpy.data.objects)
-    yield lambda: True
-    picture("reopened")
+def append() -> Iterator[Any]:
+    yield opened(FIRST)
     name = chosen().splats.name
     bpy.ops.wm.read_homefile(app_template="")
-    yield lambda: True
-    with viewport():
-        bpy.ops.wm.append(directory=f"{file}/Object/", filename=name)
-    seen["appended"] = name in bpy.data.objects
-    yield lambda: True
-    picture("appended")
+    yield 0.2
+    click("Append", bpy.ops.wm.append, directory=f"{FIRST}/Object/", filename=name)
+    seen["appended"] = chosen().splats == bpy.data.objects[name]
+    yield 0.3
+    shot("appended")
+    yield from panels_unfolded("appended")
 
 
-def choose_file() -> Iterator[Callable[[], bool]]:
-    """Open the file browser of Import Capture from a saved file."""
-    bpy.ops.wm.open_mainfile(filepath=str(FOLDER / "first.blend"))
-    yield lambda: True
-    with viewport():
-        bpy.ops.stga.import_capture("INVOKE_DEFAULT")
-    yield lambda: True
-    browser = bpy.context.window_manager.windows[-1].screen.areas[0].spaces.active
-    seen["proposed file"] = browser.params.filename
-    picture("browser")
+def delete() -> Iterator[Any]:
+    """Delete the splats, then the head; undo brings them back."""
+    yield opened(FIRST)
+    names = {*bpy.data.objects.keys()}
+    for what, thing in (("splats", chosen().splats), ("head", chosen().head)):
+        with in_viewport():
+            select_only(thing)
+            bpy.ops.ed.undo_push(message="before")
+        click(f"Delete {what}", bpy.ops.object.delete, "EXEC_DEFAULT", True)
+        yield lambda what=what: getattr(chosen(), what) is None
+        yield from panels_unfolded(f"without {what}")
+    with in_viewport():
+        bpy.ops.ed.undo()
+        bpy.ops.ed.undo()
+    seen["deletion undone"] = {*bpy.data.objects.keys()} == names
 
 
-def steps() -> Iterator[Callable[[], bool]]:
-    clock = Clock()
-    for step in (
-        install, open_demo, misunderstand, train, pose, turntable, page, display, select,
-        reopen, press, choose_file,
-    ):  # fmt: skip
-        yield from step()
-    clock.note("all_s")
+def disable() -> Iterator[Any]:
+    """Disable and enable the extension with an avatar in the scene."""
+    yield opened(FIRST)
+    before = digest()
+    for name in ("disable", "enable"):
+        click(name, getattr(bpy.ops.preferences, f"addon_{name}"), module=extension)
+        yield 0.5
+        shot(f"{name}d")
+    after = digest()
+    seen["kept"] = [name for name in before if before[name] != after.get(name)]
 
 
-class Player:
-    """Takes the steps, one after another as their conditions come true."""
+def render() -> Iterator[Any]:
+    """An image, and a video of two frames, with each engine."""
+    yield opened(FIRST)
+    scene, settings = bpy.context.scene, bpy.context.scene.render
+    click("Preview for EEVEE/Cycles", bpy.ops.stga.preview_images)
+    shot("preview of images")
+    bpy.context.preferences.view.render_display_type = "NONE"
+    settings.resolution_y = IMAGE_PX * settings.resolution_y // settings.resolution_x
+    settings.resolution_x = IMAGE_PX
+    scene.frame_end = scene.frame_start + 1
+    scene.cycles.samples = scene.eevee.taa_render_samples = SAMPLES
+    complete: list[str] = []
+    note = lambda *_: complete.append("")  # noqa: E731
+    bpy.app.handlers.render_complete.append(note)
+    eevee = "BLENDER_EEVEE_NEXT" if bpy.app.version < (5, 0) else "BLENDER_EEVEE"
+    for engine in (eevee, "CYCLES", module("stga_addon.scene.render.engine").ENGINE):
+        settings.engine = engine
+        for kind in ("PNG", "FFMPEG"):
+            complete.clear()
+            if hasattr(settings.image_settings, "media_type"):
+                settings.image_settings.media_type = "VIDEO" if kind == "FFMPEG" else "IMAGE"
+            settings.image_settings.file_format = kind
+            settings.ffmpeg.format = "MPEG4"
+            settings.filepath = str(FOLDER / f"{engine}.mp4")
+            begin = time.monotonic()
+            with in_viewport():
+                bpy.ops.render.render("INVOKE_DEFAULT", animation=kind == "FFMPEG")
+            yield lambda: complete and not bpy.app.is_job_running("RENDER")
+            seen["seconds"][f"{engine} {kind}"] = round(time.monotonic() - begin, 2)
+            if kind == "PNG":
+                path = str(FOLDER / f"{engine}.png")
+                bpy.data.images["Render Result"].save_render(path)
+                pixels = np.array(bpy.data.images.load(path).pixels).reshape(-1, 4)
+                seen["images"][engine] = [*map(float, pixels[:, :3].std(0))]
+            else:
+                seen["images"][f"{engine} video"] = Path(settings.filepath).stat().st_size
+    bpy.app.handlers.render_complete.remove(note)
 
-    def __init__(self) -> None:
-        self.steps, self.until, self.since = steps(), (lambda: True), time.monotonic()
 
-    def __call__(self) -> float | None:
-        try:
-            if self.until():
-                self.until, self.since = next(self.steps), time.monotonic()
-            elif time.monotonic() - self.since > PATIENCE_S:
-                raise TimeoutError(f"waited in vain after {list(seen)}")
-            return STEP_S
-        except StopIteration:
-            pass
-        except Exception:
-            seen["traceback"] = traceback.format_exc()
-            picture("failed")
-        write()
-        bpy.ops.wm.quit_blender()
-        return None
+def drop() -> Iterator[Any]:
+    """Drop a video: the dialog of Avatar from Video."""
+    video = str(FOLDER / "CYCLES.mp4")
+    click("Drop", bpy.ops.stga.avatar_from_video, "INVOKE_DEFAULT", filepath=video)
+    yield 0.3
+    shot("dropped video")
+    subprocess.run(["xdotool", "key", "Escape"], check=True)
+    yield 0.3
 
 
-bpy.app.timers.register(Player(), first_interval=3.0, persistent=True)
+STEPS = """fresh open_demo misunderstand train pose live display select export reopen
+pressed duplicate delete append render drop disable"""
+
+
+def steps() -> Iterator[Any]:
+    for name in ARGUMENTS[1:] or STEPS.split():
+        print(f"STEP {name} {time.monotonic() - STARTED:.0f} s", flush=True)
+        yield from globals()[name]()
+    seen["seconds"]["all"] = round(time.monotonic() - STARTED, 2)
+
+
+play(steps(), FOLDER / "result.json")

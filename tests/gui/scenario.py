@@ -5,12 +5,9 @@ kills the worker.
 function below, RESULT the JSON file that says what was seen.
 """
 
-import json
 import os
 import signal
 import sys
-import time
-import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,36 +15,16 @@ from typing import Any
 import bpy
 from mathutils import Vector
 
-PART, RESULT, CAPTURE, BLEND, PYTHON = sys.argv[sys.argv.index("--") + 1 :]
-STEP_S, PATIENCE_S = 0.1, 180.0
-WORKER_PATIENCE_S = 1200.0
-"""While a worker is alive: compiling kernels for the first time takes a minute, and far longer on a
-busy machine."""
-seen: dict[str, Any] = {}
+sys.path.insert(0, str(Path(__file__).parent))
 
-extension = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
-monitor = sys.modules[f"{extension}.operators.monitor"]
-test = sys.modules[f"{extension}.operators.training_python"].test
-lock_owner = sys.modules[f"{extension}.stga_addon.worker.lock"].lock_owner
+from in_window import ARGUMENTS, chosen, extension, in_viewport, module, play, seen
 
-
-def timed(name: str, action: Callable[..., Any]) -> Callable[..., Any]:
-    """The action, noting how long each call holds Blender up: by the clock, and in processor
-    time."""
-    noted = seen.setdefault("held up ms", {}).setdefault(name, [])
-
-    def measured(*arguments: Any, **named: Any) -> Any:
-        begin, cpu = time.perf_counter(), time.thread_time()
-        try:
-            return action(*arguments, **named)
-        finally:
-            noted.append((1000 * (time.perf_counter() - begin), 1000 * (time.thread_time() - cpu)))
-
-    return measured
-
-
-def chosen() -> Any:
-    return bpy.context.scene.stga
+PART, RESULT, CAPTURE, BLEND, PYTHON = ARGUMENTS
+PATIENCE_S = 1200.0
+"""Compiling kernels for the first time takes a minute, and far longer on a busy machine."""
+monitor = module("operators.monitor")
+test = module("operators.training_python").test
+lock_owner = module("stga_addon.worker.lock").lock_owner
 
 
 def request(kind: str) -> Any:
@@ -66,14 +43,6 @@ def is_training() -> bool:
     return state() == "working" and figures().get("iteration", 0) > 0
 
 
-def has_worker() -> bool:
-    """Whether a run or a video has a worker that is alive."""
-    video = request("video").folder
-    folders = [*Path(BLEND).parent.glob("*/job")]
-    folders += [] if video is None else [video]
-    return any(monitor.inspect_status(folder).state.is_alive for folder in folders)
-
-
 def splats() -> int:
     return 0 if chosen().splats is None else len(chosen().splats.data.vertices)
 
@@ -90,12 +59,12 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.stga.test_python()
     yield lambda: not test.is_running
     seen["tested"] = test.found.line if test.found else test.error
-    with in_window():
+    with in_viewport():
         bpy.ops.stga.import_capture(directory=CAPTURE)
     yield looks_at_head
     bpy.ops.stga.select()
     bpy.ops.wm.save_as_mainfile(filepath=BLEND)
-    timed("click on Train", bpy.ops.stga.train)(directory="//run", minutes=30)
+    bpy.ops.stga.train(directory="//run", minutes=30)
     yield lambda: is_training() and splats() > 0
     seen["figures"] = figures()
     before = splats_at_work()
@@ -118,12 +87,12 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.ops.stga.train(directory="//run", resume=True)
     yield is_training
     bpy.ops.ed.undo_push(message="before")
-    with in_window():
+    with in_viewport():
         while chosen().training_run and bpy.ops.ed.undo.poll():
             bpy.ops.ed.undo()
     seen["undone"] = chosen().training_run
     yield lambda: is_training() and chosen().training_run != ""
-    with in_window():
+    with in_viewport():
         while bpy.ops.ed.redo.poll():
             bpy.ops.ed.redo()
     yield is_training
@@ -162,7 +131,7 @@ def videos() -> Iterator[Callable[[], bool]]:
     folder, scene = Path(BLEND).parent, bpy.context.scene
     scene.frame_set(1)
     for name in ("recording", "rendering", "finished"):
-        with in_window():
+        with in_viewport():
             bpy.ops.stga.render_video(filepath=str(folder / name), seconds=0.5)
         video = request("video").folder
         if name != "recording":
@@ -181,11 +150,6 @@ def videos() -> Iterator[Callable[[], bool]]:
         yield lambda video=video: not video.exists()
         seen[f"{name} written"] = (folder / f"{name}.mp4").exists()
     seen["frame after videos"] = scene.frame_current
-
-
-def in_window() -> Any:
-    """A timer's context has none, and undo wants one."""
-    return bpy.context.temp_override(window=bpy.context.window_manager.windows[0])
 
 
 def looks_at_head() -> bool:
@@ -213,36 +177,4 @@ def splats_at_work() -> list[float]:
     return [value for vertex in mesh.vertices[:20] for value in vertex.co]
 
 
-class Player:
-    """Takes a part's steps, one after another as their conditions come true."""
-
-    def __init__(self, part: Iterator[Callable[[], bool]]) -> None:
-        self.part, self.until, self.since = part, (lambda: True), time.monotonic()
-
-    def __call__(self) -> float | None:
-        try:
-            if self.until():
-                self.until, self.since = next(self.part), time.monotonic()
-            elif time.monotonic() - self.since > (
-                WORKER_PATIENCE_S if has_worker() else PATIENCE_S
-            ):
-                raise TimeoutError(f"waited in vain: {state()}, {figures()}, {sorted(seen)}")
-            return STEP_S
-        except StopIteration:
-            pass
-        except Exception:
-            seen["traceback"] = traceback.format_exc()
-        Path(RESULT).write_text(json.dumps(seen))
-        bpy.ops.wm.quit_blender()
-        return None
-
-
-bpy.app.timers.unregister(monitor.tick) if bpy.app.timers.is_registered(monitor.tick) else None
-monitor.tick, monitor._push_undo = (
-    timed("tick", monitor.tick),
-    timed("undo step", monitor._push_undo),
-)
-monitor._start_timer()
-bpy.app.timers.register(
-    Player({"first": first, "second": second}[PART]()), first_interval=1.0, persistent=True
-)
+play({"first": first, "second": second}[PART](), Path(RESULT), PATIENCE_S)

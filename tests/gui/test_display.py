@@ -1,9 +1,6 @@
-"""The GPU display in a Blender with a window, as on screen, against the CPU rasterizer: see
-test_scenario.py."""
+"""The GPU display in a Blender with a window, as on screen, against the CPU rasterizer."""
 
 import json
-import os
-import shlex
 import shutil
 import subprocess
 from dataclasses import replace
@@ -29,18 +26,13 @@ from stga_addon.light.values import Light
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 
+from .conftest import BLENDER
+
 ROOT = Path(__file__).resolve().parents[2]
-BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window"
-)
 MIN_PSNR_DB = 42.0
 BORDER_PX = 40
 """Of the viewport, where Blender draws rounded corners and arrows."""
 BEHIND = linear_to_srgb(np.array([0.2, 0.3, 0.4]))
-BLACK = np.zeros(3)
-
-
 PROBE = (
     "import bpy, gpu, os; print('BACKEND', gpu.platform.backend_type_get(), flush=True); "
     "os._exit(0)"
@@ -75,18 +67,9 @@ def shown(
     write_avatar(folder / "avatar.npz", replace(of, light=light))
     shutil.copytree(Path(filelock.__file__).parent, folder / "packages/filelock")
     script = Path(__file__).with_name("display_script.py")
-    arguments = [
-        "--factory-startup",
-        "--gpu-backend",
-        backend,
-        "--python",
-        str(script),
-        "--",
-        str(folder),
-    ]
-    done = subprocess.run(
-        [*BLENDER, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=900
-    )
+    command = [*BLENDER, "--factory-startup", "--gpu-backend", backend]
+    command += ["--python", str(script), "--", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert (folder / "result.json").exists(), done.stdout[-3000:] + done.stderr[-3000:]
     result = json.loads((folder / "result.json").read_text())
     print({name: result[name] for name in ("version", "device", "pictures")})
@@ -111,19 +94,8 @@ def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarr
     return pixels[m:-m, m:-m].transpose(2, 0, 1) / 255, middle
 
 
-@pytest.mark.parametrize(
-    ("name", "behind"),
-    [
-        ("solid", BEHIND),
-        ("wireframe", BEHIND),
-        ("orthographic", BEHIND),
-        ("filmic", BEHIND),
-        ("engine", BLACK),
-    ],
-)
-def test_viewport_equals_the_rasterizer(
-    shown: tuple[Path, dict[str, Any]], name: str, behind: np.ndarray
-) -> None:
+@pytest.mark.parametrize("name", ["solid", "wireframe", "orthographic", "filmic", "engine"])
+def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name: str) -> None:
     """Catches colors that a view transform, a blend or an offset of the viewport changes."""
     folder, result = shown
     found, camera = on_screen(folder, result, name)
@@ -133,7 +105,7 @@ def test_viewport_equals_the_rasterizer(
     layer = PosedSplats(
         expected.splats, expected.frames(expected.neutral), pose, expected.antialiased
     )
-    image = compose([layer], camera)
+    image, behind = compose([layer], camera), np.zeros(3) if name == "engine" else BEHIND
     picture = np.clip(image.rgb + (1 - image.alpha) * behind[:, None, None], 0, 1)
     print(f"{name}: {psnr_db(found, picture):.1f} dB")
     assert image.alpha.mean() > 0.02, "nothing to compare"
@@ -162,14 +134,6 @@ def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
     for index, (kind, place) in enumerate(result["lights"].items()):
         light = Light(kind, np.ones(3), place[:3], direction=place[3:])
         check_shadow_map(atlas, index, ShadowMap(of.neutral, of.faces, light).depth)
-
-
-def test_rendering_in_a_window(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches a render thread and a main thread that wait for each other, and a view transform not
-    measured there."""
-    assert shown[1].get("rendered"), (
-        "not in a minute" if "rendered" not in shown[1] else "without the view transform"
-    )
 
 
 def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
@@ -216,9 +180,9 @@ def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches an error in every redraw, and a handler or textures that outlive the add-on or the
-    file."""
-    _, result = shown
+    """Catches an error in every redraw, a render thread and a main thread that wait for each other,
+    a handler or textures that outlive their use, and splats that undo does not bring back."""
+    folder, result = shown
     failed, removed, problem = result["failed"]
     assert failed
     assert removed
@@ -227,19 +191,11 @@ def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
     assert result["fallback"] == result["points"]
     assert result["unregistered"] == [True, True]
     assert result["after load"] == [True, True, ""]
-    assert result["drawn"] == [1, 1, 1, 1], (
-        "at first, after undo, after the add-on was off, and in the next file"
-    )
+    assert result["drawn"] == [1, 1, 1, 1], "at first, after undo, after off, and in the next file"
     assert result["drawn without"] == 0
-
-
-def test_textures_are_freed(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches GPU memory held while nothing is displayed as trained, and splats that undo does not
-    bring back."""
-    folder, result = shown
-    assert result["freed"] == {
-        "while drawn": False, "off": True, "removed": True, "disabled": True, "loaded": True,
-    }  # fmt: skip
+    ended = dict.fromkeys(("off", "removed", "disabled", "loaded"), True)
+    assert result["freed"] == {"while drawn": False, **ended}
     assert result["undone"]
     before, after = (on_screen(folder, result, name)[0] for name in ("solid", "after undo"))
     assert psnr_db(after, before) > MIN_PSNR_DB
+    assert result["rendered"], "without the view transform, which the main thread measures"

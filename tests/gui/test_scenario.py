@@ -1,9 +1,7 @@
-"""The Train step in a Blender with a window: `make test-gui`, with the command that starts it in
-STGA_BLENDER."""
+"""The Train step in a Blender with a window."""
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,11 +14,9 @@ from capture.factory import write_mesh_capture
 from stga_addon.development.package import build_zip
 from stga_addon.worker.status import request_cancel
 
+from .conftest import BLENDER
+
 ROOT = Path(__file__).resolve().parents[2]
-BLENDER = shlex.split(os.environ.get("STGA_BLENDER", ""))
-pytestmark = pytest.mark.skipif(
-    not BLENDER, reason="STGA_BLENDER does not say how to start a Blender with a window"
-)
 
 
 @pytest.fixture(scope="module")
@@ -28,16 +24,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with an empty Blender profile in which the built zip is installed."""
     folder = tmp_path_factory.mktemp("gui")
     archive = build_zip(folder)
-    blender(
-        folder,
-        "--command",
-        "extension",
-        "install-file",
-        "--repo",
-        "user_default",
-        "--enable",
-        archive,
-    )
+    command = ("--command", "extension", "install-file", "--repo", "user_default", "--enable")
+    blender(folder, *command, archive)
     yield folder
     for job in folder.glob("*/job"):  # whatever failed: no worker stays behind
         request_cancel(job)
@@ -57,26 +45,10 @@ def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
     """What a part of scenario.py saw."""
     result = home / f"{part}.json"
     script = Path(__file__).with_name("scenario.py")
-    blender(
-        home,
-        *file,
-        "--python",
-        script,
-        "--",
-        part,
-        result,
-        capture,
-        home / "head.blend",
-        sys.executable,
-    )
+    arguments = (part, result, capture, home / "head.blend", sys.executable)
+    blender(home, *file, "--python", script, "--", *arguments)
     seen: dict[str, Any] = json.loads(result.read_text())
     assert "traceback" not in seen, seen["traceback"]
-    for name, times in seen["held up ms"].items():
-        wall, cpu = (max(column) for column in zip(*times, strict=True)) if times else (0, 0)
-        print(
-            f"{part}, {name}: {len(times)}, each at most {wall:.1f} ms by the clock, {cpu:.1f} ms "
-            f"of processor time"
-        )
     return seen
 
 
@@ -104,10 +76,7 @@ def test_training_in_a_window(home: Path) -> None:
     assert then["finished"]["avatar"] == str(home / "short/avatar.npz")
     assert then["finished"]["splats"] > 0
     assert then["dismissed"]
-    assert (then["recording written"], then["rendering written"], then["finished written"]) == (
-        False,
-        False,
-        True,
-    )
+    written = [then[f"{name} written"] for name in ("recording", "rendering", "finished")]
+    assert written == [False, False, True]
     assert (then["video rendering"], then["video finished"]) == ("cancelled", "finished")
     assert then["frame after videos"] == 1

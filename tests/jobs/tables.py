@@ -5,18 +5,18 @@ from pathlib import Path
 import numpy as np
 
 from stga_addon.driving.open_motion import MotionOptions
-from stga_addon.jobs.analyze import Analyze, Select, TimePresets
+from stga_addon.jobs.analyze import Analyze, Analyzed, Select, TimePresets
 from stga_addon.jobs.avatar_source import Played
 from stga_addon.jobs.blender import RenderBlend, RenderRecording
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate, Relight
 from stga_addon.jobs.render import Render
-from stga_addon.jobs.results import Analyzed, Result, Selected, Written
-from stga_addon.jobs.table import Benchmark, Request
+from stga_addon.jobs.table import Benchmark, Request, Result
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
-from stga_addon.jobs.train import Extend, Refine, Resume, SelectForTake, Train
-from stga_addon.training.effect_decisions import EffectDecision
+from stga_addon.jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
+from stga_addon.progress import Written
+from stga_addon.training.effect_catalog import EffectDecision
 from stga_addon.training.settings import make_settings
 
 HEAD = Path("/captures/anna")
@@ -28,7 +28,7 @@ PLAYED = Played(
 REQUESTS: tuple[Request, ...] = (
     Train(
         Path("r"), HEAD, make_settings(iterations=3, preset="draft"), device="gpu:Name",
-        selection={0: np.ones(4, bool)},
+        selection={0: np.ones(4, bool)}
     ),
     Resume(Path("r"), HEAD, Path("flame.pkl"), "opencv", selection={7: np.zeros(4, bool)}),
     Refine(Path("r_2"), Path("r"), "mouth", frames=(3, 5), growth=0.5, seconds=20.0),
@@ -40,24 +40,24 @@ REQUESTS: tuple[Request, ...] = (
     SelectForTake(Path("r"), Path("/smile")),
     Track(
         Path("f"), Path("m.glb"), Path("o"), focal=900.0, stop=9, step=3, offset={"left": -3},
-        meshes=True, mattes="none",
+        meshes=True, mattes="none"
     ),
     MakeAvatar(
         Track(Path("v.mp4"), None, Path("o/capture"), focal=900.0),
-        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu"),
+        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu")
     ),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Render(Path("r"), Path("v.mp4"), True, turntable=90.0, camera=2, seconds=3.0, played=PLAYED),
     Render(
         Path("a.npz"), Path("p"), cameras=Path("t.json"), motion=Path("m.npz"),
-        background=(0.0, 1.0, 0.5),
+        background=(0.0, 1.0, 0.5)
     ),
     Benchmark(Path("b"), HEAD, 30.0, seed=2, only=("draft", "final")),
     RenderBlend(Path("/shots/head.blend"), Path("p"), (3, 12), "CYCLES"),
     Export(
         Path("r"), Path("a.html"), "web", HEAD, played=PLAYED, frames=(3, 12), fps=30.0,
-        motion_only=True,
+        motion_only=True
     ),
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
@@ -66,7 +66,7 @@ REQUESTS: tuple[Request, ...] = (
     Render(Path("r"), Path("v.mp4"), True, light=Path("sunset.hdr"), light_turn=360.0),
     ConvertMotion(
         Path("take.csv"), Path("m.npz"), HEAD,
-        options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None),
+        options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None)
     ),
 )  # fmt: skip
 RESULTS: tuple[Result, ...] = (

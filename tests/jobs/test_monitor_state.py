@@ -81,11 +81,9 @@ def test_a_running_request_of_any_kind(kind):
     assert (Store(RUN, False) in effects) == (kind in (Kind.TRAINING, Kind.TRACKING, Kind.AVATAR))
     for worker in (WorkerState.STARTING, WorkerState.WORKING, WorkerState.CANCELLING):
         state, effects = after(status(worker), state=state)
-        assert (state.is_running, state.interval_s, state.can_be_dismissed) == (
-            True,
-            CHECK_INTERVAL_S,
-            False,
-        )
+        assert state.is_running
+        assert state.interval_s == CHECK_INTERVAL_S
+        assert not state.can_be_dismissed
         assert effects == [Redraw()]
     assert after(status(WorkerState.CANCELLING), state=state) == (state, [])
 
@@ -93,10 +91,13 @@ def test_a_running_request_of_any_kind(kind):
 @pytest.mark.parametrize("kind", Kind)
 @pytest.mark.parametrize("end", ENDS)
 def test_any_end_of_any_kind_stops_the_timer(kind, end):
-    """Catches a timer that runs for ever, a result shown twice, and a failure or a cancelled
-    request that is shown."""
+    """Catches a timer that runs for ever, a result shown twice, a failure or a cancelled request
+    that is shown, and an option of the command line that the panel has not."""
     state, _ = after(
-        START, status(WorkerState.WORKING), status(end, error="why"), state=RequestState(kind)
+        START,
+        status(WorkerState.WORKING),
+        status(end, error="--effect why"),
+        state=RequestState(kind),
     )
     shown = {Kind.TRAINING: ENDS[:2], Kind.VIDEO: (), Kind.AVATAR: ()}.get(kind, ENDS[:1])
     assert (state.loading is not None) == (end in shown)
@@ -159,26 +160,6 @@ def test_a_result_waits_until_the_scene_is_free(kind):
     assert state.is_running == (kind != Kind.TRACKING)
 
 
-def test_the_option_of_the_command_line_is_not_named():
-    """Catches a panel that tells its user of an option which it has not."""
-    analysis = RequestState(Kind.ANALYSIS)
-    state, _ = after(
-        START, status(WorkerState.FAILED, error="--effect jaw=on: is impossible"), state=analysis
-    )
-    assert state.error == "jaw=on: is impossible"
-
-
-def test_an_undo_step_for_a_selection():
-    """Catches a selection that undo cannot take back."""
-    _, effects = after(
-        START,
-        status(WorkerState.FINISHED),
-        Shown(undoable=True),
-        state=RequestState(Kind.SELECTION),
-    )
-    assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
-
-
 def test_the_next_video_replaces_the_last_one():
     """Catches a temporary folder for each video, and a recording that is removed when its worker
     starts."""
@@ -204,8 +185,11 @@ def test_every_request_of_blender_has_a_kind():
 
 
 def test_each_preview_is_loaded_once():
-    """Catches previews that are read again at every check, and later ones that are not shown."""
-    state, effects = after(START, status(WorkerState.WORKING, preview=1))
+    """Catches previews that are read again at every check, later ones that are not shown, splats
+    that keep changing although live preview is off, and a preview that is lost by turning it on."""
+    state, effects = after(START, status(WorkerState.WORKING, preview=1, live_preview=False))
+    assert not loads(effects)
+    state, effects = after(status(WorkerState.WORKING, preview=1), state=state)
     assert loads(effects) == [PREVIEW]
     state, effects = after(status(WorkerState.WORKING, preview=2), state=state)
     assert not loads(effects), "the preview before is still being read"
@@ -218,18 +202,14 @@ def test_each_preview_is_loaded_once():
     assert state.interval_s == CHECK_INTERVAL_S
 
 
-def test_no_preview_unless_wanted():
-    """Catches splats that keep changing although live preview is off, and a preview that is lost by
-    turning it on."""
-    state, effects = after(START, status(WorkerState.WORKING, preview=1, live_preview=False))
-    assert not loads(effects)
-    assert loads(after(status(WorkerState.WORKING, preview=1), state=state)[1]) == [PREVIEW]
-
-
 @pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
 def test_result_is_shown_once(end):
-    """Catches a result that is not shown, or shown again at every check, or that undo cannot take
-    back."""
+    """Catches a result that is not shown, shown again at every check or where that is off, or that
+    undo cannot take back."""
+    state, effects = after(START, status(end, show_result=False))
+    assert not loads(effects)
+    assert {StoreAvatar(AVATAR), Store(RUN, True)} <= set(effects)
+    assert (state.result_shown, state.interval_s) == (True, None)
     state, effects = after(START, status(end))
     assert StoreAvatar(AVATAR) in effects
     assert loads(effects) == [AVATAR]
@@ -237,15 +217,6 @@ def test_result_is_shown_once(end):
     assert effects == [Store(RUN, True), PushUndo(), Redraw()]
     assert state.interval_s is None
     assert after(status(end), state=state) == (state, [])
-
-
-def test_result_that_is_not_wanted_is_only_stored():
-    """Catches splats that appear although the user turned that off."""
-    state, effects = after(START, status(WorkerState.FINISHED, show_result=False))
-    assert not loads(effects)
-    assert {StoreAvatar(AVATAR), Store(RUN, True)} <= set(effects)
-    assert state.result_shown
-    assert state.interval_s is None
 
 
 def test_result_waits_for_the_preview_that_is_being_built():
@@ -263,27 +234,21 @@ def test_result_waits_for_the_preview_that_is_being_built():
     assert loads(effects) == [AVATAR]
 
 
-def test_undo_does_not_lose_the_request():
+def test_undo():
     """Catches a training that nobody can cancel because an undo step took the scene back to before
-    it began."""
+    it began, an undo of the shown splats that the next check reverts, a dismissed training that
+    returns as one whose folder is missing, and a selection that undo cannot take back."""
     state, _ = after(START, status(WorkerState.WORKING))
     assert after(SceneRead(None, False), state=state) == (state, [Store(RUN, False)])
     assert after(SceneRead(RUN, False), state=state) == (state, [])
-
-
-def test_undo_does_not_show_the_result_again():
-    """Catches an undo of the shown splats that the next check reverts."""
-    state, _ = after(START, status(WorkerState.FINISHED), Shown(undoable=True))
-    state, effects = after(SceneRead(RUN, False), state=state)
-    assert effects == [Store(RUN, True)]
+    state, _ = after(status(WorkerState.FINISHED), Shown(undoable=True), state=state)
+    assert after(SceneRead(RUN, False), state=state) == (state, [Store(RUN, True)])
     assert after(status(WorkerState.FINISHED), state=state) == (state, [])
-
-
-def test_undo_does_not_bring_back_what_was_dismissed():
-    """Catches a dismissed training that returns as one whose folder is missing."""
-    state, _ = after(START, status(WorkerState.FINISHED), Dismissed())
-    assert state.interval_s is None
-    assert after(SceneRead(RUN, True), state=state)[1] == [Store(None, False)]
+    _, effects = after(Dismissed(), SceneRead(RUN, True), state=state)
+    assert effects == [Store(None, False)]
+    events = START, status(WorkerState.FINISHED), Shown(undoable=True)
+    _, effects = after(*events, state=RequestState(Kind.SELECTION))
+    assert effects == [PushUndo(), RemoveFiles(JOB), Redraw()]
 
 
 def test_loaded_file_continues():
@@ -292,9 +257,8 @@ def test_loaded_file_continues():
     loaded = RequestState(Kind.TRAINING, RUN, JOB)
     assert after(status(WorkerState.WORKING), state=loaded)[0].interval_s == CHECK_INTERVAL_S
     assert loads(after(status(WorkerState.FINISHED), state=loaded)[1]) == [AVATAR]
-    assert not loads(
-        after(status(WorkerState.FINISHED), state=replace(loaded, result_shown=True))[1]
-    )
+    shown = replace(loaded, result_shown=True)
+    assert not loads(after(status(WorkerState.FINISHED), state=shown)[1])
     assert TRAINING.interval_s is None
 
 
@@ -306,16 +270,6 @@ def test_moved_run_folder():
     assert loads(effects) == [moved / "avatar.npz"]
     assert ReadCurve(moved) in effects
     assert (state.subject, state.place) == (RUN, moved)
-
-
-def test_curve_is_read_when_it_grows():
-    """Catches a curve that is read at every check, or never again."""
-    first = StatusRead(JOB, WorkerSnapshot(WorkerState.WORKING), RunFiles(metrics=(1, 1)))
-    second = StatusRead(JOB, WorkerSnapshot(WorkerState.WORKING), RunFiles(metrics=(2, 2)))
-    state, effects = after(START, first)
-    assert ReadCurve(RUN) in effects
-    assert after(first, state=state)[1] == []
-    assert ReadCurve(RUN) in after(second, state=state)[1]
 
 
 def test_unexpected_error_stops_until_the_next_start_or_check():
@@ -355,15 +309,24 @@ def test_head_previews_and_avatar_appear_once_each():
     assert loads(effects) == [RUN / "run" / "avatar.npz"]
     assert StoreAvatar(RUN / "run" / "avatar.npz") in effects
     state, effects = after(Shown(), state=state)
-    assert (PushUndo() in effects, Store(RUN, True) in effects, state.interval_s) == (
-        True,
-        True,
-        None,
-    )
-    assert (
-        after(made(WorkerState.FINISHED, capture=1, preview=1, avatar=1), state=state)[0].loading
-        is None
-    )
+    assert {PushUndo(), Store(RUN, True)} <= set(effects)
+    assert state.interval_s is None
+    last = made(WorkerState.FINISHED, capture=1, preview=1, avatar=1)
+    assert after(last, state=state)[0].loading is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "run"),
+    [(Kind.TRAINING, "metrics", RUN), (Kind.AVATAR, "picture", RUN / "run")],
+)
+def test_the_curve_or_picture_is_read_when_it_grows(kind, file, run):
+    """Catches a curve, or a picture of the tracking, that is read at every check, or never
+    again."""
+    state, _ = after(START, made(WorkerState.WORKING), state=RequestState(kind))
+    for stamp in (1, 2):
+        state, effects = after(made(WorkerState.WORKING, **{file: stamp}), state=state)
+        assert ReadCurve(run) in effects
+    assert after(made(WorkerState.WORKING, **{file: 2}), state=state)[1] == []
 
 
 @pytest.mark.parametrize("end", [WorkerState.CANCELLED, WorkerState.FAILED])
@@ -372,12 +335,3 @@ def test_what_was_never_made_is_not_shown(end):
     from an old one."""
     state, effects = after(START, made(end, capture=1), state=RequestState(Kind.AVATAR))
     assert (state.loading, loads(effects), state.interval_s) == (None, [], None)
-
-
-def test_the_tracking_is_drawn_before_there_is_a_curve():
-    """Catches a picture of the tracking that the panel never reads again."""
-    state, _ = after(START, made(WorkerState.WORKING), state=RequestState(Kind.AVATAR))
-    for stamp in (1, 2):
-        state, effects = after(made(WorkerState.WORKING, picture=stamp), state=state)
-        assert ReadCurve(RUN / "run") in effects
-    assert after(made(WorkerState.WORKING, picture=2), state=state)[1] == []

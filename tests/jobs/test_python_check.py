@@ -27,25 +27,20 @@ def test_check_is_described():
     old = {**FOUND, "python": "3.9.1"}
     with pytest.raises(StgaError, match=r"p: is Python 3\.9\.1, training needs 3\.11 or newer"):
         describe_check("p", old)
-    bare = {
-        **FOUND,
-        "failures": {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"},
-    }
-    with pytest.raises(
-        StgaError, match=r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"
-    ):
+    failures = {"torch": "ModuleNotFoundError: No module", "PIL": "OSError: libjpeg.so"}
+    bare = {**FOUND, "failures": failures}
+    sentence = r"p: Python 3\.11\.7 lacks torch, pillow \(OSError: libjpeg\.so\); install"
+    with pytest.raises(StgaError, match=sentence):
         describe_check("p", bare)
 
 
 def test_bare_interpreter_is_checked(tmp_path):
     """Catches a check that itself needs a package: this interpreter has none."""
-    subprocess.run(
-        [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True
-    )
+    make = [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]
+    subprocess.run(make, check=True)
     python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
-    with pytest.raises(
-        StgaError, match=r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
-    ):
+    sentence = r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
+    with pytest.raises(StgaError, match=sentence):
         check(python)
 
 
@@ -80,9 +75,8 @@ def test_order_of_choices(monkeypatch):
     do."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
-    with pytest.raises(
-        StgaError, match=rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
-    ):
+    sentence = rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
+    with pytest.raises(StgaError, match=sentence):
         find_training_python()
     assert find_training_python("/preferred/python") == "/preferred/python"
     monkeypatch.setattr(training_python, "missing_packages", list)

@@ -12,8 +12,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.jobs.blender import RenderBlend, blender_command
-from stga_addon.jobs.folder import worker_arguments, write_request
-from stga_addon.jobs.perform import perform
+from stga_addon.jobs.perform import perform, worker_arguments, write_request
 from stga_addon.progress import Cancelled, Progress, ignore
 
 BLENDER = """
@@ -65,9 +64,8 @@ def test_only_missing_frames_are_rendered(shot: RenderBlend, tmp_path: Path) -> 
     shares: list[float] = []
     perform(shot, lambda progress: bool(shares.append(progress.share)), lambda line: None)
     assert pictures(shot.output) == WHOLE
-    assert calls(tmp_path) == [
-        [*span, "STGA_SPLATS", sys.executable] for span in (("8", "9"), ("11", "12"))
-    ]
+    same = ["STGA_SPLATS", sys.executable]
+    assert calls(tmp_path) == [["8", "9", *same], ["11", "12", *same]]
     assert shares == [0.2, 0.4, 0.6, 0.8, 1.0]
     perform(shot, ignore, lambda line: None)
     assert len(calls(tmp_path)) == 2
@@ -78,10 +76,8 @@ def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_
     program = tmp_path / "Blender Foundation" / "blender"
     program.parent.mkdir()
     program.touch()
-    for text, command in (
-        (str(program), [str(program)]),
-        ("xvfb-run -a blender", ["xvfb-run", "-a", "blender"]),
-    ):
+    words = ["xvfb-run", "-a", "blender"]
+    for text, command in ((str(program), [str(program)]), (" ".join(words), words)):
         monkeypatch.setenv("STGA_BLENDER", text)
         assert blender_command() == command
     monkeypatch.delenv("STGA_BLENDER")
@@ -92,16 +88,13 @@ def test_what_went_wrong_is_a_sentence(shot, tmp_path, monkeypatch):
     """Catches a film that counts as finished although frames are missing, and a Blender that is not
     there."""
     monkeypatch.setenv("FAILS", "10")
-    with pytest.raises(
-        StgaError,
-        match=r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory",
-    ):
+    sentence = r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
+    with pytest.raises(StgaError, match=sentence):
         perform(shot, ignore, lambda line: None)
     assert sorted(pictures(shot.output)) == ["000008.png", "000009.png"]
     monkeypatch.setenv("STGA_BLENDER", str(tmp_path / "nowhere"))
-    with pytest.raises(
-        StgaError, match=r"nowhere: Blender cannot be started .*; expected it on PATH"
-    ):
+    sentence = r"nowhere: Blender cannot be started .*; expected it on PATH"
+    with pytest.raises(StgaError, match=sentence):
         perform(shot, ignore, lambda line: None)
 
 
@@ -128,9 +121,8 @@ def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
     picture among the rest."""
     monkeypatch.setenv("PAUSE", "0.5")
     write_request(tmp_path / "job", shot)
-    worker = subprocess.Popen(
-        [sys.executable, "-m", *worker_arguments(tmp_path / "job", resume=True)]
-    )
+    arguments = worker_arguments(tmp_path / "job", resume=True)
+    worker = subprocess.Popen([sys.executable, "-m", *arguments])
     deadline = time.monotonic() + 60
     while not pictures(shot.output) and time.monotonic() < deadline:
         time.sleep(0.05)

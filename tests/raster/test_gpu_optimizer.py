@@ -10,15 +10,12 @@ from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import VIEW, split_rows
-from stga_addon.raster.gpu.optimizer import (
-    OptimizerTables,
-    optimize,
-    upload_step,
-)
-from stga_addon.training.optimize.adam import BETA1, BETA2, EPSILON
+from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
+from stga_addon.training.optimize.adam import BETA1, EPSILON
 
 pytestmark = pytest.mark.needs("adapter")
 
+BETA2 = 0.99
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate((*Parameters._fields, "sh_rest"))}
 COEFFICIENTS, STRAINS = 4, 2
 STRIDE = 11 + 3 * COEFFICIENTS + 3 * STRAINS
@@ -134,7 +131,7 @@ def test_a_step_at_any_age(device: Device, steps: int) -> None:
     state = random_state(64)
     state.wanted[:], state.steps[:] = True, steps
     got = on_device(device, state, ema_share=0.0)
-    n, beta1, beta2 = steps + 1.0, float(BETA1), float(BETA2)
+    n, beta1, beta2 = steps + 1.0, float(BETA1), BETA2
     first = beta1 * state.first.astype(float) + (1 - beta1) * state.gradients
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2
     correct = -1 / np.expm1(n * np.log(beta1)), 1 / np.sqrt(-np.expm1(n * np.log(beta2)))

@@ -3,15 +3,12 @@
 
 import numpy as np
 import pytest
-import torch
 
-from raster import gpu_device, reference
+from raster import gpu_device
 from raster.test_kernels import (
-    IMAGE_TOLERANCE,
     NAMES,
     SCENES,
     Scene,
-    assert_gradients_agree,
     random_cotangents,
 )
 from stga_addon.avatar.embedding import WORLD
@@ -90,21 +87,6 @@ class Raw:
         )
 
 
-def test_background_shows_through_and_pulls_on_the_splats() -> None:
-    """Catches a background left out of the image, of its gradient, or counted twice."""
-    scene, background = SCENES["plain"], np.float32([0.9, 0.2, 0.6])
-    raw = Raw(scene)
-    rendering = raw.forward(background=background)
-    gradients, _, _ = raw.gradients(rendering)
-    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
-    rgb, alpha, _ = reference.render(*tensors, scene.camera)
-    image = rgb + torch.from_numpy(background)[:, None, None] * (1 - alpha)
-    v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
-    expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
-    assert np.abs(raw.image(rendering) - image.detach().numpy()).max() < IMAGE_TOLERANCE
-    assert_gradients_agree(gradients, dict(zip(NAMES, (g.numpy() for g in expected), strict=True)))
-
-
 def test_the_same_bits_twice_and_from_used_buffers() -> None:
     """Catches sums in the order of chance, and results that depend on what an earlier image left in
     the buffers."""
@@ -120,24 +102,6 @@ def test_the_same_bits_twice_and_from_used_buffers() -> None:
             np.testing.assert_array_equal(
                 gradients[parameter], want, err_msg=f"{name}: {parameter}"
             )
-
-
-def test_what_does_not_fit_is_not_drawn_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches pairs that are dropped in silence, written past the buffers' end, or gradients of
-    half a rendering."""
-    scene = SCENES["plain"]
-    whole = Raw(scene)
-    expected = whole.image(whole.forward())
-    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
-    raw = Raw(scene)
-    rendering = raw.forward()
-    assert not raw.image(rendering).any()
-    gradients, written, _ = raw.gradients(rendering, fill=7.0)
-    assert not len(written)
-    assert all((gradient == 7).all() for gradient in gradients.values())
-    assert not raw.rasterizer.pairs_fit()
-    np.testing.assert_array_equal(raw.image(raw.forward()), expected)
-    assert raw.rasterizer.pairs_fit()
 
 
 def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:

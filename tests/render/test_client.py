@@ -83,21 +83,16 @@ def test_moving_scene_and_camera_together_changes_nothing():
     camera = replace(CAMERA, world_to_camera=np.linalg.inv(turn))
     splats = cloud()
     for size in (1.0, 2.0):
-        small = replace(
-            splats,
-            xyz=splats.xyz / np.float32(size),
-            log_scale=splats.log_scale - np.float32(np.log(size)),
-        )
+        log_scale = splats.log_scale - np.float32(np.log(size))
+        small = replace(splats, xyz=splats.xyz / np.float32(size), log_scale=log_scale)
         picture = compose([world(small, turn @ np.diag([size, size, size, 1]))], camera)
         np.testing.assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
 
 
 def test_depth_is_the_mean_of_what_a_pixel_shows():
     """Catches depth that is not divided by alpha."""
-    one = cloud(1)
-    splats = replace(
-        one, xyz=np.array([[0, 0, 3]], np.float32), log_scale=np.full((1, 3), -1, np.float32)
-    )
+    xyz, log_scale = np.array([[0, 0, 3]], np.float32), np.full((1, 3), -1, np.float32)
+    splats = replace(cloud(1), xyz=xyz, log_scale=log_scale)
     depth = compose([world(splats)], CAMERA, True).depth
     assert depth is not None
     np.testing.assert_allclose(depth[depth > 0], 3, rtol=1e-5)
@@ -112,10 +107,8 @@ def test_layers_survive_the_protocol():
             np.testing.assert_array_equal(getattr(back.splats, name), value)
         for name in ("origin", "rotation", "scale", "strain"):
             np.testing.assert_array_equal(getattr(back.frames, name), getattr(layer.frames, name))
-        assert (back.antialiased, back.to_world.tolist()) == (
-            layer.antialiased,
-            layer.to_world.tolist(),
-        )
+        assert back.antialiased == layer.antialiased
+        np.testing.assert_array_equal(back.to_world, layer.to_world)
 
 
 @pytest.mark.slow
@@ -141,22 +134,6 @@ def test_the_server_renders_the_same(monkeypatch):
     assert subprocess.Popen.poll(server) is not None
 
 
-@pytest.mark.slow
-def test_output_of_libraries_does_not_disturb_the_protocol(tmp_path, monkeypatch):
-    """Catches a server whose replies are mixed with what C code writes to descriptor 1 while
-    packages are imported."""
-    shim = "import os, sys\nos.write(1, b'noise' * 100)\nsys.path.remove({!r})\n"
-    shim += "del sys.modules[__name__]\nimport {}\n"
-    (tmp_path / "platformdirs.py").write_text(shim.format(str(tmp_path), "platformdirs"))
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
-    remote = RenderClient(lambda: sys.executable)
-    np.testing.assert_array_equal(
-        remote.compose([world(cloud())], CAMERA).rgb, compose([world(cloud())], CAMERA).rgb
-    )
-    remote.close()
-
-
 def test_what_is_no_message_is_refused():
     """Catches a length read from foreign output, for which the client would wait forever."""
     with pytest.raises(ValueError, match="begins with"):
@@ -170,9 +147,8 @@ def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
         raise StgaError("no training Python")
 
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba", "platformdirs"])
-    with pytest.raises(
-        StgaError, match=r"Rendering splats needs numba and platformdirs .*or another Python"
-    ):
+    expected = "Rendering splats needs numba and platformdirs .*or another Python"
+    with pytest.raises(StgaError, match=expected):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)

@@ -77,22 +77,22 @@ def lost(*_: object) -> ComposedImage:
     raise DeviceError("Card 9000 was lost", "try again")
 
 
-def test_the_cpu_takes_over_where_a_gpu_fails(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = "gpu:Card 9000", "why"
+    monkeypatch.setattr(compose_module, "choose_device", lambda wanted, task: chosen)
+
+
+def test_the_cpu_takes_over_where_a_gpu_fails(card, monkeypatch, caplog):
     """Catches a failed driver that ends an animation, is asked again for each image, or is not
     mentioned."""
     calls = []
-    monkeypatch.setattr(
-        compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why")
-    )
     monkeypatch.setattr(gpu, "compose", lambda *given: calls.append(given) or lost())
     composer = Composer()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            np.testing.assert_array_equal(
-                composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb
-            )
+            found = composer.compose(scene(), CAMERA).rgb
+            np.testing.assert_array_equal(found, compose(scene(), CAMERA).rgb)
     assert len(calls) == 1
     assert composer.failure == "Card 9000 was lost; the CPU renders instead"
     assert caplog.messages == [composer.failure]
@@ -102,11 +102,8 @@ def test_the_cpu_takes_over_where_a_gpu_fails(
     assert other.failure == "gpu:Card 9000: division by zero; the CPU renders instead"
 
 
-def test_a_gpu_by_name_does_not_fall_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_by_name_does_not_fall_back(card, monkeypatch):
     """Catches a CPU that renders where a GPU was asked for, unnoticed."""
-    monkeypatch.setattr(
-        compose_module, "choose_device", lambda wanted, task: ("gpu:Card 9000", "why")
-    )
     monkeypatch.setattr(gpu, "compose", lost)
     with pytest.raises(StgaError, match=r"^--device gpu: Card 9000 was lost; try again$"):
         Composer("gpu").compose(scene(), CAMERA)
@@ -129,18 +126,15 @@ def test_software_renders_by_name_only(adapter: str) -> None:
     if not gpu_device.device().is_software:
         pytest.skip("the first adapter is a GPU")
     composer = Composer()
-    np.testing.assert_array_equal(
-        composer.compose(scene(), CAMERA).rgb, compose(scene(), CAMERA).rgb
-    )
+    found = composer.compose(scene(), CAMERA).rgb
+    np.testing.assert_array_equal(found, compose(scene(), CAMERA).rgb)
     assert composer.device == "cpu"
     assert Composer("gpu").choose() == f"gpu:{adapter}"
 
 
 @pytest.mark.slow
 @pytest.mark.needs("adapter")
-def test_the_server_renders_on_the_wanted_device(
-    adapter: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_server_renders_on_the_wanted_device(adapter, monkeypatch):
     """Catches a server that renders on something else, or goes on with the device of before."""
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     device = [f"gpu:{adapter}"]
@@ -155,8 +149,7 @@ def test_the_server_renders_on_the_wanted_device(
     np.testing.assert_array_equal(remote.compose(layers, CAMERA, True).rgb, want.rgb)
     assert subprocess.Popen.poll(first) is not None
     device[0] = "gpu:Voodoo 2"
-    with pytest.raises(
-        StgaError, match=r"could not render the image \(--device gpu:Voodoo 2: no adapter"
-    ):
+    sentence = r"could not render the image \(--device gpu:Voodoo 2: no adapter"
+    with pytest.raises(StgaError, match=sentence):
         remote.compose(layers, CAMERA)
     remote.close()

@@ -6,8 +6,7 @@ import numpy as np
 from flame.small_head import small_head
 
 from stga_addon.render.video import video_writer
-from stga_addon.tracking.correspondence import picture_cameras
-from stga_addon.tracking.mesh_image import shaded_image
+from stga_addon.tracking.correspondence import picture_cameras, shaded_image
 
 
 def write_head_video(path: Path, frames: int, size: int = 256) -> None:

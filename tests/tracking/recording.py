@@ -28,16 +28,9 @@ def write_footage(folder, cameras, timesteps, picture):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(picture(camera, timestep)).save(folder / name)
             entry = {"file_path": name, "timestep_index": timestep, "camera_id": f"cam{number}"}
-            intrinsics = {
-                "fl_x": camera.fl_x, "fl_y": camera.fl_y, "cx": camera.cx,
-                "cy": camera.height - camera.cy,
-            }  # fmt: skip
-            pose = {
-                "transform_matrix": camera.camera_to_world_gl.tolist(),
-                "w": camera.width,
-                "h": camera.height,
-            }
-            frames.append({**entry, **intrinsics, **pose})
+            entry |= {name: getattr(camera, name) for name in ("fl_x", "fl_y", "cx")}
+            entry |= {"w": camera.width, "h": camera.height, "cy": camera.height - camera.cy}
+            frames.append({**entry, "transform_matrix": camera.camera_to_world_gl.tolist()})
     write_json(folder / "transforms.json", {"frames": frames})
     return folder
 
@@ -52,23 +45,15 @@ def record(
     """
     cameras, places = rig(), places_on(head, LANDMARKS)
     shape = np.zeros(head.model.n_identity)
-    meshes = [
-        flame_forward(head.model, shape, frame_at(head, timestep)) for timestep in range(timesteps)
-    ]
-    write_footage(
-        folder / "footage",
-        cameras,
-        timesteps,
-        lambda camera, timestep: picture(meshes[timestep], camera),
-    )
+    frames = [frame_at(head, timestep) for timestep in range(timesteps)]
+    meshes = [flame_forward(head.model, shape, frame) for frame in frames]
+    write_footage(folder / "footage", cameras, timesteps, lambda c, t: picture(meshes[t], c))
     write_flame(head.model, folder / "head.npz")
     write_places(folder / "points/head_model.npz", places, np.ones(LANDMARKS, bool))
     for number, camera in enumerate(cameras):
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
         confidence = np.ones(points.shape[:2])
         confidence[2] = 0
-        write_npz(
-            folder / f"points/cam{number}.npz",
-            {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence},
-        )
+        arrays = {"timesteps": np.arange(timesteps), "points": points, "confidence": confidence}
+        write_npz(folder / f"points/cam{number}.npz", arrays)
     return meshes

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.clocks import best_lag
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.sequences import FrameRange
+from stga_addon.tracking.footage.sequences import FrameRange, best_lag
 
 from .scenes import rig, write_colmap_text
 
@@ -19,9 +18,8 @@ def scene(seed, seconds=12.0):
     """Sound (N,) of speech-like bursts, and a gray level per 1/FPS second."""
     rng = np.random.default_rng(seed)
     loudness = np.repeat(rng.random(round(seconds * 12)) ** 4, SOUND_HZ // 12)
-    return loudness * rng.normal(0, 0.3, len(loudness)), np.round(
-        rng.uniform(30, 220, round(seconds * FPS))
-    )
+    sound = loudness * rng.normal(0, 0.3, len(loudness))
+    return sound, np.round(rng.uniform(30, 220, round(seconds * FPS)))
 
 
 def write_camera(path, sound, levels, start, seed, codec="pcm_s16le"):
@@ -54,17 +52,10 @@ def footage(folder, starts, silent=(), codec="pcm_s16le", suffix=".mkv", seeds=(
     names = "abc"[: len(starts)]
     for number, (name, start) in enumerate(zip(names, starts, strict=True)):
         sound, levels = scene(seeds[number])
-        write_camera(
-            folder / f"{name}{suffix}",
-            None if name in silent else sound,
-            levels,
-            start,
-            number,
-            codec,
-        )
-    write_colmap_text(
-        folder / "sparse/0", rig(len(starts), SIZE, SIZE), [f"{name}.png" for name in names]
-    )
+        heard = None if name in silent else sound
+        write_camera(folder / f"{name}{suffix}", heard, levels, start, number, codec)
+    labels = [f"{name}.png" for name in names]
+    write_colmap_text(folder / "sparse/0", rig(len(starts), SIZE, SIZE), labels)
     return folder
 
 
@@ -75,9 +66,8 @@ def footage(folder, starts, silent=(), codec="pcm_s16le", suffix=".mkv", seeds=(
 def test_clocks_that_differ(tmp_path, silent, sync, codec, suffix):
     """Catches an offset with the wrong sign, one that ignores where sound begins, and silence that
     stops it."""
-    found = open_footage(
-        footage(tmp_path, (20, 33, 9), silent, codec, suffix), frames=FrameRange(sync=sync)
-    )
+    folder = footage(tmp_path, (20, 33, 9), silent, codec, suffix)
+    found = open_footage(folder, frames=FrameRange(sync=sync))
     for camera, start in zip(found.cameras, (20, 33, 9), strict=True):
         assert camera.frames.numbers[found.timesteps[0]] + start == 33
     by = "motion" if silent else "sound"
@@ -89,9 +79,8 @@ def test_recordings_that_share_nothing(tmp_path):
     """Catches an offset that is made up."""
     footage(tmp_path, (20, 20), seeds=(5, 6))
     for sync in ("sound", "motion"):
-        with pytest.raises(
-            StgaError, match=rf"b.mkv: its {sync} does not say when camera a recorded the same"
-        ):
+        message = rf"b.mkv: its {sync} does not say when camera a recorded the same"
+        with pytest.raises(StgaError, match=message):
             open_footage(tmp_path, frames=FrameRange(sync=sync))
 
 

@@ -27,12 +27,9 @@ def reconstruction():
         found.add_camera_with_trivial_rig(camera)
         pose = np.r_[RANDOM.standard_normal(4), RANDOM.standard_normal(3)]
         rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
-        points = pycolmap.Point2DList(
-            [pycolmap.Point2D(RANDOM.uniform(0, 400, 2)) for _ in range(number % 3)]
-        )
-        image = pycolmap.Image(
-            name=f"cam {name}.jpg", image_id=number, camera_id=number, points2D=points
-        )
+        points = [pycolmap.Point2D(RANDOM.uniform(0, 400, 2)) for _ in range(number % 3)]
+        named = {"name": f"cam {name}.jpg", "image_id": number, "camera_id": number}
+        image = pycolmap.Image(**named, points2D=pycolmap.Point2DList(points))
         found.add_image_with_trivial_frame(image, rigid)
     return found
 
@@ -46,9 +43,8 @@ def test_projections_are_colmaps(tmp_path, kind):
     shots = read_colmap(tmp_path)
     assert [shot.label for shot in shots] == sorted(f"cam {name}.jpg" for name in LENSES)
     local = np.c_[RANDOM.uniform(-0.5, 0.5, (20, 2)), np.ones(20)] * RANDOM.uniform(1, 3, (20, 1))
-    for shot, image in zip(
-        shots, sorted(model.images.values(), key=lambda image: image.name), strict=True
-    ):
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    for shot, image in zip(shots, images, strict=True):
         pose = image.cam_from_world().matrix()
         world = (local - pose[:, 3]) @ pose[:, :3]
         expected = image.camera.img_from_cam(local)
@@ -70,9 +66,8 @@ def test_model_beside_the_images(tmp_path):
     assert [camera.name for camera in footage.cameras] == ["left", "middle", "right"]
     assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
     for camera, expected in zip(footage.cameras, rig(), strict=True):
-        np.testing.assert_allclose(
-            camera.camera.world_to_camera, expected.world_to_camera, atol=1e-9
-        )
+        found = camera.camera.world_to_camera
+        np.testing.assert_allclose(found, expected.world_to_camera, atol=1e-9)
 
 
 DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
@@ -109,11 +104,8 @@ def test_binary_files_cut_short(tmp_path, file):
     reconstruction().write_binary(str(tmp_path))
     data = (tmp_path / file).read_bytes()
     huge = data[:-8] + b"\xff" * 8  # the last number of points, where it is one
-    for cut in [
-        *(data[:length] for length in range(0, 60, 7)),
-        data[:-9],
-        *([huge] if file == "images.bin" else []),
-    ]:
+    cuts = [*(data[:length] for length in range(0, 60, 7)), data[:-9]]
+    for cut in (*cuts, huge) if file == "images.bin" else cuts:
         (tmp_path / file).write_bytes(cut)
         with pytest.raises(StgaError, match=re.escape(f"{tmp_path / file}: ")):
             read_colmap(tmp_path)

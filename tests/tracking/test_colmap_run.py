@@ -5,8 +5,8 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
-from stga_addon.tracking.footage.lens import Lens
 from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.shots import Lens
 
 WIDTH, HEIGHT, FOCAL = 480, 360, 420.0
 LENS = Lens(radial=(-0.22,))
@@ -19,10 +19,8 @@ def textures():
 
     random, walls = np.random.default_rng(1), []
     for _ in range(3):
-        layers = [
-            cv2.resize(random.normal(size=(n, n)), (TEXELS, TEXELS)) for n in (8, 32, 128, 512)
-        ]
-        total = sum(layers)
+        noise = [random.normal(size=(n, n)) for n in (8, 32, 128, 512)]
+        total = sum(cv2.resize(layer, (TEXELS, TEXELS)) for layer in noise)
         walls.append(((total - total.min()) / np.ptp(total) * 255).astype(np.float32))
     return walls
 
@@ -32,10 +30,8 @@ def rendered(camera, rays, walls):
     y) / depth."""
     import cv2
 
-    directions = (
-        np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
-        @ camera.world_to_camera[:3, :3]
-    )
+    directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    directions = directions @ camera.world_to_camera[:3, :3]
     with np.errstate(divide="ignore"):
         reach = (-1 - camera.position) / directions
     reach[reach <= 0] = np.inf
@@ -43,9 +39,8 @@ def rendered(camera, rays, walls):
     points = camera.position + directions * reach.min(axis=-1)[..., None]
     image = np.zeros(rays.shape[:2], np.float32)
     for wall, texture in enumerate(walls):
-        u, v = np.moveaxis((np.delete(points, wall, axis=-1) + 1.0) / 3 * TEXELS, -1, 0).astype(
-            np.float32
-        )
+        texels = (np.delete(points, wall, axis=-1) + 1.0) / 3 * TEXELS
+        u, v = np.moveaxis(texels, -1, 0).astype(np.float32)
         image = np.where(nearest == wall, cv2.remap(texture, u, v, cv2.INTER_LINEAR), image)
     return image
 
@@ -90,27 +85,22 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
         image = rendered(camera, rays, walls).round().astype(np.uint8)
         Image.fromarray(image).convert("RGB").save(tmp_path / f"images/{number}.png")
 
-    database = str(tmp_path / "database.db")
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-    pycolmap.extract_features(
-        database,
-        str(tmp_path / "images"),
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
+    database, images, sparse = (
+        str(tmp_path / name) for name in ("database.db", "images", "sparse")
     )
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    single = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(database, images, camera_mode=single, reader_options=reader)
     pycolmap.match_exhaustive(database)
     (tmp_path / "sparse").mkdir()
-    models = pycolmap.incremental_mapping(
-        database, str(tmp_path / "images"), str(tmp_path / "sparse")
-    )
+    models = pycolmap.incremental_mapping(database, images, sparse)
     assert len(models) == 1
 
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == [str(n) for n in range(len(truth))]
     positions = np.array([camera.camera.position for camera in footage.cameras])
-    scale, rotation, translation = similarity(
-        positions, np.array([camera.position for camera in truth])
-    )
+    true = np.array([camera.position for camera in truth])
+    scale, rotation, translation = similarity(positions, true)
     for found, expected in zip(footage.cameras, truth, strict=True):
         aligned = scale * rotation @ found.camera.position + translation
         np.testing.assert_allclose(aligned, expected.position, atol=0.02)

@@ -12,7 +12,7 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward, frame_of
-from stga_addon.jobs.folder import write_request
+from stga_addon.jobs.perform import write_request
 from stga_addon.jobs.track import SolveAgain
 from stga_addon.tracking.correct import SOLVED_FILE, correct_capture, corrected
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, REPORT_FILE
@@ -65,21 +65,16 @@ def test_frames_without_landmarks_follow_more():
 
 @pytest.mark.parametrize(
     "keys",
-    [{0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, {3: 0.1, 25: 0.2}, dict.fromkeys(range(30), 0.1)],
+    [{}, {0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, dict.fromkeys(range(30), 0.1)],
 )
 def test_keys_anywhere(keys):
     """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left
-    to solve."""
+    to solve, and a solution that drifts with every call."""
     given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
     found = correct(given)
     for timestep, values in given.items():
         np.testing.assert_allclose(found[timestep], values, atol=1e-12)
-    assert np.abs(found - TAKE).max() < 0.5
-
-
-def test_without_keys_nothing_changes():
-    """Catches a solution that drifts with every call."""
-    np.testing.assert_array_equal(correct({}), TAKE)
+    assert np.abs(found - TAKE).max() < (0.5 if keys else 1e-15)
 
 
 @pytest.fixture(scope="module")
@@ -100,21 +95,18 @@ def test_a_corrected_capture_shows_the_key(tracked):
     """Catches a key in other units or order than the files, and a report that is still that of
     before."""
     out, model, before = tracked
-    report = read_json(out / "tracking.json")
+    report = read_json(out / "tracking.json")["reprojection_px"]["cam0"]
     key = before[1].copy()
     key[HEAD.model.n_expression + 1] += 0.3  # turns the head
     correct_capture(out, model, {1: key}, span=1)
     capture = open_capture(out, model)
-    expected = flame_forward(
-        capture.flame.model, capture.flame.shape, frame_of(key), capture.flame.static_offset
-    )
+    flame = capture.flame
+    expected = flame_forward(flame.model, flame.shape, frame_of(key), flame.static_offset)
     np.testing.assert_allclose(capture.mesh(1), expected, atol=1e-6)
     np.testing.assert_allclose(parameters_in(out, model)[3:], before[3:], atol=1e-7)
-    after = read_json(out / "tracking.json")
-    assert after["reprojection_px"]["cam0"]["1"] > report["reprojection_px"]["cam0"]["1"] + 0.5
-    assert (
-        abs(after["reprojection_px"]["cam0"]["4"] - report["reprojection_px"]["cam0"]["4"]) < 0.02
-    )
+    after = read_json(out / "tracking.json")["reprojection_px"]["cam0"]
+    assert after["1"] > report["1"] + 0.5
+    assert abs(after["4"] - report["4"]) < 0.02
     correct_capture(out, model, {})
     np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
 
@@ -214,7 +206,6 @@ def test_a_key_that_is_none_is_named(tracked, tmp_path, capsys, key):
     out, model, before = tracked
     write_request(tmp_path / "job", SolveAgain(out, model, {1: key}))
     assert main(["perform", str(tmp_path / "job")]) == 2
-    assert re.search(
-        rf"key at timestep 1: expected \({SIZE},\) finite numbers", capsys.readouterr().err
-    )
+    message = rf"key at timestep 1: expected \({SIZE},\) finite numbers"
+    assert re.search(message, capsys.readouterr().err)
     np.testing.assert_array_equal(parameters_in(out, model), before)

@@ -8,9 +8,8 @@ from flame.small_head import small_head
 
 from stga_addon.flame.model import EYEBALL_WEIGHT
 from stga_addon.flame.teeth import flame_model
-from stga_addon.tracking.correspondence import calibrate, picture_cameras
+from stga_addon.tracking.correspondence import calibrate, picture_cameras, shaded_image
 from stga_addon.tracking.face_networks import IRIS_CENTERS, SCORE_NAMES, FaceNetworks
-from stga_addon.tracking.mesh_image import shaded_image
 
 cv2 = pytest.importorskip("cv2")
 

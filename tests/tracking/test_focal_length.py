@@ -4,17 +4,17 @@ import struct
 
 import numpy as np
 import pytest
-from flame.small_head import small_head, write_flame
+from flame.small_head import write_flame
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import camera_from_gl
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.tracking.fit import TimestepLandmarks
+from stga_addon.tracking.fit import RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import solved_focal
 from stga_addon.tracking.footage.open import open_footage, usual_focal
 from stga_addon.tracking.footage.video import VideoFrames
-from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
 from stga_addon.tracking.track import track
 
@@ -33,37 +33,28 @@ def write_photo(path, tags, size=(WIDTH, HEIGHT)):
     Image.new("RGB", size).save(path, exif=exif)
 
 
-@pytest.mark.parametrize(
-    ("tags", "expected"),
-    [
-        ({0xA405: 28}, EXPECTED),
-        ({0xA405: 28, 0xA002: 4000, 0xA003: 3000}, EXPECTED),  # made smaller
-        ({0xA405: 28, 0xA002: 3000, 0xA003: 4000}, EXPECTED),  # turned
-        ({0xA405: 28, 0xA002: 4000, 0xA003: 2000}, None),  # cropped
-        # 6.4 mm wide at 4000 pixels: f = 4.8 mm is 3000 pixels there.
-        (
-            {0x920A: 4.8, 0xA20E: 4000 / 6.4 * 25.4, 0xA210: 2, 0xA002: 4000, 0xA003: 3000},
-            3000 * WIDTH / 4000,
-        ),
-        (
-            {0x920A: 4.8, 0xA20E: 4000 / 6.4 * 10, 0xA210: 3, 0xA002: 4000, 0xA003: 3000},
-            3000 * WIDTH / 4000,
-        ),
-        ({0x920A: 4.8}, None),
-        ({0xA405: 0}, None),
-        ({}, None),
-    ],
-)
+# 6.4 mm wide at 4000 pixels: f = 4.8 mm is 3000 pixels there.
+SENSOR = {0x920A: 4.8, 0xA002: 4000, 0xA003: 3000}
+
+
+@pytest.mark.parametrize(("tags", "expected"), [
+    ({0xA405: 28}, EXPECTED),
+    ({0xA405: 28, 0xA002: 4000, 0xA003: 3000}, EXPECTED),  # made smaller
+    ({0xA405: 28, 0xA002: 3000, 0xA003: 4000}, EXPECTED),  # turned
+    ({0xA405: 28, 0xA002: 4000, 0xA003: 2000}, None),  # cropped
+    ({**SENSOR, 0xA20E: 4000 / 6.4 * 25.4, 0xA210: 2}, 3000 * WIDTH / 4000),
+    ({**SENSOR, 0xA20E: 4000 / 6.4 * 10, 0xA210: 3}, 3000 * WIDTH / 4000),
+    ({0x920A: 4.8}, None),
+    ({0xA405: 0}, None),
+    ({}, None),
+])  # fmt: skip
 def test_focal_length_of_photos(tmp_path, tags, expected):
     """Catches a photo's lens that is not read, is related to the wrong side, or survives a crop."""
     write_photo(tmp_path / "a.jpg", tags)
     footage = open_footage(tmp_path)
     camera = footage.cameras[0].camera
-    assert (
-        camera.fl_x
-        == camera.fl_y
-        == pytest.approx(expected or usual_focal(WIDTH, HEIGHT), rel=2e-3)
-    )
+    focal = pytest.approx(expected or usual_focal(WIDTH, HEIGHT), rel=2e-3)
+    assert camera.fl_x == camera.fl_y == focal
     assert footage.focal == ("file" if expected else "usual")
     assert open_footage(tmp_path, focal=50.0).cameras[0].camera.fl_x == 50
 
@@ -78,11 +69,11 @@ def with_metadata(path, value, kind, where, versioned):
     hdlr = box(b"hdlr", bytes(8) + b"mdta" + bytes(13))
     names = [b"com.apple.quicktime.camera.lens_model", QUICKTIME_KEY]
     listed = b"".join(box(b"mdta", name) for name in names)
+    data = (1, 1, b"\0\0\0\0"), (2, kind, bytes(4) + value)
     items = [
-        box(struct.pack(">I", n), box(b"data", struct.pack(">II", *own)))
-        for n, own in ((1, (1, 0)),)
+        box(struct.pack(">I", number), box(b"data", struct.pack(">I", own) + content))
+        for number, own, content in data
     ]
-    items.append(box(struct.pack(">I", 2), box(b"data", struct.pack(">II", kind, 0) + value)))
     keys = box(b"keys", struct.pack(">II", 0, len(names)) + listed)
     meta = box(b"meta", bytes(4 * versioned) + hdlr + keys + box(b"ilst", b"".join(items)))
     data = bytearray(path.read_bytes())
@@ -121,18 +112,16 @@ def test_focal_length_of_videos(tmp_path, name, value, kind, where):
 def test_damaged_metadata(tmp_path):
     """Catches a traceback, or an endless loop, for tags that are cut off or no numbers."""
     pytest.importorskip("av")
-    for number, (value, kind) in enumerate(
-        [(b"", 1), (b"..", 1), (b"\0", 23), (b"\xff\xff\xff\xff", 23), (b"-3", 1)]
-    ):
+    values = [(b"", 1), (b"..", 1), (b"\0", 23), (b"\xff\xff\xff\xff", 23), (b"-3", 1)]
+    for number, (value, kind) in enumerate(values):
         path = tmp_path / f"{number}/a.mov"
         write_video(path, [60, 90, 120], size=(WIDTH, HEIGHT))
         with_metadata(path, value, kind, "trak", versioned=False)
         assert open_footage(path).focal == "usual"
     write_image(tmp_path / "photo/a.jpg")
     whole = (tmp_path / "photo/a.jpg").read_bytes()
-    (tmp_path / "photo/a.jpg").write_bytes(
-        whole[:2] + b"\xff\xe1\x00\x10Exif\0\0MM\0*\0\0\0\x08" + whole[2:]
-    )
+    exif = b"\xff\xe1\x00\x10Exif\0\0MM\0*\0\0\0\x08"
+    (tmp_path / "photo/a.jpg").write_bytes(whole[:2] + exif + whole[2:])
     assert open_footage(tmp_path / "photo").focal == "usual"
 
 
@@ -152,13 +141,10 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
         angle, expression = np.radians(turn_deg) * share, np.zeros(head.model.n_expression)
         expression[timestep % 3] = 0.5
-        zero, pose = np.zeros(3), np.array([0.1 * share**2, angle, 0.0])
-        frame = FlameFrame(
-            expression, pose, zero, zero, np.array([0.02 * share, 0.0, -0.6]), np.zeros(6)
-        )
-        turn = np.array(
-            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        )
+        zero, moved = np.zeros(3), np.array([0.02 * share, 0.0, -0.6])
+        pose = np.array([0.1 * share**2, angle, 0.0])
+        frame = FlameFrame(expression, pose, zero, zero, moved, np.zeros(6))
+        turn = Rotation.from_rotvec([0, angle, 0]).as_matrix()
         points = places.on(flame_forward(head.model, shape, frame), head.model.faces) + own @ turn.T
         pixels = camera.project(points)[0] + rng.normal(0, width / 1080, (300, 2))
         take[timestep] = TimestepLandmarks((guessed,), pixels[None], np.ones((1, 300)))
@@ -166,31 +152,29 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.6])
-def test_focal_length_of_a_head_that_turns(factor):
+def test_focal_length_of_a_head_that_turns(head, factor):
     """Catches a head that is taken for one at a phone's distance: its depth would be that much too
     large or small."""
-    head = HeadModel(small_head(0), "flame")
     truth = factor * usual_focal(1080, 1920)
     places, take = turning(head, truth, 30)
-    found = solved_focal(head, places, np.ones(300, bool), take)
+    found = solved_focal(head, RecordedTake(places, np.ones(300, bool), take))
     assert found == pytest.approx(truth, rel=0.1)
 
 
-def test_a_head_that_does_not_turn_tells_no_focal_length():
+def test_a_head_that_does_not_turn_tells_no_focal_length(head):
     """Catches the shape of a face taken for perspective, which is off by a factor of two on people
     who sit still."""
-    head = HeadModel(small_head(0), "flame")
     places, take = turning(head, 1.6 * usual_focal(1080, 1920), 7)
-    assert solved_focal(head, places, np.ones(300, bool), take) is None
+    assert solved_focal(head, RecordedTake(places, np.ones(300, bool), take)) is None
 
 
-def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, monkeypatch):
+def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, monkeypatch):
     """Catches a video that is decoded for each stage, backwards or by seeking, and a solved focal
     length that the capture does not have."""
     pytest.importorskip("av")
     # no helping processes, whose decoders would not be seen
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    size, count, head = (108, 192), 8, HeadModel(small_head(0), "flame")
+    size, count = (108, 192), 8
     places, take = turning(head, 1.6 * usual_focal(*size), 30, size, count)
     write_video(tmp_path / "phone.mp4", range(60, 60 + 10 * count, 10), size=size, gop=count)
     write_flame(head.model, tmp_path / "head.npz")
@@ -198,21 +182,24 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, monkeypat
     points = np.concatenate([take[t].points for t in range(count)])
     write_npz(tmp_path / "points/phone.npz", {"timesteps": np.arange(count), "points": points})
     decoded, decode = [], VideoFrames._frame
-    monkeypatch.setattr(
-        VideoFrames, "_frame", lambda self, number: decoded.append(number) or decode(self, number)
+
+    def decode_and_note(self, number):
+        decoded.append(number)
+        return decode(self, number)
+
+    monkeypatch.setattr(VideoFrames, "_frame", decode_and_note)
+    footage, model, out = (
+        open_footage(tmp_path / "phone.mp4"),
+        tmp_path / "head.npz",
+        tmp_path / "out",
     )
-    footage = open_footage(tmp_path / "phone.mp4")
-    found = track(
-        footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points", mattes=False
-    )
+    found = track(footage, model, out, tmp_path / "points", mattes=False)
     assert decoded == list(range(count))
     assert found.focal == "solved"
     assert found.focal_px == pytest.approx(1.6 * usual_focal(*size), rel=0.1)
     report = read_json(tmp_path / "out/tracking.json")
-    assert (report["focal_length_px"], report["focal_length_from"]) == (
-        round(found.focal_px, 1),
-        "solved",
-    )
+    assert report["focal_length_px"] == round(found.focal_px, 1)
+    assert report["focal_length_from"] == "solved"
     frame = read_json(tmp_path / "out/transforms_train.json")["frames"][5]
     assert frame["fl_x"] == pytest.approx(found.focal_px)
     written = np.asarray(Image.open(tmp_path / "out" / frame["file_path"]))

@@ -22,13 +22,8 @@ def glb(document, data):
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
-    return (
-        head
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(data), b"BIN\0")
-        + data
-    )
+    chunks = (b"JSON", text), (b"BIN\0", data)
+    return head + b"".join(struct.pack("<I4s", len(own), kind) + own for kind, own in chunks)
 
 
 def simple(**changes):
@@ -51,19 +46,16 @@ def blender_head(mesh, faces, names, shapes):
     """A mesh object with shape keys, in Blender's axes, of a model with y up."""
     bpy = pytest.importorskip("bpy", reason="bpy is not installed")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    turned = [
-        array[:, [0, 2, 1]] * [1, -1, 1]
-        for array in (mesh, *(mesh + s for s in np.moveaxis(shapes, 2, 0)))
-    ]
+    every = mesh, *(mesh + shape for shape in np.moveaxis(shapes, 2, 0))
+    turned = [array[:, [0, 2, 1]] * [1, -1, 1] for array in every]
     data = bpy.data.meshes.new("Head")
     data.from_pydata(turned[0].tolist(), [], faces.tolist())
     head = bpy.data.objects.new("Head", data)
     bpy.context.scene.collection.objects.link(head)
     bpy.context.view_layer.objects.active = head
     for name, points in zip(("Basis", *names), turned, strict=True):
-        head.shape_key_add(name=name, from_mix=False).data.foreach_set(
-            "co", points.astype(np.float32).ravel()
-        )
+        key = head.shape_key_add(name=name, from_mix=False)
+        key.data.foreach_set("co", points.astype(np.float32).ravel())
     return head
 
 
@@ -79,9 +71,8 @@ def assert_same_surface(found, mean, faces, shapes, tolerance=2e-6):
 
     # (F, 3, 1 + K) at the centers
     expected = np.concatenate([mean[..., None], shapes], axis=2)[faces].mean(1)
-    there = np.concatenate([found.v_template[..., None], found.shapedirs], axis=2)[
-        found.faces
-    ].mean(1)
+    there = np.concatenate([found.v_template[..., None], found.shapedirs], axis=2)
+    there = there[found.faces].mean(1)
     distance, row = cKDTree(there[..., 0]).query(expected[..., 0])
     assert len(there) == len(expected) == len(set(row.tolist()))
     assert distance.max() < 2 * tolerance
@@ -114,9 +105,8 @@ def test_a_glb_agrees_with_trimesh(tmp_path):
     scene = trimesh.load(tmp_path / "head.glb", process=False)
     theirs = scene.to_geometry().vertices
     found = read_head_model(tmp_path / "head.glb").model.v_template
-    np.testing.assert_allclose(
-        [found.min(0), found.max(0)], [theirs.min(0), theirs.max(0)], atol=1e-6
-    )
+    for one, other in ((found.min(0), theirs.min(0)), (found.max(0), theirs.max(0))):
+        np.testing.assert_allclose(one, other, atol=1e-6)
 
 
 @pytest.mark.slow

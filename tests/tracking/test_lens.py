@@ -7,42 +7,31 @@ import pytest
 
 from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.lens import Lens, undistortion
+from stga_addon.tracking.footage.shots import Lens, undistortion
 
-POINTS = np.stack(
-    np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7)), axis=-1
-).reshape(-1, 2)
+POINTS = np.dstack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))).reshape(-1, 2)
 BROWN = Lens(radial=(-0.2, 0.07, 0.01), tangential=(0.003, -0.002))
 CAMERA = look_at((0, 0, 1), (0, 0, 0), 320, 240, 300.0)
 
 
-def test_perspective_lens_is_opencvs():
-    """Catches swapped tangential coefficients, and a wrong power of a radial, rational or prism
-    term."""
+@pytest.mark.parametrize(("lens", "order"), [
+    (
+        Lens(
+            radial=(-0.2, 0.07, 0.01), rational=(0.03, -0.02, 0.01), tangential=(0.003, -0.002),
+            prism=(0.01, 0.002, -0.004, 0.003),
+        ),
+        [-0.2, 0.07, 0.003, -0.002, 0.01, 0.03, -0.02, 0.01, 0.01, 0.002, -0.004, 0.003],
+    ),
+    (Lens("fisheye", radial=(0.05, -0.02, 0.01, 0.004)), [0.05, -0.02, 0.01, 0.004]),
+])  # fmt: skip
+def test_lenses_are_opencvs(lens, order):
+    """Catches swapped tangential coefficients, a wrong power of a radial, rational or prism term,
+    and a fisheye polynomial in the wrong variable."""
     cv2 = pytest.importorskip("cv2")
-    lens = Lens(
-        radial=(-0.2, 0.07, 0.01),
-        rational=(0.03, -0.02, 0.01),
-        tangential=(0.003, -0.002),
-        prism=(0.01, 0.002, -0.004, 0.003),
-    )
-    coefficients = np.array(
-        [-0.2, 0.07, 0.003, -0.002, 0.01, 0.03, -0.02, 0.01, 0.01, 0.002, -0.004, 0.003]
-    )
-    points = np.c_[POINTS, np.ones(len(POINTS))]
-    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), coefficients)[0][:, 0]
-    np.testing.assert_allclose(lens.distort(POINTS), expected, atol=1e-12)
-
-
-def test_fisheye_is_opencvs():
-    """Catches a fisheye polynomial in the wrong variable."""
-    cv2 = pytest.importorskip("cv2")
-    lens = Lens("fisheye", radial=(0.05, -0.02, 0.01, 0.004))
+    project = cv2.fisheye.projectPoints if lens.projection == "fisheye" else cv2.projectPoints
     points = np.c_[POINTS, np.ones(len(POINTS))][:, None]
-    expected = cv2.fisheye.projectPoints(
-        points, np.zeros(3), np.zeros(3), np.eye(3), np.array(lens.radial)
-    )[0][:, 0]
-    np.testing.assert_allclose(lens.distort(POINTS), expected, atol=1e-12)
+    expected = project(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(order))[0]
+    np.testing.assert_allclose(lens.distort(POINTS), expected[:, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -71,21 +60,16 @@ def test_every_undistorted_pixel_was_recorded(lens):
     pytest.importorskip("cv2")
     camera = undistortion(CAMERA, lens, "camera").camera
     y, x = np.mgrid[:241, :321]
-    recorded = lens.distort((np.stack([x, y], axis=-1) - [160, 120]) / camera.fl_x) * 300 + [
-        160,
-        120,
-    ]
-    margin = np.min(
-        [recorded[..., 0], recorded[..., 1], 320 - recorded[..., 0], 240 - recorded[..., 1]]
-    )
+    rays = (np.stack([x, y], axis=-1) - [160, 120]) / camera.fl_x
+    recorded = lens.distort(rays) * 300 + [160, 120]
+    margin = np.min([recorded, [320, 240] - recorded])
     assert -0.01 < margin < 0.05  # the border is checked at 33 points a side
 
 
 def test_without_opencv_the_message_names_it(monkeypatch):
     """Catches a traceback where the optional package is missing."""
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(
-        StgaError, match=r"^cam 3: its lens is distorted; undistorting needs opencv-python-headless"
-    ):
+    message = r"^cam 3: its lens is distorted; undistorting needs opencv-python-headless"
+    with pytest.raises(StgaError, match=message):
         undistortion(CAMERA, BROWN, "cam 3")
     assert undistortion(CAMERA, Lens(), "cam 3") is None

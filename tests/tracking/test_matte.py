@@ -8,7 +8,7 @@ from stga_addon.capture.images import read_image, read_mask
 from stga_addon.capture.mesh_geometry import silhouette
 from stga_addon.capture.open import open_capture
 from stga_addon.tracking.face_networks import PersonNetwork
-from stga_addon.tracking.mattes import find_matte, probability_by_plate
+from stga_addon.tracking.mattes import by_plate, find_matte
 
 pytest.importorskip("cv2")
 
@@ -69,13 +69,10 @@ def test_clean_plate():
     """Catches a plate that is not used: the matte is found without any network."""
     coverage, head, colors = person()
     wall = room().round().astype(np.uint8)
-    noisy = np.clip(
-        filmed(coverage, colors, wall) + np.random.default_rng(2).normal(0, 2, wall.shape), 0, 255
-    )
-    image = noisy.round().astype(np.uint8)
-    assert (
-        overlap(find_matte(image, probability_by_plate(image, wall), head) / 255, coverage) > 0.985
-    )
+    noise = np.random.default_rng(2).normal(0, 2, wall.shape)
+    image = np.clip(filmed(coverage, colors, wall) + noise, 0, 255).round().astype(np.uint8)
+    found = find_matte(image, by_plate(image, wall), head)
+    assert overlap(found / 255, coverage) > 0.985
 
 
 def test_somebody_else_in_the_room():
@@ -94,9 +91,8 @@ def test_somebody_else_in_the_room():
 def test_a_network_that_sees_nobody_or_everybody(likely):
     """Catches an error of GrabCut without one of its two sides; the tracked head stays."""
     coverage, head, colors = person()
-    matte = find_matte(
-        filmed(coverage, colors, room()), np.full((HEIGHT, WIDTH), likely, np.float32), head
-    )
+    probability = np.full((HEIGHT, WIDTH), likely, np.float32)
+    matte = find_matte(filmed(coverage, colors, room()), probability, head)
     assert matte[70:120, 80:120].min() == 255
 
 
@@ -109,17 +105,11 @@ def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
     for number, view in enumerate(capture.views["train"][2:80:13]):
         image, mask = with_a_body(read_image(view), read_mask(view))
         alpha = mask[..., None] / 255
-        filmed_head = (
-            np.clip(image + (room(*mask.shape, seed=number) - 255) * (1 - alpha), 0, 255)
-            .round()
-            .astype(np.uint8)
-        )
+        behind = (room(*mask.shape, seed=number) - 255) * (1 - alpha)
+        shown = np.clip(image + behind, 0, 255).round().astype(np.uint8)
         head = silhouette(np.asarray(capture.mesh(view.timestep)), capture.faces, view.camera)
-        found.append(
-            overlap(
-                find_matte(filmed_head, network.probability(filmed_head), head) / 255, mask / 255
-            )
-        )
+        matte = find_matte(shown, network.probability(shown), head)
+        found.append(overlap(matte / 255, mask / 255))
     assert np.mean(found) > 0.97, found
 
 

@@ -54,17 +54,22 @@ def take(folder, frames=3):
     return open_footage(folder / "footage", focal=50.0)
 
 
-def silent(stage, done, total):
-    pass
+def made(footage, folder, source=None):
+    """The footage with mattes, and warnings."""
+    return with_mattes(footage, head, folder / "out", source or {}, Helpers(1), lambda *_: None)
+
+
+def brightest(footage):
+    """Of the first camera's masks, by timestep."""
+    camera = footage.cameras[0]
+    return [int(camera.mask(timestep).max()) for timestep in camera.timesteps]
 
 
 def test_made_once_and_kept(tmp_path, halves):
     """Catches mattes that an interrupted tracking makes again, and those of another head that are
     kept."""
     footage = take(tmp_path)
-    found, warnings = with_mattes(
-        footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent
-    )
+    found, warnings = made(footage, tmp_path, {"head": "a"})
     assert (halves.asked, warnings) == (3, ())
     files = sorted(path.name for path in (tmp_path / "out/fg_masks").iterdir())
     assert files == ["00000_00.png", "00001_00.png", "00002_00.png"]
@@ -72,47 +77,32 @@ def test_made_once_and_kept(tmp_path, halves):
     assert mask[:, : WIDTH // 2 - 2].min() == 255
     assert mask[:, WIDTH // 2 + 2 :].max() == 0
     (tmp_path / "out/fg_masks/00001_00.png").unlink()
-    with_mattes(footage, head, tmp_path / "out", {"head": "a"}, Helpers(1), silent)
+    made(footage, tmp_path, {"head": "a"})
     assert halves.asked == 4
-    with_mattes(footage, head, tmp_path / "out", {"head": "b"}, Helpers(1), silent)
+    made(footage, tmp_path, {"head": "b"})
     assert halves.asked == 7
 
 
 def test_masks_of_the_footage_stay(tmp_path, halves):
-    """Catches a user's masks that are replaced, and a network that is loaded for nothing."""
-    for number in range(3):
-        write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
-    footage = take(tmp_path)
-    found, _ = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
-    assert halves.asked == 0
-    assert not (tmp_path / "out/fg_masks").exists()
-    assert found.cameras[0].mask(0).max() == 90
-
-
-def test_frames_after_the_first_that_lack_a_mask(tmp_path, halves):
-    """Catches a camera of which only the first frame is asked for its mask, so that the others get
-    no matte."""
+    """Catches a user's masks that are replaced, a camera of which only the first frame is asked for
+    its mask, so that the others get no matte, and made mattes, which are of the undistorted frame,
+    that are resampled by the lens once more."""
     for number in (0, 2):
         write_image(tmp_path / f"footage/masks/left/{number:04d}.png", 90)
-    footage = take(tmp_path, 4)
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
-    assert [int(found.cameras[0].mask(timestep).max()) for timestep in range(4)] == [
-        90,
-        255,
-        90,
-        255,
-    ]
+    found, warnings = made(take(tmp_path, 4), tmp_path)
+    assert brightest(found) == [90, 255, 90, 255]
     assert (halves.asked, warnings) == (2, ())
+    camera = replace(found.cameras[0], undistortion=lambda mask: pytest.fail("resampled"))
+    assert camera.mask(1) is not None
 
 
 def test_clean_plate_of_a_camera(tmp_path, halves):
     """Catches a plate that is taken for a camera, or not found; no network is asked."""
-
     (tmp_path / "footage/plates").mkdir(parents=True)
     Image.new("RGB", (WIDTH, HEIGHT), (220, 220, 220)).save(tmp_path / "footage/plates/left.png")
     footage = take(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["left"]
-    found, warnings = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
+    found, warnings = made(footage, tmp_path)
     assert (halves.asked, warnings) == (0, ())
     assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
     assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
@@ -122,35 +112,25 @@ def test_a_plate_of_another_size(tmp_path):
     """Catches a plate of another size that ends in OpenCV's error."""
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
     with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
-        with_mattes(take(tmp_path), head, tmp_path / "out", {}, Helpers(1), silent)
+        made(take(tmp_path), tmp_path)
 
 
-def test_a_folder_of_mattes(tmp_path):
-    """Catches mattes of other frames, and a frame without one that is not said."""
-    take(tmp_path)
-    for number in range(3):
-        write_image(tmp_path / f"mattes/left/{number:04d}.png", 10 * number)
-    footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
-    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(3)] == [0, 10, 20]
-    (tmp_path / "mattes/left/0001.png").unlink()
-    with pytest.raises(StgaError, match=r"has no matte of .*0001\.png; expected left/0001\.png"):
-        open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
-
-
-def test_mattes_of_a_turned_photo(tmp_path):
-    """Catches photos that are turned by EXIF or converted, whose stored pixels are not the frame's,
-    without a matte."""
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_folder_of_mattes(tmp_path, suffix):
+    """Catches mattes of other frames, photos without one that are turned by EXIF, whose stored
+    pixels are not the frame's, and a frame without a matte that is not said."""
     exif = Image.Exif()
     exif[274] = 3  # upside down
     for number in range(3):
-        path = tmp_path / f"footage/left/{number:04d}.jpg"
+        path = tmp_path / f"footage/left/{number:04d}.{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (WIDTH, HEIGHT), (90, 80, 70)).save(path, exif=exif)
+        Image.new("RGB", (WIDTH, HEIGHT)).save(path, exif=exif if suffix == "jpg" else None)
         write_image(tmp_path / f"mattes/left/{number:04d}.png", 10 * number)
     footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
-    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(3)] == [0, 10, 20]
+    assert brightest(footage) == [0, 10, 20]
     (tmp_path / "mattes/left/0001.png").unlink()
-    with pytest.raises(StgaError, match=r"has no matte of .*0001\.jpg; expected left/0001\.png"):
+    message = rf"has no matte of .*0001\.{suffix}; expected left/0001\.png"
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
 
 
@@ -161,32 +141,13 @@ def test_mattes_of_a_video(tmp_path):
     for number in range(4):
         write_image(tmp_path / f"mattes/left/{number:05d}.png", 10 * number)
     footage = open_footage(tmp_path / "footage", focal=50.0, mattes=tmp_path / "mattes")
-    assert [int(footage.cameras[0].mask(timestep).max()) for timestep in range(4)] == [
-        0,
-        10,
-        20,
-        30,
-    ]
+    assert brightest(footage) == [0, 10, 20, 30]
 
 
 def test_a_folder_that_is_none(tmp_path, capsys):
     """Catches a traceback for a folder that does not exist."""
     take(tmp_path)
-    more = [
-        "--model", str(tmp_path / "none.npz"), "--out", str(tmp_path / "out"), "--mattes",
-        str(tmp_path / "nowhere"),
-    ]  # fmt: skip
+    words = {"--model": "none.npz", "--out": "out", "--mattes": "nowhere"}
+    more = [word for name, file in words.items() for word in (name, str(tmp_path / file))]
     assert main(["track", str(tmp_path / "footage"), *more]) == 2
     assert "nowhere: is not a folder; expected one of mattes" in capsys.readouterr().err
-
-
-def test_undistorted_mattes_are_not_undistorted_again(tmp_path, halves):
-    """Catches made mattes, which are of the undistorted frame, that are resampled by the lens once
-    more."""
-    footage = take(tmp_path, 1)
-
-    def refuse(mask):
-        raise AssertionError("resampled")
-
-    found, _ = with_mattes(footage, head, tmp_path / "out", {}, Helpers(1), silent)
-    assert replace(found.cameras[0], undistortion=refuse).mask(0) is not None

@@ -77,13 +77,9 @@ def projected(points, angle_of=None):
         p1, p2 = values["p1"], values["p2"]
         u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
         v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
-        width, height = WIDTH / 2 + values["cx"], HEIGHT / 2 + values["cy"]
-        found.append(
-            (
-                width + u * values["f"] + u * values["b1"] + v * values["b2"],
-                height + v * values["f"],
-            )
-        )
+        center = WIDTH / 2 + values["cx"], HEIGHT / 2 + values["cy"]
+        across = u * values["f"] + u * values["b1"] + v * values["b2"]
+        found.append((center[0] + across, center[1] + v * values["f"]))
     return np.array(found)
 
 
@@ -100,10 +96,8 @@ def test_projections_are_metashapes(tmp_path, kind, angle_of):
     for shot, expected in zip(shots, rig(), strict=True):
         camera = shot.camera
         np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
-        found = shot.lens.distort(local[:, :2] / local[:, 2:]) * [camera.fl_x, camera.fl_y] + [
-            camera.cx,
-            camera.cy,
-        ]
+        distorted = shot.lens.distort(local[:, :2] / local[:, 2:])
+        found = distorted * [camera.fl_x, camera.fl_y] + [camera.cx, camera.cy]
         np.testing.assert_allclose(found, projected(local, angle_of), atol=1e-9)
 
 
@@ -130,11 +124,9 @@ def test_mirrored_axes(tmp_path):
     write_image(tmp_path / "a.png")
     text = (tmp_path / "cameras.xml").read_text(encoding="utf-8")
     matrix = np.linalg.inv(rig(1)[0].world_to_camera) * [[-1], [1], [1], [1]]
-    text = re.sub(
-        "<transform>[^<]{40,}<", f"<transform>{' '.join(map(str, matrix.ravel()))}<", text
-    )
+    mirrored = f"<transform>{' '.join(map(str, matrix.ravel()))}<"
+    text = re.sub("<transform>[^<]{40,}<", mirrored, text)
     (tmp_path / "cameras.xml").write_text(text, encoding="utf-8")
-    with pytest.raises(
-        StgaError, match=r"camera 'a': its axes are mirrored; expected a right-handed rotation"
-    ):
+    message = r"camera 'a': its axes are mirrored; expected a right-handed rotation"
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)

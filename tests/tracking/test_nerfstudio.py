@@ -14,14 +14,8 @@ from .scenes import HEIGHT, rig, write_image
 def entry(camera, path, **values):
     intrinsics = {key: getattr(camera, key) for key in ("fl_x", "fl_y", "cx", "cy")}
     pose = {"transform_matrix": camera.camera_to_world_gl.tolist()}
-    return {
-        "file_path": path,
-        "w": camera.width,
-        "h": camera.height,
-        **intrinsics,
-        **pose,
-        **values,
-    }
+    size = {"w": camera.width, "h": camera.height}
+    return {"file_path": path, **size, **intrinsics, **pose, **values}
 
 
 def write_transforms(folder, frames, name="transforms.json", **top):
@@ -33,18 +27,11 @@ def write_transforms(folder, frames, name="transforms.json", **top):
 def test_a_capture_is_footage(tmp_path):
     """Catches frames that belong to another camera or timestep than the file says, and a flipped
     principal point."""
-    frames = [
-        entry(
-            camera,
-            f"images/{t:05d}_{c:02d}.png",
-            timestep_index=t,
-            camera_index=c,
-            camera_id=f"cam{c}",
-            cy=12.0,
-        )
-        for t in (0, 3)
-        for c, camera in enumerate(rig(2))
-    ]
+    frames = []
+    for t in (0, 3):
+        for c, camera in enumerate(rig(2)):
+            named = {"timestep_index": t, "camera_index": c, "camera_id": f"cam{c}"}
+            frames.append(entry(camera, f"images/{t:05d}_{c:02d}.png", **named, cy=12.0))
     write_transforms(tmp_path, frames)
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["cam0", "cam1"]
@@ -52,19 +39,15 @@ def test_a_capture_is_footage(tmp_path):
     assert [camera.image(t)[0, 0, 0] for t, camera in footage.views()] == [0, 20, 10, 30]
     assert footage.cameras[1].file(3) == tmp_path / "images/00003_01.png"
     assert footage.cameras[0].camera.cy == HEIGHT - 12.0
-    np.testing.assert_allclose(
-        footage.cameras[1].camera.world_to_camera, rig(2)[1].world_to_camera, atol=1e-9
-    )
+    found, expected = footage.cameras[1].camera, rig(2)[1]
+    np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
 
 
 def test_one_image_per_pose_is_one_timestep(tmp_path):
     """Catches a nerfstudio file, whose images have no timesteps, taken for a sequence; and its `cy`
     turned over."""
-    write_transforms(
-        tmp_path,
-        [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())],
-        camera_model="OPENCV",
-    )
+    frames = [entry(c, f"images/{n}.png", cy=12.0) for n, c in enumerate(rig())]
+    write_transforms(tmp_path, frames, camera_model="OPENCV")
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["0", "1", "2"]
     assert footage.timesteps == (0,)
@@ -102,9 +85,8 @@ def test_two_images_of_one_moment(tmp_path):
     another."""
     camera = rig(1)[0]
     write_transforms(tmp_path, [entry(camera, "images/0.png"), entry(camera, "images/1.png")])
-    with pytest.raises(
-        StgaError, match=r"frames\[1\]: has the pose of images/0.png; expected a timestep_index"
-    ):
+    message = r"frames\[1\]: has the pose of images/0.png; expected a timestep_index"
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)
     frames = [entry(camera, f"images/{n}.png", timestep_index=4, camera_index=7) for n in range(2)]
     write_transforms(tmp_path, frames)

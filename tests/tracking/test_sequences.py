@@ -52,24 +52,13 @@ def test_range_step_and_offset(tmp_path):
     assert red(footage) == {"a": [*range(102, 109)], "b": [*range(201, 208)]}
 
 
-@pytest.mark.parametrize(
-    ("counts", "frames", "message"),
-    [
-        (
-            (6, 5),
-            FrameRange(),
-            r"Camera b has 5 frames and camera a 6; expected recordings of the same length",
-        ),
-        ((6, 5), FrameRange(0, 6), r"Camera b has 5 frames; expected all up to 6"),
-        (
-            (6, 6),
-            FrameRange(0, 6, 1, {"b": 1}),
-            r"Camera b has 6 frames; expected all up to 6 and its offset",
-        ),
-        ((6, 6), FrameRange(offsets={"z": 1}), r"Offset for camera z: expected one of a, b"),
-        ((6, 6), FrameRange(9), r"Frames from 9 on: the cameras have only 6 in common"),
-    ],
-)
+@pytest.mark.parametrize(("counts", "frames", "message"), [
+    ((6, 5), FrameRange(), "b has 5 frames and camera a 6; expected recordings of the same length"),
+    ((6, 5), FrameRange(0, 6), "Camera b has 5 frames; expected all up to 6"),
+    ((6, 6), FrameRange(0, 6, 1, {"b": 1}), "b has 6 frames; expected all up to 6 and its offset"),
+    ((6, 6), FrameRange(offsets={"z": 1}), "Offset for camera z: expected one of a, b"),
+    ((6, 6), FrameRange(9), "Frames from 9 on: the cameras have only 6 in common"),
+])  # fmt: skip
 def test_recordings_out_of_step(tmp_path, counts, frames, message):
     """Catches frames of different moments silently paired."""
     write_folders(tmp_path, counts)
@@ -77,48 +66,35 @@ def test_recordings_out_of_step(tmp_path, counts, frames, message):
         open_footage(tmp_path, frames=frames)
 
 
-def test_missing_frame_in_one_folder(tmp_path):
-    """Catches all later frames of a camera being one too early because one file is missing."""
-    write_folders(tmp_path, (7, 6))
-    (tmp_path / "images/a/frame_4.png").unlink()
-    with pytest.raises(
-        StgaError,
-        match=r"b/frame_4.png: is 3 frames after the first of camera b, where camera a has",
-    ):
-        open_footage(tmp_path)
+def without_one_frame(images):
+    write_image(images / "a/frame_7.png")
+    (images / "a/frame_4.png").unlink()
 
 
-def test_camera_without_a_recording(tmp_path):
-    """Catches a camera that disappears from the footage."""
-    write_folders(tmp_path)
-    for path in (tmp_path / "images/b").iterdir():
+def without_a_recording(images):
+    for path in (images / "b").iterdir():
         path.unlink()
-    with pytest.raises(
-        StgaError, match=r"image 'b/frame_1.png': .* has no folder or video of this camera"
-    ):
-        open_footage(tmp_path)
 
 
-def test_other_size_than_calibrated(tmp_path):
-    """Catches images of another resolution than the calibration's."""
+def of_other_size(images, numbers=range(1, 7)):
+    for number in numbers:
+        write_image(images / f"b/frame_{number}.png", size=(20, 15))
+
+
+@pytest.mark.parametrize(("damage", "message"), [
+    (without_one_frame, r"b/frame_4.png: is 3 frames after the first of camera b, where camera a "),
+    (without_a_recording, r"image 'b/frame_1.png': .* has no folder or video of this camera"),
+    (of_other_size, r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"),
+    (lambda images: of_other_size(images, [3]),
+     r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"),
+])  # fmt: skip
+def test_folders_that_do_not_fit(tmp_path, damage, message):
+    """Catches all later frames of a camera being one too early because one file is missing, a
+    camera that disappears from the footage, and images of another resolution than the
+    calibration's, all of them or from some frame on."""
     write_folders(tmp_path)
-    for path in (tmp_path / "images/b").iterdir():
-        write_image(path, size=(20, 15))
-    with pytest.raises(
-        StgaError,
-        match=r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
-    ):
-        open_footage(tmp_path)
-
-
-def test_size_that_changes_in_the_take(tmp_path):
-    """Catches a resolution that was changed while recording, which is noticed only when all cameras
-    have been read."""
-    write_folders(tmp_path)
-    write_image(tmp_path / "images/b/frame_3.png", size=(20, 15))
-    with pytest.raises(
-        StgaError, match=r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"
-    ):
+    damage(tmp_path / "images")
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)
 
 
@@ -143,22 +119,13 @@ def test_several_images_of_one_folder_are_several_cameras(tmp_path):
     assert red(footage) == {f"walk/{number + 1}": [number] for number in range(3)}
 
 
-def values_of(frames):
-    """Mean gray of frames."""
-    return [float(frame.mean()) for frame in frames]
-
-
-def write_videos(root, counts=(12, 12), rates=(25, 25), **options):
+def write_videos(root, counts=(12, 12), rates=(25, 25)):
     pytest.importorskip("av")
     names = "ab"[: len(counts)]
     write_colmap_text(root / "calibration", rig(len(counts)), [f"{name}.jpg" for name in names])
     for camera, (name, count, rate) in enumerate(zip(names, counts, rates, strict=False)):
-        write_video(
-            root / f"videos/{name}.mp4",
-            [60 + 10 * n + 5 * camera for n in range(count)],
-            rate=rate,
-            **options,
-        )
+        values = [60 + 10 * n + 5 * camera for n in range(count)]
+        write_video(root / f"videos/{name}.mp4", values, rate=rate)
 
 
 def test_range_of_videos(tmp_path):
@@ -166,35 +133,24 @@ def test_range_of_videos(tmp_path):
     write_videos(tmp_path, (12, 14))
     footage = open_footage(tmp_path, tmp_path / "calibration", FrameRange(2, 12, 4, {"b": 2}))
     assert footage.timesteps == (2, 6, 10)
-    np.testing.assert_allclose(
-        values_of(footage.cameras[1].image(t) for t in (2, 6, 10)), [105, 145, 185], atol=3
-    )
+    found = [footage.cameras[1].image(t).mean() for t in (2, 6, 10)]
+    np.testing.assert_allclose(found, [105, 145, 185], atol=3)
 
 
-def test_videos_of_different_rates(tmp_path):
-    """Catches 25 and 30 frames a second paired by number."""
-    write_videos(tmp_path, rates=(25, 30))
-    with pytest.raises(
-        StgaError, match=r"camera b has 30 frames a second, that of camera a 25; expected one rate"
-    ):
-        open_footage(tmp_path, tmp_path / "calibration")
-
-
-def test_damaged_video(tmp_path):
-    """Catches an exception of FFmpeg's, when opened or in the middle."""
-    write_videos(tmp_path)
+@pytest.mark.parametrize(("rate", "damage", "message"), [
+    (30, None, r"camera b has 30 frames a second, that of camera a 25; expected one rate"),
+    (25, "cut", r"b.mp4: is not a readable video"),
+    (25, "no av", r"a.mp4: reading videos needs the package av \(PyAV\)"),
+])  # fmt: skip
+def test_videos_that_cannot_be_used(tmp_path, monkeypatch, rate, damage, message):
+    """Catches 25 and 30 frames a second paired by number, an exception of FFmpeg's, and a traceback
+    where the package is missing."""
+    write_videos(tmp_path, rates=(25, rate))
     path = tmp_path / "videos/b.mp4"
-    data = path.read_bytes()
-    path.write_bytes(data[:200])
-    with pytest.raises(StgaError, match=r"b.mp4: is not a readable video"):
-        open_footage(tmp_path, tmp_path / "calibration")
-
-
-def test_without_pyav_the_message_names_it(tmp_path, monkeypatch):
-    """Catches a traceback where the package is missing."""
-    write_videos(tmp_path)
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(StgaError, match=r"a.mp4: reading videos needs the package av \(PyAV\)"):
+    path.write_bytes(path.read_bytes()[: 200 if damage == "cut" else None])
+    if damage == "no av":
+        monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path, tmp_path / "calibration")
 
 
@@ -216,10 +172,8 @@ def test_two_cameras_without_calibration(tmp_path):
     """Catches a rig without poses taken for one camera."""
     write_image(tmp_path / "a/1.png")
     write_image(tmp_path / "b/1.png")
-    with pytest.raises(
-        StgaError,
-        match=r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model",
-    ):
+    message = r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model"
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
@@ -237,9 +191,8 @@ def test_folders_named_as_calibrations(tmp_path):
 def test_distorted_frames_are_undistorted(tmp_path):
     """Catches frames handed out as recorded beside a pinhole camera that does not show them."""
     pytest.importorskip("cv2")
-    write_colmap_text(
-        tmp_path / "sparse", rig(1), ["a.png"], "SIMPLE_RADIAL", (50.0, WIDTH / 2, HEIGHT / 2, -0.3)
-    )
+    lens = 50.0, WIDTH / 2, HEIGHT / 2, -0.3
+    write_colmap_text(tmp_path / "sparse", rig(1), ["a.png"], "SIMPLE_RADIAL", lens)
     write_image(tmp_path / "a/1.png", 90)
     write_image(tmp_path / "masks/a/1.png", 255)
     camera = open_footage(tmp_path).cameras[0]

@@ -1,37 +1,37 @@
 """Heads moved onto the surface that the cameras see, against surfaces that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from flame.small_head import small_head
+import trimesh
+from scipy.ndimage import binary_dilation
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_geometry import Similarity, rasterize
 from stga_addon.flame.forward import flame_forward
-from stga_addon.tracking.fit import fit_head
-from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.mesh_image import shaded_image
-from stga_addon.tracking.photo_consistency import (
+from stga_addon.tracking.correspondence import nearest_points, shaded_image
+from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
+from stga_addon.tracking.posed_points import SurfacePoints
+from stga_addon.tracking.seen_surface import (
     Sweep,
     facing,
     gray_view,
     in_sight,
+    near_landmarks,
+    outline_offsets,
+    outlines_agree,
     surface_offsets,
+    surface_points,
 )
-from stga_addon.tracking.posed_points import SurfacePoints
-from stga_addon.tracking.seen_surface import RecordedTake, surface_points
-from stga_addon.tracking.smooth_offsets import smooth_offsets
-from stga_addon.tracking.surface import fit_surface
-from stga_addon.tracking.write_capture import posed_mesh
+from stga_addon.tracking.solve import person
+from stga_addon.tracking.surface import fit_surface, smooth_offsets
 from stga_addon.worker.helpers import Helpers
 
-from .test_fit import frame_at, places_on, seen
+from .test_fit import frame_at, in_cameras_world, places_on, seen
 
 RADIUS_M = 0.09
 SWEEP = Sweep(0.004, 0.0005, 0.001)
-
-
-@pytest.fixture(scope="module")
-def head():
-    return HeadModel(small_head(0), "flame")
 
 
 def rig(count, size=400):
@@ -45,12 +45,7 @@ def rig(count, size=400):
 def sphere_image(camera, contrast=1.0):
     """A ball with waves of several lengths on it, seen by intersecting rays with it: no mesh and no
     rasterizer."""
-    y, x = np.indices((camera.height, camera.width)) + 0.5
-    local = np.stack(
-        [(x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y, np.ones(x.shape)], -1
-    )
-    rays = local @ camera.world_to_camera[:3, :3]
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = rays_of(camera)
     middle = -rays @ camera.position
     inside = middle**2 - (camera.position @ camera.position - RADIUS_M**2)
     at = camera.position + (middle - np.sqrt(np.maximum(inside, 0)))[..., None] * rays
@@ -63,10 +58,24 @@ def sphere_image(camera, contrast=1.0):
     return np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 
+def rays_of(camera, grid=1):
+    """Unit directions (H grid, W grid, 3) through `grid` x `grid` places of each pixel."""
+    y, x = (np.indices((grid * camera.height, grid * camera.width)) + 0.5) / grid
+    flat = (x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y
+    rays = np.stack([*flat, np.ones(x.shape)], -1) @ camera.world_to_camera[:3, :3]
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
 def ball_points():
     """Unit directions to the front of a ball."""
     directions = np.random.default_rng(0).normal(size=(60, 3)) * [1, 1, 0.5] + [0, 0, 2]
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def views(cameras, contrast=1.0):
+    pictures = [sphere_image(camera, contrast) for camera in cameras]
+    pairs = zip(cameras, pictures, strict=True)
+    return [gray_view(*own, np.zeros(3), SWEEP.spacing) for own in pairs]
 
 
 @pytest.mark.parametrize("offset", [-0.0018, 0.0, 0.0023])
@@ -75,11 +84,8 @@ def test_offsets_lead_to_the_surface_in_the_images(offset):
     missed."""
     cameras, normals = rig(5), ball_points()
     points = (RADIUS_M - offset) * normals
-    views = [
-        gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras
-    ]
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
-    found, correlation = surface_offsets(views, cosines, points, normals, SWEEP)
+    found, correlation = surface_offsets(views(cameras), cosines, points, normals, SWEEP)
     assert (correlation > 0.8).mean() > 0.9
     assert np.median(np.abs(found - offset)[correlation > 0]) < 1e-4
     assert np.percentile(np.abs(found - offset)[correlation > 0.8], 95) < 3e-4
@@ -90,15 +96,9 @@ def test_nothing_is_found_without_texture_or_with_one_camera():
     cameras, normals = rig(5), ball_points()
     points = RADIUS_M * normals
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
-    plain = [
-        gray_view(camera, sphere_image(camera, 0), np.zeros(3), SWEEP.spacing) for camera in cameras
-    ]
-    assert not surface_offsets(plain, cosines, points, normals, SWEEP)[1].any()
-    views = [
-        gray_view(camera, sphere_image(camera), np.zeros(3), SWEEP.spacing) for camera in cameras
-    ]
+    assert not surface_offsets(views(cameras, 0), cosines, points, normals, SWEEP)[1].any()
     alone = cosines * (np.arange(5) == 2)[:, None]
-    assert not surface_offsets(views, alone, points, normals, SWEEP)[1].any()
+    assert not surface_offsets(views(cameras), alone, points, normals, SWEEP)[1].any()
 
 
 def test_large_images_are_reduced_to_the_size_of_a_sample():
@@ -106,14 +106,14 @@ def test_large_images_are_reduced_to_the_size_of_a_sample():
     image."""
     camera = look_at((0.2, 0.1, 1.0), (0, 0, 0), 1210, 900, 12000)
     rng = np.random.default_rng(0)
-    view = gray_view(camera, rng.integers(0, 255, (900, 1210, 3), np.uint8), np.zeros(3), 0.001)
-    factor = camera.fl_x / view.camera.fl_x
+    pixels = rng.integers(0, 255, (900, 1210, 3), np.uint8)
+    small, image = gray_view(camera, pixels, np.zeros(3), 0.001)
+    factor = camera.fl_x / small.fl_x
     assert factor == 11  # 0.085 mm a pixel
-    assert view.image.shape == (81, 110) == (view.camera.height, view.camera.width)
+    assert image.shape == (81, 110) == (small.height, small.width)
     points = rng.normal(0, 0.02, (9, 3))
-    np.testing.assert_allclose(
-        view.camera.project(points)[0] * factor, camera.project(points)[0], atol=1e-9
-    )
+    found = small.project(points)[0] * factor
+    np.testing.assert_allclose(found, camera.project(points)[0], atol=1e-9)
 
 
 def test_hidden_points_are_not_in_sight(head):
@@ -145,11 +145,8 @@ def test_offsets_are_smooth_robust_and_local(head):
     rng = np.random.default_rng(0)
     true = 0.003 * np.exp(-((at - at[at[:, 2].argmax()]) ** 2).sum(1) / 0.04**2)
     wrong = rng.random(len(at)) < 0.15
-    noisy = (
-        true
-        + rng.normal(0, 0.0004, len(at))
-        + np.where(wrong, rng.uniform(-0.004, 0.004, len(at)), 0)
-    )
+    outliers = np.where(wrong, rng.uniform(-0.004, 0.004, len(at)), 0)
+    noisy = true + rng.normal(0, 0.0004, len(at)) + outliers
     front = at[:, 2] > np.median(at[:, 2])
     found = smooth_offsets(vertices, faces, points, noisy, np.where(front, 0.2, 0.0))
     error = points.on(found[:, None], faces)[:, 0] - true
@@ -168,15 +165,17 @@ def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
     faces = np.concatenate([cell[:, None] + [0, 1, 12], cell[:, None] + [1, 13, 12]])
     points = SurfacePoints(np.arange(len(faces)), np.full((len(faces), 3), 1 / 3))
     slope = 0.001 + 0.05 * flat[:, 0]
-    found = smooth_offsets(
-        vertices, faces, points, points.on(slope[:, None], faces)[:, 0], np.full(len(faces), 0.1)
-    )
+    residual = points.on(slope[:, None], faces)[:, 0]
+    found = smooth_offsets(vertices, faces, points, residual, np.full(len(faces), 0.1))
     assert np.abs(found - slope).max() < 5e-5
 
 
-def painted(head):
-    """Colors of the vertices, without a pattern."""
-    return np.random.default_rng(2).uniform(0.25, 1, (len(head.model.v_template), 1)) * np.ones(3)
+def pictured(head, cameras, meshes):
+    """Images of a take, in colors of the vertices without a pattern."""
+    count, faces = len(head.model.v_template), head.model.faces
+    colors = np.random.default_rng(2).uniform(0.25, 1, (count, 1)) * np.ones(3)
+    pictures = [[(c, shaded_image(mesh, faces, c, colors)) for c in cameras] for mesh in meshes]
+    return lambda timestep, most=None: pictures[timestep]
 
 
 def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
@@ -189,41 +188,21 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     meshes = [flame_forward(model, shape, frame_at(head, t), bump) for t in (0, 6)]
     places = places_on(head, 150)
     wrong = rng.normal(0, 0.0018, (150, 3))
-    landmarks = {
-        t: seen(cameras, places.on(mesh, model.faces) + wrong) for t, mesh in enumerate(meshes)
-    }
-    pictures = [
-        [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes
-    ]
-    reliable = np.ones(150, bool)
-    first = fit_head(head, places, reliable, landmarks)
-    fit = fit_surface(
-        head,
-        first,
-        RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures[t]),
-        Helpers(1),
-    )
-    errors = [
-        [
-            np.median(distances(one, posed_mesh(one, one.parameters[t]), meshes[t], head, front))
-            for t in (0, 1)
-        ]
+    at = [places.on(mesh, model.faces) + wrong for mesh in meshes]
+    landmarks = {t: seen(cameras, own) for t, own in enumerate(at)}
+    images, reliable = pictured(head, cameras, meshes), np.ones(150, bool)
+    take = RecordedTake(places, reliable, landmarks, images)
+    first = fit_head(head, take)
+    fit = fit_surface(head, first, take, Helpers(1))
+    before, after = (
+        [distances(one, t, mesh, head, front) for t, mesh in enumerate(meshes)]
         for one in (first, fit)
-    ]
-    assert np.max(errors[1]) < 0.0006 < np.min(errors[0])
+    )
+    assert np.max(after) < 0.0006 < np.min(before)
     assert fit.static_offset is not None
     assert np.abs(fit.static_offset).max() > 0.001
-
-    blank = [[(c, np.full_like(image, 90)) for c, image in own] for own in pictures]
-    assert (
-        fit_surface(
-            head,
-            first,
-            RecordedTake(places, reliable, landmarks, lambda t, most=None: blank[t]),
-            Helpers(1),
-        )
-        is first
-    )
+    blank = replace(take, images=lambda t, most=None: [(c, 0 * i + 90) for c, i in images(t)])
+    assert fit_surface(head, first, blank, Helpers(1)) is first
 
 
 def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
@@ -233,9 +212,8 @@ def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
     wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
     landmarks = {0: seen(cameras, places.on(mesh, model.faces) + wrong)}
-    pictures = [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras]
-    take, found = RecordedTake(places, reliable, landmarks, lambda t, most=None: pictures), []
-    first = fit_head(head, places, reliable, landmarks)
+    take = RecordedTake(places, reliable, landmarks, pictured(head, cameras, [mesh]))
+    first, found = fit_head(head, take), []
     for share in (0.2, 5.0):
         monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
         found.append(fit_surface(head, first, take, Helpers(1)).parameters[0])
@@ -243,12 +221,10 @@ def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     assert np.array_equal(*found)
 
 
-def distances(fit, found, true, head, front):
-    """Distances (N,) of vertices from the true surface along its normals, in meters."""
-    from stga_addon.tracking.correspondence import nearest_points
-
-    back = (found - fit.to_capture.translation) @ fit.to_capture.rotation / fit.to_capture.scale
-    return nearest_points(true, head.model.faces, back[front])[1]
+def distances(fit, timestep, true, head, front):
+    """Median distance of vertices from the true surface along its normals, in meters."""
+    back = in_cameras_world(fit, timestep)
+    return np.median(nearest_points(true, head.model.faces, back[front])[1])
 
 
 @pytest.mark.parametrize(("count", "share"), [(5, 0.6), (3, 0.5)])
@@ -256,38 +232,26 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     """Catches poses that follow the detector's landmarks where the surface does not tell, or that
     of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each
     timestep another."""
-    model, cameras = head.model, rig(count, 280)
-    meshes = [
-        flame_forward(model, np.zeros(model.n_identity), frame_at(head, t)) for t in (0, 3, 6)
-    ]
-    places, reliable, front = (
-        places_on(head, 150), np.ones(150, bool), model.v_template[:, 2] > 0.04,
-    )  # fmt: skip
-    lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
-    right = {t: seen(cameras, places.on(mesh, model.faces)) for t, mesh in enumerate(meshes)}
-    wrong = {
-        t: seen(cameras, places.on(mesh, model.faces) + (t - 1) * lower)
-        for t, mesh in enumerate(meshes)
-    }
-    pictures = [
-        [(c, shaded_image(mesh, model.faces, c, painted(head))) for c in cameras] for mesh in meshes
-    ]
-    take, errors = (
-        RecordedTake(places, reliable, wrong, lambda t, most=None: pictures[t], metric=True),
-        [],
+    model, cameras, places = head.model, rig(count, 280), places_on(head, 150)
+    shape, reliable, front = (
+        np.zeros(model.n_identity),
+        np.ones(150, bool),
+        model.v_template[:, 2] > 0.04,
     )
+    meshes = [flame_forward(model, shape, frame_at(head, t)) for t in (0, 3, 6)]
+    lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
+    at = [places.on(mesh, model.faces) for mesh in meshes]
+    right = {t: seen(cameras, own) for t, own in enumerate(at)}
+    wrong = {t: seen(cameras, own + (t - 1) * lower) for t, own in enumerate(at)}
+    images, errors = pictured(head, cameras, meshes), []
+    take = RecordedTake(places, reliable, wrong, images, metric=True)
     for dense, landmarks in ((False, wrong), (True, right)):
-        first = fit_head(head, places, reliable, landmarks, metric=True)
+        first = fit_head(head, replace(take, landmarks=landmarks))
         fit = fit_surface(head, first, take, Helpers(1), dense=dense)
         assert fit.static_offset is not None
-        errors.append(np.mean([slip(fit, t, mesh)[front].mean() for t, mesh in enumerate(meshes)]))
+        slips = [in_cameras_world(fit, t) - mesh for t, mesh in enumerate(meshes)]
+        errors.append(np.linalg.norm(slips, axis=2)[:, front].mean())
     assert errors[1] < share * errors[0]
-
-
-def slip(fit, timestep, true):
-    """Distances (V,) of vertices from the true ones, in meters."""
-    world, mesh = fit.to_capture, posed_mesh(fit, fit.parameters[timestep])
-    return np.linalg.norm((mesh - world.translation) @ world.rotation / world.scale - true, axis=1)
 
 
 def test_one_camera_leaves_the_fit_as_it_is(head):
@@ -295,8 +259,81 @@ def test_one_camera_leaves_the_fit_as_it_is(head):
     places = places_on(head, 100)
     mesh = flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, 0))
     landmarks = {0: seen(rig(1), places.on(mesh, head.model.faces))}
-    fit = fit_head(head, places, np.ones(100, bool), landmarks)
-    take = RecordedTake(
-        places, np.ones(100, bool), landmarks, lambda t: pytest.fail("no image is needed")
-    )
+    take = RecordedTake(places, np.ones(100, bool), landmarks, no_image)
+    fit = fit_head(head, take)
     assert fit_surface(head, fit, take, Helpers(1)) is fit
+
+
+def no_image(*_):
+    pytest.fail("no image is needed")
+
+
+# Outlines in masks, against a ball whose outline is known
+
+
+CAMERA = look_at((0.3, 0.1, 1.0), (0.01, 0, 0), 120, 160, 500)
+
+
+def ball(radius):
+    """Vertices and triangles of a ball, and a thousand unit directions to its surface."""
+    mesh, directions = trimesh.creation.icosphere(4, radius), np.random.default_rng(0)
+    directions = directions.normal(size=(1000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.array(mesh.vertices), np.array(mesh.faces), directions
+
+
+def ball_mask(camera, grid=8):
+    """The ball's mask with soft edges: rays through `grid` × `grid` places of each pixel."""
+    rays = rays_of(camera, grid)
+    hits = (rays @ camera.position) ** 2 > camera.position @ camera.position - RADIUS_M**2
+    shares = hits.reshape(camera.height, grid, camera.width, grid).mean((1, 3))
+    return (255 * shares).astype(np.uint8)
+
+
+def measured(radius, mask, reach=0.005):
+    vertices, faces, directions = ball(radius)
+    return outline_offsets(CAMERA, mask, vertices, faces, radius * directions, directions, reach)
+
+
+@pytest.mark.parametrize("offset", [-0.003, 0.0, 0.002])
+def test_outlines_tell_how_far_the_surface_is_off(offset):
+    """Catches a wrong sign, half a pixel, or points beside the outline taken for points on it: 2 mm
+    a pixel."""
+    found, known = measured(RADIUS_M - offset, ball_mask(CAMERA))
+    assert known.sum() > 150
+    assert abs(np.median(found[known]) - offset) < 1e-4
+    assert np.abs(found[known] - offset).max() < 8e-4
+    assert not found[~known].any()
+
+
+def test_what_the_mask_does_not_show_is_left_open():
+    """Catches an outline made up where something stands behind the head, or the mask ends
+    elsewhere."""
+    mask = ball_mask(CAMERA)
+    mask[80:] = 255  # shoulders
+    _, known = measured(RADIUS_M, mask)
+    pixels, _ = CAMERA.project(RADIUS_M * ball(RADIUS_M)[2])
+    assert known.sum() > 60
+    assert not known[pixels[:, 1] > 84].any()
+    assert not measured(RADIUS_M, np.full_like(mask, 255))[1].any()
+    assert not measured(RADIUS_M - 0.02, ball_mask(CAMERA))[1].any()
+
+
+def test_mattes_that_are_too_wide_are_not_followed(head):
+    """Catches a face that grows by a matte's margin, or by hair: those of real captures are a pixel
+    or two too wide."""
+    places, used, frame = places_on(head, 150), np.ones(150, bool), frame_at(head, 0)
+    shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
+    mesh, faces = flame_forward(head.model, shape, frame), head.model.faces
+    fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, world)
+    points, take = surface_points(head, 2000), RecordedTake(places, used, {}, no_image)
+    near = near_landmarks(head, points, take)
+    for wide, agree in ((0, True), (2, False)):
+        shown = []
+        for camera in rig(5):
+            mask = rasterize(mesh, faces, camera)[0] >= 0
+            mask = binary_dilation(mask, iterations=wide) if wide else mask
+            shown.append((camera, 255 * mask.astype(np.uint8)))
+        masked = replace(take, masks=lambda t, own=shown: own)
+        assert outlines_agree(fit, masked, points, near, 0.003) is agree
+    assert not outlines_agree(fit, take, points, np.ones(len(points), bool), 0.003)

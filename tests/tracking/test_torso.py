@@ -22,8 +22,9 @@ from stga_addon.flame.forward import (
     joint_positions,
 )
 from stga_addon.flame.model import MIN_TORSO_WEIGHT, torso_faces
+from stga_addon.tracking.correspondence import shaded_image
 from stga_addon.tracking.dense_head import REGIONS
-from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.fit import HeadFit, posed_mesh
 from stga_addon.tracking.folder import (
     PLACES_FILE,
     REPORT_FILE,
@@ -36,7 +37,6 @@ from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
-from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
@@ -51,7 +51,6 @@ from stga_addon.tracking.torso_take import (
     with_root,
 )
 from stga_addon.tracking.track import track
-from stga_addon.tracking.write_capture import posed_mesh
 from stga_addon.worker.helpers import Helpers
 
 from .recording import write_footage
@@ -66,7 +65,7 @@ SLIDE_M = 0.01 * np.sin(0.9 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
 CLOTH_CENTER_M, CLOTH_SIGMA_M = np.array([0.04, -0.23, 0.03]), 0.05
 """By which cloth slides over the shoulders at each timestep; where, and how far around."""
 CHEST_SIZE_M, CHEST_CENTER_M = np.array([0.17, 0.08, 0.085]), np.array([0.0, -0.215, -0.04])
-BACKDROP = 115
+HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def quiet(stage, done, total):
@@ -75,24 +74,18 @@ def quiet(stage, done, total):
 
 def ellipsoid():
     """Shoulders (V, 3), faces (F, 3) and colors (V, 3) of patterned cloth, below the small head."""
-    around, down = np.meshgrid(
-        np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45), indexing="ij"
-    )
-    unit = np.stack(
-        [np.sin(down) * np.cos(around), np.cos(down), np.sin(down) * np.sin(around)], -1
-    ).reshape(-1, 3)
+    angles = np.linspace(0, 2 * np.pi, 90), np.linspace(0, np.pi, 45)
+    around, down = (own.ravel() for own in np.meshgrid(*angles, indexing="ij"))
+    across = np.sin(down)
+    unit = np.stack([across * np.cos(around), np.cos(down), across * np.sin(around)], -1)
     vertices = unit * CHEST_SIZE_M + CHEST_CENTER_M
     grid = np.arange(90 * 45).reshape(90, 45)
-    a, b, c, d = (
-        own.ravel() for own in (grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:])
-    )
+    corners = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
+    a, b, c, d = (own.ravel() for own in corners)
     faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     waves = np.sin(vertices @ np.random.default_rng(1).normal(0, 160, (3, 5)))
-    return (
-        vertices,
-        faces,
-        np.clip(0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3)), 0.05, 0.95),
-    )
+    colors = 0.5 + 0.12 * waves @ np.random.default_rng(2).normal(0, 1, (5, 3))
+    return vertices, faces, np.clip(colors, 0.05, 0.95)
 
 
 @dataclass(frozen=True)
@@ -111,11 +104,6 @@ class Frames:
 
     def mask(self, timestep):
         return self.masks[timestep]
-
-
-@pytest.fixture(scope="module")
-def head():
-    return HeadModel(small_head(0), "flame")
 
 
 @pytest.fixture(scope="module")
@@ -138,36 +126,27 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
     ]
     frames, shape = [Frames() for _ in cameras], np.zeros(pictured.n_identity)
     one = person(head, np.zeros(head.model.n_identity))
-    joints = joint_positions(one.model, one.model.v_template)
-    parameters = {}
-    for timestep, (turned, carried) in enumerate(
-        zip(np.radians(heads), np.radians(torsos), strict=True)
-    ):
-        zero = np.zeros(3)
+    joints, parameters = joint_positions(one.model, one.model.v_template), {}
+    every, zero = np.concatenate([colors, cloth_colors]), np.zeros(3)
+    turns = zip(np.radians(heads), np.radians(torsos), strict=True)
+    for timestep, (turned, carried) in enumerate(turns):
         expr, moved = np.zeros(one.model.n_expression), np.array([0.002 * timestep, 0, 0])
         root, neck = np.array([0, carried, 0]), np.array([0, turned - carried, 0])
         frame = FlameFrame(expr, root, neck, zero, moved, np.zeros(6))
-        turn = axis_angle_matrices(frame.rotation[None])[0]
+        turn, straight = axis_angle_matrices(np.array([root, [0, turned, 0]]))
         shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
         shoulders += 0 if shifts is None else shifts[timestep]
         mesh = np.concatenate([flame_forward(pictured, shape, frame), shoulders])
         for camera, own in zip(cameras, frames, strict=True):
-            own.images.append(
-                shaded_image(mesh, faces, camera, np.concatenate([colors, cloth_colors]))
-            )
-            own.masks.append(
-                np.where(rasterize(mesh, faces, camera)[0] >= 0, 255, 0).astype(np.uint8)
-            )
+            own.images.append(shaded_image(mesh, faces, camera, every))
+            seen = rasterize(mesh, faces, camera)[0] >= 0
+            own.masks.append(np.where(seen, 255, 0).astype(np.uint8))
         arm = joints[NECK] - joints[ROOT]
-        parameters[timestep] = with_root(
-            frame.parameters, axis_angle_matrices(np.array([[0, turned, 0]]))[0], arm
-        )
-    fit = HeadFit(one, np.zeros(0), parameters, Similarity(1.0, np.eye(3), np.zeros(3)))
-    filmed = [
-        FootageCamera(str(n), camera, own)
-        for n, (camera, own) in enumerate(zip(cameras, frames, strict=True))
-    ]
-    return fit, parameters, Footage(Path("take"), tuple(filmed), tuple(range(len(heads))))
+        parameters[timestep] = with_root(frame.parameters, straight, arm)
+    fit = HeadFit(one, np.zeros(0), parameters, HERE)
+    named = zip("012", cameras, frames, strict=True)
+    filmed = tuple(FootageCamera(name, camera, own) for name, camera, own in named)
+    return fit, parameters, Footage(Path("take"), filmed, tuple(range(len(heads))))
 
 
 def torso_angles(fit, parameters, offsets):
@@ -175,14 +154,10 @@ def torso_angles(fit, parameters, offsets):
     vertical axis."""
     model = fit.head.model
     used = np.unique(model.faces[torso_faces(model)])
-    turns = [
-        weighted_procrustes(
-            model.v_template[used],
-            posed_mesh(fit, values, offsets.get(timestep))[used],
-            np.ones(len(used)),
-        )[0]
-        for timestep, values in parameters.items()
-    ]
+    rest, turns = model.v_template[used], []
+    for timestep, values in parameters.items():
+        posed = posed_mesh(fit, values, offsets.get(timestep))[used]
+        turns.append(weighted_procrustes(rest, posed, np.ones(len(used)))[0])
     return np.degrees([np.arctan2(turn[0, 2], turn[2, 2]) for turn in turns])
 
 
@@ -262,9 +237,8 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     cloth, _, _ = ellipsoid()
     near = np.exp(-(((cloth - CLOTH_CENTER_M) / CLOTH_SIGMA_M) ** 2).sum(1) / 2)[:, None]
     slides = np.array([slide * near for slide in SLIDE_M])
-    fit, parameters, footage = take(
-        fine_head, 0.5 * SWING_DEG, 0 * SWING_DEG, shifts=LIFT_M[:, None] + slides
-    )
+    shifts = LIFT_M[:, None] + slides
+    fit, parameters, footage = take(fine_head, SWING_DEG / 2, 0 * SWING_DEG, shifts=shifts)
     posed = TorsoTake(fit, parameters, footage.cameras, torso_faces(fine_head.model))
     motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
     first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
@@ -277,16 +251,12 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
         meshes[timestep] = posed_mesh(fit, values, offset)
         apart = fine_head.model.weights[:, ROOT] == 0
         assert np.abs(meshes[timestep] - posed_mesh(fit, parameters[timestep]))[apart].max() < 2e-3
-    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(
-        meshes[first][bending.vertices]
-    )
+    at = {t: mesh[bending.vertices] for t, mesh in meshes.items()}
+    distance, nearest = cKDTree(cloth + slides[first] + moved[first]).query(at[first])
     on_cloth = (distance < 0.01) & (near[nearest, 0] > 0.5)
     assert on_cloth.sum() > 5
     true = (slides - slides[first])[:, nearest[on_cloth]]
-    found = [
-        meshes[t][bending.vertices] - meshes[first][bending.vertices] - moved[t] + moved[first]
-        for t in meshes
-    ]
+    found = [at[t] - at[first] - moved[t] + moved[first] for t in meshes]
     wrong = np.array(found)[:, on_cloth] - true
     assert np.linalg.norm(wrong, axis=2).mean() < 0.5 * np.linalg.norm(true, axis=2).mean()
 
@@ -297,24 +267,21 @@ def test_a_torso_that_rides_on_the_head_changes_nothing(head):
     parameters bit for bit."""
     fit, parameters, footage = take(head, SWING_DEG, SWING_DEG)
     followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
-    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
-    assert torso.motion == "head"
-    assert not offsets
-    assert torso.turn_deg < 1e-3
-    assert all(found[timestep] is parameters[timestep] for timestep in parameters)
+    assert followed.motion.motion == "head"
+    assert not followed.offsets
+    assert followed.motion.turn_deg < 1e-3
+    assert all(followed.parameters[timestep] is own for timestep, own in parameters.items())
 
 
 def test_without_masks_the_torso_is_not_told_from_the_wall(head):
     """Catches shoulders that follow the backdrop."""
     fit, parameters, footage = take(head, [0, 5, 10, 15], [0, 0, 0, 0], (40, 55))
-    bare = tuple(
-        replace(own, frames=replace(own.frames, masks=[None] * 4)) for own in footage.cameras
-    )
-    followed = follow_torso(fit, parameters, replace(footage, cameras=bare), Helpers(1), quiet)
-    found, offsets, torso = followed.parameters, followed.offsets, followed.motion
-    assert torso is None
-    assert not offsets
-    assert all(found[timestep] is parameters[timestep] for timestep in parameters)
+    for camera in footage.cameras:
+        camera.frames.masks[:] = [None] * 4
+    followed = follow_torso(fit, parameters, footage, Helpers(1), quiet)
+    assert followed.motion is None
+    assert not followed.offsets
+    assert all(followed.parameters[timestep] is own for timestep, own in parameters.items())
 
 
 def test_turning_the_root_leaves_the_head_in_its_place(head):
@@ -331,9 +298,8 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     before, after = (flame_forward(model, np.zeros(0), own) for own in (frame, frame_of(changed)))
     apart = model.weights[:, ROOT] == 0
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
-    np.testing.assert_allclose(
-        axis_angle_matrices(frame_of(changed).rotation[None])[0], rotation, atol=1e-12
-    )
+    turned = axis_angle_matrices(frame_of(changed).rotation[None])[0]
+    np.testing.assert_allclose(turned, rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])
@@ -348,8 +314,7 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     model, expressions = one.model, bare.model.n_expression
     tracked = {t: rng.normal(0, 0.2, expressions + 18) for t in (2, 5, 9)}
     posed = {t: PosedTorso(values, rng.normal(0, 0.01, 3)) for t, values in tracked.items()}
-    world = Similarity(1.0, np.eye(3), np.zeros(3))
-    fit = HeadFit(one, np.zeros(0), tracked, world, static if earlier else None)
+    fit = HeadFit(one, np.zeros(0), tracked, HERE, static if earlier else None)
     cloth = torso_sheet(model).vertices
     drape = np.zeros(size)
     drape[cloth] = rng.normal(0, 0.01, (len(cloth), 3))
@@ -365,9 +330,7 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
         rest = model.v_template + model.shapedirs @ expression
         turn, joint = Rotation.from_rotvec(pose[:3]).as_matrix(), model.j_regressor[ROOT] @ rest
         rigid = (rest - joint) @ turn.T + joint + pose[-3:] + torso.shift
-        wanted = share * rigid + (1 - share) * flame_forward(
-            model, np.zeros(0), frame_of(torso.parameters)
-        )
+        wanted = share * rigid + (1 - share) * posed_mesh(fit, torso.parameters)
         if bends:
             wanted[cloth] += (drape[cloth] + bent[timestep]) @ turn.T
         found = posed_mesh(followed.fit, followed.parameters[timestep], followed.offsets[timestep])
@@ -377,10 +340,8 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     np.testing.assert_allclose(followed.fit.head.model.v_template, template, atol=1e-15)
     motion = followed.motion
     assert motion.misfit == decided.misfit
-    turns = [
-        np.linalg.norm(values[expressions + 3 : expressions + 6]) for values in tracked.values()
-    ]
-    assert motion.turn_deg == pytest.approx(np.degrees(max(turns)))
+    necks = [values[expressions + 3 : expressions + 6] for values in tracked.values()]
+    assert motion.turn_deg == pytest.approx(np.degrees(np.linalg.norm(necks, axis=1).max()))
     shifts = [1000 * np.linalg.norm(torso.shift) for torso in posed.values()]
     assert motion.shift_mm == pytest.approx(max(shifts))
     by_cloth = [1000 * np.linalg.norm(bend, axis=1).max() for bend in bent.values()]
@@ -408,27 +369,21 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     for number, camera in enumerate(cameras):
         meshes = [posed_mesh(fit, parameters[timestep]) for timestep in range(TIMESTEPS)]
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
-        write_npz(
-            tmp_path / f"points/cam{number}.npz",
-            {"timesteps": np.arange(TIMESTEPS), "points": points},
-        )
-    out = tmp_path / "out"
-    result = track(
+        arrays = {"timesteps": np.arange(TIMESTEPS), "points": points}
+        write_npz(tmp_path / f"points/cam{number}.npz", arrays)
+    footage, model, out = (
         open_footage(tmp_path / "footage"),
         tmp_path / "head.npz",
-        out,
-        tmp_path / "points",
-        mattes=False,
+        tmp_path / "out",
     )
+    result = track(footage, model, out, tmp_path / "points", mattes=False)
     found = read_torso_motion(out)
     assert found == result.torso
     assert found.shift_mm > 5
     assert len(read_torso_points(out).at) > 100
     misfit = read_json(out / REPORT_FILE)["image_misfit"]
     assert list(misfit) == list(REGIONS)
-    assert all(
-        list(own) == [str(timestep) for timestep in range(TIMESTEPS)] for own in misfit.values()
-    )
+    assert all(list(own) == list(map(str, range(TIMESTEPS))) for own in misfit.values())
     assert all(0 < value < 0.5 for own in result.image_misfit.values() for value in own.values())
     capture = open_capture(out, tmp_path / "head.npz")
     sequence, used = capture.flame, np.unique(capture.faces[torso_faces(capture.flame.model)])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flame.small_head import small_head, write_flame
+from flame.small_head import write_flame
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
@@ -22,8 +22,8 @@ from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
 from stga_addon.jobs.perform import perform
 from stga_addon.jobs.track import STAGES, Track
-from stga_addon.tracking.correspondence import nearest_points
-from stga_addon.tracking.fit import HeadFit
+from stga_addon.tracking.correspondence import nearest_points, shaded_image
+from stga_addon.tracking.fit import HeadFit, RecordedTake
 from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.folder import PLACES_FILE
 from stga_addon.tracking.footage.model import Footage, FootageCamera
@@ -36,7 +36,6 @@ from stga_addon.tracking.landmarks import (
     landmark_file,
     read_camera,
 )
-from stga_addon.tracking.mesh_image import shaded_image
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
@@ -45,11 +44,6 @@ from .recording import LANDMARKS, SIZE, record, rig, write_footage
 from .scenes import write_video
 from .test_fit import frame_at, places_on
 from .test_sequences import write_folders
-
-
-@pytest.fixture(scope="module")
-def head():
-    return HeadModel(small_head(0), "flame")
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +63,22 @@ def recorded(tmp_path, take, monkeypatch):
 
 
 def command(folder, *more):
-    out = ["--out", str(folder / "out"), "--landmarks", str(folder / "points")]
-    return main(
-        ["track", str(folder / "footage"), "--model", str(folder / "head.npz"), *out, *more]
-    )
+    named = {"--model": "head.npz", "--out": "out", "--landmarks": "points"}
+    paths = [word for name, file in named.items() for word in (name, str(folder / file))]
+    return main(["track", str(folder / "footage"), *paths, *more])
+
+
+def assert_projects_as(capture, meshes, vertices, skipped=2):
+    """The capture's meshes lie in its images where the recording's do."""
+    for view in (*capture.views["train"], *capture.views["val"]):
+        if view.timestep != skipped:
+            pixels, _ = view.camera.project(capture.mesh(view.timestep)[vertices])
+            expected, _ = rig()[view.camera_index].project(meshes[view.timestep][vertices])
+            assert np.abs(pixels - expected).mean() < 0.4
+
+
+def change(path, **values):
+    write_npz(path, {**np.load(path), **values})
 
 
 def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
@@ -81,23 +87,13 @@ def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
     monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     head = HeadModel(flame_model(None), "flame")
     meshes = record(tmp_path, head)
-    paths = [str(tmp_path / name) for name in ("footage", "out", "points")]
-    assert (
-        main(["track", paths[0], "--out", paths[1], "--landmarks", paths[2], "--mattes", "none"])
-        == 0
-    )
+    footage, out, points = (str(tmp_path / name) for name in ("footage", "out", "points"))
+    words = ["track", footage, "--out", out, "--landmarks", points, "--mattes", "none"]
+    assert main(words) == 0
     capture = open_capture(tmp_path / "out", tmp_path / "head.npz")
     assert capture.flame_file == tmp_path / "out/bundled_head.npz"
     assert capture.flame.model.expression_names == head.model.expression_names
-    face, cameras = (
-        head.model.masks["nose"],
-        {f"cam{number}": camera for number, camera in enumerate(rig())},
-    )
-    for view in capture.views["train"]:
-        if view.timestep != 2:
-            pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
-            expected, _ = cameras[f"cam{view.camera_index}"].project(meshes[view.timestep][face])
-            assert np.abs(pixels - expected).mean() < 0.4
+    assert_projects_as(capture, meshes, head.model.masks["nose"])
 
 
 def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsys, head):
@@ -105,23 +101,15 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, capsy
     written."""
     folder, meshes = recorded
     assert command(folder, "--meshes") == 0
-    printed = capsys.readouterr().out
-    assert "interpolated: 2" in printed
+    assert "interpolated: 2" in capsys.readouterr().out
     capture = open_capture(folder / "out", folder / "head.npz")
     assert capture.layout == "flame"
     assert capture.timesteps == (0, 1, 2, 3, 4)
     assert len({view.camera_index for view in capture.views["val"]}) == 1
-    cameras = {f"cam{number}": camera for number, camera in enumerate(rig())}
-    face = head.model.masks["face"]
-    for view in (*capture.views["train"], *capture.views["val"]):
-        if view.timestep != 2:
-            pixels, _ = view.camera.project(capture.mesh(view.timestep)[face])
-            expected, _ = cameras[f"cam{view.camera_index}"].project(meshes[view.timestep][face])
-            assert np.abs(pixels - expected).mean() < 0.4
+    assert_projects_as(capture, meshes, head.model.masks["face"])
     mesh = (folder / "out/meshes/00001.obj").read_text().splitlines()
     written = np.array([line.split()[1:] for line in mesh if line.startswith("v ")], float)
     np.testing.assert_allclose(written, capture.mesh(1), atol=2e-6)
-    assert read_json(folder / "out/tracking.json")["interpolated"] == [2]
     assert (folder / "out/contact_sheet.png").is_file()
 
 
@@ -135,10 +123,8 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     """
     folder, meshes = recorded
     turn = Rotation.from_euler("xyz", [100, -40, 20], degrees=True).as_matrix()
-    world, path = (
-        Similarity(scale, turn, np.array([2.0, -1.0, 0.5]) * scale),
-        folder / "footage/transforms.json",
-    )
+    world = Similarity(scale, turn, np.array([2.0, -1.0, 0.5]) * scale)
+    path = folder / "footage/transforms.json"
     values = read_json(path)
     for entry in values["frames"]:
         pose = np.array(entry["transform_matrix"])
@@ -147,37 +133,26 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     write_json(path, values if arguments else {**values, "world": "keep"})
     assert command(folder, *arguments) == 0
     assert ("is kept but for its scale" in capsys.readouterr().out) == (scale == 1000)
-    capture, kept = (
-        open_capture(folder / "out", folder / "head.npz"),
-        read_json(folder / "out/tracking.json"),
-    )
-    unit = kept["meters_per_unit"]
-    assert unit == pytest.approx(1.0 if scale < 2 else 0.001, rel=1e-9 if scale < 2 else 0.03)
+    capture = open_capture(folder / "out", folder / "head.npz")
+    unit = read_json(folder / "out/tracking.json")["meters_per_unit"]
+    assert unit == (pytest.approx(1.0, rel=1e-9) if scale < 2 else pytest.approx(0.001, rel=0.03))
     filmed = {camera.name: camera.camera for camera in open_footage(folder / "footage").cameras}
     for view in capture.views["train"]:
-        camera = filmed[f"cam{view.camera_index}"]
+        camera, turned = filmed[f"cam{view.camera_index}"], view.camera.world_to_camera[:3, :3]
         np.testing.assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
-        np.testing.assert_allclose(
-            view.camera.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9
-        )
+        np.testing.assert_allclose(turned, camera.world_to_camera[:3, :3], atol=1e-9)
     for timestep in (0, 3):
-        missed = (capture.mesh(timestep) - unit * world.apply(meshes[timestep]))[
-            head.model.masks["face"]
-        ]
-        assert np.linalg.norm(missed, axis=1).mean() < 2e-3
+        missed = capture.mesh(timestep) - unit * world.apply(meshes[timestep])
+        assert np.linalg.norm(missed[head.model.masks["face"]], axis=1).mean() < 2e-3
 
 
 def test_progress_names_step_and_quality(recorded):
     """Catches a bar that jumps back, a step that it does not know, and a fit of which nobody hears
     how good it is."""
     folder, _ = recorded
-    paths = (folder / "footage", folder / "head.npz", folder / "out")
-    told = []
-    perform(
-        Track(*paths, landmarks=folder / "points"),
-        lambda progress: bool(told.append(progress)),
-        print,
-    )
+    paths, told = (folder / "footage", folder / "head.npz", folder / "out"), []
+    request = Track(*paths, landmarks=folder / "points")
+    perform(request, lambda progress: bool(told.append(progress)), print)
     shares = [progress.share for progress in told]
     assert shares == sorted(shares)
     assert {progress.stage for progress in told} <= {*STAGES, "Tracked"}
@@ -212,43 +187,52 @@ def test_offsets_that_are_none(recorded, capsys, offset):
     assert "expected a camera and a number of frames, as in left=-3" in capsys.readouterr().err
 
 
-def test_offsets_of_listed_frames(recorded, capsys):
-    """Catches an offset that is silently ignored where the calibration lists frames by timestep."""
-    assert command(recorded[0], "--offset", "cam1=3") == 2
-    assert (
-        "transforms.json: lists images, which offsets do not apply to; expected none"
-        in capsys.readouterr().err
-    )
-    assert not (recorded[0] / "out").exists()
-
-
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
     """Catches a layout that only FLAME's own files open in."""
-    folder, _ = recorded
-    model = head.model
-    arrays = {
-        "mean": model.v_template,
-        "faces": model.faces,
-        "identity": model.shapedirs[:, :, : model.n_identity],
-        "expression": model.shapedirs[:, :, model.n_identity :],
-    }
-    write_npz(folder / "head.npz", arrays)
+    folder, model = recorded[0], head.model
+    shapes = np.split(model.shapedirs, [model.n_identity], axis=2)
+    named = dict(zip(("identity", "expression"), shapes, strict=True))
+    write_npz(folder / "head.npz", {"mean": model.v_template, "faces": model.faces, **named})
     assert command(folder) == 0
     capture = open_capture(folder / "out")
     assert capture.layout == "mesh"
     assert len(capture.neutral) == len(model.v_template)
 
 
-def test_a_camera_that_does_not_fit_is_named(recorded, capsys):
-    """Catches a mirrored or misplaced camera that quietly ruins the capture."""
+def misplaced(folder, points):
+    change(folder / "cam3.npz", points=points * [-1, 1] + [SIZE + 9, 0])
+
+
+def out_of_step(folder, points):
+    change(folder / "cam3.npz", points=np.roll(points, 3, axis=0))
+
+
+def of_another_detector(folder, points):
+    change(folder / "cam0.npz", points=np.zeros((5, 7, 2)), confidence=np.ones((5, 7)))
+
+
+def in_one_point(folder, points):
+    barycentric = np.full((LANDMARKS, 3), 1 / 3)
+    change(folder / "head_model.npz", face=np.zeros(LANDMARKS, int), barycentric=barycentric)
+
+
+@pytest.mark.parametrize(("damage", "more", "message"), [
+    (misplaced, (), r"camera cam3: .* timestep"),
+    (out_of_step, (), r"camera cam3: .* at timestep \d, .* check its calibration, synchroniz"),
+    (of_another_detector, (), "points: the files have different numbers of landmarks"),
+    (in_one_point, (), "head_model.npz: face: its landmarks lie in one point of the head model"),
+    (None, ("--offset", "cam1=3"), "transforms.json: lists images, which offsets do not apply to"),
+])  # fmt: skip
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_does_not_fit_is_named(recorded, capsys, damage, more, message):
+    """Catches a camera that is mirrored, misplaced or was started later and quietly ruins the
+    capture, landmarks of one camera taken for those of another number, a division by the extent of
+    landmarks that all lie on one triangle, and offsets ignored where frames are listed."""
     folder, _ = recorded
-    points = dict(np.load(folder / "points/cam3.npz"))
-    points["points"][..., 0] = SIZE - points["points"][..., 0] + 9
-    write_npz(folder / "points/cam3.npz", points)
-    assert command(folder) == 2
-    message = capsys.readouterr().err
-    assert "camera cam3" in message
-    assert "timestep" in message
+    if damage is not None:
+        damage(folder / "points", np.load(folder / "points/cam3.npz")["points"])
+    assert command(folder, *more) == 2
+    assert re.search(message, capsys.readouterr().err)
     assert not (folder / "out/transforms_train.json").exists()
 
 
@@ -256,69 +240,31 @@ def test_a_mirrored_rig_is_named(recorded, capsys, head):
     """Catches images that are all mirrored, where no camera stands out from the others."""
     folder, meshes = recorded
     template, faces = head.model.v_template, head.model.faces
-    twins, _ = nearest_points(
-        template, faces, places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1]
-    )
+    mirrored = places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1]
+    twins, _ = nearest_points(template, faces, mirrored)
     for number, camera in enumerate(rig()):
-        path = folder / f"points/cam{number}.npz"
         points = np.stack([camera.project(twins.on(mesh, faces))[0] for mesh in meshes])
         # a detector calls the left eye of a mirrored face its right one
-        points[..., 0] = SIZE - points[..., 0]
-        write_npz(path, dict(np.load(path)) | {"points": points})
+        change(folder / f"points/cam{number}.npz", points=points * [-1, 1] + [SIZE, 0])
     assert command(folder) == 2
-    message = capsys.readouterr().err
-    assert re.search(
-        r"camera cam\d: .* pixels at timestep \d, and those of the other cameras are too; check",
-        message,
-    )
-    assert not (folder / "out/transforms_train.json").exists()
-
-
-def test_a_camera_out_of_step_is_named(recorded, capsys):
-    """Catches a camera that was started later, whose head is averaged into everyone's."""
-    folder, _ = recorded
-    arrays = dict(np.load(folder / "points/cam3.npz"))
-    arrays["points"] = np.roll(arrays["points"], 3, axis=0)
-    write_npz(folder / "points/cam3.npz", arrays)
-    assert command(folder) == 2
-    message = capsys.readouterr().err
-    assert re.search(
-        r"camera cam3: .* at timestep \d, .* check its calibration, synchronization", message
-    )
-    assert not (folder / "out/transforms_train.json").exists()
+    message = r"camera cam\d: .* pixels at timestep \d, and those of the other cameras are too;"
+    assert re.search(message, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])
 def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
     """Catches a camera whose focal length is 5 % off, which moves landmarks less than a detector's
     own errors."""
-    folder, _ = recorded
-    path = folder / "footage/transforms.json"
+    path = recorded[0] / "footage/transforms.json"
     written = read_json(path)
     for entry in written["frames"]:
         if entry["camera_id"] == "cam1":
             entry["fl_x"], entry["fl_y"] = factor * entry["fl_x"], factor * entry["fl_y"]
     write_json(path, written)
-    assert command(folder) == 0
-    warnings = [
-        line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: camera")
-    ]
-    assert len(warnings) == 1
-    size = "larger" if factor < 1 else "smaller"
-    assert re.search(
-        rf"camera cam1: shows the head [45]\.\d% {size} .* timestep \d; check its focal length",
-        warnings[0],
-    )
-
-
-def test_landmark_files_of_different_detectors(recorded, capsys):
-    """Catches landmarks of one camera taken for those of another number."""
-    path = recorded[0] / "points/cam0.npz"
-    write_npz(
-        path, dict(np.load(path)) | {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}
-    )
-    assert command(recorded[0]) == 2
-    assert "points: the files have different numbers of landmarks" in capsys.readouterr().err
+    assert command(recorded[0]) == 0
+    (warning,) = re.findall("(?m)^warning: camera .*$", capsys.readouterr().out)
+    expected = rf"[45]\.\d% {'larger' if factor < 1 else 'smaller'} .* timestep \d; check its focal"
+    assert re.search(f"camera cam1: shows the head {expected} length", warning)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -326,39 +272,24 @@ def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsy
     """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell
     where it is, and training on images whose head is a guess."""
     record(tmp_path, head, timesteps=8)
-    places = dict(np.load(tmp_path / "points/head_model.npz"))
-    places["face"][:7] = -1
-    write_npz(tmp_path / "points/head_model.npz", places)
+    face = np.load(tmp_path / "points/head_model.npz")["face"]
+    face[:7] = -1
+    change(tmp_path / "points/head_model.npz", face=face)
     for camera in range(5):
-        arrays = dict(np.load(tmp_path / f"points/cam{camera}.npz"))
-        points, confidence = arrays["points"], arrays["confidence"]
+        path = tmp_path / f"points/cam{camera}.npz"
+        points, confidence = (np.load(path)[name] for name in ("points", "confidence"))
         confidence[3, 7:] = 0  # unreliable ones alone
         points[4] = 5.0  # all in one point
         confidence[5] = np.arange(LANDMARKS) % 5 == camera  # each in one camera
-        confidence[6] = (np.arange(LANDMARKS) == 20) | (np.arange(LANDMARKS) == 21)  # only two
-        write_npz(tmp_path / f"points/cam{camera}.npz", arrays)
+        confidence[6] = np.isin(np.arange(LANDMARKS), (20, 21))  # only two
+        change(path, points=points, confidence=confidence)
     assert command(tmp_path) == 0
     assert read_json(tmp_path / "out/tracking.json")["interpolated"] == [2, 3, 4, 5, 6]
-    timesteps = {
-        split: {
-            frame["timestep_index"]
-            for frame in read_json(tmp_path / f"out/transforms_{split}.json")["frames"]
-        }
-        for split in ("train", "test")
-    }
+    timesteps = {}
+    for split in ("train", "test"):
+        frames = read_json(tmp_path / f"out/transforms_{split}.json")["frames"]
+        timesteps[split] = {frame["timestep_index"] for frame in frames}
     assert timesteps == {"train": {0, 1, 7}, "test": {2, 3, 4, 5, 6}}
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_places_in_one_point_are_no_face(recorded, capsys):
-    """Catches a division by the extent of landmarks that all lie on one triangle."""
-    path = recorded[0] / "points/head_model.npz"
-    arrays = {"face": np.zeros(LANDMARKS, int), "barycentric": np.full((LANDMARKS, 3), 1 / 3)}
-    write_npz(path, arrays)
-    assert command(recorded[0]) == 2
-    assert (
-        f"{path}: face: its landmarks lie in one point of the head model" in capsys.readouterr().err
-    )
 
 
 @pytest.mark.parametrize(("side_deg", "is_told"), [(68, False), (45, True)])
@@ -375,24 +306,17 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     at = places.on(head.model.v_template, head.model.faces)
     cameras, found = [], {}
     for number, angle in enumerate(np.radians([-30, -10, 10, 30, side_deg])):
-        camera = look_at(
-            at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)]),
-            at.mean(0),
-            200,
-            200,
-            500.0,
-        )
+        eye = at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)])
+        camera = look_at(eye, at.mean(0), 200, 200, 500.0)
         pixels, _ = camera.project(at)
         size = 0.93 if number == 4 else 1.0
         points = np.stack([pixels.mean(0) + size * (pixels - pixels.mean(0))] * 3)
         found[f"cam{number}"] = CameraLandmarks(np.arange(3), points, np.ones(points.shape[:2]))
         cameras.append(FootageCamera(f"cam{number}", camera, None))
-    warnings = scale_warnings(
-        fit, places, used, Footage(Path("footage"), tuple(cameras), (0, 1, 2)), found
-    )
-    assert [text[:40] for text in warnings] == (
-        ["camera cam4: shows the head 7.0% smaller"] if is_told else []
-    )
+    footage = Footage(Path("footage"), tuple(cameras), (0, 1, 2))
+    warnings = scale_warnings(fit, RecordedTake(places, used, {}), footage, found)
+    told = ["camera cam4: shows the head 7.0% smaller"]
+    assert [text[:40] for text in warnings] == (told if is_told else [])
 
 
 class Counting:
@@ -407,17 +331,10 @@ class Counting:
 
 
 def test_detection_resumes_camera_by_camera(recorded):
-    """Catches a canceled detection that starts from the beginning, or keeps half a camera."""
+    """Catches a canceled detection that starts from the beginning, or keeps half a camera, and a
+    head that jumps between two people."""
     folder, _ = recorded
-    footage, detector = (
-        open_footage(folder / "footage"),
-        Counting([np.ones((3, 2)), np.ones((3, 2))]),
-    )
-
-    def cancel(stage, done, total):
-        if done == 13:
-            raise KeyboardInterrupt
-
+    footage, detector = open_footage(folder / "footage"), Counting([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
         detect_landmarks(footage, detector, folder / "found", Helpers(1), cancel)
     assert len(list((folder / "found").iterdir())) == 2
@@ -427,9 +344,17 @@ def test_detection_resumes_camera_by_camera(recorded):
     # the same face twice is one face
     assert all(camera.confidence.all() for camera in found.values())
     camera = footage.cameras[0]
-    np.testing.assert_array_equal(
-        read_camera(landmark_file(folder / "found", camera.name), camera).points, 1
-    )
+    written = read_camera(landmark_file(folder / "found", camera.name), camera)
+    np.testing.assert_array_equal(written.points, 1)
+    two = np.array([[0.0, 0.0], [9.0, 9.0]])
+    message = r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
+    with pytest.raises(StgaError, match=message):
+        detect_landmarks(footage, Counting([two, two + 30]), folder, Helpers(1), lambda *_: None)
+
+
+def cancel(stage, done, total):
+    if done == 13:
+        raise KeyboardInterrupt
 
 
 class Remembering:
@@ -442,32 +367,29 @@ class Remembering:
         return [self.landmarks[int(image[0, 0, 0])]]
 
 
+def use_detector(monkeypatch, detector, places):
+    """Let `track` use a detector whose landmarks lie at some places of the head model."""
+    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: detector)
+    calibrated = places, np.ones(len(places), bool)
+    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: calibrated)
+
+
 def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     """Catches landmarks in another precision on disk than in memory: the same track, with other
     numbers."""
     number = iter(range(25))
-    meshes = record(
-        tmp_path, head, lambda mesh, camera: np.full((SIZE, SIZE, 3), next(number), np.uint8)
-    )
+    meshes = record(tmp_path, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
     places, rng = places_on(head, LANDMARKS), np.random.default_rng(0)
     exact = [
         camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
     ]
-    detector = Remembering([points + rng.normal(0, 0.1, points.shape) for points in exact])
-    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: detector)
-    monkeypatch.setattr(
-        "stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool))
-    )
-
-    def cancel(stage, done, total):
-        if done == 13:
-            raise KeyboardInterrupt
-
-    footage = open_footage(tmp_path / "footage")
-    track(footage, tmp_path / "head.npz", tmp_path / "unbroken")
+    noisy = [points + rng.normal(0, 0.1, points.shape) for points in exact]
+    use_detector(monkeypatch, Remembering(noisy), places)
+    footage, model = open_footage(tmp_path / "footage"), tmp_path / "head.npz"
+    track(footage, model, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
-        track(footage, tmp_path / "head.npz", tmp_path / "resumed", report=cancel)
-    track(footage, tmp_path / "head.npz", tmp_path / "resumed")
+        track(footage, model, tmp_path / "resumed", report=cancel)
+    track(footage, model, tmp_path / "resumed")
     written = [path for path in sorted((tmp_path / "unbroken").rglob("*")) if path.is_file()]
     assert len(written) > 30
     for path in written:
@@ -501,30 +423,25 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     those of a recording or a head model that was replaced under its name."""
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
-    places = places_on(head, LANDMARKS)
-    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
-    monkeypatch.setattr(
-        "stga_addon.tracking.track.calibrate", lambda *_: (places, np.ones(LANDMARKS, bool))
-    )
+    use_detector(monkeypatch, Counting([]), places_on(head, LANDMARKS))
     for name in ("out", "out_0", "out_1"):
         (tmp_path / name).mkdir()  # else nothing is left of footage without a face
-    for offset, message in (
-        (1, "shows no face"),
-        (1, "shows no face"),
-        (2, "holds landmarks of other footage"),
-    ):
-        footage = open_footage(
-            tmp_path / "footage", frames=FrameRange(stop=6, offsets={"b": offset})
-        )
+    none, other = "shows no face", "holds landmarks of other footage"
+    for offset, message in ((1, none), (1, none), (2, other)):
+        frames = FrameRange(stop=6, offsets={"b": offset})
         with pytest.raises(StgaError, match=message):
-            track(footage, tmp_path / "head.npz", tmp_path / "out")
+            track(
+                open_footage(tmp_path / "footage", frames=frames),
+                tmp_path / "head.npz",
+                tmp_path / "out",
+            )
     image = sorted((tmp_path / "footage").rglob("*.png"))[3]
     for number, changed in enumerate((image, tmp_path / "head.npz")):
         footage = open_footage(tmp_path / "footage", frames=FrameRange(stop=6))
-        with pytest.raises(StgaError, match="shows no face"):
+        with pytest.raises(StgaError, match=none):
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
         os.utime(changed, ns=(0, 1))
-        with pytest.raises(StgaError, match="holds landmarks of other footage"):
+        with pytest.raises(StgaError, match=other):
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
 
 
@@ -532,26 +449,12 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     """Catches images and landmarks that stay where the footage is of no use, and a message that
     does not name it."""
     write_video(tmp_path / "landscape.mp4", range(0, 200, 50))
-    head = HeadModel(flame_model(None), "flame")
-    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: Counting([]))
-    places = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
-    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: places)
-    with pytest.raises(
-        StgaError, match=r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
-    ):
+    bundled = HeadModel(flame_model(None), "flame")
+    use_detector(monkeypatch, Counting([]), places_on(bundled, LANDMARKS))
+    message = r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
+    with pytest.raises(StgaError, match=message):
         track(open_footage(tmp_path / "landscape.mp4"), None, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_two_faces_are_reported_with_camera_and_frame(recorded):
-    """Catches a head that jumps between two people."""
-    folder, _ = recorded
-    two = np.array([[0.0, 0.0], [9.0, 9.0]])
-    footage, detector = open_footage(folder / "footage"), Counting([two, two + 30])
-    with pytest.raises(
-        StgaError, match=r"camera cam0 sees 5 of 5 frames with two faces, the first at timestep 0"
-    ):
-        detect_landmarks(footage, detector, folder / "found", Helpers(1), lambda *_: None)
 
 
 def test_pictures_of_a_head_are_tracked(tmp_path, head):
@@ -559,18 +462,14 @@ def test_pictures_of_a_head_are_tracked(tmp_path, head):
     nothing given."""
     pytest.importorskip("cv2")
     shape = np.random.default_rng(1).normal(0, 0.5, head.model.n_identity)
-    meshes = [
-        flame_forward(
-            head.model, shape, replace(frame_at(head, t), expr=np.zeros(head.model.n_expression))
-        )
-        for t in range(2)
-    ]
-    footage = write_footage(
-        tmp_path / "footage",
-        rig(5, 256),
-        2,
-        lambda camera, t: shaded_image(meshes[t], head.model.faces, camera),
-    )
+    still = np.zeros(head.model.n_expression)
+    frames = [replace(frame_at(head, t), expr=still) for t in range(2)]
+    meshes = [flame_forward(head.model, shape, frame) for frame in frames]
+
+    def picture(camera, timestep):
+        return shaded_image(meshes[timestep], head.model.faces, camera)
+
+    footage = write_footage(tmp_path / "footage", rig(5, 256), 2, picture)
     write_flame(head.model, tmp_path / "head.npz")
     result = track(open_footage(footage), tmp_path / "head.npz", tmp_path / "out")
     assert result.median_px < 3
@@ -586,13 +485,9 @@ def test_no_face_is_found_on_the_back_of_a_head(recorded, capsys, head):
     """Catches a head model without a face that is fitted all the same."""
     pytest.importorskip("cv2")
     folder, _ = recorded
-    write_flame(
-        replace(head.model, v_template=head.model.v_template * [-1, 1, -1]), folder / "turned.npz"
-    )
-    words = [
-        "track", str(folder / "footage"), "--model", str(folder / "turned.npz"), "--out",
-        str(folder / "out"),
-    ]  # fmt: skip
-    assert main(words) == 2
+    turned = replace(head.model, v_template=head.model.v_template * [-1, 1, -1])
+    write_flame(turned, folder / "turned.npz")
+    words = ["--model", str(folder / "turned.npz"), "--out", str(folder / "out")]
+    assert main(["track", str(folder / "footage"), *words]) == 2
     assert re.search(r"turned\.npz: shows a face in . of 9 pictures", capsys.readouterr().err)
     assert not (folder / "out").exists()

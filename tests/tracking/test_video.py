@@ -103,6 +103,11 @@ def copy_packets(source, path, shift=0, first=0, last=None, options=None):
             out.mux(packet)
 
 
+def packets_of(path):
+    with av.open(str(path)) as container:
+        return [packet for packet in container.demux(video=0) if packet.size]
+
+
 def orders(count):
     shuffled = list(range(count))
     random.Random(1).shuffle(shuffled)
@@ -143,9 +148,7 @@ def test_frames_hidden_by_an_edit_list(tmp_path, codec, suffix):
     (tmp_path / "take").mkdir()
     path = tmp_path / f"take/a{suffix}"
     copy_packets(tmp_path / "whole.mp4", path, shift=7)
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-    assert any(packet.is_discard for packet in packets)
+    assert any(packet.is_discard for packet in packets_of(path))
     assert_numbers(path, list(range(7, FRAMES)))
 
 
@@ -157,27 +160,24 @@ def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
     """Catches pictures counted whose references were cut away, and frames shown in their place."""
     whole = tmp_path / f"whole{name[1:]}"
     write_numbered(whole, codec, options)
-    with av.open(str(whole)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-    second = [n for n, packet in enumerate(packets) if packet.is_keyframe][1]
+    second = [n for n, packet in enumerate(packets_of(whole)) if packet.is_keyframe][1]
     (tmp_path / "take").mkdir()
     copy_packets(whole, tmp_path / "take" / name, first=second)
     footage = open_footage(tmp_path / "take" / name)
     start = shown(footage.cameras[0].image(0))
     if name == "a.mkv":
-        assert footage.warnings[0].endswith(
-            "a.mkv: its first 3 frames cannot be decoded; they are left out, and not counted"
-        )
+        told = "its first 3 frames cannot be decoded; they are left out, and not counted"
+        assert footage.warnings[0].endswith(f"a.mkv: {told}")
     assert_numbers(tmp_path / "take" / name, list(range(start, FRAMES)))
 
 
 def test_an_open_video_goes_to_a_helping_process(tmp_path):
     """Catches a decoder in the middle of its video, which cannot be pickled."""
-    write_numbered(tmp_path / "video.mp4", "libx264", {})
+    write_numbered(tmp_path / "video.mp4", "libx264", {}, 3)
     frames = open_footage(tmp_path / "video.mp4", focal=50.0).cameras[0].frames
-    frames.image(frames.timesteps[0])
+    frames.image(0)
     there = pickle.loads(pickle.dumps(frames))
-    for timestep in frames.timesteps[1:3]:
+    for timestep in (1, 2):
         np.testing.assert_array_equal(there.image(timestep), frames.image(timestep))
 
 
@@ -185,18 +185,15 @@ def test_variable_frame_rate(tmp_path):
     """Catches frames of a phone played evenly although gaps lie between them: out of step with
     sound and other cameras, and motion taken for a jump."""
     durations = [1, 1, 1, 2, 1, 3, 1, 75] * 8
-    write_numbered(
-        tmp_path / "a.mkv", "libx264", X264, len(durations), rate=50, durations=durations
-    )
+    count, path = len(durations), tmp_path / "a.mkv"
+    write_numbered(path, "libx264", X264, count, rate=50, durations=durations)
     footage = open_footage(tmp_path)
     (warning,) = footage.warnings
     assert "a.mkv: has a variable frame rate (frames last 20 to 1500 ms)" in warning
     assert footage.fps == pytest.approx(50, rel=1e-3)
-    times = [sum(durations[:number]) for number in range(len(durations))]
-    assert footage.timesteps == tuple(times)
-    assert [shown(footage.cameras[0].image(timestep)) for timestep in times] == list(
-        range(len(durations))
-    )
+    assert footage.timesteps == tuple(sum(durations[:number]) for number in range(count))
+    found = [shown(footage.cameras[0].image(timestep)) for timestep in footage.timesteps]
+    assert found == list(range(count))
 
 
 def test_cameras_whose_rate_varies_apart(tmp_path):
@@ -206,9 +203,8 @@ def test_cameras_whose_rate_varies_apart(tmp_path):
     for name, own in durations.items():
         write_numbered(tmp_path / f"{name}.mkv", "libx264", X264, len(own), rate=50, durations=own)
         times[name] = [sum(own[:number]) for number in range(len(own))]
-    write_colmap_text(
-        tmp_path / "sparse/0", rig(2, COLUMNS * BLOCK, ROWS * BLOCK), ["a.png", "b.png"]
-    )
+    cameras = rig(2, COLUMNS * BLOCK, ROWS * BLOCK)
+    write_colmap_text(tmp_path / "sparse/0", cameras, ["a.png", "b.png"])
     footage = open_footage(tmp_path)
     assert footage.timesteps == tuple(sorted(set(times["a"]) & set(times["b"])))
     for camera in footage.cameras:
@@ -232,9 +228,8 @@ def test_display_matrices(tmp_path, turn):
     """Catches a front camera's video that is shown mirrored, lying or upside down."""
     matrix, expected = TURNS[turn]
     path, levels = tmp_path / "phone.mp4", {"a": 30, "b": 90, "c": 150, "d": 210}
-    image = np.kron(
-        [[levels["a"], levels["b"]], [levels["c"], levels["d"]]], np.ones((32, 48))
-    ).astype(np.uint8)
+    stored = np.reshape(list(levels.values()), (2, 2))
+    image = np.kron(stored, np.ones((32, 48))).astype(np.uint8)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=25, options={"crf": "8"})
         stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
@@ -280,9 +275,8 @@ def test_colors_of_phones(tmp_path, name):
         stream = container.add_stream(codec, rate=25, options=options)
         stream.width, stream.height, stream.pix_fmt = 64, 64, pixels
         context = stream.codec_context
-        context.color_primaries, context.color_trc, context.colorspace, context.color_range = (
-            primaries, transfer, matrix, 1,
-        )  # fmt: skip
+        context.color_primaries, context.color_trc = primaries, transfer
+        context.colorspace, context.color_range = matrix, 1
         image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
         frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(
             format=pixels, dst_colorspace=matrix
@@ -316,30 +310,24 @@ def test_file_that_is_cut_off(tmp_path):
     write_numbered(tmp_path / "a.mp4", "libx264", X264)
     path = tmp_path / "cut.mp4"
     copy_packets(tmp_path / "a.mp4", path, options={"movflags": "faststart"})
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-        last = packets[33]
-        expected = sorted(packet.pts for packet in packets[:33])
-        numbers = [sorted(packet.pts for packet in packets).index(time) for time in expected]
+    packets = packets_of(path)
+    times, last = [packet.pts for packet in packets], packets[33]
+    numbers = [sorted(times).index(time) for time in sorted(times[:33])]
     path.write_bytes(path.read_bytes()[: last.pos + last.size // 2])
     footage = open_footage(path)
     assert f"{path}: is cut off; it ends after 33 frames" in footage.warnings
     camera = footage.cameras[0]
     for order in orders(33).values():
-        assert [shown(camera.image(camera.timesteps[n])) for n in order] == [
-            numbers[n] for n in order
-        ]
+        found = [shown(camera.image(camera.timesteps[n])) for n in order]
+        assert found == [numbers[n] for n in order]
 
 
 def test_frame_that_the_decoder_leaves_out(tmp_path):
     """Catches the next frame shown in place of a damaged one, and a message without a reason."""
     path = tmp_path / "a.mov"
     write_numbered(path, "libx265", OPEN_X265)
-    with av.open(str(path)) as container:
-        packets = sorted(
-            (p for p in container.demux(video=0) if p.size), key=lambda packet: packet.pts
-        )
-        begin, end = packets[41].pos, packets[41].pos + packets[41].size
+    packet = sorted(packets_of(path), key=lambda packet: packet.pts)[41]
+    begin, end = packet.pos, packet.pos + packet.size
     data = bytearray(path.read_bytes())
     while begin < end:
         data[begin + 4] = 38 << 1  # makes filler data of the unit, which decoders pass over
@@ -349,9 +337,8 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
     assert shown(camera.image(40)) == 40
     for before in (40, FRAMES - 1):  # in order, and by a seek
         camera.image(before)
-        with pytest.raises(
-            StgaError, match=r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"
-        ):
+        message = r"a.mov: frame 41: cannot be decoded \(the decoder gives no picture"
+        with pytest.raises(StgaError, match=message):
             camera.image(41)
     assert shown(camera.image(50)) == 50
 
@@ -360,13 +347,11 @@ def test_without_pictures(tmp_path):
     """Catches a message that names an exception instead of what is missing."""
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
-        frame = av.AudioFrame.from_ndarray(
-            np.zeros((1, 800), np.int16), format="s16", layout="mono"
-        )
+        silence = np.zeros((1, 800), np.int16)
+        frame = av.AudioFrame.from_ndarray(silence, format="s16", layout="mono")
         frame.sample_rate = 8000
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    with pytest.raises(
-        StgaError, match=r"a.mkv: is not a readable video \(it has no video stream\)"
-    ):
+    message = r"a.mkv: is not a readable video \(it has no video stream\)"
+    with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)

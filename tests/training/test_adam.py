@@ -47,7 +47,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     rng = np.random.default_rng(seed)
     rows = separate_rows(state)
     groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
-    theirs = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-5)
+    theirs = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-5)
     history: list[list[torch.Tensor]] = [[] for _ in rows]
     for _ in range(25):
         listed = np.flatnonzero(rng.random(6) < [1, 0.7, 0.5, 0.3, 0.1, 0.0]).astype(np.int32)
@@ -62,7 +62,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
         theirs.step()
-        adam.step(state, listed, RATES, ema_share=0.2, epsilon=np.float32(1e-5))
+        adam.step(state, listed, RATES, 0.99, ema_share=0.2, epsilon=np.float32(1e-5))
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):
@@ -85,28 +85,6 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
         np.testing.assert_allclose(
             state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5
         )
-
-
-def test_frozen_rows_keep_every_bit() -> None:
-    """Catches anything at all happening to rows that are not listed, also where their gradients are
-    large or NaN."""
-    state = random_state(40, 7)
-    state.gradients.xyz[3] = np.nan
-    state.parameters.xyz[5] = [np.nan, -0.0, 1e-42]
-    before = bits(state)
-    listed = np.array([0, 7, 21, 39], np.int32)
-    for _ in range(5):
-        adam.step(state, listed, RATES)
-    after = bits(state)
-    frozen = np.setdiff1d(np.arange(40), listed)
-    for name in before:
-        np.testing.assert_array_equal(after[name][frozen], before[name][frozen], err_msg=name)
-    moved = [
-        name for name in before if (after[name][listed] != before[name][listed]).any(axis=1).all()
-    ]
-    parts = ("parameters", "average", "first", "second")
-    trained = [f"{part}/{name}" for part in parts for name in state.parameters._fields]
-    assert set(trained) | {"steps"} == set(moved)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -134,7 +112,7 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
 
 def test_many_rows() -> None:
     """Catches rows that take their neighbours' step counts where the work is cut into blocks for
-    the threads."""
+    the threads, and steps of harmonics above the degree in use."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
     state.steps[:] = rng.integers(0, 50, 1500)
@@ -147,7 +125,7 @@ def test_many_rows() -> None:
         if n != "sh_rest"
     }
     before = {name: array[rows].astype(float) for name, array in state.parameters._asdict().items()}
-    adam.step(state, rows, RATES)
+    adam.step(state, rows, RATES, sh_degree=1)
     np.testing.assert_array_equal(state.steps[rows], counts)
     for name, value in before.items():
         gradient = getattr(state.gradients, name)[rows].astype(float)
@@ -156,7 +134,7 @@ def test_many_rows() -> None:
         square = (0.999 * old[f"second/{name}"] + 0.001 * gradient**2) / (1 - 0.999**per_row)
         rate = np.full(value.shape[1:], RATES[name])
         if name == "sh":
-            rate[1:] = RATES["sh_rest"]
+            rate[1:], rate[4:] = RATES["sh_rest"], 0
         step = rate * mean / np.sqrt(square)
         # Where the random second moment is near zero a step is many rates long, and rounded in
         # proportion.

@@ -112,12 +112,32 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
     tracking = RefinedTracking(lost[0], "stga")
     some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
     tracking.take(
-        AvatarTracking((0, 5), some, *np.zeros((3, 2)), np.zeros((2, 3)), np.ones(0)),
+        AvatarTracking((0, 5), some, *np.zeros((3, 2)), np.zeros((2, 3)), np.ones(0), np.eye(1)),
         TIMESTEPS[:-1],
     )
     np.testing.assert_allclose(
         (tracking.parameters[:, :-3] - tracking.tracked)[:, 0], [1, 2, 3, 4, 0]
     )
+
+
+def test_time_says_what_images_do_not(right: Made) -> None:
+    """Catches jitter in depth that a single camera does not see, motion that it does see but that
+    is smoothed away, a blurred cut, and shifts and poses that change places."""
+    model, count = right[0].flame.model, 40
+    known = np.full(model.n_expression + 3 + 18, 1e-5) ** -2.0
+    known[[0, -1]] = 0.1**-2, 0.01**-2
+    values, noise = np.zeros((count, model.n_expression + 18)), np.random.default_rng(0)
+    values[count // 2 :, 0] = 3  # a cut
+    values[:, -3:] = noise.normal(0, 0.003, (count, 3))
+    shift = noise.normal(0, 0.003, (count, 3))
+    none = np.zeros(count)
+    each = np.tile(np.diag(known), (count, 1, 1))
+    found = AvatarTracking(tuple(range(count)), values, none, none, none, shift, none, each)
+    smooth = found.smoothed(model)
+    assert smooth.parameters[:, -1].std() < 0.6 * values[:, -1].std()
+    np.testing.assert_allclose(smooth.parameters[:, 1:-1], values[:, 1:-1], atol=1e-5)
+    np.testing.assert_allclose(smooth.parameters[:, 0], values[:, 0], atol=0.05)
+    np.testing.assert_allclose(smooth.shift, shift, atol=1e-5)
 
 
 def differences(

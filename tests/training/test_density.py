@@ -10,7 +10,7 @@ from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.training.optimize.density import MIN_OPACITY, control_density
-from stga_addon.training.optimize.state import TrainState, arrays_of, keep_rows, new_state
+from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 
 from .toys import bits, random_state
 
@@ -186,23 +186,3 @@ def test_faint_splats_go_but_no_triangles_last_one() -> None:
     assert (new.parameters.opacity[others] > FAINT_LOGIT).all()
     assert (new.parameters.opacity[new.unbound & others] > FAINT_LOGIT).all()
     assert int(others.sum()) == sum(n >= 30 and n % FACES != 2 for n in range(COUNT))
-
-
-def test_one_splat_a_triangle_survives_even_when_all_are_transparent_and_have_a_gradient() -> None:
-    """Catches pruning and splitting that together empty a triangle."""
-    state = busy_state(list(range(0, COUNT, 2)))
-    state.parameters.opacity[:] = -20.0
-    state.unbound[:] = np.arange(COUNT) % 7 == 0
-    new = control(state)
-    assert set(new.face[~new.unbound].tolist()) == set(range(FACES))
-    assert all(np.isfinite(array).all() for array in new.parameters)
-
-
-def test_no_splat_is_lost_from_the_input() -> None:
-    """Catches control that edits the state it was given, which the caller may still hold."""
-    state = busy_state([1, 2, 3])
-    before = bits(state)
-    control(state)
-    for name, value in bits(state).items():
-        np.testing.assert_array_equal(value, before[name])
-    assert len(keep_rows(state, np.ones(COUNT, bool))) == COUNT

@@ -1,7 +1,6 @@
 """Extending a finished run by further takes: what is selected, what is remembered, and resumption
 to the same bits."""
 
-import importlib
 import json
 import shutil
 from dataclasses import replace
@@ -279,31 +278,6 @@ def test_takes_that_do_not_fit(
     with pytest.raises(StgaError, match=sentences[change]):
         prepare_extension(parent, (take,), iterations=1)
     assert read_run(parent).takes == ()
-
-
-@pytest.fixture
-def benchmark(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """benchmarks/extend.py, which is no part of the package."""
-    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
-    return importlib.import_module("extend")
-
-
-def test_the_benchmark_compares_equal_effects(
-    benchmark: Any, takes: tuple[Path, Path], parent: Path
-) -> None:
-    """Catches an extension that wins because training anew goes without an effect that began with
-    the take."""
-    prepared = prepare_extension(parent, (takes[1],), iterations=1)
-    settings = replace(
-        prepared.run.settings, strain_color=True, driven_offsets=("strain_position",)
-    )
-    arms = benchmark.extend_arms(replace(prepared, run=replace(prepared.run, settings=settings)), 0)
-    assert (arms["anew"].settings.strain_color, arms["anew"].settings.driven_offsets) == (
-        True,
-        ("strain_position",),
-    )
-    plain = arms["all-in-turn-plain"].settings
-    assert (plain.strain_color, plain.driven_offsets) == (True, ())  # as the parent
 
 
 def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:

@@ -56,14 +56,14 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 4 and 5$"),
+        ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 4 to 6$"),
         ({"version": None}, r"run\.json: has run format version None"),
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: setting capture: expected a path, got None"),
         ({"settings": None}, r"run\.json: settings: fields are missing"),
         (
             {"settings": {}},
-            r"run\.json: settings: fields are missing or unknown \(adam_epsilon, antialiased, ",
+            r"run\.json: settings: fields are missing or unknown \(adam_beta2, adam_epsilon, ",
         ),
         (
             {"device": "toaster"},
@@ -93,16 +93,6 @@ def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> N
     folder.write_run(tmp_path, make_run())
     edit_json(tmp_path / "run.json", **change)
     with pytest.raises(StgaError, match=message):
-        folder.read_run(tmp_path)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "3", '{"format": "stga-run", "version": 2}'])
-def test_run_files_that_are_none(tmp_path: Path, text: str) -> None:
-    """Catches a traceback for a run.json cut off by a full disk."""
-    with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
-        folder.read_run(tmp_path)
-    (tmp_path / "run.json").write_text(text)
-    with pytest.raises(StgaError, match=r"run\.json: "):
         folder.read_run(tmp_path)
 
 
@@ -157,24 +147,6 @@ def test_arrays_by_columns_are_read(tmp_path: Path) -> None:
     assert all(array.flags.c_contiguous for array in arrays_of(state).values())
 
 
-def test_checkpoint_before_any_evaluation(tmp_path: Path) -> None:
-    """Catches ∞ and None, which plain JSON does not know, lost on their way."""
-    checkpoint = Checkpoint(random_state(3, FACES), 0, 0, None, 3, 0.0, np.inf, 0, [])
-    checkpoint_files.write_checkpoint(tmp_path, checkpoint)
-    again = checkpoint_files.read_checkpoint(tmp_path)
-    assert (again.best_difference, again.last_timestep) == (np.inf, None)
-
-
-@pytest.mark.parametrize("kept", [0.0, 0.2, 0.9, 0.999])
-def test_truncated_checkpoints(tmp_path: Path, kept: float) -> None:
-    """Catches half a checkpoint taken for a whole one."""
-    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
-    path = tmp_path / "checkpoint.npz"
-    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
-    with pytest.raises(StgaError, match=r"checkpoint\.npz"):
-        checkpoint_files.read_checkpoint(tmp_path)
-
-
 def meta(**changes: Any) -> np.ndarray:
     values = {
         "version": checkpoint_files.VERSION,
@@ -195,17 +167,14 @@ def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
     return {f"strain_position/{name}": array for name, array in arrays.items()}
 
 
-NOT_FINITE = np.full((12, 3), np.nan, np.float32)
 DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
     "no moments": ({"second/sh": None}, "a field is missing"),
-    "no rows": ({"steps": None}, "a field is missing"),
     "no meta": ({"meta": None}, "a field is missing"),
     "shorter array": (
         {"first/xyz": np.zeros((11, 3), np.float32)},
         r"/xyz is .* \(11, 3\), expected .* \(12, 3\)",
     ),
     "scalar": ({"opacity": np.zeros((), np.float32)}, "an array has no rows"),
-    "meta is no JSON": ({"meta": np.frombuffer(b"hello", np.uint8)}, "malformed"),
     "meta is a list": ({"meta": np.frombuffer(b"[]", np.uint8)}, "meta is no object"),
     "another version": ({"meta": meta(version=1)}, "was written by another version"),
     "unknown count": ({"meta": meta(color=3)}, "malformed .*color"),
@@ -213,8 +182,6 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
         {"meta": meta(iteration=-1)},
         "iteration is -1, expected a whole number from 0 up",
     ),
-    "half an iteration": ({"meta": meta(iteration=1.5)}, "iteration is 1.5"),
-    "an iteration that is true": ({"meta": meta(iteration=True)}, "iteration is True"),
     "iteration beyond what is exact": (
         {"meta": meta(iteration=1 << 53)},
         "iteration is 9007199254740992",
@@ -227,49 +194,12 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
     "negative evaluations": ({"meta": meta(evaluations=-1)}, "evaluations is -1"),
     "endless time": ({"meta": meta(elapsed_s=math.inf)}, "elapsed_s is inf"),
     "time before the start": ({"meta": meta(elapsed_s=-1.0)}, "elapsed_s is -1.0"),
-    "time that is a text": ({"meta": meta(elapsed_s="1")}, "elapsed_s is '1'"),
-    "quality that is no number": (
-        {"meta": meta(best_difference=math.nan)},
-        "best_difference is nan",
-    ),
     "negative timestep": ({"meta": meta(last_timestep=-1)}, "last_timestep is -1"),
-    "timestep beyond what is exact": (
-        {"meta": meta(last_timestep=1 << 53)},
-        "last_timestep is 9007199254740992",
-    ),
-    "losses that are no list": (
-        {"meta": meta(losses=5)},
-        "losses is .*, expected a list of numbers",
-    ),
-    "a loss that is no number": (
-        {"meta": meta(losses=[0.5, math.nan])},
-        "losses is .*, expected a list of numbers",
-    ),
     "identity that is no text": (
         {"meta": meta(identity=None)},
         "identity is None, expected a text",
     ),
-    "wrong width": (
-        {"parameters/rotation": np.zeros((12, 3), np.float32)},
-        "parameters/rotation is .*, expected",
-    ),
     "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is float64"),
-    "not finite": (
-        {"parameters/xyz": NOT_FINITE},
-        "parameters/xyz holds a value that is not finite",
-    ),
-    "moment of another shape": (
-        {"first/sh": np.zeros((12, 1, 3), np.float32)},
-        r"/sh is .* \(12, 1, 3\), expected",
-    ),
-    "coefficients of no degree": (
-        {"parameters/sh": np.zeros((12, 2, 3), np.float32)},
-        "has 2 coefficients",
-    ),
-    "strain of doubles": (
-        strain_position(value=np.zeros((FACES, 3, 3))),
-        "strain_position/value is float64",
-    ),
     "strain of other triangles": (
         strain_position(first=np.zeros((4, 3, 3), np.float32)),
         r"strain_position/first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)",
@@ -277,10 +207,6 @@ DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
     "steps that are no int32": (
         strain_position(steps=np.zeros(FACES, np.int64)),
         "strain_position/steps is int64",
-    ),
-    "strain that is not finite": (
-        strain_position(second=np.full((FACES, 3, 3), np.inf, np.float32)),
-        "strain_position/second holds a value that is not finite",
     ),
 }
 
@@ -302,19 +228,13 @@ def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
 def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
     """Catches a run that cannot be resumed because its first or last possible value counts as
     damaged."""
-    for iteration, visit, timestep in ((0, -1, 0), ((1 << 53) - 1, (1 << 53) - 1, (1 << 53) - 1)):
-        checkpoint = Checkpoint(
-            random_state(3, FACES), iteration, visit, timestep, 0, 0.0, 1.0, 0, [0.0]
-        )
+    largest = (1 << 53) - 1
+    for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
+        checkpoint = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, np.inf, 0, [])
         checkpoint_files.write_checkpoint(tmp_path, checkpoint)
         again = checkpoint_files.read_checkpoint(tmp_path)
-        assert (again.iteration, again.visit, again.last_timestep) == (iteration, visit, timestep)
-
-
-def test_missing_checkpoint(tmp_path: Path) -> None:
-    """Catches a traceback where a run stopped before its first checkpoint."""
-    with pytest.raises(StgaError, match=r"checkpoint\.npz: cannot be read"):
-        checkpoint_files.read_checkpoint(tmp_path)
+        assert (again.iteration, again.visit, again.last_timestep) == counts
+        assert again.best_difference == np.inf  # before any evaluation
 
 
 def line(iteration: int, **changes: Any) -> dict[str, Any]:
@@ -414,14 +334,6 @@ def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) ->
     with folder.locked(tmp_path):
         pass
     assert not (tmp_path / "run.lock").exists()
-
-
-def test_the_lock_goes_with_an_error(tmp_path: Path) -> None:
-    """Catches a folder that stays locked after a failed run."""
-    with pytest.raises(ValueError, match="mine"), folder.locked(tmp_path):
-        raise ValueError("mine")
-    with folder.locked(tmp_path):
-        pass
 
 
 def test_a_folder_that_cannot_be_one(tmp_path: Path) -> None:

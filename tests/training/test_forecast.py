@@ -7,7 +7,6 @@ from stga_addon.training.evaluate.forecast import (
     MIN_EVALUATIONS,
     Forecast,
     checked_forecasts,
-    curve_of,
     detail_curve,
     explain_missed_target,
     flat_since,
@@ -143,14 +142,6 @@ def test_hits() -> None:
     assert checked_forecasts([{"seconds": 1.0}]) == (0, 0)
 
 
-def test_the_curve_leaves_out_what_was_evaluated_twice() -> None:
-    """Catches a run that is stopped at an evaluation, which is then repeated: two points at once
-    have no slope."""
-    lines = [{"seconds": s, "psnr": 19 + s} for s in (1.0, 2.0, 2.0)]
-    lines.append({"seconds": 3.0})
-    assert curve_of(lines) == [(1.0, 20.0), (2.0, 21.0)]
-
-
 def test_why_a_target_was_missed() -> None:
     """Catches "train longer" where that does not help, and another time than the curve will
     take."""
@@ -175,12 +166,6 @@ def test_why_a_target_was_missed() -> None:
         "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it "
         "would take"
     )
-
-
-def test_forecasts_read_as_people_speak() -> None:
-    """Catches a sign that is lost."""
-    assert str(Forecast(240.0, 30.3, 0.12, 120.0, 0.31)) == "another 2 min: about +0.3 dB (±0.1)"
-    assert str(Forecast(240.0, 30.3, 0.12, 20.0, -0.31)) == "another 20 s: about -0.3 dB (±0.1)"
 
 
 @pytest.mark.filterwarnings("error")

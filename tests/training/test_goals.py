@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import pytest
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
-from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
@@ -137,26 +135,6 @@ def test_the_avatar_that_reached_the_target_is_kept(
     assert end.iteration == 20
     np.testing.assert_array_equal(read_avatar(path).splats.xyz, end.state.average.xyz)
     assert end.best_difference == 0.2
-
-
-def test_a_target_out_of_sight_is_said_while_training(
-    toy: Capture, tmp_path: Path, clock: Clock
-) -> None:
-    """Catches a person who waits to the end to learn that it was in vain."""
-    told: list[str] = []
-    run = run_of(toy, iterations=40, target_psnr=60.0)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
-    assert any("60 dB is out of reach" in forecast_text for forecast_text in told)
-    # near the end there is nothing else to say
-    assert not any(forecast_text.startswith(";") for forecast_text in told)
-    assert read_checkpoint(tmp_path).iteration == 40
-
-
-def test_a_target_needs_held_out_views(toy: Capture, tmp_path: Path) -> None:
-    """Catches a run that cannot know when to stop."""
-    bare = replace(toy, views={"train": toy.views["train"]})
-    with pytest.raises(StgaError, match="has no held-out views"):
-        train(bare, tmp_path, run_of(toy, target_psnr=30.0))
 
 
 @pytest.mark.parametrize("stop", [True, False])

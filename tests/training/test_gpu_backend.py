@@ -1,7 +1,6 @@
 """The iteration by the WebGPU kernels, on software Vulkan where there is no GPU, against the CPU's:
 states, freezing, whole runs."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -106,11 +105,6 @@ def batch_of(
     return Batch(**{**values, **changes})
 
 
-def moments(step: Any) -> dict[str, np.ndarray]:
-    """After the first step, a tenth of the gradient."""
-    return step.state.first._asdict()
-
-
 @pytest.mark.parametrize("part", ["whole", "mouth", "another background"])
 def test_one_step_is_the_cpus(toy: Capture, part: str) -> None:
     """Catches a term of the loss, a limit, a rate, a bias correction or a background that is left
@@ -169,36 +163,6 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
         np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
     for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
         assert (after[name] != before[name]).any(axis=1)[selected].mean() > 0.3, name
-
-
-def test_local_gradient_is_the_whole_images(toy: Capture) -> None:
-    """Catches tiles left out around the selection, and pixels read that no tile rendered: they hold
-    NaN."""
-    settings = settings_of(scale_weight=0.0, distance_weight=0.0)
-    view, target = large(view_of(toy, 1))
-    whole = batch_of(toy, settings, view=view, target=target)
-    part = batch_of(toy, settings, view=view, target=target, selected=toy.regions["mouth"])
-    (_, first), (_, second) = pair(toy, settings), pair(toy, settings)
-    first.step(whole)
-    second.render(view, np.ones(3, np.float32), 3)  # takes the buffers
-    device = second.device
-    for name in (
-        "image",
-        "pixels",
-        "v_image",
-        "pair_gradients",
-        "projected",
-        "gradients",
-        "screen",
-    ):
-        device.upload(name, np.full(device.buffer(name, 0).size // 4, np.nan, np.float32))
-    second.step(part)
-    rows = np.flatnonzero(second.state.steps != disturbed(toy, settings).steps)
-    assert 0 < device.read(device.buffer("rendered", 0), (8 * 12,), np.uint32).mean() < 0.8
-    assert 20 < len(rows) < 0.5 * len(second)
-    for name, want in moments(first).items():
-        got = moments(second)[name]
-        assert np.abs(got[rows] - want[rows]).max() <= 1e-6 * np.abs(want[rows]).max(), name
 
 
 def test_an_iteration_without_room_is_repeated(
@@ -315,56 +279,6 @@ def test_states_are_the_same_bits_on_both(toy: Capture) -> None:
     gpu.state = replace(state, driven_offsets={})
     gpu.step(batch_of(toy, settings))
     assert not gpu.state.driven_offsets
-
-
-def test_assigned_splats_are_the_trained_ones(toy: Capture) -> None:
-    """Catches density control whose result stays on the host, and a state that is no copy."""
-    settings = settings_of()
-    _, step = pair(toy, settings)
-    state = step.state
-    state.average.opacity[:] = -20  # which is what is drawn
-    white = np.ones(3, np.float32)
-    assert step.render(view_of(toy, 1), white, 3).min() < 0.9
-    step.state = state
-    assert step.render(view_of(toy, 1), white, 3).min() == 1
-
-
-@pytest.fixture(scope="module")
-def runs(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Folders of the same run, from start to end, by device."""
-    folder = tmp_path_factory.mktemp("runs")
-    for device in ("cpu", "gpu"):
-        run = make_run(toy, "selective", iterations=40, strain_color=True)
-        train(toy, folder / device, replace(run, device=device))
-    return lambda device: folder / device
-
-
-@pytest.mark.slow
-def test_a_run_reaches_the_cpus_quality(runs: Callable[[str], Path]) -> None:
-    """Catches an iteration that is nearly right: schedule, density control, resets and selection
-    all take part."""
-    ours, theirs = (read_metrics(runs(device))[-1] for device in ("gpu", "cpu"))
-    assert ours["psnr"] == pytest.approx(theirs["psnr"], abs=0.15)
-    assert ours["psnr"] > read_metrics(runs("gpu"))[0]["psnr"] + 1
-    assert ours["splats"] == pytest.approx(theirs["splats"], rel=0.02)
-    assert ours["loss"] == pytest.approx(theirs["loss"], rel=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("begun", "resumed"), [("cpu", "gpu"), ("gpu", "cpu")])
-def test_a_run_moves_to_the_other_device(
-    toy: Capture, runs: Callable[[str], Path], tmp_path: Path, begun: str, resumed: str
-) -> None:
-    """Catches a checkpoint that only its own device continues, and moments or counts lost on the
-    way."""
-    run = make_run(toy, "selective", iterations=40, strain_color=True)
-    train(toy, tmp_path, replace(run, device=begun), report=stop_at(17))
-    assert read_checkpoint(tmp_path).iteration == 17
-    train(toy, tmp_path, replace(run, device=resumed), resume=True)
-    moved, unbroken = (read_metrics(folder)[-1] for folder in (tmp_path, runs("cpu")))
-    assert moved["iteration"] == unbroken["iteration"]
-    assert moved["psnr"] == pytest.approx(unbroken["psnr"], abs=0.15)
-    assert moved["splats"] == pytest.approx(unbroken["splats"], rel=0.02)
 
 
 def assert_near(got: TrainState, want: TrainState) -> None:

@@ -1,4 +1,4 @@
-"""A run whose meshes are read by the loader's thread."""
+"""Meshes and views as training reads them: frames of few timesteps kept, no mesh on its thread."""
 
 import threading
 from dataclasses import replace
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from capture import factory
 
+from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.loader import ViewLoader
-from stga_addon.capture.model import evenly_spread
+from stga_addon.capture.model import Capture, evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.residuals import Residuals
-from stga_addon.training.optimize.frames import CACHED_TIMESTEPS
+from stga_addon.training.optimize.frames import CACHED_TIMESTEPS, FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
 from stga_addon.training.run.session import train
@@ -58,3 +59,37 @@ def test_no_mesh_is_read_on_the_training_thread(
     assert len(read) == len(timesteps) - 1 + len(before)
     assert all(on_training_thread for _, on_training_thread in read)
     assert_same_state(tmp_path / "loaded", tmp_path / "unloaded")
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_frames_are_those_of_the_timesteps_mesh(toy: Capture, convention: str) -> None:
+    """Catches frames of another timestep, of another convention, or scaled by the posed mesh
+    instead of the neutral."""
+    store = FrameStore(toy, convention)
+    for timestep in (3, 0, 3):
+        expected = face_frames(toy.mesh(timestep), toy.faces, toy.neutral, convention)
+        for name, value in vars(expected).items():
+            np.testing.assert_array_equal(getattr(store.of(timestep), name), value)
+    assert np.abs(store.of(3).origin - store.of(0).origin).max() > 1e-3
+
+
+def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
+    """Catches a mesh file read in every iteration, and a long sequence that fills the memory."""
+    read: list[int] = []
+
+    def mesh(timestep: int) -> np.ndarray:
+        read.append(timestep)
+        return toy.mesh(3)
+
+    store = FrameStore(replace(toy, mesh=mesh), "stga")
+    for _ in range(3):
+        store.of(1)
+    assert read == [1]
+    for timestep in range(2, CACHED_TIMESTEPS + 2):
+        store.of(timestep)
+    store.of(1)
+    assert read == [1, *range(2, CACHED_TIMESTEPS + 2), 1]
+    store.clear()
+    store.mesh(1)
+    store.of(1)
+    assert read[-2:] == [1, 1]  # read again, once for mesh and frames

@@ -17,9 +17,8 @@ from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.errors import StgaError
 from stga_addon.training.evaluate import lpips
-from stga_addon.training.evaluate.evaluation_views import EvaluationView
 from stga_addon.training.evaluate.lpips import read_network
-from stga_addon.training.evaluate.metrics import evaluate
+from stga_addon.training.evaluate.metrics import EvaluationView, evaluate
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train

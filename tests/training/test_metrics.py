@@ -1,17 +1,44 @@
-"""Quality figures against the same computed with numpy and scipy."""
+"""Image quality: figures against the same by numpy and scipy, fitted exposure, which pixels count,
+residuals per triangle."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from capture import factory
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import View
-from stga_addon.training.evaluate.evaluation_views import EvaluationView
-from stga_addon.training.evaluate.metrics import Quality, evaluate, peak_memory_mb, psnr
+from stga_addon.capture.model import Capture, View
+from stga_addon.render.render import render_avatar
+from stga_addon.training.evaluate.metrics import (
+    MAX_EVALUATION_VIEWS,
+    EvaluationView,
+    choose_evaluation_views,
+    detail_difference,
+    evaluate,
+    evaluate_avatar,
+    known_exposure,
+    match_exposure,
+    peak_memory_mb,
+    psnr,
+    read_evaluation_view,
+    visible_pixels,
+)
+from stga_addon.training.evaluate.residuals import MIN_WEIGHT_PX, Residuals, triangle_residuals
+from stga_addon.training.optimize.image_preparation import exposure_correction
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.metrics_log import read_metrics
+from stga_addon.training.run.session import train
+from stga_addon.training.settings import TrainingSettings
+
+from .toys import quick_settings
 
 HEIGHT, WIDTH = 31, 24
 
@@ -124,15 +151,255 @@ def test_peak_memory_never_falls() -> None:
     assert (peak_memory_mb() or 0) > after - 1  # the system counts roughly
 
 
-def test_lpips_is_left_out_where_its_weights_are_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches a crash, or a made-up number, without weights."""
-    monkeypatch.delenv("STGA_LPIPS", raising=False)
-    evaluation_views = sights_of(write_views(tmp_path, 1))
-    quality = evaluate(
-        lambda view: np.zeros((3, HEIGHT, WIDTH), np.float32), evaluation_views, perceptual=True
+def expected(image: np.ndarray, target: np.ndarray, where: np.ndarray) -> float:
+    """By loops, for images (H, W, 3) in 0…1; edges repeat by reflection."""
+
+    def windows(values: np.ndarray, side: int) -> np.ndarray:
+        padded = np.pad(values, side // 2, mode="symmetric")
+        return np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+
+    def local(rgb: np.ndarray) -> np.ndarray:
+        near = windows(rgb.astype(np.float64) @ [0.299, 0.587, 0.114], 3)
+        across = (near[..., 2].sum(-1) - near[..., 0].sum(-1)) / 3
+        down = (near[..., 2, :].sum(-1) - near[..., 0, :].sum(-1)) / 3
+        return windows(np.sqrt(across**2 + down**2), 7).mean((-1, -2))
+
+    a, b = local(image), local(target)
+    return float((abs(a - b) / (a + b + 0.02))[where].mean())
+
+
+def test_against_the_formula() -> None:
+    """Catches a wrong filter, window, channel weight or region."""
+    rng = np.random.default_rng(0)
+    image = gaussian_filter(rng.random((3, 24, 32), np.float32), (0, 1, 1))
+    target = rng.integers(0, 256, (24, 32, 3), np.uint8)
+    where = rng.random((24, 32)) < 0.3
+    found = detail_difference(image, target, where)
+    assert found == pytest.approx(expected(image.transpose(1, 2, 0), target / 255, where), rel=1e-3)
+    assert found != detail_difference(image, target)
+    same = np.ascontiguousarray(target.transpose(2, 0, 1), dtype=np.float32) / 255
+    assert detail_difference(same, target) == pytest.approx(0, abs=1e-6)
+
+
+def test_detail_that_is_a_pixel_off_beats_blur() -> None:
+    """Catches a criterion that, like PSNR, keeps the blurred state of a run instead of the one with
+    hair."""
+    rng = np.random.default_rng(1)
+    strands = np.repeat(gaussian_filter(rng.random((96, 96)), (4, 0.8))[None], 3, 0).astype(
+        np.float32
     )
-    assert quality.lpips is None
-    assert set(quality.as_json()) == {"psnr", "ssim", "detail_difference"}
-    assert Quality(30.0, 0.9, 0.1).as_json() == {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1}
+    strands = (strands - strands.min()) / np.ptp(strands)
+    target = (255 * strands).round().astype(np.uint8).transpose(1, 2, 0)
+    moved = np.roll(strands, 1, axis=2)
+    blurred = gaussian_filter(strands, (0, 0, 2.5))
+    assert psnr(blurred, target) > psnr(moved, target)
+    assert detail_difference(moved, target) < 0.5 * detail_difference(blurred, target)
+
+
+SIDE = 32
+
+
+def head_and_image() -> tuple[np.ndarray, np.ndarray]:
+    """A mask (H, W) bool and a rendering (3, H, W) float32 over white."""
+    head = np.zeros((SIDE, SIDE), bool)
+    head[6:26, 8:24] = True
+    image = np.where(head, np.random.default_rng(0).uniform(0.2, 0.7, (3, SIDE, SIDE)), 1.0).astype(
+        np.float32
+    )
+    return head, image
+
+
+def test_inverts_what_training_corrects() -> None:
+    """Catches another model than the effect's: gain and offset swapped, mixed channels, a
+    background that changes."""
+    head, image = head_and_image()
+    gain, offset = np.array([1.1, 0.9, 1.2]), np.array([5.0, -8.0, 2.0])
+    levels = 255 * image.transpose(1, 2, 0)
+    target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
+    matched = match_exposure(image, target, head, head)
+    assert np.abs(255 * matched - target.transpose(2, 0, 1)).max() < 2
+    assert np.array_equal(matched[:, ~head], image[:, ~head])
+    correct = exposure_correction(TrainingSettings(iterations=1, exposure=((0.0, *gain, *offset),)))
+    assert correct is not None
+    view = View(0, 0, Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4)), "0.png", Path("0.png"))
+    back = correct(view, target, (255 * head).astype(np.uint8))
+    assert np.abs(back - levels).max() < 3
+
+
+def test_a_rendering_of_one_color_stays_finite() -> None:
+    """Catches a singular system where gain and offset cannot be told apart, and a crash without a
+    mask or pixels."""
+    head, _ = head_and_image()
+    flat = np.full((3, SIDE, SIDE), 0.5, np.float32)
+    target = np.full((SIDE, SIDE, 3), 153, np.uint8)
+    assert match_exposure(flat, target) == pytest.approx(0.6, abs=2e-3)
+    assert np.array_equal(match_exposure(flat, target, head, np.zeros_like(head)), flat)
+
+
+def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
+    """Catches six numbers fitted to views of cameras whose exposure training has estimated, which
+    hides its errors."""
+    head, image = head_and_image()
+    gain, offset = np.array([0.8, 1.1, 0.9]), np.array([4.0, -6.0, 3.0])
+    levels = 255 * image.transpose(1, 2, 0)
+    target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
+    camera = Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4))
+    views = [View(0, number, camera, "0.png", tmp_path / "0.png") for number in range(3)]
+    known = known_exposure([[0, *gain, *offset]], views[:2])
+    trained, plain, other = (
+        evaluate(
+            lambda view: image, [EvaluationView(view, target, {"mask": head}, head)], exposure=known
+        )
+        for view in views
+    )
+    assert trained.psnr > 45
+    assert trained.psnr_unmatched is None
+    assert plain.psnr == pytest.approx(
+        evaluate(lambda view: image, [EvaluationView(views[1], target)]).psnr
+    )
+    assert plain.psnr_unmatched is None  # trained, and not corrected
+    assert other.psnr > 45
+    assert other.psnr_unmatched == other.as_json()["psnr_unmatched"] == pytest.approx(plain.psnr)
+    assert other.regions["mask"].psnr > plain.regions["mask"].psnr + 20
+
+
+def test_evaluation_views_are_evenly_spread(toy: Capture) -> None:
+    """Catches evaluations while training that cost more than the training, or look at one end of
+    the sequence."""
+    view = toy.views["val"][0]
+    many = tuple(replace(view, timestep=t) for t in range(100))
+    chosen = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
+    assert len(chosen) == MAX_EVALUATION_VIEWS
+    assert (chosen[0], chosen[-1]) == (0, 99)
+    assert set(np.diff(chosen)) <= {6, 7}
+    assert list(choose_evaluation_views(toy)) == list(toy.views["val"])
+
+
+def test_regions_of_a_view(toy: Capture) -> None:
+    """Catches a mask that is inverted, and a view in which nothing moves with a region for it."""
+    still, *_, moving = (read_evaluation_view(toy, view) for view in toy.views["val"])
+    np.testing.assert_array_equal(still.regions["mask"], factory.silhouette())
+    assert "moving" not in still.regions  # timestep 0 is the neutral one
+    where = moving.regions["moving"]
+    assert where.any()
+    # The ball's lower part moves, which is below in the image, and only the ball does.
+    rows = np.flatnonzero(where.any(1))
+    assert rows.min() > factory.CY
+    assert (
+        not (where & ~factory.silhouette())[:-1].any()
+        or (where & ~factory.silhouette()).mean() < 0.02
+    )
+    assert not moving.target.flags.writeable
+
+
+def test_interior_leaves_out_the_matte_s_border(toy: Capture, tmp_path: Path) -> None:
+    """Catches an avatar that is chosen by the matte's border or the background, which differ from
+    view to view."""
+    view, size = toy.views["val"][0], 400
+    camera = replace(view.camera, width=size, height=size)
+    mask = np.zeros((size, size), np.uint8)
+    mask[100:300, 100:300] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    Image.fromarray(np.repeat(mask[..., None], 3, 2)).save(tmp_path / "image.png")
+    view = replace(view, camera=camera, image=tmp_path / "image.png", mask=tmp_path / "mask.png")
+    interior = read_evaluation_view(toy, view).interior
+    assert interior is not None
+    rows, columns = np.nonzero(interior)
+    # 0.75 % of 400 pixels
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (103, 296, 103, 296)
+    assert interior.sum() > 0.99 * 194**2
+
+
+def test_only_the_nearest_triangle_is_seen(toy: Capture) -> None:
+    """Catches pixels of triangles on the far side of the head, which no camera sees."""
+    view = toy.views["val"][0]
+    mesh = toy.mesh(view.timestep)
+    away = mesh[toy.faces].mean(1) - view.camera.position
+    normals = np.cross(
+        mesh[toy.faces[:, 1]] - mesh[toy.faces[:, 0]], mesh[toy.faces[:, 2]] - mesh[toy.faces[:, 0]]
+    )
+    behind = (away * normals).sum(1) > 0
+    everything = visible_pixels(toy, view, np.ones(len(toy.faces), bool))
+    # edges of the silhouette
+    assert visible_pixels(toy, view, behind).sum() < 0.06 * everything.sum()
+    assert visible_pixels(toy, view, ~behind).sum() > 0.94 * everything.sum()
+    disc = factory.silhouette()
+    assert (everything ^ disc).sum() < 0.08 * disc.sum()  # the ball is a polyhedron
+
+
+def test_a_view_without_mask_has_no_head(toy: Capture, tmp_path: Path) -> None:
+    """Catches a whole image taken for a head."""
+    path = tmp_path / "plain.png"
+    Image.fromarray(factory.picture(0, 0)).save(path)
+    view = replace(toy.views["val"][0], image=path, mask=None)
+    assert "mask" not in read_evaluation_view(toy, view).regions
+    assert read_evaluation_view(toy, view).interior is None
+
+
+def test_transparent_images_lie_over_the_settings_background(toy: Capture, tmp_path: Path) -> None:
+    """Catches evaluations that compare a head over gray with one over white."""
+    pixels = np.dstack([factory.picture(0, 0), factory.silhouette().astype(np.uint8) * 255])
+    Image.fromarray(pixels).save(tmp_path / "cut.png")
+    views = tuple(replace(view, image=tmp_path / "cut.png", mask=None) for view in toy.views["val"])
+    capture = replace(toy, views={**toy.views, "val": views, "test": views})
+    gray = (0.2, 0.4, 0.6)
+    target = read_evaluation_view(capture, views[0], gray).target
+    np.testing.assert_array_equal(target[0, 0], [51, 102, 153])
+    settings = replace(
+        quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False
+    )
+    path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
+    # behind the cameras: nothing but the background is rendered
+    outside = np.ones(capture.neutral.shape) * 10
+    avatar = read_avatar(path)
+    empty = evaluate_avatar(avatar, replace(capture, mesh=lambda timestep: outside), "test")
+    over_gray = np.where(
+        factory.silhouette()[..., None], factory.picture(0, 0), np.round(255 * np.array(gray))
+    )
+    error = np.square(over_gray / 255 - np.array(gray)).mean()
+    assert empty.psnr == pytest.approx(-10 * np.log10(error), abs=0.1)
+    assert read_metrics(tmp_path / "run")[-1]["psnr"] > empty.psnr
+
+
+def plain_avatar(capture: Capture, level: float) -> Avatar:
+    """The capture's mesh in one gray; levels below zero are shown as black."""
+    splats = lattice_splats(capture.neutral, capture.faces, 1, 0)
+    sh = np.full_like(splats.sh, (level - 0.5) / SH_C0)
+    return Avatar(replace(splats, sh=sh), "stga", capture.neutral.astype(np.float32), capture.faces)
+
+
+def test_an_error_belongs_to_the_triangles_that_show_it(toy: Capture) -> None:
+    """Catches weights that depend on colors, as a gradient does where a color is clamped at black,
+    and errors given to hidden or neighboring triangles. The weights are rendered: one triangle
+    white, all others black, before black."""
+    avatar, views = plain_avatar(toy, -0.2), toy.views["train"][:2]
+    found = triangle_residuals(avatar, toy, views)
+    seen = np.flatnonzero(found.weight > 20)[::12]
+    assert len(seen) > 3
+    for triangle in seen:
+        weight = error = 0.0
+        for view in views:
+            mesh = toy.mesh(view.timestep)
+            shown = render_avatar(avatar, mesh, view.camera)
+            difference = np.abs(shown - read_image(view).transpose(2, 0, 1) / 255).mean(0)
+            sh = (
+                np.where((avatar.splats.face == triangle)[:, None, None], 0.5, -0.5).astype(
+                    np.float32
+                )
+                / SH_C0
+            )
+            sh = np.broadcast_to(sh, avatar.splats.sh.shape).astype(np.float32)
+            alone = replace(avatar, splats=replace(avatar.splats, sh=sh))
+            share = render_avatar(alone, mesh, view.camera, (0.0, 0.0, 0.0))[0]
+            weight, error = weight + float(share.sum()), error + float((share * difference).sum())
+        np.testing.assert_allclose(
+            [found.weight[triangle], found.error[triangle]], [weight, error], rtol=2e-3
+        )
+
+
+def test_triangles_that_nothing_shows_are_unknown() -> None:
+    """Catches a triangle at the back of the head that is called perfect because no camera sees
+    it."""
+    residuals = Residuals(np.array([1.0, 0.0, 3.0]), np.array([4.0, MIN_WEIGHT_PX / 2, 6.0]))
+    np.testing.assert_array_equal(residuals.mean(), [0.25, np.nan, 0.5])
+    np.testing.assert_array_equal((residuals + residuals).mean(), [0.25, 0.0, 0.5])

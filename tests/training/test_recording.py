@@ -1,8 +1,10 @@
 """Footage tracked by the avatar of its person: another exposure, another size of the world."""
 
 import json
+import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from stga_addon.tracking.folder import (
     read_torso_points,
     write_torso_points,
 )
+from stga_addon.training.optimize.avatar_tracking import AvatarTracking, track_by_avatar
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
     avatar_person,
@@ -51,7 +54,8 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
         )
         darker = np.where(mask[..., None] > 0, image * GAIN + OFFSET, image)
         Image.fromarray(darker.astype(np.uint8)).save(path)
-    write_json(root / "tracking.json", {"image_misfit": {}, "meters_per_unit": 1.0})
+    report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": False}
+    write_json(root / "tracking.json", report)
     scale_capture(root, root / "model.npz", SCALE)
     write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
     return run, root
@@ -97,3 +101,23 @@ def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
     np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
     assert fit.head.model.n_identity == 0
     assert len(fit.shape) == 4
+
+
+def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch) -> None:
+    """Catches a cancelled tracking that begins anew, or goes on with what an avatar found that was
+    trained again since."""
+    (run, root), calls, every = recording, list[int](), [1] * len(TIMESTEPS)
+    shutil.copytree(root, tmp_path / "start")
+
+    def counted(*arguments: Any) -> AvatarTracking:
+        calls.append(len(arguments[3]))
+        return track_by_avatar(*arguments)
+
+    monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", counted)
+    for trained_ns, expected in ((1, [*every, len(every)]), (1, []), (2, every)):
+        shutil.rmtree(root)
+        shutil.copytree(tmp_path / "start", root)
+        os.utime(run / AVATAR, ns=(trained_ns, trained_ns))
+        calls.clear()
+        track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore)
+        assert calls[: len(expected) or None] == expected

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
@@ -26,7 +26,6 @@ from stga_addon.training.run.continuation import (
     continued_settings,
     distinct_timesteps,
     replayed_views,
-    starting_state,
     views_of_region,
 )
 from stga_addon.training.run.folder import Continuation, Run, read_run
@@ -146,15 +145,6 @@ def test_a_stopped_refinement_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_the_run_before_is_left_alone(parent: Path, tmp_path: Path) -> None:
-    """Catches a refinement that overwrites the avatar it started from."""
-    before = {path.name: path.read_bytes() for path in parent.iterdir()}
-    run = read_run(refine(parent, tmp_path / "refined"))
-    assert {path.name: path.read_bytes() for path in parent.iterdir()} == before
-    assert run.continuation is not None
-    assert run.continuation.parent == parent.resolve()
-
-
 def test_the_avatar_before_is_the_first_evaluation(
     parent: Path, toy: Capture, tmp_path: Path
 ) -> None:
@@ -187,23 +177,6 @@ def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
     (parent / "avatar.npz").write_bytes(b"")
     with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
         train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
-
-
-@pytest.mark.parametrize("limited", [True, False])
-def test_colors_of_another_range_of_strain_are_not_continued(parent: Path, limited: bool) -> None:
-    """Catches an avatar of an earlier version, whose colors all change when today's strain is put
-    into them."""
-    avatar = read_avatar(parent / "avatar.npz")
-    assert avatar.strain_range is not None
-    wider = avatar.strain_range.copy()
-    wider[0, 1, 0] = 0.0
-    write_avatar(parent / "avatar.npz", replace(avatar, strain_range=wider if limited else None))
-    prepared = prepare_refinement(parent, "mouth")
-    assert prepared.run.continuation is not None
-    with pytest.raises(StgaError, match="as in an earlier version"):
-        starting_state(
-            prepared.run.continuation, prepared.run.settings, len(prepared.capture.faces)
-        )
 
 
 def test_without_its_checkpoint_an_avatar_is_refined_as_well(

@@ -110,26 +110,6 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     ]  # fmt: skip
 
 
-def test_stopped_and_resumed_is_the_unbroken_run(
-    toy: Capture, unbroken: Path, tmp_path: Path
-) -> None:
-    """Catches anything a step depends on and a checkpoint does not hold: order, moments, counts,
-    random numbers."""
-    run = make_run(toy)
-    train(toy, tmp_path, run, report=stop_at(7))
-    assert read_checkpoint(tmp_path).iteration == 7
-    train(toy, tmp_path, run, resume=True, report=stop_at(16))
-    train(toy, tmp_path, run, resume=True)
-    assert_same_state(tmp_path, unbroken)
-    # Stopping adds an evaluation of its own; those of the schedule are the same.
-    ours = {line["iteration"]: line for line in without_times(read_metrics(tmp_path))}
-    for line in without_times(read_metrics(unbroken)):
-        again = ours[line["iteration"]]
-        assert {k: again[k] for k in ("psnr", "ssim", "splats")} == {
-            k: line[k] for k in ("psnr", "ssim", "splats")
-        }
-
-
 class Crash(Exception):
     """What a power cut looks like from inside."""
 
@@ -307,29 +287,23 @@ def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path
     assert all("psnr" not in line for line in read_metrics(tmp_path))
 
 
-def test_a_folder_with_a_run_is_not_overwritten(
-    toy: Capture, unbroken: Path, tmp_path: Path
-) -> None:
-    """Catches hours of training lost to a forgotten --resume."""
-    before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
-    with pytest.raises(StgaError, match="already holds a run"):
-        train(toy, unbroken, make_run(toy))
-    assert {p.name: p.read_bytes() for p in unbroken.iterdir()} == before
-
-
-def test_a_run_is_not_put_into_its_capture(toy: Capture) -> None:
-    """Catches files of a run among those of a recording, which nothing is to change."""
-    before = sorted(path.name for path in toy.root.iterdir())
-    with pytest.raises(StgaError, match="is the folder of the capture"):
-        train(toy, toy.root, make_run(toy))
-    assert sorted(path.name for path in toy.root.iterdir()) == before
-
-
-def test_a_capture_without_training_views(toy: Capture, tmp_path: Path) -> None:
-    """Catches an endless wait for views that never come, and a folder made for nothing."""
+def test_what_is_refused_changes_nothing(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
+    """Catches hours of training lost to a forgotten --resume, files of a run among those of a
+    recording, an endless wait for views that never come, and a folder made for nothing."""
+    for out, says in (
+        (unbroken, "already holds a run"),
+        (toy.root, "is the folder of the capture"),
+    ):
+        before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+        with pytest.raises(StgaError, match=says):
+            train(toy, out, make_run(toy))
+        assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     for views in ({}, {"train": (), "val": toy.views["val"]}):
         with pytest.raises(StgaError, match="has no training views"):
             train(replace(toy, views=views), tmp_path / "run", make_run(toy))
+    bare = replace(toy, views={"train": toy.views["train"]})
+    with pytest.raises(StgaError, match="has no held-out views"):
+        train(bare, tmp_path / "run", make_run(toy, target_psnr=30.0))
     assert not (tmp_path / "run").exists()
 
 
@@ -369,16 +343,6 @@ def test_every_strategy_and_schedule_runs(
     assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
     assert set(avatar.splats.face.tolist()) == set(range(len(toy.faces)))
     assert (read_selection(tmp_path, len(toy.faces)) != {}) == (strategy == "selective")
-
-
-def test_a_resumed_run_checks_the_mesh(toy: Capture, tmp_path: Path) -> None:
-    """Catches splats on triangles that the capture no longer has, which kernels would read beyond
-    the end for."""
-    run = make_run(toy, "global", iterations=4)
-    train(toy, tmp_path, run, report=stop_at(2))
-    fewer = replace(toy, faces=toy.faces[:100], regions={})
-    with pytest.raises(StgaError):
-        train(fewer, tmp_path, run, resume=True)
 
 
 def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path) -> None:

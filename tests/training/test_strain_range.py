@@ -19,11 +19,11 @@ from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.run.checkpoint import STRAIN_RANGE, trained_strain_range
 from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.identity import identity_of
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
-from stga_addon.training.run.strain_range import STRAIN_RANGE, trained_strain_range
 from stga_addon.training.settings import Rates
 
 from .toys import quick_settings, random_splats

@@ -16,9 +16,14 @@ from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.render.render import render
-from stga_addon.training.world import world_splats
-from stga_addon.training.world.clean_plates import CleanPlate, clean_plates
-from stga_addon.training.world.world_splats import first_splats, shell_radius, trained_on
+from stga_addon.training import world
+from stga_addon.training.world import (
+    CleanPlate,
+    clean_plates,
+    first_splats,
+    shell_radius,
+    trained_on,
+)
 
 WALL_M = 1.0
 """Behind the person, who is at the origin."""
@@ -169,5 +174,5 @@ def test_many_cameras_before_a_busy_wall() -> None:
     be."""
     noise = np.random.default_rng(0).random((512, 512, 3))
     plates = plates_of(noise)[:1] * 3
-    with patch.object(world_splats, "MAX_FIRST_SPLATS", 10):
+    with patch.object(world, "MAX_FIRST_SPLATS", 10):
         assert 10 < len(first_splats(plates, np.zeros(3))) < 500

@@ -71,9 +71,8 @@ def test_results_are_those_of_one_process_in_order():
     assert 1 <= len(pids) <= 3
     with Helpers(1) as alone:
         told = []
-        assert {pid for part in alone.map(squares, PARTS, told.append) for _, pid in part} == {
-            os.getpid()
-        }
+        found = alone.map(squares, PARTS, told.append)
+        assert {pid for part in found for _, pid in part} == {os.getpid()}
         assert told == list(range(1, 22))
         assert {pid for _, pid in alone.run(squares, (0, 3), told.append)} == {os.getpid()}
 
@@ -105,9 +104,8 @@ def test_what_was_found_is_not_worked_on_again(tmp_path, count):
     calls = len(list(called.iterdir()))
     with Helpers(count, tmp_path / "kept") as helpers:
         found = helpers.map(halves, parts, told.append, keep=True)
-        np.testing.assert_array_equal(
-            [own["half"] for own in found], [part[0] / 2 for part in parts]
-        )
+        expected = [part[0] / 2 for part in parts]
+        np.testing.assert_array_equal([own["half"] for own in found], expected)
         assert told[-1] == 12
         assert len(list(called.iterdir())) == calls + 4 - before
         helpers.map(halves, [(np.arange(3.0) + 9, called), parts[0]], told.append, keep=True)
@@ -141,10 +139,8 @@ def test_a_package_of_another_name_is_the_helpers_own(monkeypatch):
     )
     right, wrong = progress.Progress(45.0), progress.Progress(44.0)
     with helpers.Helpers(2) as two:
-        assert two.map(is_own, [(right, texts.format_duration)] * 2, lambda steps: None) == [
-            right,
-            right,
-        ]
+        parts = [(right, texts.format_duration)] * 2
+        assert two.map(is_own, parts, lambda steps: None) == [right, right]
         with pytest.raises(errors.StgaError, match="expected 45 seconds"):
             two.map(is_own, [(wrong, texts.format_duration)] * 2, lambda steps: None)
 
@@ -172,13 +168,9 @@ def test_helpers_end_with_a_process_that_is_killed():
         "helpers.map(takes_long, [(60,), (60,)], lambda steps: "
         "print(*(process.pid for process in helpers._processes), flush=True))"
     )
-    variables = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([*sys.path, str(Path(__file__).parents[1])]),
-    }
-    asking = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=variables
-    )
+    path = os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])
+    command, variables = [sys.executable, "-c", script], {**os.environ, "PYTHONPATH": path}
+    asking = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
     pids = [int(pid) for pid in asking.stdout.readline().split()]
     asking.kill()
     asking.communicate()

@@ -25,24 +25,14 @@ HOLD = (
 )
 
 
-def test_probing_leaves_no_trace(tmp_path: Path) -> None:
-    """Catches a probe that leaves a lock file behind, or a held lock that it misses."""
+def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
+    """Catches a worker that is reported alive forever after kill -9, a probe that leaves a lock
+    file behind, and a held lock that it misses."""
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
     assert not path.exists()
-    with hold_lock(path):
-        assert is_locked(path)
-        assert lock_owner(path) == os.getpid()
-    assert not is_locked(path)
-
-
-def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
-    """Catches a worker that is reported alive forever after kill -9."""
-    path = tmp_path / "worker.lock"
-    command = [sys.executable, "-c", HOLD, str(path)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
+    command, pipe = [sys.executable, "-c", HOLD, str(path)], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         assert is_locked(path)
@@ -53,7 +43,9 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
     assert path.exists()
     assert not is_locked(path)
     with hold_lock(path):
+        assert is_locked(path)
         assert lock_owner(path) == os.getpid()
+    assert not is_locked(path)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
@@ -87,17 +79,13 @@ def probed(path: Path) -> Iterator[None]:
     thread.join()
 
 
-def test_probes_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a free lock that one probe reports as held because another probe has it for a
-    moment."""
+def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a free lock that is reported as held because another probe has it for a moment, and a
+    worker that fails to start while its folder is watched."""
     monkeypatch.setattr(lock, "PROBE_TIMEOUT_S", 10.0)
+    monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
     with probed(tmp_path / "worker.lock"):
         assert not is_locked(tmp_path / "worker.lock")
-
-
-def test_probes_do_not_keep_a_holder_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a worker that fails to start while its folder is watched."""
-    monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
     with probed(tmp_path / "worker.lock"), hold_lock(tmp_path / "worker.lock"):
         pass
 
@@ -124,39 +112,27 @@ def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches workers that cannot run on such storage, two in one folder, and a lock that outlives
-    its worker."""
-    path = tmp_path / "worker.lock"
-    with hold_lock(path):
+    """Catches workers that cannot run, or count as lost while they go on, on such storage, two in
+    one folder, and a lock that outlives its worker."""
+    folder, path = tmp_path / "job", tmp_path / "job/worker.lock"
+    lease = path.with_name("worker.lock.lease")
+    with status_writer(folder) as writer:
+        writer.update(0.5, "Working")
         assert lock_owner(path) == os.getpid()
+        own = lease.read_text()
         time.sleep(1.5)  # longer than a lock without a heartbeat lasts
-        assert is_locked(path)
-        with pytest.raises(BlockingIOError), hold_lock(path):
+        assert inspect_worker(folder).state == WorkerState.WORKING
+        with pytest.raises(StgaError, match="another worker is running"), status_writer(folder):
             pass
         assert is_locked(path)
+    assert inspect_worker(folder).state == WorkerState.FINISHED
     assert not is_locked(path)
-    lease = tmp_path / "worker.lock.lease"
     assert not lease.exists()
-    with hold_lock(path):
-        left = (
-            lease.read_text().replace(f"{os.getpid()}", "123").replace(platform.node(), "elsewhere")
-        )
-    lease.write_text(left)  # what a process that was killed on another machine leaves
+    # what a process that was killed on another machine leaves
+    lease.write_text(own.replace(f"{os.getpid()}", "123").replace(platform.node(), "elsewhere"))
+    path.touch()
     assert is_locked(path)
     os.utime(lease, (time.time() - 2, time.time() - 2))
     assert not is_locked(path)
     with hold_lock(path):
         assert is_locked(path)
-
-
-def test_a_worker_on_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches work that fails, or counts as lost while it goes on, where locks do not work."""
-    with status_writer(tmp_path / "job") as writer:
-        writer.update(0.5, "Working")
-        assert inspect_worker(tmp_path / "job").state == WorkerState.WORKING
-        with (
-            pytest.raises(StgaError, match="another worker is running here"),
-            status_writer(tmp_path / "job"),
-        ):
-            pass
-    assert inspect_worker(tmp_path / "job").state == WorkerState.FINISHED

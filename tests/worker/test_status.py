@@ -2,7 +2,7 @@
 that are killed."""
 
 import errno
-import json
+import math
 import os
 import platform
 import signal
@@ -131,26 +131,25 @@ def test_worker_is_cancelled(start):
     assert inspect_worker(folder) == WorkerSnapshot()
 
 
-def test_user_error_is_a_sentence(start):
-    """Catches a user's mistake reported with a traceback."""
-    folder, process = start("sentence")
-    process.wait(20)
-    snapshot = inspect_worker(folder)
-    assert snapshot.state == WorkerState.FAILED
-    assert (snapshot.status.error, snapshot.status.traceback) == ("capture: is not a folder", "")
+@pytest.mark.parametrize(
+    ("action", "code", "error"),
+    [
+        ("sentence", 1, "capture: is not a folder"),
+        ("bug", 1, "ValueError: a bug"),
+        ("exit", 7, "Worker exited with status 7: a line of the log"),
+    ],
+)
+def test_failures_are_reported(start, action, code, error):
+    """Catches a user's mistake reported with a traceback, a crash whose report lacks traceback or
+    log, and a worker that ends before its first status and leaves an exit status alone."""
+    folder, process = start(action)
+    assert process.wait(20) == code
+    snapshot = inspect_worker(folder, process)
+    assert snapshot.state == (WorkerState.LOST if action == "exit" else WorkerState.FAILED)
+    assert snapshot.status.error == error
     assert snapshot.log_tail
-    assert "a line of the log" in failure_report(folder, snapshot)
-
-
-def test_bug_has_a_traceback(start):
-    """Catches a crash whose report lacks traceback or log."""
-    folder, process = start("bug")
-    assert process.wait(20) == 1
-    snapshot = inspect_worker(folder)
-    assert snapshot.state == WorkerState.FAILED
-    assert snapshot.status.error == "ValueError: a bug"
     report = failure_report(folder, snapshot)
-    assert report.startswith("ValueError: a bug\nTraceback")
+    assert report.startswith(f"{error}\nTraceback") == (action == "bug")
     assert "a line of the log" in report
 
 
@@ -166,16 +165,6 @@ def test_killed_worker_is_lost(start):
     assert "(signal 9)" in inspect_worker(folder, process).status.error
     prepare_status_folder(folder)
     assert inspect_worker(folder).state == WorkerState.LOST  # prepared, and no worker yet
-
-
-def test_exit_status_is_reported(start):
-    """Catches a worker that ends before its first status and leaves an exit status alone."""
-    folder, process = start("exit")
-    process.wait(20)
-    assert (
-        inspect_worker(folder, process).status.error
-        == "Worker exited with status 7: a line of the log"
-    )
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell closes the descriptors")
@@ -256,7 +245,7 @@ def test_symbolic_links_are_not_followed(tmp_path):
     [
         "", "{", "[]", "null", '{"state": "dancing"}', '{"state": 3}', '{"progress": "half"}',
         '{"progress": NaN}', '{"progress": 2}', '{"error": ["a"]}', '{"figures": []}',
-        '{"figures": {"n": "many"}}', '{"surprise": 1}',
+        '{"figures": {"n": "many"}}', '{"surprise": 1}'
     ],
 )  # fmt: skip
 def test_damaged_status_is_ignored(tmp_path, text):
@@ -267,31 +256,31 @@ def test_damaged_status_is_ignored(tmp_path, text):
 
 
 def test_status_round_trip(tmp_path, monkeypatch):
-    """Catches a field that is lost between worker and panel."""
-    figures, machine = {"psnr": 30.5}, platform.node()
-    expected = WorkerStatus(
-        WorkerState.WORKING, 0.25, "training", "enough", "", "", figures, machine, 0.25
-    )
-    now = 100.0
+    """Catches a field that is lost between worker and panel, and two workers that overwrite each
+    other's status."""
+    figures, machine, now = {"psnr": 30.5}, platform.node(), 100.0
+    expected = WorkerStatus("working", 0.25, "training", "enough", "", "", figures, machine, 0.25)
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
     with status_writer(tmp_path) as writer:
         now += 0.25
         writer.update(0.25, "training", "enough", lambda: figures)
+        with pytest.raises(StgaError, match="another worker"), status_writer(tmp_path):
+            pass
         assert read_status(tmp_path) == expected
         now += 1
     assert read_status(tmp_path) == replace(expected, state=WorkerState.FINISHED, seconds=1.25)
 
 
 def test_status_is_written_rarely(tmp_path, monkeypatch):
-    """Catches a status written in every iteration, and a new message that is delayed."""
+    """Catches a status written in every iteration, a new message that is delayed, and a NaN in
+    status.json, which other programs cannot read."""
     written = []
-    monkeypatch.setattr(
-        status, "write_json", lambda path, value, **options: written.append(value["message"])
-    )
+    monkeypatch.setattr(status, "write_json", lambda path, value, **_: written.append(value))
     writer = StatusWriter(tmp_path)
     for message in ("a", "a", "b", "b"):
-        writer.update(0, message)
-    assert written == ["a", "b"]
+        writer.update(0, message, "", lambda: {"psnr": math.nan, "loss": math.inf, "n": 1.0})
+    assert [value["message"] for value in written] == ["a", "b"]
+    assert written[0]["figures"] == {"n": 1.0}
 
 
 def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
@@ -317,31 +306,23 @@ def test_folder_that_cannot_be_written(tmp_path):
     for use in (prepare_status_folder, request_cancel):
         with pytest.raises(StgaError, match=r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
-    with (
-        pytest.raises(StgaError, match=r"cannot be written"),
-        status_writer(tmp_path / "file" / "status"),
-    ):
+    writing = status_writer(tmp_path / "file" / "status")
+    with pytest.raises(StgaError, match="cannot be written"), writing:
         pass
 
 
-def test_one_worker_per_folder(tmp_path):
-    """Catches two workers that overwrite each other's status."""
-    with status_writer(tmp_path) as writer:
-        writer.update(0.5, "first")
-        with pytest.raises(StgaError, match="another worker"), status_writer(tmp_path):
-            pass
-        assert read_status(tmp_path).message == "first"
-
-
-def test_worker_environment():
-    """Catches a worker with Blender's own standard library, or one that writes into the extension's
-    folder."""
+def test_worker_environment(monkeypatch):
+    """Catches a worker with Blender's own standard library, one that writes into the extension's
+    folder, and one of Blender's Python without the packages of Blender's extensions."""
     variables = {"PATH": "/bin", "PYTHONHOME": "/blender/python", "PYTHONPATH": "/other"}
     made = worker_environment(variables, "/usr/bin/python3")
     assert made["PATH"] == "/bin"
     assert "PYTHONHOME" not in made
     assert made["PYTHONPATH"] == str(ROOT)
     assert made["PYTHONDONTWRITEBYTECODE"] == "1"
+    monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])
+    expected = os.pathsep.join([str(ROOT), "/extensions/site-packages"])
+    assert worker_environment({}, sys.executable)["PYTHONPATH"] == expected
 
 
 def test_bytecode_of_the_own_interpreter(monkeypatch, tmp_path):
@@ -361,13 +342,6 @@ def test_bytecode_of_the_own_interpreter(monkeypatch, tmp_path):
     assert "PYTHONPYCACHEPREFIX" not in worker_environment(variables, "/usr/bin/python3")
 
 
-def test_own_interpreter_finds_the_bundled_packages(monkeypatch):
-    """Catches a worker of Blender's Python without the packages of Blender's extensions."""
-    monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])
-    expected = os.pathsep.join([str(ROOT), "/extensions/site-packages"])
-    assert worker_environment({}, sys.executable)["PYTHONPATH"] == expected
-
-
 def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
     """Catches a worker of Blender's Python that imports from the user's site-packages or runs the
     user's settings."""
@@ -375,18 +349,12 @@ def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
     theirs.mkdir(parents=True)
     (theirs / "strange_package.py").touch()
     variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
-    looking = (
-        "import importlib.util as u, sys; sys.exit(3 if u.find_spec('strange_package') else 0)"
-    )
+    looking = "import importlib.util as u; exit(3 if u.find_spec('strange_package') else 0)"
     variables["PYTHONPATH"] = str(theirs)
     for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
         command = [sys.executable, "-c", looking]
-        assert (
-            subprocess.run(
-                command, env=environment, stdin=subprocess.DEVNULL, check=False
-            ).returncode
-            == code
-        )
+        done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False)
+        assert done.returncode == code
     assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
 
 
@@ -407,20 +375,7 @@ def test_own_python(monkeypatch, tmp_path):
 
 def test_log_lines(tmp_path):
     """Catches progress bars, which use carriage returns, and a character that is cut in half."""
-    (tmp_path / LOG_FILE).write_bytes(
-        "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
-    )
+    text = "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
+    (tmp_path / LOG_FILE).write_bytes(text)
     assert log_lines(tmp_path, 2) == ["second", "third"]
     assert log_lines(tmp_path / "none", 2) == []
-
-
-def test_status_is_standard_json(tmp_path):
-    """Catches a NaN in status.json, which other programs cannot read."""
-    with status_writer(tmp_path) as writer:
-        writer.update(0.5, "x", "", lambda: {"psnr": float("nan"), "loss": float("inf"), "n": 1.0})
-
-    def refuse(name: str) -> None:
-        raise AssertionError(name)
-
-    text = (tmp_path / STATUS_FILE).read_text()
-    assert json.loads(text, parse_constant=refuse)["figures"] == {"n": 1.0}

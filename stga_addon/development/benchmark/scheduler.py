@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...errors import StgaError
-from ...jobs.folder import request_folder, write_request
+from ...jobs.perform import request_folder, write_request
 from ...jobs.train import Train
 from ...progress import Cancelled, Progress, Report, Say, ignore
 from ...raster.cpu.threads import threads

@@ -4,10 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...errors import StgaError
-from ...jobs.results import Written
 from ...jobs.table import Benchmark
 from ...jobs.train import Train, prepare
-from ...progress import Progress, Report, Say, ignore
+from ...progress import Progress, Report, Say, Written, ignore
 from ...training.settings import TrainingSettings
 from .scheduler import BenchmarkRun, train_in_turns
 from .variants import settings_of, variants_of, without_choices

@@ -24,7 +24,7 @@ MAIN_VARIANTS: dict[str, Changes] = {
 SETTING_VARIANTS: dict[str, Changes] = {
     STANDARD: {},
     "scale-0.5": {"scale": 0.5},
-    "coarse-30%": {"coarse_share": 0.3},
+    "full-size": {"coarse_share": 0.0},
     "splats-3": {"lattice": 1},
     "splats-10": {"lattice": 3},
     "splats-15": {"lattice": 4},
@@ -32,7 +32,7 @@ SETTING_VARIANTS: dict[str, Changes] = {
     "sh-1": {"sh_degree": 1, "sh_steps": (0.3,)},
     "no-dssim": {"ssim_weight": 0.0},
     "no-density": {"density_interval": 0},
-    "density-x2": {"growth": 0.5, "density_interval": 100},
+    "density-x2": {"growth": 0.5},
     "no-strays": {"stray_reset_interval": 0},
     "frame-batches": {"views_per_visit": 0},
     "selective": {"strategy": "selective"},

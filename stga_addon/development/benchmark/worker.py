@@ -2,7 +2,7 @@
 
     python -m stga_addon.development.benchmark.worker FOLDER --threads=N [--fit-exposure]
 
-Trains as the request in FOLDER asks (`jobs.folder`), or resumes the run in FOLDER. Each line on
+Trains as the request in FOLDER asks (`jobs.perform`), or resumes the run in FOLDER. Each line on
 stdin is a share of the budget to train up to; the end of stdin means save and end. Each line, and
 the start, is answered by a line of JSON on stdout: {"share": …, "iteration": …} when ready for the
 next, {"done": …} at the end, or {"error": …}.
@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from ...errors import StgaError
 from ...files import write_json
-from ...jobs.folder import read_request, request_folder
+from ...jobs.perform import read_request, request_folder
 from ...jobs.train import Resume, Train
 from ...progress import ignore
 from ...training.run.folder import has_run

@@ -17,7 +17,7 @@ from ...capture.camera import Camera
 from ...capture.images import read_image
 from ...capture.model import Capture
 from ...capture.open import open_capture
-from ...cli.carry_out import carry_out
+from ...cli.commands import carry_out
 from ...errors import StgaError
 from ...export.formats import export_avatar
 from ...export.playback import Playback
@@ -109,7 +109,7 @@ def _import_and_select(capture: Capture) -> tuple[object, dict[int, np.ndarray]]
     """Make a Blender scene with head, cameras and a vertex group per frame; returns head and
     selection read back."""
     from ...scene.avatar_scene import set_up_head
-    from ...scene.blend_file import new_file
+    from ...scene.objects import new_file
     from ...scene.vertex_groups import read_selection, write_selection
 
     new_file()
@@ -140,8 +140,8 @@ def _show(capture: Capture, avatar: Avatar, head: object, path: Path) -> float:
     """Show the avatar, save and reopen the file; returns the largest distance (meters) of a splat
     from numpy's."""
     from ...scene.avatar_scene import show_on_head
-    from ...scene.blend_file import go_to_frame, object_named, open_file, save_file
     from ...scene.display.splat_object import evaluated_splats
+    from ...scene.objects import go_to_frame, object_named, open_file, save_file
 
     name = show_on_head(avatar, head, "//run/avatar.npz", FRAMES_PER_SECOND).name
     save_file(path)

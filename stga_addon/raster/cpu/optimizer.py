@@ -26,7 +26,7 @@ class AdamTables(NamedTuple):
 
     gradient, first, second, average  first and second moment, and the exponential moving average of
                                       the values
-    rates  (D,) float32 learning rate of each column
+    rates  (C,) float32 learning rates of the first C columns; the others are not stepped
     """
 
     value: Any
@@ -84,7 +84,7 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
     vectorizes."""
     values, gradient, first, second, average, rates = parameter
     beta1, beta2, epsilon, _ = options
-    width = values.shape[1]
+    width = len(rates)
     for n in range(len(rows)):
         i = rows[n]
         invalid = ZERO

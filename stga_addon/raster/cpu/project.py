@@ -243,16 +243,14 @@ def _load_projected(rows, projected, b):
 
 @part_jit
 def _color_gradient(b, q, i, coefficients, sh, v_sh):
-    """Write the gradient of splat i's coefficients, and the weights of the harmonics to the block
-    at q."""
+    """Write the gradient of splat i's coefficients in use, and the weights of the harmonics to the
+    block at q."""
     red, green, blue = b[block.G_RED + q], b[block.G_GREEN + q], b[block.G_BLUE + q]
     for k in range(coefficients):
         harmonic = b[block.B0 + k * COLUMN + q]
         v_sh[i, k, 0], v_sh[i, k, 1] = harmonic * red, harmonic * green
         v_sh[i, k, 2] = harmonic * blue
         b[block.W0 + k * COLUMN + q] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
-    for k in range(coefficients, np.uint64(v_sh.shape[1])):
-        v_sh[i, k, 0] = v_sh[i, k, 1] = v_sh[i, k, 2] = ZERO
     for k in range(coefficients, np.uint64(block.BASIS_SIZE)):
         b[block.W0 + k * COLUMN + q] = ZERO
 

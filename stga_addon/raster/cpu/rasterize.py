@@ -187,8 +187,9 @@ def render_backward(
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients`
     that belong to a visible splat, one in focus if the output has a focus, and leaves all others
-    unchanged. Returns the rows written (M,) int32, and screen_gradient (N,): for those rows, the
-    length of the gradient with respect to the projected center in units of half the image.
+    and coefficients above the degree in use unchanged. Returns the rows written (M,) int32, and
+    screen_gradient (N,): for those rows, the length of the gradient with respect to the projected
+    center in units of half the image.
     """
     n, buffers = len(splats.xyz), buffers or BufferPool()
     tiles_x, _ = tile_grid(*frames.size)

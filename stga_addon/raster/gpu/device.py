@@ -335,7 +335,7 @@ def _open(name: str) -> tuple[Any, dict[tuple, Kernel], list[Exception]]:
     failures."""
     adapter = adapters()[name]
     device = adapter.request_device_sync(
-        required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS},
+        required_limits={limit: adapter.limits[limit] for limit in _RAISED_LIMITS}
     )
     failures: list[Exception] = []
     reference = weakref.ref(device)

@@ -1,6 +1,6 @@
 """Node groups that compute triangles' frames and strain on the head, and place splats by them."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from functools import cache, partial, reduce
 from typing import Any, NamedTuple
 
@@ -8,21 +8,8 @@ import bpy
 
 from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
 from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, STRAIN_GAIN
-from .display_modes import WORLD_ROTATION, WORLD_SCALE
+from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
-from .splat_attributes import (
-    DRIVEN_OFFSET,
-    FACE,
-    GRAM,
-    NEUTRAL_AREA,
-    PLANE,
-    RANGE,
-    ROTATION,
-    SCALE,
-    TENSOR,
-    TENSOR_HALVES,
-    XYZ,
-)  # fmt: skip
 
 # Temporary attributes on the head's faces.
 _FRAME_ORIGIN, _FRAME_ROTATION = "stga_frame_origin", "stga_frame_rotation"
@@ -32,33 +19,22 @@ _FRAME_SIZE = "stga_frame_size"
 def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
     """The mesh with each triangle's frame stored on its faces."""
     # Sampling a stored attribute is fast; sampling a field would evaluate it once per splat.
-    origin, rotation, size = _FRAMES[convention](nodes, *nodes.triangle_corners())
+    p0, p1, p2 = nodes.triangle_corners()
+    origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
+    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    rotation, size = _FRAMES[convention](nodes, edge, side)
     mesh = nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
     mesh = nodes.store(mesh, _FRAME_ROTATION, rotation, "QUATERNION", "FACE")
     return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
 
 
-def shifted_frames(nodes: Nodes, mesh: Any, shift: Any, convention: str) -> Any:
-    """The mesh with its frames moved by a shift in their own axes and unit
-    (`avatar.embedding.shifted_frames`).
-
-    mesh: from FRAMES, with the neutral mesh's attributes; shift: a vector field on its faces.
-    """
-    size = nodes.attribute(_FRAME_SIZE, "FLOAT")
-    shift = nodes.scale(shift, _frame_scale(nodes, size, convention))
-    rotation = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
-    moved = nodes.out("FunctionNodeRotateVector", {"Vector": shift, "Rotation": rotation})
-    origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN, "FLOAT_VECTOR"), moved)
-    return nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
-
-
 def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
     """Splats placed in object space, rotation and scale stored; mesh: from `_stored_frames`."""
-    xyz = nodes.attribute(XYZ, "FLOAT_VECTOR")
-    rotation = nodes.attribute(ROTATION, "QUATERNION")
-    scale = nodes.attribute(SCALE, "FLOAT_VECTOR")
+    xyz = nodes.attribute(stored.XYZ)
+    rotation = nodes.attribute(stored.ROTATION, "QUATERNION")
+    scale = nodes.attribute(stored.SCALE)
     if convention is not None:
-        face = nodes.attribute(FACE, "INT")
+        face = nodes.attribute(stored.FACE, "INT")
 
         def sample(name: str, data_type: str) -> Any:  # of each splat's triangle
             return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
@@ -72,58 +48,49 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
         rotation = nodes.out("FunctionNodeRotateRotation", rotations, rotation_space="GLOBAL")
         scale = nodes.scale(scale, size)
     splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
-    splats = nodes.store(splats, WORLD_ROTATION, rotation, "QUATERNION")
-    return nodes.store(splats, WORLD_SCALE, scale, "FLOAT_VECTOR")
+    splats = nodes.store(splats, stored.WORLD_ROTATION, rotation, "QUATERNION")
+    return nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
 
 
 def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
     """A frame's scale by its size, where NEUTRAL_AREA is that of its triangle."""
     if convention != "stga":
         return size
-    neutral = nodes.attribute(NEUTRAL_AREA, "FLOAT")
+    neutral = nodes.attribute(stored.NEUTRAL_AREA, "FLOAT")
     ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
     # A neutral triangle without area gives no ratio: its splats keep their size.
     return nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
 
 
-def _stga_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p0−o), ·, normal]; the triangle's area."""
-    origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
-    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+def _stga_frame(nodes: Nodes, edge: Any, side: Any) -> tuple[Any, Any]:
+    """Axes [n(p0−o), ·, normal], o being the centroid; the triangle's area."""
     # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a
     # rounded mean is not.
     first = nodes.scale(nodes.vector("ADD", edge, side), -1 / 3)
     rotation, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
-    return origin, rotation, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
+    return rotation, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
 
 
-def _gaussian_avatars_frame(nodes: Nodes, p0: Any, p1: Any, p2: Any) -> tuple[Any, Any, Any]:
-    """Centroid; axes [n(p1−p0), normal, ·]; mean of the first edge and the height over it."""
-    origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
-    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+def _gaussian_avatars_frame(nodes: Nodes, edge: Any, side: Any) -> tuple[Any, Any]:
+    """Axes [n(p1−p0), normal, ·]; mean of the first edge and the height over it."""
     rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
     # Height over the edge = |edge × side| / |edge|, or the side where the edge has no length.
     length = nodes.vector("LENGTH", edge)
     height = nodes.math("DIVIDE", nodes.vector("LENGTH", normal), length)
     height = nodes.switch("FLOAT", no_edge, height, nodes.vector("LENGTH", side))
-    return origin, rotation, nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
+    return rotation, nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
 
 
-_FRAMES: dict[str, Callable[..., tuple[Any, Any, Any]]] = {
-    "stga": _stga_frame,
-    "gaussian_avatars": _gaussian_avatars_frame,
-}
+_FRAMES = {"stga": _stga_frame, "gaussian_avatars": _gaussian_avatars_frame}
 
 
 def _axes_to_rotation(
     nodes: Nodes, first: Any, edge: Any, side: Any, normal_axis: str
 ) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
     """Rotation whose x axis is `first` exactly, of a triangle with two edges from its first corner.
-
     Where `first` or the normal is degenerate, it takes the substitutes of `avatar.embedding`; the
     node's own differ. Returns the rotation, the normal (its length twice the area) and whether
-    `first` is degenerate.
-    """
+    `first` is degenerate."""
     normal = nodes.vector("CROSS_PRODUCT", edge, side)
     edges = edge, side, nodes.vector("SUBTRACT", edge, side)
     longest = reduce(partial(nodes.math, "MAXIMUM"), [nodes.vector("LENGTH", v) for v in edges])
@@ -160,8 +127,7 @@ PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "S
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
 
 
-SMOOTHED_STRAIN = "stga_smoothed_strain"
-"""Vector on the faces of the mesh from SMOOTHED."""
+SMOOTHED_STRAIN = "stga_smoothed_strain"  # vector on the faces of the mesh from SMOOTHED
 # Temporary attributes on the faces of the deformed neutral mesh.
 _GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
 
@@ -174,32 +140,32 @@ def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
     p0, p1, p2 = nodes.triangle_corners()
     e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
     products = (nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2)))
-    rest = nodes.attribute(GRAM, "FLOAT_VECTOR")
+    rest = nodes.attribute(stored.GRAM)
     change = nodes.vector("SUBTRACT", nodes.combine(*products), rest)
     mesh = nodes.store(mesh, _GRAM_CHANGE, change, "FLOAT_VECTOR", "FACE")
-    changes = nodes.components(nodes.attribute(_GRAM_CHANGE, "FLOAT_VECTOR"))
-    for half in TENSOR_HALVES:
-        tensor = _weighted(nodes, [TENSOR.format(k, half) for k in range(3)], changes)
+    changes = nodes.components(nodes.attribute(_GRAM_CHANGE))
+    for half in stored.TENSOR_HALVES:
+        tensor = _weighted(nodes, [stored.TENSOR.format(k, half) for k in range(3)], changes)
         mesh = nodes.store(mesh, half, tensor, "FLOAT_VECTOR", "FACE")
     return mesh
 
 
 def _weighted(nodes: Nodes, names: Iterable[str], factors: Iterable[Any]) -> Any:
     """Sum of vector attributes times numbers."""
-    vectors = (nodes.attribute(name, "FLOAT_VECTOR") for name in names)
+    vectors = (nodes.attribute(name) for name in names)
     return nodes.sum(*(nodes.scale(v, by) for v, by in zip(vectors, factors, strict=True)))
 
 
 def _strained(nodes: Nodes, mesh: Any) -> Any:
     """The mesh from `_deformed` with triangles' strain (`avatar.strain.face_strain`) stored."""
     # Faces to points and back: the mean over the triangles that touch a triangle.
-    tensors = [nodes.attribute(half, "FLOAT_VECTOR") for half in TENSOR_HALVES]
+    tensors = [nodes.attribute(half) for half in stored.TENSOR_HALVES]
     means = [nodes.on_domain(tensor, "FLOAT_VECTOR", "POINT") for tensor in tensors]
     strains = []
     for index in range(STRAIN_COMPONENTS):
         products = []
-        for half, mean in zip(TENSOR_HALVES, means, strict=True):
-            plane = nodes.attribute(PLANE.format(index, half), "FLOAT_VECTOR")
+        for half, mean in zip(stored.TENSOR_HALVES, means, strict=True):
+            plane = nodes.attribute(stored.PLANE.format(index, half))
             products.append(nodes.vector("DOT_PRODUCT", mean, plane))
         strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
     strain = _in_range(nodes, nodes.combine(*strains))
@@ -208,13 +174,13 @@ def _strained(nodes: Nodes, mesh: Any) -> Any:
 
 def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
     """Strain of each splat's triangle as a vector; mesh: from `_strained`."""
-    strain, face = nodes.attribute(_STRAIN, "FLOAT_VECTOR"), nodes.attribute(FACE, "INT")
+    strain, face = nodes.attribute(_STRAIN), nodes.attribute(stored.FACE, "INT")
     return nodes.sample(mesh, strain, face, "FLOAT_VECTOR")
 
 
 def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
-    strain, rest = nodes.attribute(_STRAIN, "FLOAT_VECTOR"), _in_range(nodes, (0, 0, 0))
+    strain, rest = nodes.attribute(_STRAIN), _in_range(nodes, (0, 0, 0))
     change = nodes.vector("SUBTRACT", strain, rest)
     # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge
     # with it.
@@ -224,7 +190,7 @@ def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
 
 
 def _in_range(nodes: Nodes, strain: Any) -> Any:
-    lowest, highest = (nodes.attribute(name, "FLOAT_VECTOR") for name in RANGE)
+    lowest, highest = (nodes.attribute(name) for name in stored.RANGE)
     return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", strain, highest), lowest)
 
 
@@ -251,19 +217,20 @@ SIGNALS = {"strain_position": SignalNodes("position", SMOOTHED, SMOOTHED_STRAIN)
 """Driven offset -> its signal; those without are displayed as trained only."""
 
 
-def displayed_offsets(names: Collection[str]) -> tuple[str, ...]:
-    """Those of the driven offsets that nodes display, in the order of SIGNALS."""
-    return tuple(name for name in SIGNALS if name in names)
-
-
 @cache
 def shifted(offset: str, convention: str) -> NodeGroup:
     """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
 
     def build(nodes: Nodes, mesh: Any) -> Any:
         mesh = nodes.group(SIGNALS[offset].group, mesh)
-        signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute, "FLOAT_VECTOR"))
-        names = [DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
-        return shifted_frames(nodes, mesh, _weighted(nodes, names, signal), convention)
+        signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute))
+        names = [stored.DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
+        # In the frames' own axes and unit (`avatar.embedding.shifted_frames`).
+        scale = _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention)
+        turn = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
+        local = {"Vector": nodes.scale(_weighted(nodes, names, signal), scale), "Rotation": turn}
+        moved = nodes.out("FunctionNodeRotateVector", local)
+        origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN), moved)
+        return nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
 
     return _meshes(f"Driven Offset ({SIGNALS[offset].label}, {convention})", build, "Frames")

@@ -30,6 +30,11 @@ def find_tree(name: str) -> bpy.types.NodeTree | None:
     return None
 
 
+def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:
+    """Add an input or output ("INPUT", "OUTPUT") of a socket type ("Vector") to the tree."""
+    return tree.interface.new_socket(name, in_out=side, socket_type=f"NodeSocket{kind}")
+
+
 def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
     """Whether `splat_nodes.splat_tree` made the tree, in this version or another."""
     return _VERSION in tree and bool(tree.is_modifier)
@@ -54,17 +59,14 @@ class NodeGroup:
     output: str
     build: Callable[..., bpy.types.NodeSocket]
 
-    def exists(self) -> bool:
-        return find_tree(f".{self.name}") is not None
-
     def tree(self) -> bpy.types.NodeTree:
         """The group's tree, built where the file has none."""
         if (existing := find_tree(f".{self.name}")) is not None:
             return existing
         tree = new_tree(f".{self.name}")
-        sockets = [(self.output, "OUTPUT", self.output)]
-        for name, side, kind in sockets + [(n, "INPUT", k) for n, k in self.inputs.items()]:
-            tree.interface.new_socket(name, in_out=side, socket_type=f"NodeSocket{kind}")
+        new_socket(tree, self.output, "OUTPUT", self.output)
+        for name, kind in self.inputs.items():
+            new_socket(tree, name, "INPUT", kind)
         nodes = Nodes(tree)
         inputs = nodes.add("NodeGroupInput").outputs
         result = self.build(nodes, *(inputs[name] for name in self.inputs))
@@ -92,10 +94,8 @@ class Nodes:
         self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
     ) -> bpy.types.Node:
         """New node; `inputs` maps an enabled socket's name or identifier to a value or socket.
-
         Several sockets of one name take a list. Names differ between Blender versions more often
-        than identifiers. Raises ValueError where no socket has the name.
-        """
+        than identifiers. Raises ValueError where no socket has the name."""
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)
@@ -111,16 +111,15 @@ class Nodes:
 
     def finish(self, kind: str, inputs: Mapping[str, Any]) -> None:
         """Add the tree's output node and arrange all nodes in columns, by links to it."""
-        output, sources = self.add(kind, inputs), defaultdict[str, list[Any]](list)
+        sources = defaultdict[str, list[str]](list)
+        columns, waiting = dict[str, int](), [(self.add(kind, inputs).name, 0)]
         for link in self.tree.links:
-            sources[link.to_node.name].append(link.from_node)
-        columns: dict[str, int] = {}
-        waiting = [(output, 0)]
+            sources[link.to_node.name].append(link.from_node.name)
         while waiting:
-            node, column = waiting.pop()
-            if columns.get(node.name, -1) < column:
-                columns[node.name] = column
-                waiting += [(source, column + 1) for source in sources[node.name]]
+            name, column = waiting.pop()
+            if columns.get(name, -1) < column:
+                columns[name] = column
+                waiting += [(source, column + 1) for source in sources[name]]
         rows, locations = Counter[int](), list[float]()
         for node in self.tree.nodes:
             column = columns.get(node.name, 0)
@@ -170,7 +169,7 @@ class Nodes:
         inputs = {"Switch": condition, "False": false, "True": true}
         return self.out("GeometryNodeSwitch", inputs, input_type=kind)
 
-    def attribute(self, name: Any, data_type: str) -> bpy.types.NodeSocket:
+    def attribute(self, name: Any, data_type: str = "FLOAT_VECTOR") -> bpy.types.NodeSocket:
         return self.attribute_if_any(name, data_type)[0]
 
     def attribute_if_any(self, name: Any, data_type: str) -> list[bpy.types.NodeSocket]:
@@ -179,17 +178,13 @@ class Nodes:
         node = self.add(kind, {"Name": name}, data_type=data_type)
         return [socket for socket in node.outputs if socket.enabled]
 
-    def store(
-        self, geometry: Any, name: str, value: Any, data_type: str, domain: str = "POINT"
-    ) -> Any:
-        inputs, kind = {"Geometry": geometry, "Name": name, "Value": value}, {"domain": domain}
-        return self.out("GeometryNodeStoreNamedAttribute", inputs, data_type=data_type, **kind)
+    def store(self, mesh: Any, name: str, value: Any, data_type: str, domain: str = "POINT") -> Any:
+        inputs, kind = {"Geometry": mesh, "Name": name, "Value": value}, {"data_type": data_type}
+        return self.out("GeometryNodeStoreNamedAttribute", inputs, domain=domain, **kind)
 
-    def sample(
-        self, geometry: Any, value: Any, index: Any, data_type: str, domain: str = "FACE"
-    ) -> Any:
-        inputs = {"Geometry": geometry, "Value": value, "Index": index}
-        return self.out("GeometryNodeSampleIndex", inputs, data_type=data_type, domain=domain)
+    def sample(self, mesh: Any, value: Any, index: Any, kind: str, domain: str = "FACE") -> Any:
+        inputs = {"Geometry": mesh, "Value": value, "Index": index}
+        return self.out("GeometryNodeSampleIndex", inputs, data_type=kind, domain=domain)
 
     def on_domain(self, value: Any, data_type: str, domain: str) -> bpy.types.NodeSocket:
         """A field interpolated to another domain: means of the touching elements."""

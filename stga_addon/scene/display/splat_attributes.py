@@ -33,6 +33,9 @@ FACE = "stga_face"
 # of the splat's triangle, m²; also on the faces that have driven offsets
 NEUTRAL_AREA = "stga_neutral_area"
 
+WORLD_ROTATION, WORLD_SCALE = "rotation", "scale"
+"""As posed by the nodes, by the names that Blender's native splats have."""
+
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz
 # and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
@@ -174,8 +177,7 @@ def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
     return np.stack([read_values(mesh.attributes[name].data, "vector", 3) for name in names], 1)
 
 
-PROPERTY = "stga_light"
-"""On the neutral mesh: JSON of what is not by vertex."""
+PROPERTY = "stga_light"  # on the neutral mesh: JSON of what is not by vertex
 VECTORS = ("stga_transfer_0", "stga_transfer_1", "stga_transfer_2", "stga_irradiance")
 NUMBERS = ("stga_occlusion", "stga_roughness")
 REST = ("residual", "damping", "source")

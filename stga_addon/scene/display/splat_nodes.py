@@ -1,32 +1,22 @@
-"""The geometry node tree that displays splats, without Python at playback.
+"""The geometry node tree that displays splats, without Python at playback: colors, display modes
+and their materials. For splats that follow a head it computes each triangle's frame on the head's
+*evaluated* mesh, samples the frames by the splats' face index and composes position, rotation and
+scale."""
 
-For splats that follow a head it computes each triangle's frame on the head's *evaluated* mesh,
-samples the frames by the splats' face index and composes position, rotation and scale.
-"""
-
+from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import bpy
 
+from ...avatar.splats import SH_C0, harmonics
 from ...capture.meshes import SELECTED_WEIGHT
 from .. import tags
-from ..compat import NATIVE_SPLATS
+from ..compat import NATIVE_SPLATS, native_splats
 from ..layers import FROZEN_COLOR
-from .display_modes import (
-    AS_TRAINED,
-    DISPLAY_COLOR,
-    LINEAR_TO_SRGB,
-    MODES,
-    NATIVE_GROUPS,
-    SH_BANDS,
-    SRGB_TO_LINEAR,
-    constant_color,
-    displayed,
-    view_color,
-)  # fmt: skip
+from . import splat_attributes as stored
 from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
-from .node_builder import NodeGroup, Nodes, find_tree, new_tree
-from .splat_attributes import COLOR, FACE, OPACITY, RELIT_COLOR
+from .node_builder import NodeGroup, Nodes, find_tree, new_material, new_socket, new_tree
 
 # Inputs of the modifier, by their displayed names.
 HEAD = "Head"
@@ -39,6 +29,273 @@ VIEW_DEPENDENT = "View-Dependent Color"
 SHOW_SELECTION = "Show Selection"
 SELECTED_ONLY = "Selected Only"
 
+
+def constant_color(nodes: Nodes, strain: Any) -> Any:
+    """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
+    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in
+    `Splats`."""
+    terms = [nodes.scale(nodes.attribute(stored.SH.format(0)), SH_C0), (0.5, 0.5, 0.5)]
+    for index, factor in enumerate(() if strain is None else nodes.components(strain)):
+        color = nodes.attribute(stored.STRAIN_COLOR.format(index))
+        terms.append(nodes.scale(color, factor))
+    return nodes.sum(*terms)
+
+
+def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
+    """Scene-linear color of sRGB, clamped to 0…1 (IEC 61966-2-1)."""
+    clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", srgb, (0, 0, 0)), (1, 1, 1))
+    linear = []
+    for value in nodes.components(clamped):
+        base = nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055)
+        line, power = nodes.math("DIVIDE", value, 12.92), nodes.math("POWER", base, 2.4)
+        is_bright = nodes.compare("GREATER_THAN", value, 0.04045)
+        linear.append(nodes.switch("FLOAT", is_bright, line, power))
+    return nodes.combine(*linear)
+
+
+def _linear_to_srgb(nodes: Nodes, color: Any) -> Any:
+    """The inverse, of colors from 0 on."""
+    srgb = []
+    for value in nodes.components(color):
+        power = nodes.math("MULTIPLY_ADD", nodes.math("POWER", value, 1 / 2.4), 1.055, -0.055)
+        line = nodes.math("MULTIPLY", value, 12.92)
+        is_bright = nodes.compare("GREATER_THAN", value, 0.0031308)
+        srgb.append(nodes.switch("FLOAT", is_bright, line, power))
+    return nodes.combine(*srgb)
+
+
+class _Formula:
+    """Arithmetic of numbers and sockets, whose nodes are made once its socket is asked for."""
+
+    def __init__(self, nodes: Nodes, operation: str = "", *values: Any) -> None:
+        self._nodes, self._operation, self._values = nodes, operation, values
+
+    @cached_property
+    def socket(self) -> Any:
+        values = [each.socket if isinstance(each, _Formula) else each for each in self._values]
+        return self._nodes.math(self._operation, *values)
+
+    def __mul__(self, other: Any) -> "_Formula":
+        return _Formula(self._nodes, "MULTIPLY", self, other)
+
+    def __sub__(self, other: Any) -> "_Formula":
+        return _Formula(self._nodes, "SUBTRACT", self, other)
+
+    __rmul__ = __mul__
+
+
+def _band(degree: int, nodes: Nodes, direction: Any) -> Any:
+    """Sum of the coefficients of one degree times their harmonics in a unit direction."""
+    axes = _Formula(nodes), _Formula(nodes), _Formula(nodes)
+    for axis, component in zip(axes, nodes.components(direction), strict=True):
+        axis.socket = component
+    total, terms = (0, 0, 0), harmonics(*axes)
+    for index in range(degree**2, (degree + 1) ** 2):
+        coefficient = nodes.attribute(stored.SH.format(index))
+        total = nodes.vector("MULTIPLY_ADD", coefficient, terms[index].socket, total)
+    return total
+
+
+SRGB_TO_LINEAR = NodeGroup("STGA sRGB to Linear", {"sRGB": "Vector"}, "Color", _srgb_to_linear)
+LINEAR_TO_SRGB = NodeGroup("STGA Linear to sRGB", {"Color": "Color"}, "Vector", _linear_to_srgb)
+SH_BANDS = tuple(
+    NodeGroup(f"STGA Spherical Harmonics {n}", {"Direction": "Vector"}, "Vector", partial(_band, n))
+    for n in (1, 2, 3)
+)
+
+
+DISPLAY_COLOR = "stga_display_color"  # attribute that the splat nodes store
+DISK = 0.7  # radius of the disk that an octahedron of radius 1 shows whole
+DOT_SIZE = 1.8  # radius of a dot in mean standard deviations, at which dots leave no holes
+EXTENT = 3.0
+"""Standard deviations from a quad's center to its sides; a Gaussian is below 1.2 % there."""
+
+
+def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bpy.types.Material:
+    """Built where the file has none; method: EEVEE's, "DITHERED" or "BLENDED"."""
+    material = bpy.data.materials.get(name)
+    if material is None:
+        material = new_material(name, build)
+        material.surface_render_method = method
+        material.use_backface_culling = True
+    return material
+
+
+def _point_shader(nodes: Nodes) -> Any:
+    """Emits the colors of points; cuts disks out of the octahedra around them that EEVEE draws."""
+    color, opacity = _color_and_opacity(nodes, "GEOMETRY")
+    geometry = nodes.add("ShaderNodeNewGeometry").outputs
+    point = nodes.add("ShaderNodePointInfo").outputs
+    offset = nodes.vector("SUBTRACT", geometry["Position"], point["Position"])
+    distance2 = _squared_distance(nodes, offset, geometry["Incoming"])
+    limit = nodes.math("MULTIPLY", point["Radius"], DISK)
+    inside = nodes.math("LESS_THAN", distance2, nodes.math("MULTIPLY", limit, limit))
+    return _emission(nodes, color, nodes.math("MULTIPLY", opacity, inside))
+
+
+def _gaussian_shader(nodes: Nodes) -> Any:
+    """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
+
+    Along a ray with unit direction D through a point P of the quad, both in the instance's space,
+    the Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² −
+    (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
+    overlapping splats, and for EEVEE up to their order by centers.
+    """
+    color, opacity = _color_and_opacity(nodes, "INSTANCER")
+    geometry = nodes.add("ShaderNodeNewGeometry").outputs
+    position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
+    to_object = {"vector_type": "VECTOR", "convert_from": "WORLD", "convert_to": "OBJECT"}
+    ray = nodes.out("ShaderNodeVectorTransform", {"Vector": geometry["Incoming"]}, **to_object)
+    distance2 = _squared_distance(nodes, position, nodes.vector("NORMALIZE", ray))
+    density = nodes.math("EXPONENT", nodes.math("MULTIPLY", distance2, -0.5))
+    # Whatever is behind a quad sees through it.
+    front = nodes.math("SUBTRACT", 1.0, geometry["Backfacing"])
+    visible = nodes.math("MULTIPLY", density, front)
+    return _emission(nodes, color, nodes.math("MULTIPLY", visible, opacity))
+
+
+def _squared_distance(nodes: Nodes, point: Any, direction: Any) -> Any:
+    """Of the origin from the line through a point in a unit direction."""
+    along = nodes.vector("DOT_PRODUCT", point, direction)
+    length2 = nodes.vector("DOT_PRODUCT", point, point)
+    return nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))
+
+
+def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
+    """What the splat nodes stored on points ("GEOMETRY") or instances ("INSTANCER")."""
+    color, opacity = nodes.add("ShaderNodeAttribute"), nodes.add("ShaderNodeAttribute")
+    color.attribute_type = opacity.attribute_type = attribute_type
+    color.attribute_name, opacity.attribute_name = DISPLAY_COLOR, stored.OPACITY
+    return color.outputs["Color"], opacity.outputs["Fac"]
+
+
+def _emission(nodes: Nodes, color: Any, alpha: Any) -> Any:
+    shaders = [nodes.out("ShaderNodeBsdfTransparent")]
+    shaders.append(nodes.out("ShaderNodeEmission", {"Color": color}))
+    return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": shaders})
+
+
+# Attributes that Blender's native splats use, beside WORLD_ROTATION and WORLD_SCALE.
+RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
+RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
+
+AS_TRAINED = "As Trained"
+POINTS = "Points"
+QUADS = "Camera Quads"
+NATIVE = "Native Splats"
+LIMITS = {
+    AS_TRAINED: "Exact in viewports and by the engine STGA Splats; "
+    "EEVEE and Cycles render camera quads",
+    POINTS: "Fast: a dot for each splat, in one color; for Material Preview",
+    QUADS: "For EEVEE and Cycles; right through the scene's camera only",
+    NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
+}
+"""What each display is for and what it is not, in its tooltip and in the panel."""
+
+
+def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
+    """Geometry of the splats in the display mode that the menu socket `mode` chooses. visible:
+    field, which splats; size: factor on their standard deviations; native: points from
+    NATIVE_GROUPS, None in a Blender without native splats."""
+    made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
+    # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads
+    # that face the camera.
+    choice = {"Switch": nodes.out("GeometryNodeIsViewport"), "False": made[QUADS]}
+    in_images = nodes.out("GeometryNodeSwitch", choice, input_type="GEOMETRY")
+    geometries = {AS_TRAINED: in_images, **made}
+    if native is not None and (points := native_splats(nodes.tree, native)) is not None:
+        geometries[NATIVE] = points
+    menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
+    menu.enum_definition.enum_items.clear()
+    for name in geometries:
+        menu.enum_definition.enum_items.new(name).description = LIMITS[name]
+    for name, geometry in geometries.items():
+        nodes.tree.links.new(geometry, menu.inputs[name])
+    nodes.tree.links.new(mode, menu.inputs["Menu"])
+    return menu.outputs[0]
+
+
+def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
+    # A point has one radius.
+    scale = nodes.attribute(stored.WORLD_SCALE)
+    mean = nodes.vector("DOT_PRODUCT", scale, (DOT_SIZE / DISK / 3,) * 3)
+    inputs = {"Mesh": splats, "Selection": visible, "Radius": nodes.math("MULTIPLY", mean, size)}
+    points = nodes.out("GeometryNodeMeshToPoints", inputs)
+    # EEVEE does not sort the points of a point cloud.
+    material = _splat_material("STGA Points", _point_shader, "DITHERED")
+    return nodes.out("GeometryNodeSetMaterial", {"Geometry": points, "Material": material})
+
+
+def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
+    """Two triangles per splat, which cover its ellipsoid as the scene's active camera sees it. In
+    the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances:
+    realizing them would take twenty times as long."""
+    sides = {"Size X": 2 * EXTENT, "Size Y": 2 * EXTENT, "Vertices X": 2, "Vertices Y": 2}
+    quad = nodes.out("GeometryNodeMeshGrid", sides)
+    # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come
+    # as close.
+    material = _splat_material("STGA Gaussians", _gaussian_shader, "BLENDED")
+    quad = nodes.out("GeometryNodeSetMaterial", {"Geometry": quad, "Material": material})
+    points = {"Points": splats, "Selection": visible, "Instance": quad}
+    quads = nodes.out("GeometryNodeInstanceOnPoints", points)
+    # Per splat: its ellipsoid's transform after a rotation that turns +Z to the active camera.
+    position = nodes.out("GeometryNodeInputPosition")
+    rotation = nodes.attribute(stored.WORLD_ROTATION, "QUATERNION")
+    scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), size)
+    camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
+    inverse = nodes.out("FunctionNodeInvertRotation", {"Rotation": rotation})
+    to_camera = nodes.vector("SUBTRACT", camera, position)
+    to_camera = nodes.out("FunctionNodeRotateVector", {"Vector": to_camera, "Rotation": inverse})
+    to_camera = nodes.vector("NORMALIZE", nodes.vector("DIVIDE", to_camera, scale))
+    axes = {"Primary Axis": to_camera, "Secondary Axis": (1, 0, 0)}
+    facing = nodes.out("FunctionNodeAxesToRotation", axes, primary_axis="Z", secondary_axis="X")
+    ellipsoid = {"Translation": position, "Rotation": rotation, "Scale": scale}
+    turn = {"Rotation": facing}
+    both = [nodes.out("FunctionNodeCombineTransform", part) for part in (ellipsoid, turn)]
+    transform = nodes.out("FunctionNodeMatrixMultiply", {"Matrix": both})
+    placed = {"Instances": quads, "Transform": transform}
+    return nodes.out("GeometryNodeSetInstanceTransform", placed)
+
+
+def _native(
+    degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any,
+    view_dependent: Any, gray: Any,
+) -> bpy.types.NodeSocket:  # fmt: skip
+    """Points with what native splats are drawn from: harmonics have the object's axes, in which
+    they were trained. color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are
+    those that are relit."""
+    _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
+    flat = nodes.logic("OR", gray, is_relit)
+    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
+    color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
+    red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
+    opacity = nodes.attribute(stored.OPACITY, "FLOAT")
+    base = {"Red": red, "Green": green, "Blue": blue, "Alpha": opacity}
+    # A color, which 5.3 draws as four floats; of FLOAT4, this node of 5.2 stores three.
+    radiance = nodes.out("FunctionNodeCombineColor", base)
+    splats = nodes.store(splats, RADIANCE, radiance, "FLOAT_COLOR")
+    scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), size)
+    splats = nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
+    factor = nodes.logic("NIMPLY", view_dependent, flat)
+    for index in range((degree + 1) ** 2 - 1):
+        coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
+        splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
+    return nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
+
+
+_INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
+MODES = {
+    POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
+    QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
+}
+_NATIVE_INPUTS = _INPUTS | {"Color": "Vector", "View-Dependent": "Bool", "Gray": "Bool"}
+NATIVE_GROUPS = tuple(
+    NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
+    for n in range(4)
+)
+"""By the harmonics' degree."""
+
+
 _FROZEN = "stga_frozen"
 
 
@@ -48,7 +305,7 @@ class TreeOptions(NamedTuple):
     convention       of the splats' embedding ("stga", "gaussian_avatars"); None for world space
     degree           of their spherical harmonics
     strain_color     whether colors follow the strain of triangles
-    offsets          driven offsets that move the splats, of `displayed_offsets`
+    offsets          driven offsets that move the splats, of SIGNALS, in its order
     """
 
     convention: str | None
@@ -67,27 +324,19 @@ class TreeOptions(NamedTuple):
 
 def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
     """The node tree for splats of this kind. Built once per file."""
-    if (existing := find_splat_tree(options)) is not None:
-        return existing
-    tree = new_tree(options.tree_name)
-    tree.is_modifier = True
-    _add_interface(tree, options.convention is not None, options.degree)
-    _build(Nodes(tree), options)
+    tree = find_tree(options.tree_name)
+    if tree is None:
+        tree = new_tree(options.tree_name)
+        tree.is_modifier = True
+        _add_interface(tree, options.convention is not None, options.degree)
+        _build(Nodes(tree), options)
     return tree
-
-
-def find_splat_tree(options: TreeOptions) -> bpy.types.NodeTree | None:
-    """What `splat_tree` built before in this file, or None."""
-    return find_tree(options.tree_name)
 
 
 def build_next_node_group(options: TreeOptions) -> bool:
     """Build one node group that `splat_tree` needs, the tree itself last; returns False if all
-    exist.
-
-    Calling it from a timer until it returns False keeps the UI responsive meanwhile.
-    """
-    if find_splat_tree(options) is not None:
+    exist. Calling it from a timer until it returns False keeps the UI responsive meanwhile."""
+    if find_tree(options.tree_name) is not None:
         return False
     convention, degree, strain_color, offsets = options
     # What `_build` uses, each after those that it uses itself.
@@ -103,23 +352,21 @@ def build_next_node_group(options: TreeOptions) -> bool:
     if degree > 0 or strain_color:
         groups.append(SRGB_TO_LINEAR)
     groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else []
-    missing = next((group for group in groups if not group.exists()), None)
-    if missing is not None:
-        missing.tree()
-    else:
+    missing = next((group for group in groups if find_tree(f".{group.name}") is None), None)
+    if missing is None:
         splat_tree(options)
+    else:
+        missing.tree()
     return True
 
 
 def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> None:
     def add(name: str, kind: str, description: str, **properties: Any) -> None:
-        socket = tree.interface.new_socket(
-            name, in_out="INPUT", socket_type=f"NodeSocket{kind}", description=description
-        )
-        for key, value in properties.items():
+        socket = new_socket(tree, name, "INPUT", kind)
+        for key, value in {"description": description, **properties}.items():
             setattr(socket, key, value)
 
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    new_socket(tree, "Geometry", "OUTPUT", "Geometry")
     add("Geometry", "Geometry", "")
     if embedded:
         add(HEAD, "Object", "The animated head whose triangles carry the splats")
@@ -142,7 +389,7 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats = inputs["Geometry"]
-    opacity, threshold = nodes.attribute(OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
+    opacity, threshold = nodes.attribute(stored.OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
     opaque = nodes.compare("GREATER_EQUAL", opacity, threshold)
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
@@ -182,7 +429,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
 
 def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
     """Scene-linear color of each splat; strain: a vector field, None where unused."""
-    color = nodes.attribute(COLOR, "FLOAT_COLOR")
+    color = nodes.attribute(stored.COLOR, "FLOAT_COLOR")
     if strain is None and degree == 0:
         return color
     srgb = constant_color(nodes, strain)
@@ -190,7 +437,13 @@ def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
         color = nodes.group(SRGB_TO_LINEAR, srgb)
     if degree == 0:
         return color
-    seen, has_camera = view_color(nodes, srgb, degree)
+    # In the space that splats were trained in.
+    camera = nodes.object_info(nodes.out("GeometryNodeInputActiveCamera")).outputs["Location"]
+    position = nodes.out("GeometryNodeInputPosition")
+    direction = nodes.vector("NORMALIZE", nodes.vector("SUBTRACT", position, camera))
+    seen = nodes.sum(srgb, *(nodes.group(band, direction) for band in SH_BANDS[:degree]))
+    # Without a camera object the location is zero, which is inside the head: no camera is there.
+    has_camera = nodes.compare("GREATER_THAN", nodes.vector("LENGTH", camera), 0.0)
     is_chosen = nodes.logic("AND", inputs[VIEW_DEPENDENT], has_camera)
     return nodes.switch("RGBA", is_chosen, color, nodes.group(SRGB_TO_LINEAR, seen))
 
@@ -205,7 +458,7 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
     selected = nodes.compare("GREATER_EQUAL", weight, SELECTED_WEIGHT)
     # On the points: a boolean is true on a face where it is true at all the face's points.
     frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(selected, "BOOLEAN", "POINT"))
-    return nodes.sample(mesh, frozen, nodes.attribute(FACE, "INT"), "BOOLEAN")
+    return nodes.sample(mesh, frozen, nodes.attribute(stored.FACE, "INT"), "BOOLEAN")
 
 
 _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _frozen_splats)
@@ -213,7 +466,7 @@ _FROZEN_SPLATS = NodeGroup("STGA Frozen Splats", {"Mesh": "Geometry"}, "Bool", _
 
 def _relit_color(nodes: Nodes, color: Any) -> bpy.types.NodeSocket:
     """Field: the relit color of a frame where the splats have one, else `color`."""
-    relit, exists = nodes.attribute_if_any(RELIT_COLOR, "FLOAT_COLOR")
+    relit, exists = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
     return nodes.switch("RGBA", exists, color, relit)
 
 

@@ -14,27 +14,12 @@ from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
 from ..compat import modifier_input, modifier_menu, set_modifier_input
 from ..layers import DisplaySettings
+from . import splat_attributes as stored
 from . import splat_nodes
-from .display_modes import AS_TRAINED, POINTS, WORLD_ROTATION, WORLD_SCALE
-from .frame_nodes import displayed_offsets
-from .node_builder import is_splat_tree
-from .splat_attributes import (
-    RANGE,
-    Attributes,
-    SplatAttributes,
-    avatar_attributes,
-    read_driven_offsets,
-    read_light,
-    read_splats,
-    read_vectors,
-    splat_attributes,
-    write_attributes,
-    write_light,
-    write_splats,
-)  # fmt: skip
-
-TRANSPARENT_BOUNCES = 64
-"""Layers of overlapping splats that Cycles has to see through; behind its default of 8 is black."""
+from .frame_nodes import SIGNALS
+from .node_builder import find_tree, is_splat_tree
+from .splat_attributes import Attributes, SplatAttributes, avatar_attributes
+from .splat_nodes import AS_TRAINED, POINTS
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
@@ -52,37 +37,27 @@ def use_transparent_bounces(scene: bpy.types.Scene) -> None:
     """Let Cycles, where enabled, see through overlapping splats; higher limits stay."""
     cycles = getattr(scene, "cycles", None)
     for limit in ("transparent_max_bounces", "min_transparent_bounces") if cycles else ():
-        setattr(cycles, limit, max(getattr(cycles, limit), TRANSPARENT_BOUNCES))
+        # layers of splats; behind Cycles' default of 8 is black
+        setattr(cycles, limit, max(getattr(cycles, limit), 64))
 
 
-SETTING_NAMES = {
-    splat_nodes.SIZE: "size",
-    splat_nodes.OPACITY_THRESHOLD: "opacity_threshold",
-    splat_nodes.PERCENTAGE: "percentage",
-    splat_nodes.VIEW_DEPENDENT: "view_dependent",
-    splat_nodes.SHOW_SELECTION: "show_selection",
-    splat_nodes.SELECTED_ONLY: "selected_only",
-}
+SETTINGS = {getattr(splat_nodes, name.upper()): name for name in DisplaySettings.__annotations__}
 """Inputs of the splat modifier -> fields of `DisplaySettings`."""
 
 
 def show_avatar(
     avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None
 ) -> Any:
-    """Make a splat object that follows the evaluated mesh of the object `head`; returns it.
-
-    head: a mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes`
-    of the avatar, computed here by default. Raises StgaError where the head has other triangles.
-    """
+    """Make a splat object that follows the evaluated mesh of the object `head`; returns it. head: a
+    mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes` of the
+    avatar, computed here by default. Raises StgaError where the head has other triangles."""
     check_head(avatar, head)
-    prepared = prepared or avatar_attributes(avatar)
-    # or all are linked
-    local = (collection for collection in head.users_collection if collection.library is None)
-    collection = next(local, bpy.context.scene.collection)
-    splat_object = _splat_object(name or f"{head.name} splats", prepared.splats, collection)
+    prepared, title = prepared or avatar_attributes(avatar), name or f"{head.name} splats"
+    local = [each for each in head.users_collection if each.library is None]
+    collection = [*local, bpy.context.scene.collection][0]  # the scene's where all are linked
+    splat_object = _splat_object(title, prepared.splats, collection, _tree_options(avatar))
     splat_object[tags.CONVENTION] = avatar.convention
     splat_object[tags.ANTIALIASED] = avatar.antialiased
-    _add_modifier(splat_object, _tree_options(avatar))
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
     neutral = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
@@ -97,18 +72,18 @@ def show_avatar(
 
 def show_world_splats(splats: Splats, name: str) -> Any:
     """Make a splat object of a world-space set, for example a standard 3DGS PLY; returns it."""
-    splat_object = _splat_object(name, splat_attributes(splats), bpy.context.scene.collection)
-    _add_modifier(splat_object, splat_nodes.TreeOptions(None, splats.sh_degree))
-    return splat_object
+    options = splat_nodes.TreeOptions(None, splats.sh_degree)
+    attributes = stored.splat_attributes(splats)
+    return _splat_object(name, attributes, bpy.context.scene.collection, options)
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
     """Whether the avatar differs from this object's in splats and strain only."""
     if _stored_neutral(splat_object) is None:
         return False
-    stored = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
-    tree = splat_nodes.find_splat_tree(_tree_options(avatar))
-    is_same = stored == (avatar.convention, avatar.antialiased)
+    kind = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
+    tree = find_tree(_tree_options(avatar).tree_name)
+    is_same = kind == (avatar.convention, avatar.antialiased)
     return is_same and splat_modifier(splat_object).node_group == tree
 
 
@@ -122,21 +97,17 @@ def _stored_neutral(splat_object: Any) -> Any:
 
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
     """Show other splats in the same object, which keeps its display settings, name and users.
-
-    prepared: `avatar_attributes` of an avatar for which `can_update` is true.
-    """
+    prepared: `avatar_attributes` of an avatar for which `can_update` is true."""
     _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared)
-    write_splats(splat_object.data, prepared.splats)
+    stored.write_splats(splat_object.data, prepared.splats)
 
 
 def store_light(splat_object: Any, avatar: Avatar) -> bool:
     """Give the object the light of the same avatar; False where it shows another one."""
-    neutral = _stored_neutral(splat_object)
-    if neutral is None or not has_triangles(neutral, avatar.faces):
+    neutral, count = _stored_neutral(splat_object), len(splat_object.data.vertices)
+    if neutral is None or not has_triangles(neutral, avatar.faces) or count != len(avatar.splats):
         return False
-    if len(splat_object.data.vertices) != len(avatar.splats):
-        return False
-    write_light(neutral, avatar.light)
+    stored.write_light(neutral, avatar.light)
     splat_object.data[tags.REVISION] = uuid4().hex  # what was read of it before is out of date
     return True
 
@@ -144,7 +115,7 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
 def stored_light(splat_object: Any) -> AvatarLight | None:
     """The light of the object's avatar; None without one, or without a modifier."""
     neutral = _stored_neutral(splat_object)
-    return None if neutral is None else read_light(neutral)
+    return None if neutral is None else stored.read_light(neutral)
 
 
 def build_next_node_group(avatar: Avatar) -> bool:
@@ -182,10 +153,8 @@ def splat_modifier(splat_object: Any) -> Any:
 
 
 def set_input(splat_object: Any, name: str, value: Any) -> None:
-    """Set an input of the splat modifier by its displayed name, such as `splat_nodes.SIZE`.
-
-    Raises StgaError where the splats have no such input: those in world space follow no head.
-    """
+    """Set an input of the splat modifier by its displayed name, such as `splat_nodes.SIZE`. Raises
+    StgaError where the splats have no such input: those in world space follow no head."""
     modifier = splat_modifier(splat_object)
     identifier = input_identifier(modifier, name)
     if identifier is None:
@@ -209,7 +178,7 @@ def input_identifier(modifier: Any, name: str) -> str | None:
 
 
 def display_mode(splat_object: Any) -> str:
-    """The display mode that is chosen for a splat object, one of `display_modes`."""
+    """The display mode that is chosen for a splat object, a name in `LIMITS`."""
     modifier = splat_modifier(splat_object)
     identifier = input_identifier(modifier, splat_nodes.DISPLAY)
     return modifier_menu(modifier, identifier) if identifier else ""
@@ -217,12 +186,9 @@ def display_mode(splat_object: Any) -> str:
 
 def display_settings(modifier: Any) -> DisplaySettings:
     """The settings by a `splat_modifier`; defaults for those that its splats lack."""
-    chosen = {
-        SETTING_NAMES[item.name]: modifier_input(modifier, item.identifier)
-        for item in modifier.node_group.interface.items_tree
-        if item.name in SETTING_NAMES
-    }
-    return DisplaySettings(**chosen)
+    items = [each for each in modifier.node_group.interface.items_tree if each.name in SETTINGS]
+    values = {SETTINGS[item.name]: modifier_input(modifier, item.identifier) for item in items}
+    return DisplaySettings(**values)
 
 
 def stored_avatar(splat_object: Any) -> Avatar:
@@ -232,24 +198,22 @@ def stored_avatar(splat_object: Any) -> Avatar:
     if neutral is None:
         raise StgaError(f"{splat_object.name}: its neutral mesh is missing; show the avatar again")
     return Avatar(
-        splats=read_splats(splat_object.data),
+        splats=stored.read_splats(splat_object.data),
         convention=splat_object[tags.CONVENTION],
         neutral=mesh_vertices(neutral),
         faces=mesh_triangles(neutral),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
-        strain_range=read_vectors(neutral, RANGE),
-        driven_offsets=read_driven_offsets(neutral),
-        light=read_light(neutral),
+        strain_range=stored.read_vectors(neutral, stored.RANGE),
+        driven_offsets=stored.read_driven_offsets(neutral),
+        light=stored.read_light(neutral),
     )
 
 
 def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a splat object displays as points at the current frame, in its object space.
-
-    Returns position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32.
-    Splats displayed as trained are posed by the GPU display: here they are evaluated as points.
-    Raises StgaError where it displays quads, which are instances and not one geometry.
-    """
+    """What a splat object displays as points at the current frame, in its object space. Returns
+    position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32. Splats
+    displayed as trained are posed by the GPU display: here they are evaluated as points. Raises
+    StgaError where it displays quads, which are instances and not one geometry."""
     if display_mode(splat_object) == AS_TRAINED:
         set_input(splat_object, splat_nodes.DISPLAY, POINTS)
         try:
@@ -262,43 +226,38 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
         is_own = owner is not None and owner.original == splat_object
         if is_own and instance.object.type == "POINTCLOUD":
             attributes = instance.object.data.attributes
-            return (
-                read_values(attributes["position"].data, "vector", 3),
-                read_values(attributes[WORLD_ROTATION].data, "value", 4),
-                read_values(attributes[WORLD_SCALE].data, "vector", 3),
+            rotation = read_values(attributes[stored.WORLD_ROTATION].data, "value", 4)
+            position, scale = (
+                read_values(attributes[name].data, "vector", 3)
+                for name in ("position", stored.WORLD_SCALE)
             )
+            return position, rotation, scale
     raise StgaError(f"{splat_object.name}: shows quads or nothing, expected points")
 
 
-def _splat_object(name: str, attributes: Attributes, collection: Any) -> Any:
+def _splat_object(
+    name: str, attributes: Attributes, collection: Any, options: splat_nodes.TreeOptions
+) -> Any:
     mesh = bpy.data.meshes.new(name)
-    write_splats(mesh, attributes)
+    stored.write_splats(mesh, attributes)
     splat_object = bpy.data.objects.new(name, mesh)
     splat_object[tags.KIND] = tags.SPLATS
     collection.objects.link(splat_object)
-    return splat_object
-
-
-def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
-    write_attributes(mesh, prepared.neutral, "FACE")
-    write_light(mesh, prepared.light)
-    mesh.update()
-
-
-def _add_modifier(splat_object: Any, options: splat_nodes.TreeOptions) -> None:
-    modifier = splat_object.modifiers.new("STGA Splats", "NODES")
-    modifier.node_group = splat_nodes.splat_tree(options)
+    splat_object.modifiers.new("STGA Splats", "NODES").node_group = splat_nodes.splat_tree(options)
     # the default reaches it in some versions only
     set_input(splat_object, splat_nodes.DISPLAY, AS_TRAINED)
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
+    return splat_object
+
+
+def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
+    stored.write_attributes(mesh, prepared.neutral, "FACE")
+    stored.write_light(mesh, prepared.light)
+    mesh.update()
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
-    splats = avatar.splats
-    return splat_nodes.TreeOptions(
-        avatar.convention,
-        splats.sh_degree,
-        splats.strain_color.shape[1] > 0,
-        displayed_offsets(avatar.driven_offsets),
-    )
+    degree, strain = avatar.splats.sh_degree, avatar.splats.strain_color.shape[1] > 0
+    offsets = tuple(name for name in SIGNALS if name in avatar.driven_offsets)
+    return splat_nodes.TreeOptions(avatar.convention, degree, strain, offsets)

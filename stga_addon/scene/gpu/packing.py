@@ -1,27 +1,23 @@
-"""Splats, triangle frames, light and a view as the float32 arrays that the shaders read; numpy
-only.
+"""Splats, triangle frames, light and a view as the float32 arrays that the shaders read: lists of
+texels (vec4), in the order that `shaders.py` documents; numpy only."""
 
-Every array is a list of texels (vec4), in the order that `shaders.py` documents.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ...avatar.embedding import FaceFrames
-from ...avatar.splats import Splats
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
 from ...light.lamps import LightView, head_bounds, light_rows, light_view, texel_meters
 from ...light.relight import Relighter
-from ..layers import Relit, SceneLayer, random_percentage
+from ..layers import SceneLayer, random_percentage
 
-NEAR_M = 0.01
-"""Splats nearer to the camera than this are dropped, as by the rasterizer."""
+NEAR_M = 0.01  # splats nearer to the camera than this are dropped, as by the rasterizer
 CLIP_PLANES = 6
 VIEW_TEXELS = 2 + CLIP_PLANES
 LAYER_TEXELS = 5
@@ -36,11 +32,8 @@ MAX_RELATIVE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class View:
-    """A camera, and the part of its space in which splats are drawn.
-
-    far: meters; clip_planes (P, 4), P ≤ 6, in world space: a splat is drawn where plane · (center,
-    1) ≥ 0 for all.
-    """
+    """A camera, and the part of its space in which splats are drawn. far: meters; clip_planes (P,
+    4), P ≤ 6, in world space: a splat is drawn where plane · (center, 1) ≥ 0 for all."""
 
     camera: Camera
     near: float = NEAR_M
@@ -49,11 +42,9 @@ class View:
 
 
 class StaticSplats:
-    """What does not change while layers show the same splats.
-
-    positions (3, N): in the splats' triangles; face (N,) index into all layers' triangles. texels:
-    name -> (M, 4) for the textures.
-    """
+    """What does not change while layers show the same splats. positions (3, N): in the splats'
+    triangles; face (N,) index into all layers' triangles. texels: name -> (M, 4) for the
+    textures."""
 
     def __init__(self, layers: Sequence[SceneLayer]) -> None:
         self.key = static_key(layers)
@@ -67,7 +58,12 @@ class StaticSplats:
             splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
             centers[rows, :3] = splats.xyz
             self.face[rows] = splats.face + first_face
-            axes[rows] = _axes(splats, index)
+            deviation = np.exp(splats.log_scale.astype(np.float64))[:, None]
+            turns = to_matrices(normalized(splats.rotation))
+            axes[rows, :, :3] = np.swapaxes(turns * deviation, 1, 2)
+            with np.errstate(over="ignore"):
+                axes[rows, 0, 3] = splats.opacities()
+            axes[rows, 1, 3], axes[rows, 2, 3] = random_percentage(len(splats)), index
             coefficients = np.concatenate([splats.sh, splats.strain_color], axis=1)
             colors.append(np.pad(coefficients, ((0, 0), (0, 0), (0, 1))).reshape(-1, 4))
             self.rows[index] = first_color, begin, coefficients.shape[1], splats.sh_degree
@@ -77,32 +73,13 @@ class StaticSplats:
             raise StgaError(f"{count} splats are too many to display as trained; choose Points")
         centers[:, 3] = self.face
         self.positions = np.ascontiguousarray(centers[:, :3].T)
-        self.texels = {
-            "centers": centers,
-            "axes": axes.reshape(-1, 4),
-            "colors": np.concatenate(colors),
-        }
-
-    def __len__(self) -> int:
-        return len(self.face)
+        self.texels = {"centers": centers, "axes": axes.reshape(-1, 4)}
+        self.texels["colors"] = np.concatenate(colors)
 
 
 def static_key(layers: Sequence[SceneLayer]) -> tuple[tuple[int, int], ...]:
     """What tells a `StaticSplats` of these layers, as long as their splats are alive."""
     return tuple((id(layer.splats), len(layer.frames.origin)) for layer in layers)
-
-
-def _axes(splats: Splats, layer: int) -> np.ndarray:
-    """(N, 3, 4): the standard deviations along the splat's axes as vectors, beside them opacity, a
-    random value in 0…100 for the display's percentage, and the layer's index."""
-    axes = np.empty((len(splats), 3, 4), np.float32)
-    deviation = np.exp(splats.log_scale.astype(np.float64))
-    axes[..., :3] = np.swapaxes(to_matrices(normalized(splats.rotation)) * deviation[:, None], 1, 2)
-    with np.errstate(over="ignore"):
-        axes[:, 0, 3] = splats.opacities()
-    axes[:, 1, 3] = random_percentage(len(splats))
-    axes[:, 2, 3] = layer
-    return axes
 
 
 def frame_block(frames: FaceFrames) -> np.ndarray:
@@ -115,15 +92,11 @@ def frame_block(frames: FaceFrames) -> np.ndarray:
     return block.reshape(3, -1)
 
 
-@dataclass(frozen=True)
-class PosedFrames:
-    """The triangles of all layers as a camera sees them.
-
-    texels (4, F, 4) float32: three rows of the map to camera space, then strain and whether the
-    triangle is frozen.
-    depth_rows (4, F) float32: the third row, less `base` meters: far from the camera, float32 would
-    round away the differences by which splats are sorted.
-    """
+class PosedFrames(NamedTuple):
+    """The triangles of all layers as a camera sees them. texels (4, F, 4) float32: three rows of
+    the map to camera space, then strain and whether frozen. depth_rows (4, F) float32: the third
+    row, less `base` meters: far from the camera, float32 would round away the differences by which
+    splats are sorted."""
 
     texels: np.ndarray
     depth_rows: np.ndarray
@@ -156,12 +129,10 @@ def drawing_order(
     static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False
 ) -> np.ndarray:
     """Indices (M,) float32 of the splats within the view's near and far ends, farthest first.
-
     short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes
-    half the time.
-    """
+    half the time."""
     depth = np.take(frames.depth_rows[3], static.face, mode="clip")
-    product = np.empty(len(static), np.float32)
+    product = np.empty(len(depth), np.float32)
     for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
         np.take(row, static.face, out=product, mode="clip")  # row by row, which is fastest
         product *= coordinate
@@ -172,28 +143,21 @@ def drawing_order(
         depth = depth[chosen]
     if not len(depth):
         return np.empty(0, np.float32)
-    order = _ascending(depth, frames.base, short_keys)
-    # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
-    return np.asarray(order[::-1] if chosen is None else chosen[order[::-1]], np.float32)
-
-
-def _ascending(depth: np.ndarray, base: float, short_keys: bool) -> np.ndarray:
-    """Indices that sort depths (M,), less `base`, by keys of 24 bits in two passes; changes
-    `depth`.
-
-    Keys and passes have 8 or 16 bits, for which numpy uses radix sort. With short_keys, one pass by
-    keys of 16 bits, except where these would swap splats farther apart, as in a large scene.
-    """
-    nearest, farthest = float(depth.min()), float(depth.max())
-    span = max(farthest - nearest, 1e-30)
-    is_short = short_keys and span <= MAX_RELATIVE_STEP * MAX_SHORT_KEY * (nearest + base)
+    # By keys of 24 bits in two passes of 8 and 16, for which numpy uses radix sort. Short keys of
+    # 16 bits take one, except where they would swap splats farther apart, as in a large scene.
+    nearest = float(depth.min())
+    span = max(float(depth.max()) - nearest, 1e-30)
+    is_short = short_keys and span <= MAX_RELATIVE_STEP * MAX_SHORT_KEY * (nearest + frames.base)
     depth -= np.float32(nearest)
     depth *= np.float32((MAX_SHORT_KEY if is_short else MAX_LONG_KEY) / span)
     if is_short:
-        return np.argsort(depth.astype(np.uint16), kind="stable")
-    key = depth.astype(np.uint32)
-    order = np.argsort(key.astype(np.uint8), kind="stable")
-    return np.asarray(order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")])
+        order = np.argsort(depth.astype(np.uint16), kind="stable")
+    else:
+        key = depth.astype(np.uint32)
+        order = np.argsort(key.astype(np.uint8), kind="stable")
+        order = order[np.argsort((key >> 8).astype(np.uint16)[order], kind="stable")]
+    # Reversed, so that of splats at the same depth the first is in front, as the rasterizer has it.
+    return np.asarray(order[::-1] if chosen is None else chosen[order[::-1]], np.float32)
 
 
 def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.ndarray:
@@ -207,9 +171,7 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
     rows = texels[VIEW_TEXELS:].reshape(-1, LAYER_TEXELS, 4)
     for layer, first, row in zip(layers, static.rows, rows, strict=True):
         settings = layer.settings
-        row[0] = first
-        if not settings.view_dependent:
-            row[0, 3] = 0
+        row[0] = first if settings.view_dependent else (*first[:3], 0)
         strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
         row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
         # From directions in camera space to those of training: without scale and reflection.
@@ -243,21 +205,17 @@ def surface(layers: Sequence[SceneLayer]) -> np.ndarray:
     return np.concatenate(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class ShadowView:
+class ShadowView(NamedTuple):
     """A shadow map to draw: `vertices` (V, 3) and `faces` of the head, then those of casters."""
 
     view: LightView
     meshes: tuple[tuple[np.ndarray, np.ndarray], ...]
 
 
-@dataclass(frozen=True, eq=False)
-class RelitScene:
-    """What changes with pose or light, for layers that are relit.
-
-    vertices (V · VERTEX_TEXELS, 4): position, normal, irradiance of the world and of skin around.
-    lights (M, 4): as of `with_eye`. maps: the shadow maps, in order.
-    """
+class RelitScene(NamedTuple):
+    """What changes with pose or light, for layers that are relit. vertices (V · VERTEX_TEXELS, 4):
+    position, normal, irradiance of the world and of skin around. lights (M, 4): as of `with_eye`.
+    maps: the shadow maps, in order."""
 
     vertices: np.ndarray
     lights: np.ndarray
@@ -265,10 +223,11 @@ class RelitScene:
 
 
 def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
-    """Pack poses and light of all layers; those that are not relit have a share of 0."""
-    vertices, maps, rows = [np.zeros((0, 4), np.float32)], list[ShadowView](), list[np.ndarray]()
+    """Pack poses and light of all layers; those that are not relit have a share of 0, and lights
+    beyond MAX_MAPS throw no shadow."""
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
-    first, map_rows = len(layers) * RELIT_TEXELS, list[np.ndarray]()
+    vertices, maps = [np.zeros((0, 4), np.float32)], list[ShadowView]()
+    points, map_rows = list[np.ndarray](), list[np.ndarray]()
     for block, layer in zip(head, layers, strict=True):
         if layer.relit is None:
             continue
@@ -279,22 +238,31 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
         arriving = np.maximum(relighter.light.transfer @ distant, 0)
         texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
         vertices.append(texels.reshape(-1, 4))
-        points = _lights(layer.relit, maps, map_rows)
         block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
         block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
-        block[1] = (
-            max(lighting.roughness, 0.05),
-            lighting.specular,
-            first,
-            len(points) // LIGHT_TEXELS,
-        )
+        first, bounds = head.size // 4 + LIGHT_TEXELS * sum(map(len, points)), head_bounds(mesh)
+        casters = *layer.relit.casters, *relighter.lash_casters(mesh, lighting)
+        meshes = (mesh, relighter.avatar.faces), *((one.vertices, one.faces) for one in casters)
+        count = 0
+        for light in lighting.lights:
+            number = -1
+            if lighting.shadows and light.casts_shadow and len(maps) < MAX_MAPS:
+                view, number = light_view(bounds, light), len(maps)
+                maps.append(ShadowView(view, meshes))
+                # The map's rows to the light's axes; scale, whether parallel, meters of a texel.
+                row = np.zeros((MAP_TEXELS, 4), np.float32)
+                row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
+                row[3] = view.scale, view.is_parallel, texel_meters(bounds), 0
+                map_rows.append(row)
+            points.append(light_rows(light, bounds.center, number))
+            count += len(points[-1])
+        block[1] = max(lighting.roughness, 0.05), lighting.specular, first, count
         block[2, 3], block[3, :3] = relighter.light.damping, relighter.typical_albedo
         block[4:13, :3] = GLOSSY[:, None] * lighting.world
         block[13] = *kept.gain, kept.share
-        rows.append(points)
-        first += len(points)
-    head[:, 3, 3] = first
-    lights = np.concatenate([head.reshape(-1, 4), *rows, *map_rows])
+    head[:, 3, 3] = head.size // 4 + LIGHT_TEXELS * sum(map(len, points))
+    rows = [head, *points, *map_rows]
+    lights = np.concatenate([each.reshape(-1, 4) for each in rows])
     return RelitScene(np.concatenate(vertices), lights, tuple(maps))
 
 
@@ -306,53 +274,25 @@ def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -
     return lights
 
 
-def _lights(relit: Relit, maps: list[ShadowView], map_rows: list[np.ndarray]) -> np.ndarray:
-    """(points · LIGHT_TEXELS, 4); adds shadow maps; lights beyond MAX_MAPS throw no shadow."""
-    bounds = head_bounds(relit.mesh)
-    faces = relit.relighter.avatar.faces
-    casters = *relit.casters, *relit.relighter.lash_casters(relit.mesh, relit.lighting)
-    found = [np.zeros((0, 16), np.float32)]
-    for light in relit.lighting.lights:
-        shadowed = relit.lighting.shadows and light.casts_shadow and len(maps) < MAX_MAPS
-        if shadowed:
-            view = light_view(bounds, light)
-            meshes = (relit.mesh, faces), *((caster.vertices, caster.faces) for caster in casters)
-            maps.append(ShadowView(view, meshes))
-            # The rows of the map to the light's axes; scale, whether parallel, meters of a texel.
-            row = np.zeros((MAP_TEXELS, 4), np.float32)
-            row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
-            row[3] = view.scale, view.is_parallel, texel_meters(bounds), 0
-            map_rows.append(row)
-        found.append(light_rows(light, bounds.center, len(maps) - 1 if shadowed else -1))
-    return np.concatenate(found).reshape(-1, 4)
+@lru_cache(maxsize=8)
+def _normals(relighter: Relighter) -> Callable[[np.ndarray], np.ndarray]:
+    """`surface.vertex_normals` of a head's meshes, in a fraction of the time."""
+    faces, count = relighter.avatar.faces, len(relighter.avatar.neutral)
+    corners = [np.ascontiguousarray(corner) for corner in faces.T]
+    order = np.argsort(faces.ravel(), kind="stable")
+    used, first = np.unique(faces.ravel()[order], return_index=True)
+    face = order // 3
 
-
-class _Normals:
-    """`surface.vertex_normals` for one mesh, in a fraction of the time."""
-
-    def __init__(self, faces: np.ndarray, vertices: int) -> None:
-        self._corners = [np.ascontiguousarray(corner) for corner in faces.T]
-        order = np.argsort(faces.ravel(), kind="stable")
-        self._face = order // 3
-        self._used, self._first = np.unique(faces.ravel()[order], return_index=True)
-        self._shape = vertices, 3
-
-    def __call__(self, mesh: np.ndarray) -> np.ndarray:
+    def normals(mesh: np.ndarray) -> np.ndarray:
         rows = [np.ascontiguousarray(row, np.float32) for row in mesh.T]
-        a, b, c = ([row[corner] for row in rows] for corner in self._corners)
-        u = [q - p for p, q in zip(a, b, strict=True)]
-        v = [q - p for p, q in zip(a, c, strict=True)]
-        total = [
-            np.add.reduceat((u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2])[self._face], self._first)
-            for k in range(3)
-        ]
+        a, b, c = ([row[corner] for row in rows] for corner in corners)
+        u, v = ([q - p for p, q in zip(a, end, strict=True)] for end in (b, c))
+        crosses = (u[k - 2] * v[k - 1] - u[k - 1] * v[k - 2] for k in range(3))
+        total = [np.add.reduceat(cross[face], first) for cross in crosses]
         scale = 1 / np.maximum(np.sqrt(sum(row * row for row in total)), 1e-20)
-        found = np.zeros(self._shape, np.float32)
+        found = np.zeros((count, 3), np.float32)
         for k, row in enumerate(total):
-            found[self._used, k] = row * scale
+            found[used, k] = row * scale
         return found
 
-
-@lru_cache(maxsize=8)
-def _normals(relighter: Relighter) -> _Normals:
-    return _Normals(relighter.avatar.faces, len(relighter.avatar.neutral))
+    return normals

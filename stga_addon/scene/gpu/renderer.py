@@ -1,8 +1,5 @@
 """Draws layers of splats with Blender's `gpu` module: off-screen, into a viewport, or to an image
-in memory.
-
-Needs a GPU context: a viewport's drawing, or a render engine with `bl_use_gpu_context`.
-"""
+in memory. Needs a GPU context: a viewport's drawing, or an engine with `bl_use_gpu_context`."""
 
 import ctypes
 import sys
@@ -13,51 +10,23 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from gpu.types import (
-    Buffer,
-    GPUBatch,
-    GPUFrameBuffer,
-    GPUIndexBuf,
-    GPUTexture,
-    GPUVertBuf,
-    GPUVertFormat,
-)
 from mathutils import Vector
 
 from ...avatar.embedding import FaceFrames
 from ...light.lamps import MAP_SIZE
 from ...raster.posed_splats import ComposedImage
 from ..layers import SceneLayer
-from . import packing
+from . import packing, shaders
 from .packing import RelitScene, ShadowView, StaticSplats, View, relit_scene, surface, with_eye
-from .shaders import (
-    BLOCK_SPLATS,
-    EXACT,
-    MAP_COLUMNS,
-    NOTHING,
-    PACKED_TEXTURES,
-    PROJECTED_TEXTURES,
-    RELIT_TEXTURES,
-    TEXTURE_WIDTH,
-    composite_shader,
-    projection_shader,
-    shadow_map_shader,
-    splat_shader,
-    texture,
-    texture_rows,
-)  # fmt: skip
-
-EGL_PLATFORM_DEVICE = 0x313F
+from .shaders import EXACT, MAP_COLUMNS, PROJECTED_TEXTURES, TEXTURE_WIDTH, texture
 
 
 @cache
 def has_gpu_context() -> bool:
-    """Whether Blender can be asked for a GPU context: it aborts where it asks in vain.
-
-    With a window; without one only where EGL, by which Blender then gets its context, initializes
-    its default display or, as Blender tries next, its first device (Linux; other systems were not
-    tried without a window).
-    """
+    """Whether Blender can be asked for a GPU context: it aborts where it asks in vain. With a
+    window; without one only where EGL, by which Blender then gets its context, initializes its
+    default display or, as Blender tries next, its first device (Linux; other systems were not tried
+    without a window)."""
     if not bpy.app.background or sys.platform != "linux":
         return not bpy.app.background
     try:
@@ -79,7 +48,7 @@ def has_gpu_context() -> bool:
     if not query(1, ctypes.byref(device), ctypes.byref(count)) or not count.value:
         return False
     open_device = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)(open_device)
-    display = open_device(EGL_PLATFORM_DEVICE, device, None)
+    display = open_device(0x313F, device, None)  # EGL_PLATFORM_DEVICE_EXT
     return bool(display and egl.eglInitialize(display, None, None))
 
 
@@ -93,10 +62,9 @@ class RelitTextures:
     """What the shaders read of light for the layers drawn last."""
 
     def __init__(self) -> None:
-        self._shader = shadow_map_shader()
+        self._shader = shaders.shadow_map_shader()
         self._surface_of: tuple[Any, ...] = ()
-        self._scene_of: tuple[Any, ...] = ()
-        self._kept: tuple[Any, ...] = ()
+        self._layers: Sequence[SceneLayer] = ()
         self._scene: RelitScene | None = None
         self._atlas: tuple[int, Any, Any, Any] | None = None
         self._batches: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -107,13 +75,11 @@ class RelitTextures:
         relighters = tuple((id(x.splats), x.relit and id(x.relit.relighter)) for x in layers)
         if relighters != self._surface_of:
             self.textures["surface"], self._surface_of = texture(surface(layers)), relighters
-        scene_of = tuple(id(layer.relit) for layer in layers)
-        if self._scene is None or scene_of != self._scene_of:
-            self._scene = relit_scene(layers)
+        known = [layer.relit for layer in self._layers]
+        if self._scene is None or known != [layer.relit for layer in layers]:
+            self._scene, self._layers = relit_scene(layers), tuple(layers)
             self.textures["vertices"] = texture(self._scene.vertices)
             self.textures["shadows"] = self._draw_maps(self._scene.maps)
-            self._scene_of = scene_of
-            self._kept = tuple(layers)  # whose identity was compared
         self.textures["lights"] = texture(with_eye(self._scene, layers, eye))
         return self.textures
 
@@ -121,76 +87,66 @@ class RelitTextures:
         rows = max(1, -(-len(maps) // MAP_COLUMNS))
         if self._atlas is None or self._atlas[0] != rows:
             size = MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows
-            depths = GPUTexture(size, format="R32F")
-            tested = GPUTexture(size, format="DEPTH_COMPONENT32F")
-            target = GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
+            depths = gpu.types.GPUTexture(size, format="R32F")
+            tested = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+            target = gpu.types.GPUFrameBuffer(depth_slot=tested, color_slots=(depths,))
             # a framebuffer does not keep its textures alive
             self._atlas = rows, depths, target, tested
         _, depths, target, _ = self._atlas
-        known, self._batches = self._batches, {}
+        known, self._batches, shader = self._batches, {}, self._shader
         with target.bind():
-            target.clear(color=(NOTHING, 0.0, 0.0, 0.0), depth=1.0)
+            target.clear(color=(shaders.NOTHING, 0.0, 0.0, 0.0), depth=1.0)
             gpu.state.depth_test_set("LESS_EQUAL")
             gpu.state.depth_mask_set(True)
             gpu.state.blend_set("NONE")
             gpu.state.face_culling_set("NONE")
-            for index, drawn in enumerate(maps):
+            for index, (view, meshes) in enumerate(maps):
                 x, y = MAP_SIZE * (index % MAP_COLUMNS), MAP_SIZE * (index // MAP_COLUMNS)
                 gpu.state.viewport_set(x, y, MAP_SIZE, MAP_SIZE)
-                self._draw_map(drawn, known)
+                shader.bind()
+                for name, axis in zip(("row_x", "row_y", "row_z"), view.axes.T, strict=True):
+                    shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
+                distance = float(((meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
+                near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
+                lens = 2 * view.scale / view.size, float(view.is_parallel), near, 0.0
+                shader.uniform_float("lens", lens)
+                for mesh in meshes:
+                    key = id(mesh[0]), id(mesh[1])
+                    if key not in self._batches:
+                        batch = known.get(key) or (mesh, _triangles("position", *mesh))
+                        self._batches[key] = batch
+                    self._batches[key][1].draw(shader)
             gpu.state.viewport_set(0, 0, MAP_SIZE * MAP_COLUMNS, MAP_SIZE * rows)
             gpu.state.depth_test_set("NONE")
             gpu.state.depth_mask_set(False)
         return depths
 
-    def _draw_map(self, drawn: ShadowView, known: dict[tuple[int, int], tuple[Any, Any]]) -> None:
-        shader, view = self._shader, drawn.view
-        shader.bind()
-        for name, axis in zip(("row_x", "row_y", "row_z"), view.axes.T, strict=True):
-            shader.uniform_float(name, (*axis, -float(view.origin @ axis)))
-        distance = float(((drawn.meshes[0][0] - view.origin) @ view.axes[:, 2]).max())
-        near = min(max(1e-3, NEAR_PER_SQUARE * distance**2), abs(distance) / 2)
-        lens = 2 * view.scale / view.size, float(view.is_parallel), near, 0.0
-        shader.uniform_float("lens", lens)
-        for mesh in drawn.meshes:
-            key = id(mesh[0]), id(mesh[1])
-            if key not in self._batches:
-                self._batches[key] = known.get(key) or (mesh, _triangles("position", *mesh))
-            self._batches[key][1].draw(shader)
-
 
 def _triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
     """A batch of triangles (F, 3) with one attribute (V, 2 or 3) of their vertices."""
-    layout = GPUVertFormat()
+    layout = gpu.types.GPUVertFormat()
     layout.attr_add(id=name, comp_type="F32", len=vertices.shape[1], fetch_mode="FLOAT")
-    buffer = GPUVertBuf(len=len(vertices), format=layout)
+    buffer = gpu.types.GPUVertBuf(len=len(vertices), format=layout)
     buffer.attr_fill(id=name, data=np.ascontiguousarray(vertices, np.float32))
-    indices = GPUIndexBuf(type="TRIS", seq=np.ascontiguousarray(faces, np.uint32))
-    return GPUBatch(type="TRIS", buf=buffer, elem=indices)
+    indices = gpu.types.GPUIndexBuf(type="TRIS", seq=np.ascontiguousarray(faces, np.uint32))
+    return gpu.types.GPUBatch(type="TRIS", buf=buffer, elem=indices)
 
 
 NO_BONES = np.zeros((0, 2, 4), np.float32)
-MAX_SHAPES = 256
-"""Bones looked for in each pixel; those of a larger rig are covered by splats."""
+MAX_SHAPES = 256  # bones looked for in each pixel; those of a larger rig are covered by splats
 WIDTH_SHARE, MARGIN_PX = 0.15, 6.0
 """Half the width of a bone as a share of its length, and what is added for outlines."""
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
     """(M, 2, 4) float32: for each bone two ends in pixels (x0, y0, x1, y1), and a radius beside
-    three zeros.
-
-    space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels, from the
-    bottom left.
-    """
+    three zeros. space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels,
+    from the bottom left."""
     overlay = space.overlay
     if not (overlay.show_overlays and overlay.show_bones):
         return NO_BONES
-    rigs = [
-        rig
-        for rig in bpy.context.view_layer.objects
-        if rig.type == "ARMATURE" and rig.show_in_front and rig.visible_get(viewport=space)
-    ]
+    armatures = [each for each in bpy.context.view_layer.objects if each.type == "ARMATURE"]
+    rigs = [each for each in armatures if each.show_in_front and each.visible_get(viewport=space)]
     spheres = [ends for rig in rigs for ends in _bone_ends(rig)][:MAX_SHAPES]
     if not spheres:
         return NO_BONES
@@ -229,8 +185,7 @@ def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
 CLEAR = (0.0, 0.0, 0.0, 0.0)
 OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
 """Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
-COMPACT = "RGBA16F"
-"""Format of the color target, beside EXACT."""
+COMPACT = "RGBA16F"  # format of the color target, beside EXACT
 DEPTH_FORMAT = "RG32F"
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 """Parts of the names, in lower case, of OpenGL and Vulkan drivers that compute on the CPU."""
@@ -244,15 +199,14 @@ def fastest_format() -> str:
 
 class SplatRenderer:
     """Shaders, the textures of the layers drawn last, and the targets they were drawn to.
-
-    color_format: EXACT or COMPACT; short_keys: as of `packing.drawing_order`, for viewports.
-    """
+    color_format: EXACT or COMPACT; short_keys: as of `packing.drawing_order`, for viewports."""
 
     def __init__(self, color_format: str = EXACT, short_keys: bool = False) -> None:
-        self._projection_shader, self._splat_shader = projection_shader(), splat_shader()
-        self._composite_shader = composite_shader()
+        self._projection_shader = shaders.projection_shader()
+        self._splat_shader = shaders.splat_shader()
+        self._composite_shader = shaders.composite_shader()
         self._relit: tuple[RelitTextures, Any] | None = None
-        self._screen, self._splat_rectangles = _rectangles(1), _rectangles(BLOCK_SPLATS)
+        self._screen, self._splat_rectangles = _rectangles(1), _rectangles(shaders.BLOCK_SPLATS)
         self._color_format, self._short_keys = color_format, short_keys
         self._static: StaticSplats | None = None
         self._static_textures: dict[str, Any] = {}
@@ -264,16 +218,14 @@ class SplatRenderer:
         self._projected_target: Any = None
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
-        """Draw layers, sorted together, to this renderer's own targets.
-
-        In two passes: the first projects and colors each splat, into a texel of the projected
-        textures; the second reads these and draws the splats from far to near.
-        """
+        """Draw layers, sorted together, to this renderer's own targets. In two passes: the first
+        projects and colors each splat, into a texel of the projected textures; the second reads
+        these and draws the splats from far to near."""
         size = view.camera.width, view.camera.height
         if self._size != size:
-            self._size, self._color = size, GPUTexture(size, format=self._color_format)
-            self._depth = GPUTexture(size, format=DEPTH_FORMAT)
-            self._target = GPUFrameBuffer(color_slots=(self._color, self._depth))
+            self._size, self._color = size, gpu.types.GPUTexture(size, format=self._color_format)
+            self._depth = gpu.types.GPUTexture(size, format=DEPTH_FORMAT)
+            self._target = gpu.types.GPUFrameBuffer(color_slots=(self._color, self._depth))
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         count = self._project(layers, view) if layers else 0
@@ -282,7 +234,7 @@ class SplatRenderer:
             if not count:
                 return
             gpu.state.blend_set("ALPHA_PREMULT")
-            shader, blocks = self._splat_shader, -(-count // BLOCK_SPLATS)
+            shader, blocks = self._splat_shader, -(-count // shaders.BLOCK_SPLATS)
             shader.bind()
             for name in PROJECTED_TEXTURES:
                 shader.uniform_sampler(name, self._projected[name])
@@ -290,13 +242,12 @@ class SplatRenderer:
             rectangles.draw_instanced(shader, instance_start=0, instance_count=blocks)
             gpu.state.blend_set("NONE")
 
-    def read(self, with_depth: bool = False) -> ComposedImage:
+    def read(self) -> ComposedImage:
         """What was drawn last, in memory."""
         color, depth = _pixels(self._color, 4)[::-1], _pixels(self._depth, 2)[::-1]
         alpha = np.ascontiguousarray(color[..., 3])
         rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
-        mean = depth[..., 0] / np.maximum(alpha, 1e-30) if with_depth else None
-        return ComposedImage(rgb, alpha, mean)
+        return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30))
 
     def composite(
         self, corner: tuple[int, int], to_depth: tuple[float, ...],
@@ -316,7 +267,10 @@ class SplatRenderer:
         (`has_background`), what they cover is taken out.
         """
         bones = bones if scene is not None else NO_BONES
-        shader, bone_image = self._composite_shader, _image(bones)  # lives as long as its name
+        texels = np.ascontiguousarray(bones if len(bones) else np.zeros((1, 2, 4)), np.float32)
+        pixels = gpu.types.Buffer("FLOAT", texels.size, texels.reshape(-1))
+        bone_image = gpu.types.GPUTexture((2, len(texels)), format=EXACT, data=pixels)
+        shader = self._composite_shader
 
         def draw(part: int, behind: tuple[float, ...] | None) -> None:
             gpu.state.blend_set("SUBTRACT" if part == BEHIND else "ALPHA_PREMULT")
@@ -347,9 +301,10 @@ class SplatRenderer:
             self._static = StaticSplats(layers)
             texels = self._static.texels.items()
             self._static_textures = {name: texture(values) for name, values in texels}
-            size = TEXTURE_WIDTH, texture_rows(len(self._static))
-            self._projected = {name: GPUTexture(size, format=EXACT) for name in PROJECTED_TEXTURES}
-            self._projected_target = GPUFrameBuffer(color_slots=tuple(self._projected.values()))
+            size = TEXTURE_WIDTH, shaders.texture_rows(len(self._static.face))
+            made = [gpu.types.GPUTexture(size, format=EXACT) for _ in PROJECTED_TEXTURES]
+            self._projected = dict(zip(PROJECTED_TEXTURES, made, strict=True))
+            self._projected_target = gpu.types.GPUFrameBuffer(color_slots=tuple(made))
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
         static, known, self._blocks = self._static, self._blocks, {}
         for each in (layer.frames for layer in layers):  # computed again only where they are new
@@ -360,11 +315,9 @@ class SplatRenderer:
         if not len(order):
             return 0
         shader, relit = self._projection_shader, dict[str, Any]()
-        names: tuple[str, ...] = PACKED_TEXTURES
         if any(layer.relit is not None for layer in layers):
-            self._relit = self._relit or (RelitTextures(), projection_shader(relit=True))
+            self._relit = self._relit or (RelitTextures(), shaders.projection_shader(relit=True))
             relit, shader = self._relit[0].update(layers, view.camera.position), self._relit[1]
-            names = PACKED_TEXTURES + RELIT_TEXTURES
         textures = self._static_textures | relit
         textures["orders"] = texture(order[:, None], "R32F")
         textures["frames"] = texture(frames.texels.reshape(-1, 4))
@@ -372,8 +325,8 @@ class SplatRenderer:
         with self._projected_target.bind():
             gpu.state.blend_set("NONE")
             shader.bind()
-            for name in names:
-                shader.uniform_sampler(name, textures[name])
+            for name, read in textures.items():
+                shader.uniform_sampler(name, read)
             shader.uniform_int("faces", frames.texels.shape[1])
             shader.uniform_int("count", len(order))
             self._screen.draw(shader)
@@ -387,17 +340,9 @@ def _rectangles(count: int) -> Any:
     return _triangles("corner", corners, triangles.reshape(-1, 3))
 
 
-def _image(texels: np.ndarray) -> Any:
-    """(H, W, 4) float32 as a texture of that size, or of one texel where there are none."""
-    texels = np.ascontiguousarray(texels if texels.size else np.zeros((1, 1, 4)), np.float32)
-    pixels = Buffer("FLOAT", texels.size, texels.reshape(-1))
-    return GPUTexture((texels.shape[1], texels.shape[0]), format=EXACT, data=pixels)
-
-
 def _pixels(texture: Any, channels: int) -> np.ndarray:
     """(H, W, channels) float32, bottom row first."""
     buffer = texture.read()
-    # Of several axes, a buffer tells numpy the wrong strides in some versions. The copy is made
-    # while it lives.
+    # Of several axes, a buffer tells numpy wrong strides in some versions; copied while it lives.
     buffer.dimensions = (texture.height * texture.width * channels,)
     return np.array(buffer, np.float32).reshape(texture.height, texture.width, channels)

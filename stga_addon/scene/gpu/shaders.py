@@ -30,30 +30,19 @@ drawing:
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gpu
 import numpy as np
-from gpu.types import Buffer, GPUShaderCreateInfo, GPUStageInterfaceInfo, GPUTexture
 
 from ...avatar.splats import harmonics_text
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS, SRGB_FUNCTIONS
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
-from .packing import (
-    CLIP_PLANES,
-    LAYER_TEXELS,
-    LIGHT_TEXELS,
-    MAP_TEXELS,
-    RELIT_TEXELS,
-    SURFACE_TEXELS,
-    VERTEX_TEXELS,
-    VIEW_TEXELS,
-)
+from . import packing
 
 TEXTURE_WIDTH = 2048
-CORNER = "VEC2", "corner"  # of rectangles, ±1
 EXACT = "RGBA32F"
 
 
@@ -67,26 +56,32 @@ def texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
     rows = texture_rows(len(texels))
     padded = np.zeros((rows * TEXTURE_WIDTH, texels.shape[1]), np.float32)
     padded[: len(texels)] = texels
-    pixels = Buffer("FLOAT", padded.size, padded.reshape(-1))
-    return GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
+    pixels = gpu.types.Buffer("FLOAT", padded.size, padded.reshape(-1))
+    return gpu.types.GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
 
 
-RELIT_TEXTURES = ("surface", "vertices", "lights", "shadows")
+MIN_ALPHA = 1 / 255  # a splat adds nothing to a pixel where its alpha is less, as in the rasterizer
+PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
+PROJECTED_TEXTURES = ("places", "sides", "shades")
+BLOCK_SPLATS = 128
+"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four
+vertices.
+
+A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures'
+last row."""
 MAP_COLUMNS = 4
-NOTHING = 1e30
-"""Depth of a shadow map where nothing is."""
+NOTHING = 1e30  # depth of a shadow map where nothing is
 
+_CONSTANTS = {name: value for name, value in vars(packing).items() if name.endswith("_TEXELS")}
+_CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS, "MIN_ALPHA": MIN_ALPHA}
+_CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES, "FROZEN_COLOR": f"vec3{FROZEN_COLOR_SRGB}"}
+_DEFINES = "".join(f"#define {name} {value}\n" for name, value in _CONSTANTS.items())
 RELIT_DEFINES = f"""
-#define SURFACE_TEXELS {SURFACE_TEXELS}
-#define VERTEX_TEXELS {VERTEX_TEXELS}
-#define LIGHT_TEXELS {LIGHT_TEXELS}
-#define MAP_TEXELS {MAP_TEXELS}
-#define RELIT_TEXELS {RELIT_TEXELS}
+#define RELIT
 #define MAP_COLUMNS {MAP_COLUMNS}
 #define SHADOW_DEPTH(cell) texelFetch(shadows, cell, 0).r
 #define WORLD(first, k) texelFetch(lights, at(first + k), 0).rgb
 {SHADING_DEFINES}"""
-
 RELIT_FUNCTIONS = """
 float lit_share_of(int map_index, int first, vec3 point, float cosine)
 {
@@ -189,61 +184,43 @@ void main()
 
 
 def shadow_map_shader() -> Any:
-    """Draws triangles into a shadow map: depth in meters along the light's axis.
-
-    row_x, row_y, row_z: as packed by `packing`; lens: scale to normalized device coordinates,
-    whether parallel, least depth in perspective.
-    """
-    info = _shader_info("", ("VEC3", "position"), ["depth_out"], "FLOAT")
-    passed = GPUStageInterfaceInfo("stga_shadow")
+    """Draws triangles into a shadow map: depth in meters along the light's axis. row_x, row_y,
+    row_z: as packed by `packing`; lens: scale to normalized device coordinates, whether parallel,
+    least depth in perspective."""
     # In perspective, depth itself is interpolated as it should be: linear in space.
-    passed.smooth("FLOAT", "distance_out")
-    info.vertex_out(passed)
-    for name in ("row_x", "row_y", "row_z", "lens"):
-        info.push_constant("VEC4", name)
-    return _shader(info, _MAP_VERTEX, _MAP_FRAGMENT)
+    rows = dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4")
+    passed = {"distance_out": ("smooth", "FLOAT")}
+    attribute = "VEC3", "position"
+    outputs = {"depth_out": "FLOAT"}
+    return _shader(_MAP_VERTEX, _MAP_FRAGMENT, outputs, rows, (), "", passed, attribute)
 
 
-def _shader_info(
-    defines: str, attribute: tuple[str, str], outputs: Sequence[str], output: str = "VEC4",
-    samplers: Sequence[str] = (),
+def _shader(
+    vertex: str, fragment: str, outputs: Mapping[str, str], constants: Mapping[str, str],
+    samplers: Sequence[str], defines: str, passed: Mapping[str, tuple[str, str]] | None = None,
+    attribute: tuple[str, str] = ("VEC2", "corner"),
 ) -> Any:  # fmt: skip
-    info = GPUShaderCreateInfo()
+    """passed: name -> qualifier and type; attribute: of vertices, by default rectangles' at ±1."""
+    info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(defines)
     info.vertex_in(0, *attribute)
-    for slot, name in enumerate(outputs):
-        info.fragment_out(slot, output, name)
+    for slot, (name, kind) in enumerate(outputs.items()):
+        info.fragment_out(slot, kind, name)
     for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D", name)
-    return info
-
-
-def _shader(info: Any, vertex: str, fragment: str) -> Any:
+    for name, kind in constants.items():
+        info.push_constant(kind, name)
+    if passed:
+        stage = gpu.types.GPUStageInterfaceInfo("stga_stage")
+        for name, (qualifier, kind) in passed.items():
+            getattr(stage, qualifier)(kind, name)
+        info.vertex_out(stage)
+    if "gl_FragDepth" in fragment:
+        allow_depth_write(info)
     info.vertex_source(vertex)
     info.fragment_source(fragment)
     return gpu.shader.create_from_info(info)
 
-
-MIN_ALPHA = 1 / 255
-"""A splat adds nothing to a pixel where its alpha is less, as in the rasterizer."""
-PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
-PROJECTED_TEXTURES = ("places", "sides", "shades")
-BLOCK_SPLATS = 128
-"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four
-vertices.
-
-A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures'
-last row."""
-
-_DEFINES = f"""
-#define WIDTH {TEXTURE_WIDTH}
-#define BLOCK_SPLATS {BLOCK_SPLATS}
-#define VIEW_TEXELS {VIEW_TEXELS}
-#define LAYER_TEXELS {LAYER_TEXELS}
-#define CLIP_PLANES {CLIP_PLANES}
-#define MIN_ALPHA {MIN_ALPHA!r}
-#define FROZEN_COLOR vec3({", ".join(f"{channel:.6f}" for channel in FROZEN_COLOR_SRGB)})
-"""
 
 _TEXEL_FUNCTION = """
 ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
@@ -428,45 +405,35 @@ void main()
 
 def projection_shader(relit: bool = False) -> Any:
     """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`;
-    others become 0.
-
-    relit: for layers of which at least one is lit by the scene, with RELIT_TEXTURES.
-    """
-    defines = _DEFINES + ("#define RELIT\n" + RELIT_DEFINES if relit else "")
-    samplers = PACKED_TEXTURES + (RELIT_TEXTURES if relit else ())
-    info = _shader_info(defines, CORNER, ("place_out", "sides_out", "shade_out"), samplers=samplers)
-    for name in ("faces", "count"):
-        info.push_constant("INT", name)
-    functions = _HARMONICS + (SHADING_FUNCTIONS + RELIT_FUNCTIONS if relit else "")
-    return _shader(info, _SCREEN_VERTEX, _TEXEL_FUNCTION + functions + _PROJECTION_FRAGMENT)
+    others become 0. relit: for layers of which at least one is lit by the scene."""
+    defines, functions = _DEFINES, _HARMONICS
+    samplers: tuple[str, ...] = PACKED_TEXTURES
+    if relit:
+        defines += RELIT_DEFINES
+        functions += SHADING_FUNCTIONS + RELIT_FUNCTIONS
+        samplers += "surface", "vertices", "lights", "shadows"
+    outputs = dict.fromkeys(("place_out", "sides_out", "shade_out"), "VEC4")
+    fragment = _TEXEL_FUNCTION + functions + _PROJECTION_FRAGMENT
+    constants = {"faces": "INT", "count": "INT"}
+    return _shader(_SCREEN_VERTEX, fragment, outputs, constants, samplers, defines)
 
 
 def splat_shader() -> Any:
     """Second pass: draws PROJECTED_TEXTURES, a rectangle for each splat, in instances of
-    BLOCK_SPLATS of them.
-
-    Two color targets: sRGB premultiplied, and (depth · alpha, alpha).
-    """
-    outputs = "color_out", "depth_out"
-    info = _shader_info(_DEFINES, CORNER, outputs, samplers=PROJECTED_TEXTURES)
-    passed = GPUStageInterfaceInfo("stga_splat")
-    passed.no_perspective("VEC2", "offset")
-    passed.flat("VEC4", "shade")
-    passed.flat("FLOAT", "depth")
-    info.vertex_out(passed)
-    return _shader(info, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
+    BLOCK_SPLATS of them. Two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
+    outputs = dict.fromkeys(("color_out", "depth_out"), "VEC4")
+    passed = {"offset": ("no_perspective", "VEC2"), "shade": ("flat", "VEC4")}
+    passed["depth"] = "flat", "FLOAT"
+    shader = _SPLAT_VERTEX, _SPLAT_FRAGMENT, outputs
+    return _shader(*shader, {}, PROJECTED_TEXTURES, _DEFINES, passed)
 
 
 def composite_shader() -> Any:
     """Puts the two targets of `splat_shader` into a viewport, with depth; outputs display-linear,
-    premultiplied.
-
-    part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of `behind` that it
-    covers. part.y: how many bones; bones: for each, two texels as `front_bones` returns them.
-    """
+    premultiplied. part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of
+    `behind` that it covers. part.y: how many bones; bones: for each, two texels as `front_bones`
+    returns them."""
+    constants = dict.fromkeys(("corner_px", "to_depth", "behind", "part"), "VEC4")
     samplers = "color_image", "depth_image", "bones"
-    info = _shader_info(_DEFINES, CORNER, ["color_final"], samplers=samplers)
-    allow_depth_write(info)
-    for name in ("corner_px", "to_depth", "behind", "part"):
-        info.push_constant("VEC4", name)
-    return _shader(info, _SCREEN_VERTEX, SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT)
+    fragment = SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT
+    return _shader(_SCREEN_VERTEX, fragment, {"color_final": "VEC4"}, constants, samplers, _DEFINES)

@@ -15,14 +15,13 @@ from ...files import replacing
 from ...render.video import finished, is_video
 from ..compat import choose_video_file, sequencer_strips
 from ..layers import SceneLayer
+from ..objects import set_frames_per_second
 from .engine import draw_image
 
 
 class DrawnVideo:
     """Draws the images into a folder as PNGs, one call each; `encode` makes the output of them.
-
-    background: sRGB in 0…1; None: transparent in PNGs, black in a video.
-    """
+    background: sRGB in 0…1; None: transparent in PNGs, black in a video."""
 
     def __init__(
         self, folder: Path, output: Path, background: tuple[float, float, float] | None
@@ -43,13 +42,12 @@ class DrawnVideo:
 
     def encode(self, fps: float) -> None:
         """Write the video, or copy the PNGs to the output folder. Raises StgaError."""
+        outputs = {self._output / image.name: image for image in self._images}
         if is_video(self._output):
-            with replacing(self._output) as partial:
-                shutil.copyfile(_encode(self._images, fps), partial)
-            return
-        for image in self._images:
-            with replacing(self._output / image.name) as partial:
-                shutil.copyfile(image, partial)
+            outputs = {self._output: _encode(self._images, fps)}
+        for output, made in outputs.items():
+            with replacing(output) as partial:
+                shutil.copyfile(made, partial)
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:
@@ -60,11 +58,11 @@ def png_bytes(pixels: np.ndarray) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
     data = zlib.compress(rows.tobytes(), 6)
     chunks = (b"IHDR", header), (b"sRGB", b"\0"), (b"IDAT", data), (b"IEND", b"")
-    packed = (
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+    packed = b"\x89PNG\r\n\x1a\n"
+    for kind, data in chunks:
+        packed += struct.pack(">I", len(data)) + kind + data
+        packed += struct.pack(">I", zlib.crc32(kind + data))
+    return packed
 
 
 def _encode(images: Sequence[Path], fps: float) -> Path:
@@ -83,8 +81,7 @@ def _encode(images: Sequence[Path], fps: float) -> Path:
         # even, as the format needs
         render.resolution_x, render.resolution_y = width + width % 2, height + height % 2
         render.resolution_percentage = 100
-        render.fps = max(round(fps), 1)
-        render.fps_base = render.fps / fps
+        set_frames_per_second(scene, fps)
         render.use_sequencer, render.use_file_extension = True, True
         choose_video_file(render)
         scene.view_settings.view_transform = "Standard"

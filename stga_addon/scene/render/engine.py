@@ -1,19 +1,15 @@
-"""The render engine "STGA Splats": final images, animations and viewports that show splats exactly
-as trained.
-
-The GPU draws them, or, where it cannot, the training rasterizer. It renders splats and nothing
-else; meshes are composited by its alpha and depth. Registering it imports no rasterizer: that
-happens with the first image.
-"""
+"""The render engine "STGA Splats": final images, animations and viewports of splats, exactly as
+trained, and nothing else; meshes are composited by its alpha and depth. The GPU draws them, or,
+where it cannot, the training rasterizer, imported with the first image."""
 
 import logging
 import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import partial
-from typing import Any
+from dataclasses import fields
+from functools import cached_property
+from typing import Any, NamedTuple
 from weakref import ref
 
 import bpy
@@ -32,30 +28,18 @@ from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
 from ..light import settings_values
 from .scene_splats import SplatCache, visible_layers
-from .view_transform import (
-    combined,
-    inverse_view,
-    measure,
-    needs_inverse,
-    scene_background,
-    srgb_background,
-)
+from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, is_drawn_by_engine, region_view
 
 MAX_RENDER_TIME_S = 0.05
 """Time an image of a moving view may take; its resolution is adapted to that."""
-INITIAL_SCALE = 0.5
-MIN_SCALE = 1 / 8
-"""Fractions of the viewport's width and height in pixels."""
+INITIAL_SCALE, MIN_SCALE = 0.5, 1 / 8  # fractions of the viewport's width and height in pixels
+POLL_INTERVAL_S = 1 / 60
 
 
-@dataclass(frozen=True, eq=False)
-class RenderRequest:
-    """What one viewport image shows.
-
-    layers: the scene's splats; camera: at the viewport's full size; background: scene-linear RGB,
-    None if transparent.
-    """
+class RenderRequest(NamedTuple):
+    """A viewport image: splats, a camera of the viewport's full size, and the scene-linear color
+    behind them, None if transparent."""
 
     layers: Sequence[PosedSplats]
     camera: Camera
@@ -68,23 +52,20 @@ class RenderRequest:
 
 
 class ViewportRenderer:
-    """Renders the latest request in a thread, which ends once that request has its full-resolution
-    image.
+    """Renders the latest request in a thread, which touches nothing of Blender and ends once that
+    request has its full-resolution image.
 
-    render: (request, scale) -> image (H, W, 4) float32, scale being a fraction of the camera's
-    size. The thread touches nothing of Blender; the main thread polls `is_busy` and `take_update`.
+    render: (request, scale) -> image (H, W, 4) float32, scale a fraction of the camera's size.
 
     image  the last image rendered, or None
     error  why the last request failed, else empty
     """
 
     def __init__(self, render: Callable[[RenderRequest, float], np.ndarray]) -> None:
-        self._render = render
-        self._lock = threading.Lock()
+        self._render, self._lock = render, threading.Lock()
         self._thread: threading.Thread | None = None
         self._request: RenderRequest | None = None
-        self._moving_scale = INITIAL_SCALE
-        self._has_update = False
+        self._moving_scale, self._has_update = INITIAL_SCALE, False
         self.image: np.ndarray | None = None
         self.error = ""
 
@@ -106,8 +87,7 @@ class ViewportRenderer:
 
     def join(self) -> None:
         """Wait for the end of the thread, if it runs."""
-        thread = self._thread
-        if thread is not None:
+        if (thread := self._thread) is not None:
             thread.join()
 
     def is_busy(self) -> bool:
@@ -132,11 +112,9 @@ class ViewportRenderer:
             begin = time.perf_counter()
             try:
                 self.image, self.error = self._render(request, scale), ""
-            except StgaError as error:
-                self.error, scale = str(error), 1.0
-            # shown in the viewport: an exception would end the thread unseen
-            except Exception as error:
-                self.error, scale = f"{type(error).__name__}: {error}", 1.0
+            except Exception as error:  # shown in the viewport: it would end the thread unseen
+                kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "
+                self.error, scale = f"{kind}{error}", 1.0
             elapsed_s = time.perf_counter() - begin
             if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
                 factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
@@ -144,29 +122,6 @@ class ViewportRenderer:
             with self._lock:
                 self._has_update = True
 
-
-class ViewportImage:
-    """An image as a GPU texture."""
-
-    def __init__(self) -> None:
-        self._uploaded: np.ndarray | None = None
-        self._texture: Any = None
-
-    def draw(self, image: np.ndarray, width: int, height: int) -> None:
-        """Draw an image (H, W, 4), bottom row first, over a region of width × height pixels."""
-        from gpu_extras.presets import draw_texture_2d
-
-        if image is not self._uploaded:
-            rows, columns, _ = image.shape
-            pixels = gpu.types.Buffer("FLOAT", image.size, image.ravel())
-            self._texture = gpu.types.GPUTexture((columns, rows), format="RGBA16F", data=pixels)
-            self._uploaded = image
-        gpu.state.blend_set("ALPHA_PREMULT")
-        draw_texture_2d(self._texture, (0, 0), width, height)
-        gpu.state.blend_set("NONE")
-
-
-POLL_INTERVAL_S = 1 / 60
 
 _active: dict[ViewportRenderer, "ref[Any]"] = {}
 """Renderers whose threads run, and engines, which Blender frees with their viewports."""
@@ -185,9 +140,8 @@ def stop_redraws() -> None:
         bpy.app.timers.unregister(_poll)
     for renderer in _active:
         renderer.cancel()
-    for renderer in _active:
-        renderer.join()
-    _active.clear()
+    while _active:
+        _active.popitem()[0].join()
 
 
 def _poll() -> float | None:
@@ -209,15 +163,12 @@ def _poll() -> float | None:
 
 class Rasterizer:
     """A render client whose Python and device the main thread looks up, for render threads.
-
-    find_python   the interpreter that renders where Blender's own cannot; raises StgaError where
-                  there is none
-    find_device   the device, as `render.device.Composer` takes it
-    """
+    find_python: the interpreter that renders where Blender's own cannot; raises StgaError where
+    there is none. find_device: as `render.device.Composer` takes it."""
 
     def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str]) -> None:
         self._find_python, self._find_device = find_python, find_device
-        self._python = self._error = ""
+        self._python: str | StgaError = ""
         self._device = "auto"
         self.client = RenderClient(self.python, lambda: self._device)
 
@@ -226,34 +177,35 @@ class Rasterizer:
         self._device = self._find_device()
         if missing_packages():
             try:
-                self._python, self._error = self._find_python(), ""
+                self._python = self._find_python()
             except StgaError as error:
-                self._error = str(error)
+                self._python = error
 
     def python(self) -> str:
         """As last looked up. Raises StgaError where there was none."""
-        if self._error:
-            raise StgaError(self._error)
+        if isinstance(self._python, StgaError):
+            raise self._python
         return self._python
 
 
 class EngineViewport:
-    """What one viewport of the engine keeps between redraws.
-
-    Owned by its engine alone, so that the texture is freed with it, by the main thread.
-    """
+    """What one viewport of the engine keeps between redraws; its engine alone owns it, so that the
+    main thread frees the texture."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
-        self._rasterizer = rasterizer
-        self.renderer = ViewportRenderer(partial(_render_request, rasterizer.client))
-        self.image = ViewportImage()
-        self.error = ""
+        def render(request: RenderRequest, scale: float) -> np.ndarray:
+            """Scene-linear RGBA, bottom row first; runs in a render thread."""
+            image = rasterizer.client.compose(request.layers, request.camera.scaled(scale))
+            return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
+
+        self._rasterizer, self.renderer, self.error = rasterizer, ViewportRenderer(render), ""
+        self._uploaded: np.ndarray | None = None
+        self._texture: Any = None
         self._gpu: SplatRenderer | None = None
-        self._gpu_failed = False
-        self._cache = SplatCache()
+        self._gpu_failed, self._cache = False, SplatCache()
         self._layers: list[SceneLayer] | None = None
         self._posed: list[PosedSplats] = []
-        self._posed_for: bytes = b""
+        self._posed_for = b""
         self._lighting: tuple[Any, ...] = ()
 
     def update(self, depsgraph: Any) -> None:
@@ -268,7 +220,16 @@ class EngineViewport:
         if self._gpu_failed:
             return False
         try:
-            self._draw(context, depsgraph)
+            color = scene_background(depsgraph.scene)
+            if color is not None:
+                gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
+            is_read = is_drawn_by_engine(context) and self._update_layers(context, depsgraph)
+            if is_read and self._layers:
+                self._gpu = self._gpu or SplatRenderer()
+                x, y, width, height = gpu.state.viewport_get()
+                view, to_depth = region_view(context.region_data, width, height)
+                self._gpu.draw(self._layers, view)
+                self._gpu.composite((x, y), to_depth, None if color is None else srgb(color))
         except Exception:  # from then on, the rasterizer renders
             traceback.print_exc()
             self._gpu, self._gpu_failed, self._layers = None, True, None
@@ -306,37 +267,24 @@ class EngineViewport:
             self._posed, self._posed_for, self.error = [], b"", ""
         return True
 
-    def _draw(self, context: Any, depsgraph: Any) -> None:
-        color = scene_background(depsgraph.scene)
-        if color is not None:
-            gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
-        if not is_drawn_by_engine(context) or not self._update_layers(context, depsgraph):
-            return
-        if not self._layers:
-            return
-        self._gpu = self._gpu or SplatRenderer()
-        x, y, width, height = gpu.state.viewport_get()
-        view, to_depth = region_view(context.region_data, width, height)
-        self._gpu.draw(self._layers, view)
-        self._gpu.composite((x, y), to_depth, srgb_background(depsgraph.scene))
+    def draw_image(self, image: np.ndarray, width: int, height: int) -> None:
+        """Draw an image (H, W, 4), bottom row first, over a region of width × height pixels."""
+        from gpu_extras.presets import draw_texture_2d
 
-
-def _render_request(client: RenderClient, request: RenderRequest, scale: float) -> np.ndarray:
-    """(H, W, 4) float32 scene-linear RGBA, bottom row first; runs in a render thread."""
-    image = client.compose(request.layers, request.camera.scaled(scale))
-    return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
+        if image is not self._uploaded:
+            rows, columns, _ = image.shape
+            pixels = gpu.types.Buffer("FLOAT", image.size, image.ravel())
+            self._texture = gpu.types.GPUTexture((columns, rows), format="RGBA16F", data=pixels)
+            self._uploaded = image
+        gpu.state.blend_set("ALPHA_PREMULT")
+        draw_texture_2d(self._texture, (0, 0), width, height)
+        gpu.state.blend_set("NONE")
 
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
-VIEW_TRANSFORM_UNKNOWN = (
-    "The view transform could not be measured in time and changes the splats' colors; "
-    "render again, or choose Standard"
-)
+SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")  # for some engines, and this one
 
 _rasterizer = Rasterizer(lambda: "", lambda: "auto")
-
-# Those that are for some engines only and apply to this one too.
-SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -345,9 +293,9 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     bl_use_eevee_viewport = True  # Material Preview stays EEVEE's
     bl_use_gpu_context = has_gpu_context()
 
-    # No __init__: its signature differs between Blender's versions. Created when a viewport is
-    # first drawn.
-    _viewport: EngineViewport | None = None
+    @cached_property  # no __init__: its signature differs between Blender's versions
+    def _viewport(self) -> EngineViewport:
+        return EngineViewport(_rasterizer)
 
     def update_render_passes(self, scene: Any = None, renderlayer: Any = None) -> None:
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
@@ -355,19 +303,16 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
 
     def render(self, depsgraph: Any) -> None:
-        message = ""
+        message, border = "", self._border(depsgraph.scene.render)
         try:
-            passes = self._render(depsgraph)
-        except StgaError as error:
+            passes = self._render(depsgraph, border)
+        except Exception as error:  # raised, it would not stop Blender from saving an empty image
             passes, message = {}, str(error)
-        # raised here, it would not stop Blender from saving an image without passes
-        except Exception as error:
-            traceback.print_exc()
-            reason = f"{type(error).__name__}: {error}"
-            passes, message = {}, f"Unexpected error ({reason}); see the console"
+            if not isinstance(error, StgaError):
+                traceback.print_exc()
+                message = f"Unexpected error ({type(error).__name__}: {error}); see the console"
         # Those that the view layer has; those not given stay empty.
-        size = _border(depsgraph.scene.render, self.resolution_x, self.resolution_y)[2:]
-        result = self.begin_result(0, 0, *size, layer=depsgraph.view_layer.name)
+        result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         for render_pass in result.layers[0].passes:
             if render_pass.name in passes:
                 from_bottom = np.ascontiguousarray(passes[render_pass.name][::-1], np.float32)
@@ -378,10 +323,19 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             if not bpy.app.background:
                 self.error_set(message)  # shown in place of the image
 
-    def _render(self, depsgraph: Any) -> dict[str, np.ndarray]:
+    def _border(self, render: Any) -> tuple[int, int, int, int]:
+        """x, y, width, height in pixels of the render region, from below, rounded as by Blender."""
+        width, height = self.resolution_x, self.resolution_y
+        if not render.use_border:
+            return 0, 0, width, height
+        edges = render.border_min_x, render.border_min_y, render.border_max_x, render.border_max_y
+        sizes = np.array([width, height] * 2, np.float32)
+        left, low, right, high = (np.array(edges, np.float32) * sizes).astype(int).tolist()
+        return left, low, right - left, high - low
+
+    def _render(self, depsgraph: Any, border: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
         """Values (H, W, channels) of each pass, top row first."""
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
-        border = _border(scene.render, *size)
         camera_object = scene.camera.evaluated_get(depsgraph) if scene.camera else None
         camera = render_camera(camera_object, depsgraph, *size, border)
         layers = visible_layers(depsgraph, SplatCache())
@@ -395,7 +349,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
                 self.report({"WARNING"}, _rasterizer.client.failure)
         view = inverse_view(scene)
         if view is None and needs_inverse(scene):
-            self.report({"WARNING"}, VIEW_TRANSFORM_UNKNOWN)
+            problem = "The view transform could not be measured in time and changes colors"
+            self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
         assert image.depth is not None
         covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_ALPHA)
         return {
@@ -404,26 +359,21 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         }
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
-        self._get_viewport().update(depsgraph)
+        self._viewport.update(depsgraph)
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
-        viewport, region = self._get_viewport(), context.region
+        viewport, region = self._viewport, context.region
+        renderer = viewport.renderer
         if viewport.draw(context, depsgraph):
             self.update_stats("", viewport.error)
             return
-        renderer = viewport.renderer
         if viewport.request_image(context, depsgraph):
             redraw_when_rendered(renderer, self)
         self.update_stats("", renderer.error)
         if renderer.image is not None:
             self.bind_display_space_shader(depsgraph.scene)
-            viewport.image.draw(renderer.image, region.width, region.height)
+            viewport.draw_image(renderer.image, region.width, region.height)
             self.unbind_display_space_shader()
-
-    def _get_viewport(self) -> EngineViewport:
-        if self._viewport is None:
-            self._viewport = EngineViewport(_rasterizer)
-        return self._viewport
 
 
 def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
@@ -433,28 +383,17 @@ def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None
     try:
         renderer = SplatRenderer()
         renderer.draw(layers, View(camera))
-        return renderer.read(with_depth=True)
+        return renderer.read()
     except Exception as error:  # of many kinds, by device and version
         logging.getLogger(__name__).info("No GPU rendering (%s); the rasterizer renders", error)
         return None
 
 
-def _border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
-    """x, y, width, height in pixels of the render region, from below, rounded as Blender does."""
-    if not render.use_border:
-        return 0, 0, width, height
-    edges = render.border_min_x, render.border_min_y, render.border_max_x, render.border_max_y
-    sizes = np.array([width, height] * 2, np.float32)
-    left, low, right, high = (np.array(edges, np.float32) * sizes).astype(int).tolist()
-    return left, low, right - left, high - low
-
-
 @persistent
 def _before_render(*_: Any) -> None:
     """Measure the view transforms of all scenes of this engine: a compositor may render any."""
-    for scene in list(bpy.data.scenes):
-        if scene.render.engine == ENGINE:
-            measure(scene)
+    for scene in [scene for scene in bpy.data.scenes if scene.render.engine == ENGINE]:
+        measure(scene)
 
 
 def register(

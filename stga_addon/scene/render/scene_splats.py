@@ -29,15 +29,10 @@ from ..vertex_groups import frame_selection
 
 
 class SplatCache:
-    """Avatars and world splats as last read from Blender's meshes, and avatars' frames on their
-    heads' last shapes.
-
-    Reading attributes takes longer than posing splats, and an animated head does not change them.
-    `write_splats` gives a mesh a new revision, so that neither undo nor a loaded file brings up
-    what another state of the mesh held.
-
-    light  of the scene, as last read
-    """
+    """Avatars and world splats as last read from Blender's meshes, avatars' frames on their heads'
+    last shapes, and the scene's light. Reading attributes takes longer than posing splats, and an
+    animated head does not change them. `write_splats` gives a mesh a new revision, so that neither
+    undo nor a loaded file brings up what another state of the mesh held."""
 
     def __init__(self) -> None:
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
@@ -54,9 +49,8 @@ class SplatCache:
         if key not in self._stored:
             current = {_key(mesh) for mesh in bpy.data.meshes}
             self._keep(lambda known: known in current)
-            is_avatar = tags.CONVENTION in splat_object
-            stored = stored_avatar(splat_object) if is_avatar else read_splats(splat_object.data)
-            self._stored[key] = stored
+            is_avatar, mesh = tags.CONVENTION in splat_object, splat_object.data
+            self._stored[key] = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
         return self._stored[key]
 
     def frames(
@@ -84,20 +78,17 @@ def visible_layers(
     view: Any = None,
     is_wanted: Callable[[Any], bool] = lambda splat_object: True,
 ) -> list[SceneLayer]:
-    """The splats of each visible object at the depsgraph's frame.
-
-    view: the 3D viewport (a SpaceView3D) to draw, None for a final image. is_wanted: chooses among
-    splat objects. Raises StgaError where the head of an object is gone or has other triangles than
-    its splats.
-    """
+    """The splats of each visible object at the depsgraph's frame. view: the 3D viewport (a
+    SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects. Raises
+    StgaError where the head of an object is gone or has other triangles than its splats."""
     visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]
     if view is None:
         visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
     shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
     return [
-        _layer(visible, matrix, depsgraph, cache, shown)
-        for visible, matrix in shown
-        if visible.get(tags.KIND) == tags.SPLATS and is_wanted(visible)
+        _layer(each, matrix, depsgraph, cache, shown)
+        for each, matrix in shown
+        if each.get(tags.KIND) == tags.SPLATS and is_wanted(each)
     ]
 
 
@@ -105,9 +96,10 @@ def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    own = [each for each in layer.collection.objects if _is_rendered(each, depsgraph)]
-    inside = (each for child in layer.children for each in _rendered_objects(child, depsgraph))
-    return list(dict.fromkeys([*own, *inside]))
+    found = [each for each in layer.collection.objects if _is_rendered(each, depsgraph)]
+    for child in layer.children:
+        found += _rendered_objects(child, depsgraph)
+    return list(dict.fromkeys(found))
 
 
 def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
@@ -145,30 +137,24 @@ def _layer(
     posed = head.evaluated_get(depsgraph)
     if posed.type != "MESH" or len(posed.data.loops) != stored.faces.size:
         name = splat_object.name
+        reason = f"has other triangles than {name}, which follows it; check its modifiers"
         if head.mode == "EDIT":
-            raise StgaError(
-                f"{head.name}: is in Edit Mode; {name} is drawn again when you leave it"
-            )
-        raise StgaError(
-            f"{head.name}: has other triangles than {name}, which follows it; check its modifiers"
-        )
+            reason = f"is in Edit Mode; {name} is drawn again when you leave it"
+        raise StgaError(f"{head.name}: {reason}")
     placed = splat_object.evaluated_get(depsgraph).matrix_world
     to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
     vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
     vertices, frames = cache.frames(splat_object, stored, vertices)
     relit = cache.light.relit(splat_object, head, stored, vertices, to_world, shown, depsgraph)
-    selected = None
-    if settings.show_selection or settings.selected_only:
-        selected = frame_selection(head, depsgraph.scene.frame_current)
+    asks = settings.show_selection or settings.selected_only
+    selected = frame_selection(head, depsgraph.scene.frame_current) if asks else None
     frozen = None if selected is None else ~selected
     return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen, relit)
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
     """Store the splats' scene-linear colors in the scene's light, at its frame and from its camera.
-
-    Raises StgaError where the lighting is as recorded, or the avatar does not know its light.
-    """
+    Raises StgaError where the lighting is as recorded, or the avatar does not know its light."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     layers = visible_layers(depsgraph, SplatCache(), is_wanted=lambda shown: shown == splat_object)
     if not layers or layers[0].relit is None:

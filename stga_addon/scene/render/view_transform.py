@@ -17,27 +17,20 @@ from ..light import world_light
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
-GRID, INVERSE_GRID = 41, 25
-"""Samples along an axis of the table measured, and of its inverse."""
-DARKEST, BRIGHTEST = -14.0, 6.0
-"""Range of the scene-linear samples, in log2; the first sample is 0."""
+GRID, INVERSE_GRID = 41, 25  # samples along an axis of the table measured, and of its inverse
+DARKEST, BRIGHTEST = -14.0, 6.0  # range of the scene-linear samples, in log2; the first sample is 0
 INVERSE_STEPS, MAX_STEP, DAMPING = 15, 4, 1e-3
 """Of finding a color of the inverse; steps in samples, damped where colors hardly change."""
-CHUNK = 1 << 16
-"""Pixels converted at a time, which bounds the memory."""
+CHUNK = 1 << 16  # pixels converted at a time, which bounds the memory
 MAIN_THREAD_TIMEOUT_S = 10.0
-MAX_MEASURED = 8
-"""Inverses that are kept, of a megabyte each."""
+MAX_MEASURED = 8  # inverses that are kept, of a megabyte each
 
 _measured: dict[tuple[Any, ...], "InverseView"] = {}
 
 
 class InverseView:
-    """The inverse of a view transform.
-
-    shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors whose red, green and blue are `axis`
-    (G,), in that order.
-    """
+    """The inverse of a view transform. shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors
+    whose red, green and blue are `axis` (G,), in that order."""
 
     def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
         self._axis, self._shown = axis, shown
@@ -104,12 +97,9 @@ def inverse_view(scene: Any) -> InverseView | None:
 
 
 def measure(scene: Any) -> None:
-    """Find `inverse_view` if it is needed, before rendering.
-
-    Blender calls this in its render thread, and data may be changed by the main thread only; that
-    is waited for. Once the render engine has the GPU, it must not be: the main thread then waits
-    for the GPU to draw.
-    """
+    """Find `inverse_view` if it is needed, before rendering. Blender calls this in its render
+    thread, and data may be changed by the main thread only; that is waited for. Once the render
+    engine has the GPU, it must not be: the main thread then waits for the GPU to draw."""
     key = _settings(scene)
     if key in _measured:
         _keep(key, _measured[key])
@@ -218,11 +208,8 @@ def srgb_background(scene: Any) -> tuple[float, float, float] | None:
 
 
 def scene_background(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color behind the splats, None where the film is transparent.
-
-    From the world's Background node if its inputs are constants, else its viewport color; black
-    without a world.
-    """
+    """Scene-linear color behind the splats, None where the film is transparent. From the world's
+    Background node if its inputs are constants, else its viewport color; black without a world."""
     if scene.render.film_transparent:
         return None
     color = world_color(scene)

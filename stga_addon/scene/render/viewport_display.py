@@ -1,9 +1,5 @@
-"""GPU display: draws avatars as trained in every 3D viewport, in every shading mode, over what
-Blender has drawn.
-
-An object is drawn where its display mode is *As Trained*. Playback, posing and edits need no
-handler of their own: each redraw reads the evaluated head.
-"""
+"""GPU display: draws avatars whose display mode is *As Trained* in every 3D viewport, in every
+shading mode, over what Blender has drawn. Each redraw reads the evaluated head."""
 
 import traceback
 from contextlib import suppress
@@ -15,18 +11,17 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ...errors import StgaError
-from ...scene import tags
+from .. import tags
 from ..cameras import viewport_camera
 from ..display import splat_nodes
-from ..display.display_modes import AS_TRAINED, POINTS
+from ..display.splat_nodes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
 from ..gpu.packing import NEAR_M, View
 from ..gpu.renderer import NO_BONES, SplatRenderer, fastest_format, front_bones
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import keeps_colors, srgb, world_color
 
-ENGINE = "STGA_SPLATS"
-"""The render engine, which draws all splats in *Rendered* mode."""
+ENGINE = "STGA_SPLATS"  # the render engine, which draws all splats in *Rendered* mode
 POINTS_INTERVAL_S = 1.0
 
 
@@ -63,10 +58,6 @@ class GpuDisplay:
         self._renderer, self._scene_target, self.cache = None, None, SplatCache()
         self.problem = self.problem if self.failed else ""
 
-    def scene_changed(self) -> None:
-        """Read what throws shadows onto heads again."""
-        self.cache.light.forget_casters()
-
     def _before(self) -> None:
         """Keep the framebuffer of the scene's colors, before that of the overlays is bound."""
         self._scene_target = gpu.state.active_framebuffer_get()
@@ -90,16 +81,16 @@ class GpuDisplay:
             self._scene_target = None
 
     def _draw_region(self, context: Any) -> None:
-        space, depsgraph = context.space_data, context.evaluated_depsgraph_get()
         if is_drawn_by_engine(context):
             return
         # and nothing else, although its depth buffer has other displays of splats
-        everything = is_engine_view(context)
-
-        def is_wanted(shown: Any) -> bool:
-            return everything or display_mode(shown) == AS_TRAINED
-
-        layers = visible_layers(depsgraph, self.cache, space, is_wanted)
+        space, everything = context.space_data, is_engine_view(context)
+        layers = visible_layers(
+            context.evaluated_depsgraph_get(),
+            self.cache,
+            space,
+            lambda shown: everything or display_mode(shown) == AS_TRAINED,
+        )
         if not layers:
             if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
                 self._renderer = None  # frees its textures
@@ -112,7 +103,10 @@ class GpuDisplay:
         is_plain = space.shading.type in ("SOLID", "WIREFRAME") or keeps_colors(context.scene)
         bones = front_bones(space, context.region_data, width, height) if is_plain else NO_BONES
         background, has_background = expected_background(context)
-        test_depth = has_scene_depth(space) and not everything
+        # Whether the depth buffer holds the scene: render engines leave it zero where overlays are
+        # off, always in 4.3, at times in 5.2.
+        has_depth = space.overlay.show_overlays or space.shading.type in ("SOLID", "WIREFRAME")
+        test_depth = has_depth and not everything
         self._renderer.composite(
             (x, y), to_depth, background, test_depth, bones, self._scene_target, has_background
         )
@@ -123,10 +117,8 @@ display = GpuDisplay()
 
 def is_shown_as_trained(candidate: Any) -> bool:
     """Whether the object is one of splats that are displayed as trained."""
-    if candidate.get(tags.KIND) != tags.SPLATS:
-        return False
     with suppress(StgaError):  # it has lost its modifier
-        return display_mode(candidate) == AS_TRAINED
+        return candidate.get(tags.KIND) == tags.SPLATS and display_mode(candidate) == AS_TRAINED
     return False
 
 
@@ -144,11 +136,8 @@ def is_engine_view(context: Any) -> bool:
 
 
 def is_drawn_by_engine(context: Any) -> bool:
-    """Whether the render engine draws the splats itself, below overlays and bones.
-
-    It draws before the view transform. Where that would change colors, the display draws them,
-    after it.
-    """
+    """Whether the render engine draws the splats itself, below overlays and bones. It draws before
+    the view transform. Where that would change colors, the display draws them, after it."""
     return is_engine_view(context) and keeps_colors(context.scene)
 
 
@@ -168,11 +157,8 @@ def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float
 
 def expected_background(context: Any) -> tuple[tuple[float, ...] | None, bool]:
     """sRGB color that the viewport shows behind everything, None where that is not one color; and
-    whether it draws that itself.
-
-    Splats were trained to be blended in sRGB, and a viewport blends linearly: their soft edges are
-    right over what is known to be behind them.
-    """
+    whether it draws that itself. Splats were trained to be blended in sRGB, and a viewport blends
+    linearly: their soft edges are right over what is known to be behind them."""
     shading, scene = context.space_data.shading, context.scene
     theme = context.preferences.themes[0].view_3d.space.gradients
     if shading.type in ("SOLID", "WIREFRAME"):
@@ -192,14 +178,6 @@ def expected_background(context: Any) -> tuple[tuple[float, ...] | None, bool]:
     return None, True
 
 
-def has_scene_depth(space: Any) -> bool:
-    """Whether a 3D viewport's depth buffer holds the scene when draw handlers run.
-
-    Render engines leave it zero where overlays are off: always in 4.3, at times in 5.2.
-    """
-    return bool(space.overlay.show_overlays) or space.shading.type in ("SOLID", "WIREFRAME")
-
-
 @persistent
 def _forget_file(*_: Any) -> None:
     display.forget()
@@ -207,19 +185,24 @@ def _forget_file(*_: Any) -> None:
 
 @persistent
 def _scene_changed(*_: Any) -> None:
-    display.scene_changed()
+    """Read what throws shadows onto heads again."""
+    display.cache.light.forget_casters()
+
+
+def _handlers() -> tuple[tuple[Any, Any], ...]:
+    called = bpy.app.handlers
+    changes = called.depsgraph_update_post, called.frame_change_post
+    return (called.load_pre, _forget_file), *((those, _scene_changed) for those in changes)
 
 
 def register() -> None:
-    bpy.app.handlers.load_pre.append(_forget_file)
-    bpy.app.handlers.depsgraph_update_post.append(_scene_changed)
-    bpy.app.handlers.frame_change_post.append(_scene_changed)
+    for called, handler in _handlers():
+        called.append(handler)
     display.start()
 
 
 def unregister() -> None:
-    bpy.app.handlers.load_pre.remove(_forget_file)
-    bpy.app.handlers.depsgraph_update_post.remove(_scene_changed)
-    bpy.app.handlers.frame_change_post.remove(_scene_changed)
+    for called, handler in _handlers():
+        called.remove(handler)
     display.failed = False
     display.stop()

@@ -1,31 +1,44 @@
-"""The tracked head as an animated mesh, and meshes with shape keys as head models."""
+"""The tracked head as an animated mesh, and meshes with shape keys as head models.
 
+A FLAME head is a Blender rig whose mesh equals FLAME's forward pass, on tracked frames and for any
+pose set by hand.
+
+Expression coefficients are shape keys, joint rotations are pose bones, pose correctives are shape
+keys driven by the bones, and linear blend skinning is the armature modifier. The first identity
+components are shape keys too, relative to the tracked person: with all of them at zero the head is
+that person's.
+
+FLAME regresses its joints from the *shaped* vertices, so the sliders displace a joint's center of
+rotation by d = D·sliders, which a bone's rest position cannot follow. Such a joint's bone is
+therefore the child of a hidden bone `<name>_joint`, driven to d, and the parent of a hidden bone
+`<name>_deform`, driven to -d, which the vertices follow. All drivers are arithmetic, which Blender
+evaluates without Python.
+"""
+
+from collections.abc import Sequence
 from typing import Any
 
+import bpy
 import numpy as np
+from mathutils import Matrix, Vector
 
 from ...capture.model import Capture
 from ...errors import StgaError
-from .. import tags
-from ..arrays import (
-    Z_UP_TO_Y_UP,
-    flat_floats,
-    has_triangles,
-    key_points,
-    read_values,
-    triangle_mesh,
-    write_triangle_curves,
-)  # fmt: skip
-from ..objects import Warn, capture_root, log_warning, place, reset
-from .flame_rig import add_rig, remove_rig
-from .keyframes import key_value_path
+from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
+from ...flame.model import JOINTS
+from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
+from .. import arrays, tags
+from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
+from ..objects import Warn, capture_root, leave_edit_mode, log_warning, place, remove, reset
+from . import keyframes
+from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path, rotation_path
 
 
 def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "all") -> Any:
     """The capture's head as a mesh object, animated so that Blender's frame number is the capture's
     timestep.
 
-    A FLAME capture becomes a rig (see `flame_rig.add_rig`); any other gets one shape key per
+    A FLAME capture becomes a rig (see `add_rig`); any other gets one shape key per
     timestep, `t00012`, with value 1 at its own frame, so that the evaluated mesh of that frame is
     the timestep's mesh; frames between two timesteps blend them. Object coordinates are the
     capture's (meters, y-up). Regions become boolean face attributes `stga_region_<name>`. Importing
@@ -39,23 +52,26 @@ def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "
         head = _place_head(capture)
         add_rig(head, sequence, frames, warn, correctives)
         return head
-    meshes = np.empty((len(capture.timesteps), *capture.neutral.shape), np.float32)
-    for row, timestep in enumerate(capture.timesteps):
-        meshes[row] = capture.mesh(timestep)
+    meshes = [flat_floats(capture.mesh(timestep)) for timestep in capture.timesteps]
     head = _place_head(capture)
-    remove_rig(head)
+    rigs = _rigs(head)
+    _remove_bone_groups(head, rigs)
+    for modifier in list(head.modifiers):
+        if modifier.type == "ARMATURE" and modifier.object in rigs:
+            head.modifiers.remove(modifier)
+    remove(rigs)
     names = [f"t{timestep:05d}" for timestep in capture.timesteps]
     for name, mesh in zip(names, meshes, strict=True):
-        head.shape_key_add(name=name, from_mix=False).points.foreach_set("co", mesh.ravel())
+        head.shape_key_add(name=name, from_mix=False).points.foreach_set("co", mesh)
     keys = head.data.shape_keys
-    write_triangle_curves(keys, [key_value_path(name) for name in names], capture.timesteps)
+    arrays.write_triangle_curves(keys, [key_value_path(name) for name in names], capture.timesteps)
     return head
 
 
 def _place_head(capture: Capture) -> Any:
     root = capture_root(capture.root)
     head = next(iter(tags.find(tags.HEAD, capture.root)), None)
-    if head is not None and has_triangles(head.data, capture.faces):
+    if head is not None and arrays.has_triangles(head.data, capture.faces):
         # Into the same mesh, which keeps materials, vertex groups and painted attributes.
         reset(head)
         mesh = head.data
@@ -71,7 +87,7 @@ def _place_head(capture: Capture) -> Any:
                 head.vertex_groups.remove(group)
     else:
         title = f"{root.name} head"
-        mesh = triangle_mesh(title, capture.neutral, capture.faces)
+        mesh = arrays.triangle_mesh(title, capture.neutral, capture.faces)
         head = place(root, tags.HEAD, title, mesh, head)
     for region, members in capture.regions.items():
         attribute = head.data.attributes.new(tags.REGION_PREFIX + region, "BOOLEAN", "FACE")
@@ -89,11 +105,9 @@ def has_shape_keys(thing: Any) -> bool:
 
 def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
     """Basis (V, 3) in meters, y up, triangles (F, 3), and names and displacements (V, 3, K) of the
-    other shape keys.
-
-    In world space, turned from Blender's axes, in which a head looks along -y: z up becomes y up.
-    Modifiers, values and drivers are left out. Raises StgaError for an object without shape keys.
-    """
+    other shape keys. In world space, turned from Blender's axes, in which a head looks along -y: z
+    up becomes y up. Modifiers, values and drivers are left out. Raises StgaError for an object
+    without shape keys."""
     if not has_shape_keys(thing):
         raise StgaError(f"{thing.name}: has no shape keys; a head model needs some")
     turn = Z_UP_TO_Y_UP @ np.array(thing.matrix_world)
@@ -103,5 +117,225 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
     moved = np.stack([key_points(each) - key_points(each.relative_key) for each in others], axis=2)
     shapes = np.einsum("ab,vbk->vak", turn[:3, :3], moved)
     thing.data.calc_loop_triangles()
-    faces = read_values(thing.data.loop_triangles, "vertices", 3, np.int32)
+    faces = arrays.read_values(thing.data.loop_triangles, "vertices", 3, np.int32)
     return mean, faces, tuple(block.name for block in others), shapes
+
+
+BONE_SHAPE = "STGA Bone"
+BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
+# meters along an axis that a joint may be off when all sliders are at their limits
+NEGLIGIBLE_DISPLACEMENT = 1e-6
+SQUARED_NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions are interpolated without normalization
+# (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.
+ROTATION_MINUS_IDENTITY = (
+    ("-y*y-z*z", "x*y-w*z", "x*z+w*y"),
+    ("x*y+w*z", "-x*x-z*z", "y*z-w*x"),
+    ("x*z-w*y", "y*z+w*x", "-x*x-y*y"),
+)
+# A driver's variables, one per term: few enough for Blender's limit of 255 characters per
+# expression.
+VARIABLES = "abcdfghijklmnopqrs"
+
+
+def add_rig(
+    head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], warn: Warn, correctives: str
+) -> Any:
+    """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature
+    object.
+
+    head has its "Basis" shape key; frames: the sequence's frames, one per timestep. The evaluated
+    mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by frame become one shape
+    key per timestep, which `warn` reports, as it does coefficients beyond ±10. correctives: "all",
+    or "moving" for the shape keys and drivers of those joints only that turn in the frames.
+    """
+    model = sequence.model
+    no_expression = np.zeros(model.n_expression)
+    basis = shaped_vertices(model, sequence.shape, no_expression, sequence.static_offset)
+    sliders = keyframes.slider_components(model)
+    # (5, 3, K): how far each component of the shape moves each joint.
+    shapes = model.shapedirs[:, :, list(sliders.values())]
+    directions = np.einsum("jv,vck->jck", model.j_regressor, shapes)
+    has_offsets = any(frame.dynamic_offset is not None for frame in frames)
+    displaced = [has_offsets or any(_significant_terms(direction)) for direction in directions]
+    moved = zip(JOINTS, displaced, strict=True)
+    deformed = [keyframes.deform_bone(name) if moves else name for name, moves in moved]
+    _remove_bone_groups(head, _rigs(head))
+    rig = _place_armature(head, joint_positions(model, basis), model.parents, deformed)
+    for name, column in zip(deformed, model.weights.T, strict=True):
+        group = head.vertex_groups.new(name=name)
+        for vertex in np.flatnonzero(column).tolist():
+            group.add([vertex], column[vertex], "REPLACE")
+    modifiers = (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig)
+    modifier = next(modifiers, None) or head.modifiers.new(rig.name, "ARMATURE")
+    modifier.object = rig
+    modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
+    modifier.use_deform_preserve_volume = False
+    _draw_at_skin(rig, basis, model.weights, joint_positions(model, basis))
+    head.pop(keyframes.ARKIT_MAP, None)  # of shape keys that an earlier import had
+    if model.expression_names:
+        head[keyframes.EXPRESSION_NAMES] = ",".join(model.expression_names)
+    for name, component in sliders.items():
+        _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
+    corrected = np.array(correctives == "all") | (joint_angles(frames) > MIN_JOINT_ANGLE_DEG)
+    # Nine per joint, each driven by one entry of the joint's rotation minus identity.
+    for feature in range(model.posedirs.shape[2]):
+        joint, row, column = 1 + feature // 9, feature % 9 // 3, feature % 3
+        if not corrected[joint] or not model.posedirs[:, :, feature].any():
+            continue
+        name, path = f"pose_{JOINTS[joint]}_{row}{column}", rotation_path(JOINTS[joint])
+        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
+        expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
+        rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
+        add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
+    keyframes.key_motion(head, rig, np.array(sequence.timesteps), frames, warn=warn)
+    if has_offsets:
+        warn(
+            f"{head.name}: the capture has a dynamic_offset per frame, which a rig cannot "
+            f"represent; added one shape key per timestep ({len(frames)})"
+        )
+        for timestep, frame in zip(sequence.timesteps, frames, strict=True):
+            offset = 0 if frame.dynamic_offset is None else frame.dynamic_offset
+            _new_shape_key(head, keyframes.offset_key(timestep), basis + offset, 1.0)
+        for name in JOINTS:
+            rig[keyframes.offset_property(name)] = [0.0] * 3
+        keyframes.key_tracked_offsets(head, rig, sequence, sequence.timesteps)
+    for joint in np.flatnonzero(displaced).tolist():
+        _drive_joint(head, rig, JOINTS[joint], list(sliders), directions[joint])
+    return rig
+
+
+def rig_of(head: Any) -> Any:
+    """The armature object that moves `head`. Raises StgaError where it has no FLAME rig."""
+    for modifier in head.modifiers:
+        rig = modifier.object if modifier.type == "ARMATURE" else None
+        if rig is not None and rig.get(tags.KIND) == tags.RIG:
+            return rig
+    raise StgaError(
+        f"{head.name}: has no FLAME rig, because it was not imported from FLAME parameters; "
+        "its splats follow whatever moves its mesh (shape keys, modifiers, a mesh cache)"
+    )
+
+
+def _remove_bone_groups(head: Any, rigs: Sequence[Any]) -> None:
+    bones = {bone.name for rig in rigs for bone in rig.data.bones}
+    for group in reversed([group for group in head.vertex_groups if group.name in bones]):
+        head.vertex_groups.remove(group)
+
+
+def _rigs(head: Any) -> list[Any]:
+    return [child for child in head.parent.children if child.get(tags.KIND) == tags.RIG]
+
+
+def _place_armature(
+    head: Any, joints: np.ndarray, parents: np.ndarray, deformed: Sequence[str]
+) -> Any:
+    """The rig's object with bones at joints (5, 3); deformed: the bone that each one's vertices
+    follow."""
+    title = f"{head.parent.name} rig"
+    armature = bpy.data.armatures.new(title)
+    temporary = bpy.data.objects.new(title, armature)  # edit mode needs an object that is visible
+    layer = bpy.context.view_layer
+    active = layer.objects.active
+    leave_edit_mode()
+    bpy.context.scene.collection.objects.link(temporary)
+    layer.objects.active = temporary
+    bpy.ops.object.mode_set(mode="EDIT")
+    for name, last, parent, (x, y, z) in zip(
+        JOINTS, deformed, parents.tolist(), joints.tolist(), strict=True
+    ):
+        above = deformed[parent] if parent >= 0 else None
+        for link in [name] if last == name else [keyframes.parent_bone(name), name, last]:
+            edited = armature.edit_bones.new(link)
+            # Along +Y without roll, its rest orientation is the identity: its rotation is FLAME's.
+            edited.head, edited.tail, edited.roll = (x, y, z), (x, y + BONE_LENGTH, z), 0.0
+            edited.parent = armature.edit_bones[above] if above else None
+            above = link
+    bpy.ops.object.mode_set(mode="OBJECT")
+    layer.objects.active = active
+    bpy.data.objects.remove(temporary)
+    visible, hidden = armature.collections.new("Joints"), armature.collections.new("Helpers")
+    hidden.is_visible = False
+    for made in armature.bones:
+        (visible if made.name in JOINTS else hidden).assign(made)
+    rig = place(head.parent, tags.RIG, title, armature, next(iter(_rigs(head)), None))
+    rig.show_in_front = True
+    layer.update()  # creates the pose bones
+    for bone in rig.pose.bones:
+        bone.matrix_basis = Matrix()
+    for joint, name in enumerate(JOINTS):
+        bone = rig.pose.bones[name]
+        bone.rotation_mode, bone.lock_location = "QUATERNION", [joint > 0] * 3
+        for earlier in (keyframes.sum_property(name), keyframes.offset_property(name)):
+            rig.pop(earlier, None)
+    return rig
+
+
+def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> None:
+    """Draw jaw and eyes from their joints to the skin in front: as bones they point up, because
+    their rest orientation is FLAME's."""
+    shape = bpy.data.objects.get(BONE_SHAPE)
+    if shape is None:
+        mesh = bpy.data.meshes.new(BONE_SHAPE)
+        ring = [(0.1, 0.1, 0), (0, 0.1, 0.1), (-0.1, 0.1, 0), (0, 0.1, -0.1)]
+        sides = [(end, 2 + k, 2 + (k + 1) % 4) for end in (0, 1) for k in range(4)]
+        mesh.from_pydata([(0, 0, 0), (0, 1, 0), *ring], [], sides)
+        shape = bpy.data.objects.new(BONE_SHAPE, mesh)  # in no collection
+    for name in ("jaw", "left_eye", "right_eye"):
+        joint, bone = JOINTS.index(name), rig.pose.bones[name]
+        moved = basis[weights[:, joint] > 0.5] - joints[joint]
+        rig.data.bones[name].hide = not len(moved)  # a jaw that a shape moves
+        if len(moved):
+            tip = Vector(moved[(moved[:, 2] - np.abs(moved[:, 0])).argmax()])
+            bone.custom_shape, bone.use_custom_shape_bone_size = shape, False
+            bone.custom_shape_scale_xyz = (tip.length,) * 3
+            bone.custom_shape_rotation_euler = tip.to_track_quat("Y", "Z").to_euler()
+
+
+def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:
+    key = head.shape_key_add(name=name, from_mix=False)
+    key.points.foreach_set("co", flat_floats(vertices))
+    key.slider_min, key.slider_max = -limit, limit
+    key.value = 0.0  # a key made from a script starts at 1
+
+
+def _significant_terms(directions: np.ndarray) -> list[list[int]]:
+    """Per axis, the columns of directions (3, K) that displace the joint. The smallest are left
+    out, as long as all of them together stay negligible with the sliders at their limits."""
+    kept = []
+    for coefficients in np.abs(directions):
+        order = np.argsort(coefficients)
+        displacement = np.cumsum(coefficients[order]) * MAX_SLIDER
+        kept.append(sorted(order[displacement > NEGLIGIBLE_DISPLACEMENT].tolist()))
+    return kept
+
+
+def _drive_joint(
+    head: Any, rig: Any, joint: str, sliders: Sequence[str], directions: np.ndarray
+) -> None:
+    """Drive a joint's helper bones by directions (3, K) · sliders, plus the per-frame offset where
+    there is one. Blender limits an expression's length, so partial sums are driven first, in a
+    property of the rig."""
+    parts = [
+        (axis, terms[start : start + len(VARIABLES)])
+        for axis, terms in enumerate(_significant_terms(directions))
+        for start in range(0, len(terms), len(VARIABLES))
+    ]
+    sums, offset = keyframes.sum_property(joint), keyframes.offset_property(joint)
+    if parts:
+        rig[sums] = [0.0] * len(parts)
+    summands: list[list[str]] = [[], [], []]
+    for slot, (axis, terms) in enumerate(parts):
+        weighted = zip(directions[axis, terms], VARIABLES, strict=False)
+        expression = "".join(f"{weight:+.5e}*{letter}" for weight, letter in weighted)
+        sources = [(head.data.shape_keys, key_value_path(sliders[k])) for k in terms]
+        variables = dict(zip(VARIABLES, sources, strict=False))
+        add_driver(rig, property_path(sums), slot, expression, variables)
+        summands[axis].append(f"{property_path(sums)}[{slot}]")
+    for axis, paths in enumerate(summands):
+        paths += [f"{property_path(offset)}[{axis}]"] if offset in rig else []
+        if paths:
+            variables = dict(zip(VARIABLES, ((rig, path) for path in paths), strict=False))
+            total = "+".join(variables)
+            moved, deform = keyframes.parent_bone(joint), keyframes.deform_bone(joint)
+            add_driver(rig, location_path(moved), axis, total, variables)
+            add_driver(rig, location_path(deform), axis, f"-({total})", variables)

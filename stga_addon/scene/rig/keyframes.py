@@ -1,18 +1,23 @@
-"""Keyframes of a FLAME head, and the names and data paths of what they move."""
+"""Keyframes of a FLAME head, the names and data paths of what they move, and ARKit's 52 shapes:
+shape keys of these names, which FLAME heads are given."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import bpy
 import numpy as np
 
-from ...driving.performance import ARKIT_SHAPES
+from ...driving.head_map import PRODUCTS, HeadMap, features
+from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance, arkit_name
+from ...driving.shapes import JAW_OPEN
 from ...errors import StgaError
-from ...flame.forward import FlameFrame, joint_positions
+from ...flame.forward import FlameFrame, flame_forward, joint_positions
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import continuous, from_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
-from ..arrays import write_curve, write_curves, write_triangle_curves
+from ..arrays import add_driver, flat_floats, key_points, write_curves, write_triangle_curves
 from ..compat import action_curves, copy_action, push_down_action
 from ..objects import Warn, log_warning
 
@@ -83,30 +88,25 @@ def bones_of(parts: Sequence[str]) -> list[str]:
     return [bone for part in parts for bone in PART_JOINTS.get(part, ())]
 
 
-UNCHANGED = 1e-6
-"""Change of a slider's value below which it is not keyframed."""
-MAX_SLIDER = 10.0
-"""The widest range that Blender allows a shape key's value: -10 to 10."""
+UNCHANGED = 1e-6  # change of a slider's value below which it is not keyframed
+MAX_SLIDER = 10.0  # the widest range that Blender allows a shape key's value: -10 to 10
 
 
 def key_motion(
-    head: Any, rig: Any, numbers: Sequence[int], frames: Sequence[FlameFrame],
-    parts: Sequence[str] = tuple(PARTS), warn: Warn = log_warning,
-) -> None:  # fmt: skip
+    head: Any,
+    rig: Any,
+    at: np.ndarray,
+    frames: Sequence[FlameFrame],
+    parts: Sequence[str] = tuple(PARTS),
+    warn: Warn = log_warning,
+) -> None:
     """Add keyframes of the parts (`flame.motion.PARTS`) of `frames` to the active actions of rig
-    and shape keys.
-
-    numbers: the Blender frame of each, ascending. A slider that the motion never moves gets a
-    single keyframe.
-    """
-    at = np.asarray(numbers)
+    and shape keys. at: the Blender frame of each, ascending. A slider that the motion never moves
+    gets one keyframe."""
     if "expression" in parts:
         values = np.stack([frame.expr for frame in frames])
-        curves = action_curves(head.data.shape_keys)
-        for component, column in enumerate(values.T):
-            path = key_value_path(expression_key(head, component))
-            keyed = slice(None) if column.any() else slice(1)
-            write_curve(curves, path, 0, at[keyed], column[keyed])
+        names = (expression_key(head, component) for component in range(values.shape[1]))
+        _key_values(head.data.shape_keys, dict(enumerate(map(key_value_path, names))), at, values)
         if np.abs(values).max(initial=0.0) > MAX_SLIDER:
             row, component = np.unravel_index(np.abs(values).argmax(), values.shape)
             warn(
@@ -116,16 +116,17 @@ def key_motion(
             )
     for bone in bones_of(parts):
         turns = np.stack([frame.pose[JOINTS.index(bone)] for frame in frames])
-        key_turns(rig, bone, numbers, turns)
+        write_curves(rig, rotation_path(bone), at, continuous(from_axis_angle(turns)))
     if "head" in parts:
         translations = np.stack([frame.translation for frame in frames])
-        write_curves(action_curves(rig), location_path("root"), at, translations)
+        write_curves(rig, location_path("root"), at, translations)
 
 
-def key_turns(rig: Any, bone: str, numbers: Sequence[int], turns: np.ndarray) -> None:
-    """Keyframe a bone's rotation, axis-angle (T, 3), at the frames `numbers`."""
-    turned = continuous(from_axis_angle(turns))
-    write_curves(action_curves(rig), rotation_path(bone), numbers, turned)
+def _key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:
+    """Keyframe columns of values (T, C) at their paths; one that stays 0 once."""
+    for column, path in paths.items():
+        keyed = slice(None if values[:, column].any() else 1)
+        write_curves(owner, path, at[keyed], values[keyed, column])
 
 
 def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
@@ -137,26 +138,34 @@ def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
             raise StgaError(f"{owner.name}: the rotation mode of bone {name} must be Quaternion")
 
 
-def start_action(owner: Any, name: str, replaces: Callable[[str], bool], as_strip: bool) -> None:
-    """Give `owner` a new action: with the old one as a strip, or a copy less replaced curves."""
-    if as_strip:
-        push_down_action(owner)
-        (owner.animation_data or owner.animation_data_create()).action = bpy.data.actions.new(name)
-        return
-    curves = copy_action(owner, name)
-    for curve in [curve for curve in curves if replaces(curve.data_path)]:
-        curves.remove(curve)
+@contextmanager
+def new_actions(
+    owners: Sequence[Any], name: str, replaces: Callable[[str], bool], as_strip: bool
+) -> Iterator[None]:
+    """Keyframe `owners` in new actions: copies less the replaced curves, or strips on the old."""
+    for owner in owners:
+        title = f"{owner.name} {name}"
+        if as_strip:
+            push_down_action(owner)
+            animation = owner.animation_data or owner.animation_data_create()
+            animation.action = bpy.data.actions.new(title)
+            continue
+        curves = copy_action(owner, title)
+        for curve in [curve for curve in curves if replaces(curve.data_path)]:
+            curves.remove(curve)
+    yield
+    for owner in owners:
+        owner.animation_data.action.use_fake_user = True
+        if as_strip:
+            push_down_action(owner, extrapolation="NOTHING")
 
 
 def key_tracked_offsets(
-    head: Any, rig: Any, sequence: FlameSequence, frames: Sequence[FlameFrame],
-    numbers: Sequence[float],
-) -> None:  # fmt: skip
-    """Keyframe the tracked per-frame offsets of mesh and joints.
-
-    sequence: the one that the head was imported from, with its frames; numbers: the Blender frame
-    of each, ascending.
-    """
+    head: Any, rig: Any, sequence: FlameSequence, numbers: Sequence[float]
+) -> None:
+    """Keyframe the per-frame offsets of mesh and joints of the sequence that the head was imported
+    from; numbers: the Blender frame of each timestep, ascending."""
+    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     paths = [key_value_path(offset_key(timestep)) for timestep in sequence.timesteps]
     write_triangle_curves(head.data.shape_keys, paths, numbers)
     displacement = np.zeros((len(frames), len(JOINTS), 3))
@@ -165,17 +174,16 @@ def key_tracked_offsets(
             displacement[row] = joint_positions(sequence.model, frame.dynamic_offset)
     for joint, name in enumerate(JOINTS):
         path = property_path(offset_property(name))
-        write_curves(action_curves(rig), path, numbers, displacement[:, joint])
+        write_curves(rig, path, numbers, displacement[:, joint])
 
 
 def key_zero_offsets(head: Any, rig: Any, frame: int) -> None:
     """Keyframe tracked per-frame offsets of mesh and joints to zero from `frame` on."""
     for key in offset_keys(head):
-        curves = action_curves(head.data.shape_keys)
-        write_curve(curves, key_value_path(key.name), 0, [frame], np.zeros(1))
+        write_curves(head.data.shape_keys, key_value_path(key.name), [frame], np.zeros(1))
     for name in map(offset_property, JOINTS):
         if name in rig:
-            write_curves(action_curves(rig), property_path(name), [frame], np.zeros((1, 3)))
+            write_curves(rig, property_path(name), [frame], np.zeros((1, 3)))
 
 
 def key_current_pose(head: Any, rig: Any, frame: int) -> None:
@@ -199,3 +207,107 @@ def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
     """The data-blocks in whose actions the parts are keyframed: rig, shape keys, or both."""
     in_rig = set(parts) & set(PART_JOINTS) or ("expression" in parts and offset_keys(head))
     return ([rig] if in_rig else []) + ([head.data.shape_keys] if "expression" in parts else [])
+
+
+ARKIT_MAP = "stga_arkit_map"
+"""Property of a FLAME head that was given the shapes: parameters (expression, jaw, eyes) by
+feature of their weights (`head_map.features`)."""
+NEGLIGIBLE_M = 1e-5  # displacement of a product of two shapes that gets no shape key
+
+
+def has_shapes(head: Any) -> bool:
+    """Whether a FLAME head was given ARKit's shapes."""
+    return ARKIT_MAP in head
+
+
+def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements (52, V, 3) of a person's neutral mesh by each shape at 1, and (PRODUCTS, V, 3)
+    by what each of PRODUCTS at 1 adds to jawOpen at 1, or takes from it; meters."""
+    open_jaw = np.eye(COUNT)[JAW_OPEN]
+    weights = np.concatenate([np.zeros((1, COUNT)), np.eye(COUNT), np.eye(COUNT)[PRODUCTS]])
+    weights[1 + COUNT :] += open_jaw
+    frames = found.frames(Performance(np.arange(len(weights)), weights, None, 1.0))
+    person = partial(flame_forward, sequence.model, sequence.shape)
+    meshes = np.stack([person(frame, sequence.static_offset) for frame in frames])
+    alone, pairs = meshes[1 : 1 + COUNT] - meshes[0], meshes[1 + COUNT :] - meshes[0]
+    pairs = pairs - alone[PRODUCTS] - alone[JAW_OPEN]
+    pairs[PRODUCTS == JAW_OPEN] = 0
+    return alone, pairs
+
+
+def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) -> None:
+    """Give a FLAME head the shape keys of `head_shapes`, beside its own animation; those of
+    products are driven. Sliders that it has already keep their values and keyframes."""
+    keys = head.data.shape_keys
+    basis = key_points(keys.reference_key)
+    named = list(zip(ARKIT_SHAPES, alone, strict=True))
+    named += [
+        (f"{ARKIT_SHAPES[column]} * jawOpen", displacement)
+        for column, displacement in zip(PRODUCTS.tolist(), pairs, strict=True)
+        if np.abs(displacement).max() > NEGLIGIBLE_M
+    ]
+    for name, displacement in named:
+        key = keys.key_blocks.get(name)
+        if key is None:
+            key = head.shape_key_add(name=name, from_mix=False)
+            key.value = 0.0  # a key made from a script starts at 1
+            factors = [(keys, key_value_path(factor)) for factor in name.split(" * ")]
+            if len(factors) == 2:
+                variables = dict(zip("ab", factors, strict=True))
+                add_driver(keys, key_value_path(name), -1, "a*b", variables)
+        key.points.foreach_set("co", flat_floats(basis + displacement))
+    rows = np.zeros((len(found.expressions), found.expressions.shape[1] + 9))
+    rows[:, :-9] = found.expressions
+    rows[:COUNT, -9:] = np.concatenate([found.jaw, found.eyes], axis=1)
+    head[ARKIT_MAP] = rows.ravel().tolist()
+
+
+def shape_parameters(head: Any) -> np.ndarray | None:
+    """(E + 9,) expression, and axis-angles of jaw and eyes, that the sliders of `add_shapes` stand
+    for; None without them."""
+    if not has_shapes(head):
+        return None
+    keys = head.data.shape_keys.key_blocks
+    weights = np.array([[keys[name].value if name in keys else 0.0 for name in ARKIT_SHAPES]])
+    found = features(weights)[0]
+    return np.asarray(found @ np.reshape(head[ARKIT_MAP], (len(found), -1)))
+
+
+def key_shapes(head: Any, start: int, weights: np.ndarray) -> None:
+    """Add keyframes of weights (T, 52), one row per Blender frame from `start` on, to the action of
+    a head's shape keys."""
+    paths = {column: key_value_path(name) for name, column in COLUMN.items()}
+    _key_values(head.data.shape_keys, paths, np.arange(start, start + len(weights)), weights)
+
+
+def shape_key_names(head: Any) -> dict[int, str]:
+    """Column of the 52 -> shape key that has its name in any spelling."""
+    keys = head.data.shape_keys if head.type == "MESH" else None
+    blocks = [] if keys is None else [block.name for block in keys.key_blocks[1:]]
+    return {COLUMN[name]: block for block in reversed(blocks) if (name := arkit_name(block))}
+
+
+def apply_weights(
+    owner: Any,
+    paths: dict[int, str],
+    weights: np.ndarray,
+    start: int,
+    name: str,
+    as_strip: bool = False,
+) -> None:
+    """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T,
+    52), one row per Blender frame from `start` on. The previous animation is kept as
+    `rig.motion.apply_motion` keeps it. Raises StgaError as `check_keyable` does."""
+    check_keyable(owner)
+    with new_actions([owner], name, set(paths.values()).__contains__, as_strip):
+        _key_values(owner, paths, np.arange(start, start + len(weights)), weights)
+
+
+def checked_shape_keys(head: Any) -> dict[int, str]:
+    """Column -> data path of the keys with ARKit names. Raises StgaError without any."""
+    names = shape_key_names(head)
+    if not names:
+        raise StgaError(
+            f"{head.name}: has neither a FLAME rig nor shape keys with ARKit's names (jawOpen)"
+        )
+    return {column: key_value_path(name) for column, name in names.items()}

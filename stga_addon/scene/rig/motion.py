@@ -17,30 +17,12 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
 from ..arrays import evaluated_vertices, key_points
-from ..blend_file import iterate_frames
-from ..compat import push_down_action
-from ..objects import Warn, log_warning
-from .arkit import has_shapes, key_shapes, shape_key_names, shape_parameters
-from .flame_rig import rig_of
-from .keyframes import (
-    OFFSET_KEY,
-    animated_by,
-    check_keyable,
-    expression_key,
-    expression_keys,
-    is_of_parts,
-    key_motion,
-    key_tracked_offsets,
-    key_zero_offsets,
-    offset_keys,
-    offset_property,
-    parent_bone,
-    slider_components,
-    start_action,
-)
+from ..objects import Warn, iterate_frames, log_warning
+from . import keyframes
+from .head import rig_of
+from .keyframes import OFFSET_KEY
 
-MESH_TOLERANCE = 1e-4
-"""Metres that the mesh may differ from FLAME's of the sampled parameters."""
+MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sampled parameters
 
 
 def apply_motion(
@@ -65,35 +47,31 @@ def apply_motion(
     or one that cannot take the motion; nothing is changed then.
     """
     rig = rig_of(head)
-    check_keyable(rig, JOINTS)
-    check_keyable(head.data.shape_keys)
+    keyframes.check_keyable(rig, JOINTS)
+    keyframes.check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0)
     for component in np.flatnonzero(used).tolist() if "expression" in parts else ():
-        if (key := expression_key(head, component)) not in head.data.shape_keys.key_blocks:
+        key = keyframes.expression_key(head, component)
+        if key not in head.data.shape_keys.key_blocks:
             raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
     # Coefficients of the sliders that the motion lacks are zero.
-    sliders = len(expression_keys(head))
+    sliders = len(keyframes.expression_keys(head))
     frames = [
         replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
         for each in frames
     ]
-    owners = animated_by(head, rig, parts)
-    for owner in owners:
-        start_action(owner, f"{owner.name} {name}", lambda path: is_of_parts(path, parts), as_strip)
-    key_motion(head, rig, range(start, start + len(frames)), frames, parts, warn)
-    if "expression" in parts and has_shapes(head):
-        key_shapes(head, start, np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights)
-    if "expression" in parts and offset_keys(head):
-        if tracked is None:
-            key_zero_offsets(head, rig, start)
-        else:
-            sequence, numbers = tracked
-            own_frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-            key_tracked_offsets(head, rig, sequence, own_frames, numbers)
-    for owner in owners:
-        owner.animation_data.action.use_fake_user = True
-        if as_strip:
-            push_down_action(owner, extrapolation="NOTHING")
+    owners = keyframes.animated_by(head, rig, parts)
+    at = np.arange(start, start + len(frames))
+    with keyframes.new_actions(owners, name, lambda p: keyframes.is_of_parts(p, parts), as_strip):
+        keyframes.key_motion(head, rig, at, frames, parts, warn)
+        if "expression" in parts and keyframes.has_shapes(head):
+            still = np.zeros((1, len(ARKIT_SHAPES)))
+            keyframes.key_shapes(head, start, still if weights is None else weights)
+        if "expression" in parts and keyframes.offset_keys(head):
+            if tracked is None:
+                keyframes.key_zero_offsets(head, rig, start)
+            else:
+                keyframes.key_tracked_offsets(head, rig, *tracked)
 
 
 def sample_motion(
@@ -107,14 +85,12 @@ def sample_motion(
     the scene: another modifier, a sculpted key, a scaled bone. Raises StgaError where the head has
     no rig.
     """
-    rig = rig_of(head)
     frames: list[FlameFrame] = []
-    shape, largest_error = sequence.shape, 0.0
+    shape, largest_error = sequence.shape.copy(), 0.0
     for _ in iterate_frames(numbers):
-        frame = _sample_frame(head, rig, sequence.model)
+        frame = sample_pose(head, sequence.model)
         if not frames:
-            shape = shape.copy()
-            for name, component in slider_components(sequence.model).items():
+            for name, component in keyframes.slider_components(sequence.model).items():
                 if component < sequence.model.n_identity:
                     shape[component] += _key_value(head, name)
         vertices = flame_forward(sequence.model, shape, frame, sequence.static_offset)
@@ -132,22 +108,19 @@ def sample_motion(
 
 def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
     """FLAME parameters of the head as posed now, keyed or not. Raises StgaError without a rig."""
-    return _sample_frame(head, rig_of(head), model)
-
-
-def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
-    bones = rig.evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones
+    bones = rig_of(head).evaluated_get(bpy.context.evaluated_depsgraph_get()).pose.bones
     rotations = {name: bones[name].matrix.to_3x3().normalized() for name in JOINTS}
     vectors = {}
     for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):
         above = rotations[JOINTS[parent]].transposed() if parent >= 0 else Matrix.Identity(3)
         vectors[name] = to_axis_angle(np.array((above @ rotations[name]).to_quaternion()))
-    root, above = bones["root"], bones.get(parent_bone("root"))
+    root, above = bones["root"], bones.get(keyframes.parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
-    expr = np.array([_key_value(head, expression_key(head, k)) for k in range(model.n_expression)])
+    names = [keyframes.expression_key(head, k) for k in range(model.n_expression)]
+    expr = np.array([_key_value(head, name) for name in names])
     offsets = [
         value * (key_points(key) - key_points(key.relative_key))
-        for key in offset_keys(head)
+        for key in keyframes.offset_keys(head)
         if (value := _key_value(head, key.name))
     ]
     return FlameFrame(
@@ -164,8 +137,7 @@ def _sample_frame(head: Any, rig: Any, model: FlameModel) -> FlameFrame:
 def _with_shapes(head: Any, expr: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
     """The expression with what ARKit's sliders add to it; turns of jaw and eyes are exchanged for
     those with them."""
-    found = shape_parameters(head)
-    if found is None:
+    if (found := keyframes.shape_parameters(head)) is None:
         return expr
     for joint, row in zip(("jaw", "left_eye", "right_eye"), (-9, -6, -3), strict=True):
         own = np.array([found[row : row + 3 or None], turns[joint]])
@@ -185,9 +157,7 @@ WEIGHT_RANGE = (-1.0, 2.0)
 
 class LivePose:
     """What a head's sliders, bones and controls held before, and how live values are set on them.
-
-    Objects are looked up by name each time: references to them do not survive undo.
-    """
+    Objects are looked up by name each time: references to them do not survive undo."""
 
     def __init__(self, head: Any, rig: Any) -> None:
         """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
@@ -199,17 +169,17 @@ class LivePose:
         self._values = self._sliders.copy()
         names = [key.name for key in keys]
         if rig is None:
-            named = shape_key_names(head).items()
+            named = keyframes.shape_key_names(head).items()
             self._rows = {column: names.index(name) for column, name in named}
             return
-        own = expression_keys(head)
-        still = {*own, *(ARKIT_SHAPES if has_shapes(head) else ())}
+        own = keyframes.expression_keys(head)
+        still = {*own, *(ARKIT_SHAPES if keyframes.has_shapes(head) else ())}
         self._values[[name in still or name.startswith(OFFSET_KEY) for name in names]] = 0.0
         self._rows = dict(enumerate(map(names.index, own)))
         bones = rig.pose.bones
         self._turns = {joint: tuple(bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
-        self._offsets = [name for joint in JOINTS if (name := offset_property(joint)) in rig]
-        self._properties: dict[str, Any] = {name: tuple(rig[name]) for name in self._offsets}
+        offsets = [name for name in map(keyframes.offset_property, JOINTS) if name in rig]
+        self._offsets: dict[str, Any] = {name: tuple(rig[name]) for name in offsets}
 
     @property
     def is_there(self) -> bool:
@@ -225,7 +195,8 @@ class LivePose:
             self._values[row] = frame.expr[component] if component < len(frame.expr) else 0.0
         self._set_sliders(self._values)
         turns = [frame.neck_pose, frame.jaw_pose, frame.eyes_pose[:3], frame.eyes_pose[3:]]
-        self._set_turns(dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True)))
+        turned = dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True))
+        self._set_bones(turned, dict.fromkeys(self._offsets, (0.0, 0.0, 0.0)))
 
     def set_weights(self, weights: Sequence[float] | np.ndarray) -> None:
         """Set the 52 weights on the shape keys of a head without a rig."""
@@ -238,10 +209,7 @@ class LivePose:
         """Give back what was there before the first live pose."""
         self._set_sliders(self._sliders)
         if self._rig is not None:
-            rig = bpy.data.objects[self._rig]
-            for name, value in self._properties.items():
-                rig[name] = value
-            self._set_turns(self._turns, clear_offsets=False)
+            self._set_bones(self._turns, self._offsets)
 
     def _set_sliders(self, values: np.ndarray) -> None:
         mesh = bpy.data.objects[self._head].data
@@ -249,17 +217,16 @@ class LivePose:
         mesh.shape_keys.update_tag()
         mesh.update_tag()
 
-    def _set_turns(self, turns: dict[str, Any], clear_offsets: bool = True) -> None:
+    def _set_bones(self, turns: dict[str, Any], offsets: dict[str, Any]) -> None:
         rig = bpy.data.objects[self._rig]
         for joint, quaternion in turns.items():
             rig.pose.bones[joint].rotation_quaternion = quaternion
-        for name in self._offsets if clear_offsets else ():
-            rig[name] = (0.0, 0.0, 0.0)
+        for name, value in offsets.items():
+            rig[name] = value
         rig.update_tag()
 
 
-TRAINED = "stga_trained"
-"""Property of the head: the arrays of a `TrainedRange`, by field and part."""
+TRAINED = "stga_trained"  # property of the head: the arrays of a `TrainedRange`, by field and part
 FIELDS = ("middle", "width", "quiet", "first")
 
 
@@ -284,7 +251,7 @@ def stored_range(head: Any) -> TrainedRange | None:
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     """Part -> how far outside the range the head is as it is posed now (`transfer.outside`)."""
     keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
-    names = [expression_key(head, k) for k in range(len(trained.middle["face"]))]
+    names = [keyframes.expression_key(head, k) for k in range(len(trained.middle["face"]))]
     expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
     turns = {
         bone: to_axis_angle(np.array(bones[bone].rotation_quaternion))

@@ -9,7 +9,6 @@ from ...capture.transforms import MAX_NUMBER, SPLITS, frame_rate, inside, read_t
 from ...errors import StgaError, shorten
 from ...files import read_json
 from .colmap import find_colmap, read_colmap
-from .lens import Lens
 from .photogrammetry import (
     ImageSize,
     is_metashape,
@@ -18,7 +17,7 @@ from .photogrammetry import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from .shots import Shot
+from .shots import Lens, Shot
 
 TRANSFORMS = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
 EXPECTED = (

@@ -10,8 +10,7 @@ import numpy as np
 from ...errors import StgaError, shorten
 from ...files import read_bytes
 from ...flame.quaternions import to_matrices
-from .lens import Lens
-from .shots import Shot, numbers, pinhole, read_text
+from .shots import Lens, Shot, numbers, pinhole, read_text
 from .sources import natural_order
 
 _Camera = tuple[int, tuple[str, tuple[int, int], Sequence[float]]]
@@ -61,13 +60,12 @@ def read_colmap(folder: Path) -> list[Shot]:
     """
     suffix = _suffix(folder)
     if suffix is None:
-        raise StgaError(
-            f"{folder}: is no COLMAP model; expected cameras.bin and images.bin, or .txt"
-        )
+        expected = "expected cameras.bin and images.bin, or .txt"
+        raise StgaError(f"{folder}: is no COLMAP model; {expected}")
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
-    binary, shots = suffix == ".bin", []
-    cameras = dict((_binary_cameras if binary else _text_cameras)(cameras_file))
-    images = (_binary_images if binary else _text_images)(images_file)
+    text = _text_cameras, _text_images
+    read_cameras, read_images = text if suffix == ".txt" else (_binary_cameras, _binary_images)
+    cameras, images, shots = dict(read_cameras(cameras_file)), read_images(images_file), []
     for name, pose, camera in sorted(images, key=lambda image: natural_order(image[0])):
         where = f"{images_file}: image {shorten(name)}"
         if camera not in cameras:
@@ -100,9 +98,8 @@ def _split(
         raise StgaError(f"{where}: model {shorten(model)} is not one of {', '.join(LENSES)}")
     _, focals, count, lens = LENSES[model]
     if len(values) != focals + 2 + count:
-        raise StgaError(
-            f"{where}: expected {focals + 2 + count} parameters of {model}, not {len(values)}"
-        )
+        expected = f"{focals + 2 + count} parameters of {model}"
+        raise StgaError(f"{where}: expected {expected}, not {len(values)}")
     *focal, cx, cy = values[: focals + 2]
     return (focal[0], focal[-1]), (cx, cy), lens(*values[focals + 2 :])
 
@@ -124,9 +121,8 @@ def _text_cameras(path: Path) -> Iterator[_Camera]:
         if not words:
             continue
         if len(words) < 5:
-            raise StgaError(
-                f"{where}: expected number, model, width, height and parameters of a camera"
-            )
+            expected = "number, model, width, height and parameters of a camera"
+            raise StgaError(f"{where}: expected {expected}")
         identity, width, height = (_whole(word, where) for word in (words[0], *words[2:4]))
         yield identity, (words[1], (width, height), numbers(words[4:], where))
 
@@ -139,9 +135,8 @@ def _text_images(path: Path) -> Iterator[_Image]:
         if not words:
             continue
         if len(words) < 10:
-            raise StgaError(
-                f"{where}: expected number, quaternion, translation, camera and name of an image"
-            )
+            expected = "number, quaternion, translation, camera and name of an image"
+            raise StgaError(f"{where}: expected {expected}")
         yield words[9], numbers(words[1:8], where, 7), _whole(words[8], where)
         next(lines, None)
 
@@ -188,9 +183,8 @@ def _binary_cameras(path: Path) -> Iterator[_Camera]:
     for _ in range(int(cursor.unpack("Q")[0])):
         identity, model, width, height = (int(value) for value in cursor.unpack("IiQQ"))
         if model not in names:
-            raise StgaError(
-                f"{path}: camera {identity}: model {model} is not one of {', '.join(LENSES)}"
-            )
+            known = ", ".join(LENSES)
+            raise StgaError(f"{path}: camera {identity}: model {model} is not one of {known}")
         _, focals, count, _ = LENSES[names[model]]
         yield identity, (names[model], (width, height), cursor.unpack(f"{focals + 2 + count}d"))
 

@@ -11,7 +11,7 @@ from ...capture.images import image_size, is_plain, read_image, read_mask
 from ...capture.model import View
 from ...errors import StgaError
 from ...files import replacing
-from .lens import Undistortion
+from .shots import Undistortion
 from .video import VideoFrames
 
 
@@ -34,10 +34,9 @@ class ImageFrames:
             width, height = image_size(view.image)
             expected = view.camera.width, view.camera.height
             if (width, height) != expected:
-                raise StgaError(
-                    f"{view.image}: has {width} x {height} pixels at timestep {timestep}, "
-                    f"but camera {name} has {expected[0]} x {expected[1]}"
-                )
+                has = f"{width} x {height} pixels at timestep {timestep}"
+                needed = f"camera {name} has {expected[0]} x {expected[1]}"
+                raise StgaError(f"{view.image}: has {has}, but {needed}")
 
     def image(self, timestep: int) -> np.ndarray:
         return read_image(self.views[timestep])

@@ -15,10 +15,9 @@ from ...capture.model import View
 from ...errors import StgaError
 from .calibrations import EXPECTED, find_calibration, read_calibration
 from .focal_tags import photo_focal, video_focal
-from .lens import Lens, undistortion
 from .model import Footage, FootageCamera, Frames, ImageFrames
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
-from .shots import Shot
+from .shots import Lens, Shot, undistortion
 from .sources import (
     Sources,
     find_sources,
@@ -28,7 +27,7 @@ from .sources import (
     sequence_names,
     still_image,
 )
-from .video import Video, VideoFrames, video_size
+from .video import Video, VideoFrames, first_frames
 
 ALL_FRAMES = FrameRange()
 USUAL_VIEW_DEG = 65.0
@@ -87,12 +86,11 @@ def _calibrated(
 ) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
-    if (frames.offsets or frames.sync != "none") and not any(names):
-        raise StgaError(
-            f"{calibration}: lists images, which offsets do not apply to; expected none"
-        )
     if any(names):
         return _rig(sources, _by_name(shots, names, sources.root), frames)
+    if frames.offsets or frames.sync != "none":
+        lists = "lists images, which offsets do not apply to; expected none"
+        raise StgaError(f"{calibration}: {lists}")
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
     listed = _listed_cameras(chosen if timed else _with_stills(shots, sources), calibration)
@@ -113,12 +111,11 @@ def _masked(
     camera: FootageCamera, recorded: Sources, given: Sources, single: bool
 ) -> FootageCamera:
     """The camera with masks of a folder. single: it needs no folder of its own."""
-    names, frames, masks = [camera.name, ""] if single else [camera.name], camera.frames, {}
-    by_number = {
-        frame_number(path): path for name in reversed(names) for path in given.folders.get(name, [])
-    }
+    frames, masks = camera.frames, {}
+    files = [*(given.folders.get("", []) if single else ()), *given.folders.get(camera.name, [])]
+    by_number = {frame_number(path): path for path in files}
     for timestep in camera.timesteps:
-        source = Path(camera.source(timestep))
+        source = Path(frames.source(timestep))
         if isinstance(frames, VideoFrames):
             expected = f"{camera.name}/{frames.numbers[timestep]:05d}"
             path = by_number.get(frames.numbers[timestep])
@@ -127,9 +124,7 @@ def _masked(
             expected = recorded.name_of(source) if inside else source.stem
             path = next(iter(given.images.get(expected) or given.masks.get(expected, [])), None)
         if path is None:
-            raise StgaError(
-                f"{given.root}: has no matte of {camera.source(timestep)}; expected {expected}.png"
-            )
+            raise StgaError(f"{given.root}: has no matte of {source}; expected {expected}.png")
         masks[timestep] = View(timestep, 0, camera.camera, camera.name, source, path)
     if isinstance(frames, VideoFrames):
         return replace(camera, frames=VideoFrames(frames.video, frames.numbers, masks))
@@ -145,15 +140,11 @@ def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str
     found: dict[str, Shot] = {}
     for shot, name in zip(shots, names, strict=True):
         if name is None:
-            raise StgaError(
-                f"{shot.where}: {root} has no folder or video of this camera, "
-                "though it has of others"
-            )
+            missing = "has no folder or video of this camera, though it has of others"
+            raise StgaError(f"{shot.where}: {root} {missing}")
         if name in found:
-            raise StgaError(
-                f"{shot.where}: and {found[name].where} are both of camera {name}; "
-                "expected different names"
-            )
+            same = f"are both of camera {name}; expected different names"
+            raise StgaError(f"{shot.where}: and {found[name].where} {same}")
         found[name] = shot
     return found
 
@@ -166,9 +157,8 @@ def _rig(
 ) -> Footage:
     """opened: the sequences, where they are."""
     sequences = opened or {name: open_sequence(sequence_files(sources, name)) for name in shots}
-    warnings = tuple(
-        warning for own in sequences.values() if isinstance(own, Video) for warning in own.warnings
-    )
+    videos = [own for own in sequences.values() if isinstance(own, Video)]
+    warnings = [warning for video in videos for warning in video.warnings]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
     cameras = tuple(_camera(name, shots[name], recorded[name]) for name in shots)
     return _footage(sources.root, cameras, fps, (*warnings, *sentences))
@@ -186,9 +176,8 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
     names, root = sorted({*sources.videos, *sources.folders}), sources.root
     if len(names) != 1:
         found = f"{len(names)} cameras" if names else "neither images nor videos"
-        raise StgaError(
-            f"{root}: has {found} and no calibration; expected {EXPECTED}, or one camera"
-        )
+        expected = f"expected {EXPECTED}, or one camera"
+        raise StgaError(f"{root}: has {found} and no calibration; {expected}")
     sequence, known = open_sequence(sequence_files(sources, names[0])), "given"
     width, height = sequence_size(sequence)
     if focal is None:
@@ -224,10 +213,8 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     for shot in shots:
         other = poses.setdefault(_pose(shot), shot)
         if other is not shot:
-            raise StgaError(
-                f"{shot.where}: has the pose of {other.label}; "
-                "expected a timestep_index, or one image of each camera"
-            )
+            expected = "expected a timestep_index, or one image of each camera"
+            raise StgaError(f"{shot.where}: has the pose of {other.label}; {expected}")
         listed = shot.image if shot.image is not None and isfile(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
         inside = image.is_relative_to(sources.root)
@@ -243,7 +230,7 @@ def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     if name is None:
         return image_size(still_image(sources, label, f"camera {label}"))
     files = sequence_files(sources, name)
-    return video_size(files) if isinstance(files, Path) else image_size(files[0])
+    return first_frames(files)[0] if isinstance(files, Path) else image_size(files[0])
 
 
 def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera, ...]:
@@ -261,9 +248,8 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
     for name, group in zip(names, groups.values(), strict=True):
         unique = name if names.count(name) == 1 else f"{name} at timestep {group[0].timestep}"
         if unique in (camera.name for camera in cameras):
-            raise StgaError(
-                f"{group[0].where}: two cameras are named {unique}; expected different names"
-            )
+            same = f"two cameras are named {unique}; expected different names"
+            raise StgaError(f"{group[0].where}: {same}")
         cameras.append(_camera(unique, group[0], ImageFrames(_views(unique, group))))
     return tuple(cameras)
 

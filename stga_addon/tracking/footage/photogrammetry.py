@@ -11,8 +11,7 @@ import numpy as np
 
 from ...capture.camera import GL_TO_CV, MAX_FOCAL_PIXELS
 from ...errors import StgaError, shorten
-from .lens import Lens
-from .shots import Shot, numbers, pinhole, read_text, read_xml
+from .shots import Lens, Shot, numbers, pinhole, read_text, read_xml
 
 PROJECTIONS = {"frame": "perspective", "fisheye": "fisheye"}  # Metashape's
 FILM_WIDTH_MM = 36.0
@@ -48,10 +47,8 @@ def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
     aligned = [camera for camera in cameras if camera.find("transform") is not None]
     components = {camera.get("component_id") for camera in aligned}
     if len(components) > 1:
-        raise StgaError(
-            f"{path}: its cameras are in {len(components)} components; "
-            "expected one alignment of all"
-        )
+        parts = f"its cameras are in {len(components)} components"
+        raise StgaError(f"{path}: {parts}; expected one alignment of all")
     for camera in aligned:
         label, number = camera.get("label") or "", camera.get("sensor_id")
         where = f"{path}: camera {shorten(label)}"
@@ -75,9 +72,8 @@ def _sensor(
     adjusted = (c for c in found if c.get("class") == "adjusted")
     calibration = next(adjusted, found[-1] if found else None)
     if calibration is None or calibration.find("f") is None:
-        raise StgaError(
-            f"{where}: has no calibration with f; align the cameras and export them again"
-        )
+        missing = "no calibration with f; align the cameras and export them again"
+        raise StgaError(f"{where}: has {missing}")
     kind = calibration.get("type") or sensor.get("type")
     if kind not in PROJECTIONS:
         raise StgaError(f"{where}: type {shorten(kind)} is not one of {', '.join(PROJECTIONS)}")
@@ -92,10 +88,8 @@ def _sensor(
         return numbers([calibration.findtext(name, "0")], f"{where}: {name}", 1)[0]
 
     if value("p3") or value("p4"):
-        raise StgaError(
-            f"{where}: p3 and p4 are not supported; optimize the cameras without them and "
-            "export again"
-        )
+        unknown = "p3 and p4 are not supported"
+        raise StgaError(f"{where}: {unknown}; optimize the cameras without them and export again")
     focal = value("f")
     if not 1 <= focal <= MAX_FOCAL_PIXELS:
         raise StgaError(f"{where}: f: expected a focal length of 1 to 1e7 pixels, not {focal:g}")
@@ -133,10 +127,8 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     columns = _columns(rows[0][1]) if rows else []
     missing = [name for name in REQUIRED_COLUMNS if name not in columns]
     if missing:
-        raise StgaError(
-            f"{path}: has no column {', '.join(missing)}; "
-            "expected internal and external camera parameters"
-        )
+        expected = "expected internal and external camera parameters"
+        raise StgaError(f"{path}: has no column {', '.join(missing)}; {expected}")
     shots = []
     for number, line in rows[1:]:
         where = f"{path}: line {number}"
@@ -184,11 +176,9 @@ def _columns(names: Iterable[str]) -> list[str]:
 
 def _turn(axis: int, angle: float) -> np.ndarray:
     """Rotation (3, 3) by `angle` radians about axis 0, 1 or 2."""
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    matrix = np.eye(3)
-    matrix[first, first] = matrix[second, second] = np.cos(angle)
-    matrix[second, first], matrix[first, second] = np.sin(angle), -np.sin(angle)
-    return matrix
+    cos, sin = np.cos(angle), np.sin(angle)
+    about_x = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    return np.roll(about_x, (axis, axis), (0, 1))
 
 
 def _xmp_shot(path: Path, fields: dict[str, str], size: tuple[int, int]) -> Shot:

@@ -59,22 +59,22 @@ def find_sources(root: Path) -> Sources:
         names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
         count += len(files)
         if count > MAX_FILES:
-            raise StgaError(
-                f"{root}: holds more than {MAX_FILES} files; expected a folder of footage"
-            )
-        for path in (Path(folder, name) for name in sorted(files, key=natural_order)):
+            many = f"more than {MAX_FILES} files; expected a folder of footage"
+            raise StgaError(f"{root}: holds {many}")
+        visible = (name for name in files if not name.startswith("."))
+        for path in (Path(folder, name) for name in sorted(visible, key=natural_order)):
             key, suffix = sources.name_of(path), path.suffix.lower()
             first, _, rest = path.relative_to(root).as_posix().partition("/")
             name = rest.rpartition(".")[0]
-            if path.name.startswith("."):
-                continue
             if suffix in VIDEO_SUFFIXES:
                 sources.videos.setdefault(key, []).append(path)
-            elif suffix in IMAGE_SUFFIXES and first in MASK_FOLDERS:
+            elif suffix not in IMAGE_SUFFIXES:
+                continue
+            elif first in MASK_FOLDERS:
                 sources.masks.setdefault(_without_container(name), []).append(path)
-            elif suffix in IMAGE_SUFFIXES and first == PLATE_FOLDER:
+            elif first == PLATE_FOLDER:
                 sources.plates.setdefault(name, path)
-            elif suffix in IMAGE_SUFFIXES:
+            else:
                 sources.images.setdefault(key, []).append(path)
                 sources.folders.setdefault(key.rpartition("/")[0], []).append(path)
     return sources
@@ -102,13 +102,11 @@ def still_image(sources: Sources, label: str, where: str) -> Path:
     """The image of that name. Raises StgaError where there is none, or more than one."""
     found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
     if not found:
-        raise StgaError(
-            f"{where}: {sources.root} has no image, folder or video of the name {shorten(label)}"
-        )
+        missing = f"no image, folder or video of the name {shorten(label)}"
+        raise StgaError(f"{where}: {sources.root} has {missing}")
     if len(found) > 1:
-        raise StgaError(
-            f"{where}: {found[0]} and {found[1]} are both named {shorten(label)}; expected one"
-        )
+        both = f"{found[0]} and {found[1]} are both named {shorten(label)}"
+        raise StgaError(f"{where}: {both}; expected one")
     return found[0]
 
 
@@ -117,10 +115,8 @@ def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
     videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent
-        raise StgaError(
-            f"{videos[0]} and {other} are both named {shorten(name)}; "
-            "expected one video or folder a camera"
-        )
+        both = f"{videos[0]} and {other} are both named {shorten(name)}"
+        raise StgaError(f"{both}; expected one video or folder a camera")
     return videos[0] if videos else images
 
 

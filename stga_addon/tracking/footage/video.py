@@ -69,7 +69,7 @@ def read_video(path: Path) -> Video:
     Where the container says when packets are shown, only the first frames are decoded; otherwise,
     all are.
     """
-    size, first = _first_frames(path)
+    size, first = first_frames(path)
     times: Sequence[int | None] | None
     times, is_cut_off = _packet_times(path)
     left_out = 0 if times is None or first[0] not in times else times.index(first[0])
@@ -79,7 +79,7 @@ def read_video(path: Path) -> Video:
             times, left_out = [frame.pts for frame in _decoded_frames(container)], 0
     with opened_video(path) as container:
         stream = container.streams.video[0]
-        exact = _is_of(container, SEEKABLE_CONTAINERS) or _is_intra_only(stream)
+        exact = _is_of(container, SEEKABLE_CONTAINERS) or stream.codec_context.codec.intra_only
         seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
@@ -89,18 +89,11 @@ def read_video(path: Path) -> Video:
     shown = tuple(time for time in times[left_out:] if time is not None)
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     if left_out:
-        warnings += (
-            f"{path}: its first {left_out} frames cannot be decoded; "
-            "they are left out, and not counted",
-        )
+        fate = "cannot be decoded; they are left out, and not counted"
+        warnings += (f"{path}: its first {left_out} frames {fate}",)
     if is_cut_off:
         warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
     return Video(path, shown, timesteps, fps, size, warnings=warnings)
-
-
-def video_size(path: Path) -> tuple[int, int]:
-    """(width, height) as displayed. Raises StgaError as `read_video` does."""
-    return _first_frames(path)[0]
 
 
 class VideoFrames:
@@ -136,9 +129,8 @@ class VideoFrames:
             pixels = _pixels(self._frame(number))
         except (av.FFmpegError, ValueError) as error:
             self.close()
-            raise StgaError(
-                f"{self.source(timestep)}: cannot be decoded ({_reason(error)})"
-            ) from error
+            failed = f"cannot be decoded ({_reason(error)})"
+            raise StgaError(f"{self.source(timestep)}: {failed}") from error
         if timestep == self.timesteps[-1]:
             self.close()  # a decoder holds dozens of frames, and a rig has dozens of cameras
         return pixels
@@ -219,8 +211,9 @@ class VideoFrames:
             self._container.streams.video[0].thread_type = "AUTO"
 
 
-def _first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """Size as displayed and times of the first frames in the order shown. Raises StgaError."""
+def first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
+    """(width, height) as displayed, and times of the first frames in the order shown. Raises
+    StgaError as `read_video` does."""
     with opened_video(path) as container:
         frames = _decoded_frames(container)
         first = next(frames, None)
@@ -256,12 +249,12 @@ def _packet_times(path: Path) -> tuple[list[int] | None, bool]:
         stream = container.streams.video[0]
         timed = stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
         timed = timed and _is_of(container, TIMED_CONTAINERS)
-        if not (timed or _is_intra_only(stream)):
+        if not (timed or stream.codec_context.codec.intra_only):
             return None, False
         packets, is_cut_off = [], False
         for packet in container.demux(stream):
-            if _is_cut_off(container, packet):
-                is_cut_off = True
+            is_cut_off = _is_cut_off(container, packet)
+            if is_cut_off:
                 break
             if packet.size and not packet.is_discard:
                 packets.append(packet.pts)
@@ -313,10 +306,6 @@ def _ascending(times: Sequence[int | None]) -> bool:
 
 def _is_of(container: Any, formats: Sequence[str]) -> bool:
     return not set(formats).isdisjoint(container.format.name.split(","))
-
-
-def _is_intra_only(stream: Any) -> bool:
-    return bool(stream.codec_context.codec.intra_only)
 
 
 def _timed(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.strain import range_with_margin
+from ..optimize.image_preparation import fit_lines
 from .samples import Samples
 
 FOLDS = 4
@@ -33,16 +34,15 @@ RIDGE_WEIGHT = 1.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Root mean square errors, in levels of 255, of colors that a model was not fitted to: without
-    it and with it."""
+    """Root mean square errors, in levels of 255, without and with a model, of other colors than it
+    was fitted to."""
 
     before: float
     after: float
 
     @property
     def gain(self) -> float:
-        """Root mean square, in levels of 255, of the error that the model removes; 0 where it adds
-        error."""
+        """Root mean square, in levels of 255, of the error that it removes, or 0."""
         return math.sqrt(max(0.0, self.before**2 - self.after**2))
 
     @property
@@ -58,17 +58,15 @@ class Evidence:
 
 
 def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
-    """Evidence from the errors (…) on the same samples without and with a model; zero without
-    samples."""
-    if not before.size:
-        return Evidence(0.0, 0.0)
-    return Evidence(float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))))
+    """Evidence from the errors (…) on the same samples without and with a model."""
+    roots = (float(np.sqrt(np.mean(error**2))) if error.size else 0.0 for error in (before, after))
+    return Evidence(*roots)
 
 
 @dataclass(frozen=True)
 class CameraColors:
-    """Cameras (C,), and per camera and channel the gain (C, 3) and offset (C, 3), in levels, of its
-    images against the mean of all cameras, for which they are 1 and 0."""
+    """Cameras (C,), and their gain (C, 3) and offset (C, 3), in levels, of each channel against the
+    mean of all cameras, for which they are 1 and 0."""
 
     camera: np.ndarray
     gain: np.ndarray
@@ -87,26 +85,17 @@ def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
     fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
     for _ in range(CAMERA_FIT_ITERATIONS):
         mean = _mean(fitted.undo(color, samples.camera))
-        fits = [
-            _line(np.broadcast_to(mean, color[row == c].shape), color[row == c])
-            for c in range(len(camera))
-        ]
-        gain, offset = np.array([fit[0] for fit in fits]), np.array([fit[1] for fit in fits])
-        gain /= gain.mean(0)
-        fitted = CameraColors(camera, gain, offset - offset.mean(0))
+        fits = []
+        for number in range(len(camera)):
+            own = color[row == number].reshape(-1, 3)
+            x = np.broadcast_to(mean, color[row == number].shape).reshape(-1, 3)
+            known = ~np.isnan(own[:, 0]) & ~np.isnan(x[:, 0])
+            offset_prior = CAMERA_PRIOR_SAMPLES + OFFSET_PENALTY * known.sum()
+            prior = [[CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2], [offset_prior]]
+            fits.append(fit_lines(x[known].T, own[known].T, np.array(prior)))
+        gain, offset = np.stack(fits, axis=1)
+        fitted = CameraColors(camera, gain / gain.mean(0), offset - offset.mean(0))
     return fitted
-
-
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gain (3,) and offset (3,) of y ≈ gain·x + offset over the samples (…, 3) that are not NaN."""
-    x, y = x.reshape(-1, 3), y.reshape(-1, 3)
-    known = ~np.isnan(y[:, 0]) & ~np.isnan(x[:, 0])
-    x, difference = x[known], (y - x)[known]
-    xx, xo = (x**2).sum(0) + CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2, x.sum(0)
-    oo = len(x) * (1 + OFFSET_PENALTY) + CAMERA_PRIOR_SAMPLES
-    dx, do = (x * difference).sum(0), difference.sum(0)
-    determinant = xx * oo - xo**2
-    return 1 + (oo * dx - xo * do) / determinant, (xx * do - xo * dx) / determinant
 
 
 def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
@@ -114,15 +103,18 @@ def camera_evidence(samples: Samples, color: np.ndarray) -> Evidence:
     half = np.arange(len(samples.faces)) % 2 == 0
     fitted = fit_cameras(samples, np.where(half[:, None], color, np.nan))
     other = color[:, ~half]
-    return compare(_scatter(other), _scatter(fitted.undo(other, samples.camera)))
+    return _agreement(other, fitted.undo(other, samples.camera))
+
+
+def _agreement(before: np.ndarray, after: np.ndarray) -> Evidence:
+    """From the deviations of colors (S, K, 3), where known, from each triangle's mean."""
+    away = [color - _mean(color) for color in (before, after)]
+    return compare(*(each[~np.isnan(each)] for each in away))
 
 
 def stable_colors(color: np.ndarray) -> np.ndarray:
     """color (S, K, 3) of the half of the triangles with the least relative change of color, NaN for
-    the others.
-
-    Lids, lips and whatever the mesh does not follow change ten times as much as cameras differ.
-    """
+    the others: lids and lips change ten times as much as cameras differ."""
     mean = _mean(color)
     change = ((color - mean) / (mean + RELATIVE_CHANGE_BIAS_LEVELS)) ** 2
     seen = ~np.isnan(color[..., 0])
@@ -160,13 +152,7 @@ def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
             known, columns = samples.timestep[others], gain[others].T
             predicted[row] = [np.interp(timestep, known, column) for column in columns]
     other = color[:, ~half]
-    return compare(_scatter(other), _scatter(other / predicted[:, None]))
-
-
-def _scatter(color: np.ndarray) -> np.ndarray:
-    """Deviations from each triangle's mean of color (S, K, 3), where known."""
-    away = color - _mean(color)
-    return np.asarray(away[~np.isnan(away)])
+    return _agreement(other, other / predicted[:, None])
 
 
 Fold = tuple[np.ndarray, np.ndarray]
@@ -174,24 +160,17 @@ Fold = tuple[np.ndarray, np.ndarray]
 
 
 def scattered_folds(group: np.ndarray) -> list[Fold]:
-    """FOLDS folds of the groups (S,), of which each takes every fourth: for groups without an
-    order, as cameras are."""
-    groups = np.unique(group)
-    number = np.searchsorted(groups, group) % FOLDS
+    """Folds of every fourth of the groups (S,), which have no order, as cameras."""
+    groups, rank = np.unique(group, return_inverse=True)
+    number = rank % FOLDS
     return [(number == fold, number != fold) for fold in range(min(FOLDS, len(groups)))]
 
 
 def consecutive_folds(timestep: np.ndarray) -> list[Fold]:
-    """FOLDS folds of consecutive timesteps (S,); a model is not fitted to the timesteps directly
-    beside them either.
-
-    What changes slowly is alike in neighboring timesteps, so that they say nothing of unseen ones.
-    A fold that leaves nothing to fit is left out.
-    """
-    timesteps = np.unique(timestep)
-    order = np.searchsorted(timesteps, timestep)
-    count = min(FOLDS, len(timesteps))
-    folds = []
+    """FOLDS folds of consecutive timesteps (S,), without those that leave nothing to fit. A model
+    is not fitted to the timesteps beside them either, in which slow changes are alike."""
+    timesteps, order = np.unique(timestep, return_inverse=True)
+    count, folds = min(FOLDS, len(timesteps)), []
     for fold in range(count):
         held = order * count // len(timesteps) == fold
         fitted = (order < order[held].min() - 1) | (order > order[held].max() + 1)
@@ -207,12 +186,12 @@ def linear_evidence(
     max_error: float = np.inf,
     rest: np.ndarray | None = None,
 ) -> Evidence:
-    """Whether each triangle's color follows its features linearly, by cross-validation.
+    """Whether each triangle's color (S, K, 3), NaN where not seen, follows its features (S, K, D)
+    linearly, by cross-validation.
 
-    color (S, K, 3), NaN where not seen; features (S, K, D); folds: views that are held out, and
-    those that the model is fitted to meanwhile; errors of more than `max_error` times the median
-    are clipped to that; rest (K, D): features of views that are held out are clipped to the range,
-    with its margin, of those that the model was fitted to, as an avatar's strain is.
+    Errors of more than `max_error` times the median are clipped to that; rest (K, D): features of
+    views that are held out are clipped to the range, with its margin, of those that the model was
+    fitted to, as an avatar's strain is.
     """
     before, after = [], []
     for held, fitted in folds:
@@ -236,10 +215,10 @@ def linear_evidence(
         known = ~np.isnan(error)
         before.append(error[known])
         after.append((error - predicted)[known])
-    errors = np.abs(np.concatenate([[], *before])), np.abs(np.concatenate([[], *after]))
+    errors = [np.abs(np.concatenate([[], *each])) for each in (before, after)]
     is_clipped = np.isfinite(max_error) and errors[0].size
     limit = max_error * float(np.median(errors[0])) if is_clipped else np.inf
-    return compare(np.minimum(errors[0], limit), np.minimum(errors[1], limit))
+    return compare(*(np.minimum(each, limit) for each in errors))
 
 
 def _mean(color: np.ndarray) -> np.ndarray:

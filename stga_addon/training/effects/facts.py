@@ -39,26 +39,19 @@ of view."""
 
 
 class CaptureFacts:
-    """A capture with training views, and the settings it is to be trained with."""
+    """A capture with training views, and the settings it is to be trained with; cameras,
+    timesteps: how many there are to train on."""
 
     def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
         """device: one of `choose_device`."""
         self.capture, self.settings, self.device = capture, settings, device
         self.views = capture.views["train"]
+        self.cameras = len({view.camera_index for view in self.views})
+        self.timesteps = len({view.timestep for view in self.views})
 
     @cached_property
     def samples(self) -> Samples:
         return take_samples(self.capture)
-
-    @cached_property
-    def cameras(self) -> int:
-        """How many cameras there are to train on."""
-        return len({view.camera_index for view in self.views})
-
-    @cached_property
-    def timesteps(self) -> int:
-        """How many timesteps there are to train on."""
-        return len({view.timestep for view in self.views})
 
     @cached_property
     def stable_colors(self) -> np.ndarray:
@@ -76,15 +69,17 @@ class CaptureFacts:
         return colors / self.drift[:, None] if self.drifts.gain >= MIN_EXPOSURE_LEVELS else colors
 
     @cached_property
+    def _unexposed(self) -> np.ndarray:
+        return self.camera_colors.undo(self.stable_colors, self.samples.camera)
+
+    @cached_property
     def drift(self) -> np.ndarray:
         """(S, 3) gains of the sampled views against their camera's mean."""
-        colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
-        return fit_drift(self.samples, colors)
+        return fit_drift(self.samples, self._unexposed)
 
     @cached_property
     def drifts(self) -> Evidence:
-        colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
-        return drift_evidence(self.samples, colors)
+        return drift_evidence(self.samples, self._unexposed)
 
     @cached_property
     def camera_difference(self) -> Evidence:
@@ -106,8 +101,8 @@ class CaptureFacts:
     @cached_property
     def smoothed_strain_dependence(self) -> dict[str, Evidence]:
         """Of colors on the strain around their triangle, as what moves over it changes them."""
-        smoothed = self.samples.smoothed_strain
-        return self._strain_evidence(smoothed, np.zeros_like(smoothed[0]))
+        rest = np.zeros_like(self.samples.smoothed_strain[0])
+        return self._strain_evidence(self.samples.smoothed_strain, rest)
 
     def _strain_evidence(self, strain: np.ndarray, rest: np.ndarray) -> dict[str, Evidence]:
         """In "frames" that are left out, as unseen expressions, and in "cameras" that are, as other
@@ -175,15 +170,14 @@ class CaptureFacts:
                 moved.add(view.camera_index)
         return len(moved)
 
-    @cached_property
+    @property
     def sampled_timesteps(self) -> tuple[int, ...]:
         """At most MAX_TIMESTEPS of the tracked timesteps, evenly spread."""
         return tuple(evenly_spread(self.capture.timesteps, MAX_TIMESTEPS))
 
     @cached_property
     def sampled(self) -> Capture:
-        """The capture at the sampled timesteps only; meshes of a head with teeth are kept, for its
-        lips."""
+        """The capture at these only; meshes of a head with teeth are kept, for its lips."""
         pose = self.capture.expression_mesh
         pose = cache(pose) if self.has_teeth else pose
         return replace(self.capture, timesteps=self.sampled_timesteps, expression_mesh=pose)
@@ -216,8 +210,7 @@ class CaptureFacts:
         assert self.capture.flame is not None
         upper, lower = lip_pairs(self.capture.flame.model)
         pose, zero_pose = self.sampled.expression_mesh, self.settings.selection.zero_pose
-        posed = (pose(timestep, zero_pose) for timestep in self.sampled_timesteps)
-        meshes = [self.capture.neutral, *posed]
+        meshes = [self.capture.neutral, *(pose(t, zero_pose) for t in self.sampled_timesteps)]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])
 

@@ -1,19 +1,279 @@
-"""Effect plan: deciding the effects of a run from its capture."""
+"""Effect plan: rules that decide the effects of a run from measurements of its capture."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from ...avatar.offsets import OFFSETS
 from ...capture.model import Capture
 from ...errors import StgaError
-from ..effect_catalog import EFFECTS, Effect
-from ..effect_decisions import EffectDecision
+from ...flame.sequence import MIN_JOINT_ANGLE_DEG
+from ...tracking.folder import is_tracked, read_torso_motion
+from ..effect_catalog import EFFECTS, Effect, EffectDecision
 from ..settings import TrainingSettings
+from .evidence import MIN_EXPOSURE_LEVELS, Evidence
 from .facts import CaptureFacts
-from .rules import RULES
 
+MIN_CAMERAS_FOR_VIEW_COLOR = 4
+"""With fewer, view-dependent color is not constrained between the cameras."""
+MIN_VIEW_DEPENDENCE_LEVELS = 1.0
+"""Gain in levels of 255 from which color depends on the direction of view."""
+MIN_STRAIN_GAIN_DB = 0.35
+"""Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
+deformation: with less, trainings with and without differ by no more than their noise
+(docs/experiments.md)."""
+MIN_TIMESTEPS_FOR_STRAIN = 4
+"""With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
+MIN_STRETCH = 1e-6
+"""Share of a triangle's size; less is rounding."""
+MAX_PIXEL_WIDTH_RATIO = 1.25
+"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look
+different to each camera."""
+FINE_SPLAT_PIXELS = 4.0
+"""Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
+MAX_BACKGROUND_SPREAD_LEVELS = 6.0
+"""Root mean square deviation of a uniform background, in levels of 255."""
+BACKGROUND_TOLERANCE_LEVELS = 3.0
+"""Largest difference, in levels of 255, between the background and the color in the settings."""
+MESH_AS_MASK = (
+    "what the head's mesh does not cover, hair included, is left out (`stga track --mattes auto` "
+    "makes masks)"
+)
+"""What becomes of images without a mask."""
+MIN_UNCOVERED_SHARE = 0.003
+"""Share of the foreground that the mesh does not cover, from which splats are added for it."""
+MIN_PIXELS_PER_SPLAT = 0.5
+"""90th percentile over triangles, below which further splats have no detail to show."""
+MIN_LIP_GAP_MM, MIN_JAW_ANGLE_DEG = 1.5, 3.0
+"""Teeth are visible when the lips part, or the jaw opens, by more than this."""
+MAX_OUTSIDE_SHARE = 0.001
+"""Share of the mesh outside of the masks above which the tracking is inaccurate."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a rule decided: whether the capture calls for the effect, and a clause with the figure
+    that decided. fixed: no other choice can work, an override is refused with the reason; changes:
+    further settings for when the effect is on."""
+
+    on: bool
+    reason: str
+    fixed: bool = False
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+Rule = Callable[[CaptureFacts], Verdict | None]
+"""Decides one effect; None where the effect does not apply to the capture."""
+
+
+def view_color(facts: CaptureFacts) -> Verdict:
+    if facts.cameras == 1:
+        return Verdict(False, "a single camera sees everything from one direction", fixed=True)
+    if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
+        reason = f"{facts.cameras} cameras are too few to tell how color depends on the view"
+        return Verdict(False, reason)
+    found = facts.view_dependence
+    variance = f"({found.share:.1%} of the variance)"
+    reason = f"colors depend on the view by {found.gain:.1f} of 255 levels {variance}"
+    return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
+
+
+def exposure(facts: CaptureFacts) -> Verdict:
+    if facts.cameras == 1 and facts.timesteps == 1:
+        return Verdict(False, "a single image has no other to differ from", fixed=True)
+    colors, samples = facts.camera_colors, facts.samples
+    table = np.column_stack([colors.camera, colors.gain, colors.offset])
+    found, drift = facts.camera_difference.gain, facts.drifts.gain
+    reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
+    if drift >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
+        own = table[np.searchsorted(colors.camera, samples.camera)]
+        own[:, 1:4] *= facts.drift
+        table = np.column_stack([own, samples.timestep])
+        found = max(found, drift)
+        reason = f"a camera shows the same colors {drift:.1f} of 255 levels apart over time"
+    rows = tuple(map(tuple, table.tolist()))
+    return Verdict(found >= MIN_EXPOSURE_LEVELS, reason, changes={"exposure": rows})
+
+
+def antialiasing(facts: CaptureFacts) -> Verdict:
+    settings, widest = facts.settings, facts.pixel_range
+    if settings.scale < 1:
+        return Verdict(True, "images are trained at a smaller size than they are rendered at")
+    if widest > MAX_PIXEL_WIDTH_RATIO:
+        return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
+    pixels = facts.pixels_per_splat(50)
+    width = "pixels have the same width at the head"
+    reason = f"{width}, and half of the splats cover less than {pixels:.1f}"
+    return Verdict(pixels < FINE_SPLAT_PIXELS, reason)
+
+
+def background(facts: CaptureFacts) -> Verdict:
+    samples = facts.samples
+    if facts.shows_backdrop:
+        count = f"{facts.unmasked} of {len(samples.white)} sampled images have no mask"
+        reason = f"{count}, and show more than white behind the head: {MESH_AS_MASK}"
+        return Verdict(True, reason, changes={"backdrop": "mesh"})
+    spread, every = facts.backdrop_spread, "every image has a mask"
+    if spread is None:
+        reason = "not every image has a mask or transparency that shows where the head ends"
+        return Verdict(False, reason, fixed=True)
+    if spread > MAX_BACKGROUND_SPREAD_LEVELS:
+        varies = f"varies by {spread:.0f} of 255 levels"
+        reason = f"{every}; what lies outside, which {varies}, is replaced"
+        return Verdict(True, reason, changes={"backdrop": "masked"})
+    color = samples.background[~np.isnan(samples.background_spread)].mean(0)
+    differs = abs(color - 255 * np.array(facts.settings.background)).max()
+    is_named = differs < BACKGROUND_TOLERANCE_LEVELS
+    changes = {} if is_named else {"background": tuple((color / 255).round(4).tolist())}
+    red, green, blue = color.round().astype(int).tolist()
+    reason = f"{every}, and one color behind the head ({red}, {green}, {blue})"
+    return Verdict(True, reason, changes=changes)
+
+
+def hull_points(facts: CaptureFacts) -> Verdict:
+    if facts.shows_backdrop:
+        reason = "without masks, it is not known what beside the mesh belongs to the head"
+        return Verdict(False, reason, fixed=True)
+    if np.isnan(facts.uncovered):
+        reason = "without masks, it is not known how much lies beside the mesh"
+        return Verdict(facts.settings.hull_points, reason)
+    reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    if facts.cameras == 1:
+        reason += "; a single camera does not show how far away, so that it becomes a flat layer"
+    return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
+
+
+def depth_limits(facts: CaptureFacts) -> Verdict:
+    reason = "a single camera does not show how far in front of or behind the mesh a splat is"
+    if facts.cameras > 1:
+        reason = f"{facts.cameras} cameras show how far away a splat is"
+    return Verdict(facts.cameras == 1, reason)
+
+
+def density(facts: CaptureFacts) -> Verdict:
+    pixels = facts.pixels_per_splat(90)
+    reason = f"triangles show up to {pixels:.1f} pixels a splat"
+    return Verdict(pixels > MIN_PIXELS_PER_SPLAT, reason)
+
+
+def selection(facts: CaptureFacts) -> Verdict:
+    threshold = 1000 * facts.settings.selection.threshold
+    if facts.selected_share == 0:
+        count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
+        reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
+        return Verdict(False, reason, fixed=count == total)
+    share, asked = f"{facts.selected_share:.0%}", facts.settings.strategy == "selective"
+    reason = f"a frame moves {share} of the triangles by more than {threshold:g} mm"
+    return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
+
+
+def strain_color(facts: CaptureFacts) -> Verdict:
+    return _following(facts, "color follows", "deformation", "strain_dependence")
+
+
+def strain_position(facts: CaptureFacts) -> Verdict:
+    what = "deformation around a triangle"
+    return _following(facts, "positions follow", what, "smoothed_strain_dependence")
+
+
+def _following(facts: CaptureFacts, follows: str, what: str, evidence: str) -> Verdict:
+    """On where what follows brings enough in the mean of frames and cameras that were left out: of
+    what a head shows, unseen expressions and unseen views count alike."""
+    if facts.strain < MIN_STRETCH:
+        return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
+    if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
+        reason = f"{facts.timesteps} frames are too few to tell how {follows} deformation"
+        return Verdict(False, reason)
+    left_out: Mapping[str, Evidence] = getattr(facts, evidence)
+    gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
+    figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
+    is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
+    return Verdict(is_on, f"colors that follow {what} bring {figures}")
+
+
+def relight(facts: CaptureFacts) -> Verdict:
+    lit = "the lights of a scene that has any light the avatar"
+    return Verdict(True, f"{lit}; elsewhere colors stay as recorded")
+
+
+def world(facts: CaptureFacts) -> Verdict:
+    spread = facts.backdrop_spread
+    if spread is None:
+        reason = "not every image has a mask that shows where the person ends"
+        return Verdict(False, reason, fixed=True)
+    if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
+        return Verdict(False, "what lies behind the person is of one color", fixed=True)
+    if facts.moving_cameras:
+        return Verdict(False, f"{facts.moving_cameras} of {facts.cameras} cameras move", fixed=True)
+    return Verdict(False, "kept only where it is asked for; no export has it but its own file")
+
+
+def teeth(facts: CaptureFacts) -> Verdict | None:
+    if not facts.has_teeth:
+        return None
+    jaw, lips = facts.joint_angle(2), facts.lip_gap_mm
+    reason = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
+    return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
+
+
+def torso(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    found = read_torso_motion(facts.capture.root)
+    if found is None:
+        where = "in the images, as `stga track` does where they have masks"
+        return Verdict(False, f"the torso was not followed {where}")
+    return Verdict(found.motion != "head", found.description)
+
+
+def _turning(name: str, *joints: int) -> Rule:
+    """On where one of these FLAME joints turns."""
+
+    def rule(facts: CaptureFacts) -> Verdict | None:
+        if not facts.frames:
+            return None
+        turn = facts.joint_angle(*joints)
+        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
+
+    rule.__name__ = name
+    return rule
+
+
+def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    count = sum(frame.dynamic_offset is not None for frame in facts.frames)
+    have = f"{count} of {len(facts.frames)} frames have some, and the tracked mesh with them"
+    return Verdict(bool(count), have if count else "no frame has any", fixed=True)
+
+
+def tracking(facts: CaptureFacts) -> Verdict | None:
+    if not facts.frames:
+        return None
+    if facts.device != "cpu" or facts.timesteps == 1:
+        reason = "the splats of a single frame follow its images without it"
+        if facts.device != "cpu":
+            reason = f"FLAME's parameters are refined on the CPU only, not on {facts.device}"
+        return Verdict(False, reason, fixed=True)
+    if is_tracked(facts.capture.root):
+        sharper = "splats see motion more sharply than landmarks do"
+        return Verdict(True, f"the capture is from `stga track`: {sharper}")
+    if np.isnan(facts.outside):
+        return Verdict(False, "without masks, the mesh cannot be compared with the images")
+    reason = f"{facts.outside:.2%} of the mesh sticks out of the masks"
+    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, reason)
+
+
+_RULES: tuple[Rule, ...] = (
+    view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection,
+    strain_color, strain_position, relight, world, teeth, torso, _turning("neck", 1),
+    _turning("jaw", 2), _turning("eyes", 3, 4), dynamic_offsets, tracking,
+)  # fmt: skip
+RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
+"""Effect -> its rule, a function of that name."""
 Plan = tuple[EffectDecision, ...]
 
 
@@ -57,11 +317,10 @@ def add_effects(
     facts, plan = CaptureFacts(capture, settings), {each.effect: each for each in before}
     for effect in EFFECTS.values():
         decision = plan.get(effect.name)
-        is_open = decision is not None and not decision.on and decision.choice == "auto"
-        if effect.added_later and is_open:
-            verdict = RULES[effect.name](facts)
-            assert verdict is not None
-            assert decision is not None
+        if not effect.added_later or decision is None or decision.on:
+            continue
+        verdict = RULES[effect.name](facts) if decision.choice == "auto" else None
+        if verdict is not None:
             plan[effect.name] = replace(decision, on=verdict.on, reason=verdict.reason)
             settings = switched(settings, effect, verdict.on)
     return settings, tuple(plan.values())

@@ -33,26 +33,22 @@ triangle there."""
 
 @dataclass(frozen=True)
 class Samples:
-    """S views of K triangles.
+    """S views of K triangles. Pixels are those of the image at its own size.
 
-    faces      (K,) the triangles
-    camera, timestep  (S,) of the views
+    faces, camera, timestep  (K,) the triangles, (S,) and (S,) of the views
     color      (S, K, 3) float32 from 0 to 255, mean around the triangle's center; NaN where it is
                not visible
     direction  (S, K, 3) unit vectors from the camera to the triangle, world axes
-    strain     (S, K, 3) of the triangles, as far as colors follow it (`avatar.strain`)
-    smoothed_strain  (S, K, 3) strain around the triangles, as positions follow it
-                     (`avatar.strain.smoothed_strain`)
+    strain, smoothed_strain  (S, K, 3) of the triangles and around them, as far as colors and
+               positions follow it (`avatar.strain`)
     pixels     (S, K) area of the triangle in pixels; NaN where it is not visible
     pixel_width  (S,) meters that a pixel spans at the head; NaN for a head behind the camera
-    foreground (S,) pixels inside the mask; NaN without one, like the following
-    uncovered  (S,) those of them that lie beside the mesh
-    mesh       (S,) pixels of the mesh
-    outside    (S,) those of them that lie outside the mask
-    background (S, 3) mean color outside the mask
-    background_spread  (S,) root mean square deviation from it in levels of 255
+    foreground, uncovered  (S,) pixels inside the mask, and those of them that lie beside the mesh;
+               NaN without a mask, like the following
+    mesh, outside  (S,) pixels of the mesh, and those of them that lie outside the mask
+    background, background_spread  (S, 3) mean color outside the mask, and (S,) root mean square
+               deviation from it in levels of 255
     white      (S,) share of the pixels beside the mesh that are white, with or without a mask
-    Pixels are those of the image at its own size.
     """
 
     faces: np.ndarray
@@ -71,11 +67,6 @@ class Samples:
     background: np.ndarray
     background_spread: np.ndarray
     white: np.ndarray
-
-    @property
-    def seen(self) -> np.ndarray:
-        """(S, K) bool."""
-        return np.asarray(~np.isnan(self.color[..., 0]))
 
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:

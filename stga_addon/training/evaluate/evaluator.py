@@ -10,16 +10,8 @@ import numpy as np
 
 from ...capture.model import View, ViewExposure
 from ..settings import TrainingSettings
-from .evaluation_views import EvaluationView
-from .forecast import (
-    DETAIL,
-    curve_of,
-    describe_forecast,
-    flat_since,
-    forecast,
-    forecast_horizon,
-)
-from .metrics import evaluate
+from .forecast import DETAIL, curve_of, describe_forecast, flat_since, forecast, forecast_horizon
+from .metrics import EvaluationView, evaluate
 
 EVALUATIONS = 10
 """Evaluations over a budget in iterations, at fixed shares of it, so that runs are reproducible."""
@@ -46,15 +38,6 @@ class Spent:
         """Seconds of training until the budget is spent, at the speed so far; NaN before the first
         step."""
         return max(0.0, self.seconds * (1 / self.share - 1)) if self.share > 0 else math.nan
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What an evaluation found: fields of a metrics line (`Quality.as_json`), and whether the
-    avatar is to be kept."""
-
-    quality: dict[str, float]
-    is_kept: bool
 
 
 @dataclass
@@ -101,29 +84,27 @@ class Evaluator:
 
     def evaluate(
         self, render: Callable[[View], np.ndarray], perceptual: bool = False
-    ) -> Evaluation:
-        """Measure `render(view)` on the evaluation views; perceptual: with LPIPS.
+    ) -> tuple[dict[str, float], bool]:
+        """Fields of a metrics line (`Quality.as_json`) of `render(view)` on the evaluation views,
+        and whether the avatar is to be kept. perceptual: with LPIPS.
 
-        An avatar is kept that is the sharpest so far, or reaches the target, which ends the run
-        (`saved_line`). Otherwise not by PSNR, which prefers an early, blurred state to detail that
-        is a pixel off.
+        Kept is the sharpest so far, or what reaches the target, which ends the run (`saved_line`);
+        not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
         """
         if not self.views:
-            return Evaluation({}, True)
+            return {}, True
         quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
         difference, target = quality.get(DETAIL), self.settings.target_psnr
         reached = target is not None and quality["psnr"] >= target
         is_sharp = difference is None or difference <= self.best_difference
-        return Evaluation(quality, self.keeps_latest or reached or is_sharp)
+        return quality, self.keeps_latest or reached or is_sharp
 
-    def record(
-        self, evaluation: Evaluation, line: Mapping[str, Any], spent: Spent
-    ) -> dict[str, Any]:
+    def record(self, is_kept: bool, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
         """Remember an evaluation; returns its metrics line, to which a forecast is added that can
         be checked later."""
         self.count = max(self.count, int(min(1.0, spent.share) * EVALUATIONS))
-        if evaluation.is_kept:
-            self.best_difference = evaluation.quality.get(DETAIL, self.best_difference)
+        if is_kept:
+            self.best_difference = line.get(DETAIL, self.best_difference)
         self.lines.append(dict(line))
         lines, elapsed, left = self.lines, spent.seconds, spent.left_s
         ahead = forecast_horizon(elapsed, left)

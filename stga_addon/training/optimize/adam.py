@@ -5,11 +5,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ...avatar.offsets import OFFSETS
+from ...avatar.splats import MAX_SH_DEGREE
 from ...capture.camera import Camera
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from .state import OffsetState, TrainState
 
-BETA1, BETA2, EPSILON = np.float32(0.9), np.float32(0.999), np.float32(1e-15)
+BETA1, EPSILON = np.float32(0.9), np.float32(1e-15)
 
 
 def image_epsilon(share: float, camera: Camera) -> np.float32:
@@ -22,24 +23,30 @@ def step(
     state: TrainState,
     rows: np.ndarray,
     rates: Mapping[str, float],
+    beta2: float = 0.999,
     ema_share: float = 1.0,
     epsilon: np.float32 = EPSILON,
+    sh_degree: int = MAX_SH_DEGREE,
 ) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
+    beta2      decay of the second moment
     ema_share  least share of the stepped row in its exponential moving average; with 1, the average
                is the row
     epsilon    added to the root of the second moment; `image_epsilon` in training
+    sh_degree  in use: coefficients of higher ones have no gradient, and memory is left alone
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
     """
-    for name, table in state.tables.items():
+    tables = dict(state.tables)
+    for name, table in tables.items():
         table.rates[:] = rates[name]
-        if name == "sh":
-            table.rates[3:] = rates["sh_rest"]
-    options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
-    adam_rows(rows, state.steps, tuple(state.tables.values()), options)
+    sh_rates = tables["sh"].rates
+    sh_rates[3:] = rates["sh_rest"]
+    tables["sh"] = tables["sh"]._replace(rates=sh_rates[: 3 * (sh_degree + 1) ** 2])
+    options = AdamOptions(BETA1, np.float32(beta2), epsilon, np.float32(ema_share))
+    adam_rows(rows, state.steps, tuple(tables.values()), options)
 
 
 def step_offsets(
@@ -49,14 +56,15 @@ def step_offsets(
     xyz_gradient: np.ndarray,
     signal: Callable[[str], np.ndarray],
     position_rate: float,
+    beta2: float,
     ema_share: float,
     epsilon: np.float32,
 ) -> None:
     """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have
     xyz_gradient (N, 3).
 
-    signal: name of an offset -> (F, S); position_rate: the splats'; ema_share, epsilon: as in
-    `adam_rows`. A triangle moves all its splats alike, so its gradient is their sum.
+    signal: name of an offset -> (F, S); position_rate: the splats'; beta2, ema_share, epsilon: as
+    in `step`. A triangle moves all its splats alike, so its gradient is their sum.
     """
     for name, state in states.items():
         count = len(state.steps)
@@ -66,5 +74,5 @@ def step_offsets(
         rates = np.full(gradient[0].size, OFFSETS[name].rate_share * position_rate, np.float32)
         arrays = (state.value, gradient, state.first, state.second, state.average)
         tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rates])
-        options = AdamOptions(BETA1, BETA2, epsilon, np.float32(ema_share))
+        options = AdamOptions(BETA1, np.float32(beta2), epsilon, np.float32(ema_share))
         adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)

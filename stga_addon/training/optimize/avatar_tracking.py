@@ -15,8 +15,9 @@ from time import perf_counter
 import numpy as np
 
 from ...avatar.file import Avatar
+from ...capture.camera import Camera
 from ...capture.images import read_view
-from ...capture.mesh_geometry import silhouette, vertex_normals
+from ...capture.mesh_geometry import rasterize, silhouette, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -37,20 +38,33 @@ from ...flame.sequence import (
     torso_shapes,
     with_identity,
 )
+from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar
-from ...tracking.appearance import CHANNEL_WEIGHTS, NOISE_LEVELS, pyramid, sampled
-from ...tracking.dense_terms import POINT_SHARE, inside, projection_derivative
+from ...tracking.appearance import (
+    CHANNEL_WEIGHTS,
+    NOISE_LEVELS,
+    POINT_SHARE,
+    inside,
+    projection_derivative,
+    pyramid,
+    sampled,
+)
 from ...tracking.head_model import HeadModel
-from ...tracking.photo_consistency import facing, in_sight
 from ...tracking.posed_points import PosedPoints
-from ...tracking.seen_surface import surface_points
-from ...tracking.solve import WEIGHT_EXCESS_SIGMA, parameter_precision
+from ...tracking.seen_surface import facing, in_sight, surface_points
+from ...tracking.solve import (
+    TRANSLATION_ACCELERATION_M,
+    WEIGHT_EXCESS_SIGMA,
+    acceleration_precision,
+    parameter_precision,
+    smoothed,
+)
 from ..schedule import sh_degree
 from ..settings import TrainingSettings
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
-from .image_preparation import image_preparation
+from .image_preparation import MAX_GAIN, image_preparation
 from .state import new_offset, new_state
 
 RENDERINGS = 7
@@ -82,7 +96,8 @@ class AvatarTracking:
     """Parameters (T, E + 18) of timesteps; what was minimized, (T,), where they started and where
     they are: the loss of their images, in the points' units, and the prior; and (T,) the share of
     the head's pixels whose colors the avatar misses by more than MISS_LEVELS; (T, 3) by how much
-    the torso is shifted, of `torso_shapes`; and (T,) the head's scale, where it was sought."""
+    the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and (T, P,
+    P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -91,6 +106,18 @@ class AvatarTracking:
     misfit: np.ndarray
     shift: np.ndarray
     scale: np.ndarray
+    information: np.ndarray
+
+    def smoothed(self, model: FlameModel) -> "AvatarTracking":
+        """Smooth over time where the images do not say; model: of the person. Not where scale was
+        sought."""
+        count = model.n_expression
+        shift = np.full(SHIFT_SIZE, TRANSLATION_ACCELERATION_M**-2)
+        stiffness = np.insert(acceleration_precision(model), count, shift)
+        parts = self.parameters[:, :count], self.shift, self.parameters[:, count:]
+        values = smoothed(np.concatenate(parts, axis=1), self.information, stiffness)
+        expression, shift, pose = np.split(values, [count, count + SHIFT_SIZE], axis=1)
+        return replace(self, parameters=np.concatenate([expression, pose], axis=1), shift=shift)
 
 
 class RefinedTracking:
@@ -162,6 +189,7 @@ def track_by_avatar(
     report: Callable[[int, int], bool] = lambda done, total: False,
     is_far: bool = False,
     scales: bool = False,
+    shading: np.ndarray | None = None,
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
@@ -169,10 +197,11 @@ def track_by_avatar(
     timesteps: None: all; as many of them, evenly spread, as `seconds` allow. report: how many are
     done; returns whether to stop. is_far: the starts are some way off, as of another recording: the
     first timestep is sought in small images first. scales: whether the head's size is sought too.
+    shading: harmonics (9, 3) of a factor by the surface's normal, by which the light differs.
     Each timestep begins where the one before has led. Raises StgaError where the capture has no
     parameters or is of another head, and Cancelled.
     """
-    tracker, found = _Tracker(avatar, settings, capture, is_far, scales), []
+    tracker, found = _Tracker(avatar, settings, capture, is_far, scales, shading), []
     chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
     number = 0
     while number < len(chosen):
@@ -183,12 +212,26 @@ def track_by_avatar(
         if number == 1 and seconds is not None:
             most = int(seconds / (perf_counter() - begin))
             chosen = sorted({chosen[0], *evenly_spread(chosen, max(2, most))})
-    values, *figures = zip(*found, strict=True)
+    values, information, *figures = zip(*found, strict=True)
     rows, added = np.stack(values), np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
     shift, scale = np.split(rows[:, added], [SHIFT_SIZE], axis=1)
     rows = np.delete(rows, added, axis=1)
     before, after, misfit = map(np.array, figures)
-    return AvatarTracking(tuple(chosen), rows, before, after, misfit, shift, 1 + scale.ravel())
+    scale = 1 + scale.ravel()
+    known = np.stack(information).astype(np.float32)
+    return AvatarTracking(tuple(chosen), rows, before, after, misfit, shift, scale, known)
+
+
+def normal_images(
+    mesh: np.ndarray, faces: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3)."""
+    triangles, share = rasterize(mesh, faces, camera)
+    seen, found = triangles >= 0, np.zeros((*triangles.shape, 3))
+    corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
+    own = np.einsum("nk,nkc->nc", share[seen], corners)
+    found[seen] = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-9)
+    return seen, found
 
 
 class _Posed:
@@ -214,6 +257,7 @@ class _Tracker:
         capture: Capture,
         is_far: bool,
         scales: bool,
+        shading: np.ndarray | None,
     ) -> None:
         sequence = capture.flame
         if sequence is None:
@@ -232,7 +276,7 @@ class _Tracker:
         # what is sought beside the expressions, as if they were some
         shapes = [person.shapedirs, torso_shapes(person), grown]
         person = replace(person, shapedirs=np.concatenate(shapes, axis=2))
-        self._is_far, self._added = is_far, SHIFT_SIZE + scales
+        self._is_far, self._added, self._shading = is_far, SHIFT_SIZE + scales, shading
         self._change: np.ndarray | None = None
         self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
@@ -248,15 +292,15 @@ class _Tracker:
         )
         self._backend = CpuBackend(settings, self._frames, state)
 
-    def solve(self, timestep: int) -> tuple[np.ndarray, float, float, float]:
+    def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float, float, float]:
         """Parameters (E + 18,) with the torso's shift, and the scale where it is sought, after the
-        expressions; what was minimized before and after; and the misfit. As tracked where no view
-        shows the timestep."""
+        expressions; their inverse covariance; what was minimized before and after; and the misfit.
+        As tracked where no view shows the timestep."""
         frame = self._sequence.frame(timestep).parameters
         tracked = np.insert(frame, len(frame) - RIGID_SIZE, np.zeros(self._added))
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
         if not views:
-            return tracked, 0.0, 0.0, 0.0
+            return tracked, np.diag(self._precision()), 0.0, 0.0, 0.0
         heights: tuple[int, ...] = (MAX_HEIGHT_PX,)
         renderings, found = RENDERINGS, tracked
         if self._change is not None:
@@ -268,9 +312,9 @@ class _Tracker:
         energies: list[float] = []
         for height in heights:
             shots = [self._read(view, height) for view in views]
-            found, *energies = self._minimize(timestep, shots, tracked, found, renderings)
+            found, known, *energies = self._minimize(timestep, shots, tracked, found, renderings)
         self._change = found - tracked
-        return found, energies[0], energies[1], self._misfit(found, shots)
+        return found, known, energies[0], energies[1], self._misfit(found, shots)
 
     def _minimize(
         self,
@@ -279,13 +323,15 @@ class _Tracker:
         tracked: np.ndarray,
         start: np.ndarray,
         renderings: int,
-    ) -> tuple[np.ndarray, float, float]:
-        """Parameters from `start` on, and what was minimized before and after."""
+    ) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Parameters from `start` on, their inverse covariance, and what was minimized before and
+        after."""
         from scipy.linalg import solve_triangular
         from scipy.optimize import minimize
 
         precision = self._precision()  # of the change from those that were tracked
-        root = np.linalg.cholesky(self._gauss_newton(start, timestep, shots) + np.diag(precision))
+        known = self._gauss_newton(start, timestep, shots) + np.diag(precision)
+        root = np.linalg.cholesky(known)
 
         def energy(whitened: np.ndarray) -> tuple[float, np.ndarray]:
             values = start + solve_triangular(root, whitened, lower=True, trans=1)
@@ -306,7 +352,7 @@ class _Tracker:
         options = {"maxfun": renderings, "maxiter": renderings}
         best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
         change = solve_triangular(root, scale * best.x, lower=True, trans=1)
-        return start + change, before, float(best.fun)
+        return start + change, known, before, float(best.fun)
 
     def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
         self._posed.values = values
@@ -324,6 +370,12 @@ class _Tracker:
         view, image, mask = read_view(view, scale, (background[0], background[1], background[2]))
         if self._prepare is not None:
             image, _ = self._prepare(view, image, mask)
+        if self._shading is not None:
+            mesh = self._capture.mesh(view.timestep)
+            head, normals = normal_images(mesh, self._capture.faces, view.camera)
+            ratio = np.clip(basis(normals[head]) @ self._shading, 1 / MAX_GAIN, MAX_GAIN)
+            image = image.copy()
+            image[head] = np.clip(image[head] / ratio + 0.5, 0, 255)
         image = np.ascontiguousarray(image).view()
         image.setflags(write=False)  # like the loader's: Numba compiles for one type only
         return view, image

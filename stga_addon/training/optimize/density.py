@@ -11,8 +11,6 @@ from .state import TrainState, join, keep_rows, new_state
 
 MIN_OPACITY = 0.005
 """Splats with a lower opacity are pruned."""
-MAX_SPLIT_SHARE = 0.02
-"""Largest share of the splats that one round of density control splits."""
 SPLIT_LOG_SCALE = np.log(1.6)
 """Reduction of the log scale of both halves of a split splat along the axis it is split on."""
 
@@ -21,7 +19,7 @@ def control_density(
     state: TrainState,
     budget: int,
     rng: np.random.Generator,
-    max_share: float = MAX_SPLIT_SHARE,
+    max_share: float,
     region: np.ndarray | None = None,
 ) -> TrainState:
     """Split the splats with the largest mean screen gradient and prune those of low opacity.

@@ -13,9 +13,8 @@ from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.gpu import optimizer
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
-from ...raster.gpu.image_loss import image_loss, upload_target
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
-from ...raster.gpu.optimizer import OffsetTables, OptimizerTables
+from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
 from ...raster.gpu.rasterize import (
     Rasterizer,
     SplatTable,
@@ -26,7 +25,7 @@ from ...raster.gpu.rasterize import (
     upload_splats,
 )
 from ..settings import TrainingSettings
-from .adam import BETA1, BETA2, image_epsilon
+from .adam import BETA1, image_epsilon
 from .frames import FrameStore
 from .state import Batch, OffsetState, TrainState
 
@@ -180,7 +179,7 @@ class GpuBackend:
         upload_target(self.device, batch.target, settings.ssim_weight, batch.mask, change)
         opacity_weight = settings.unseen_opacity_weight / max(len(self), 1)
         optimizer.upload_step(
-            self.device, batch.rates, (float(BETA1), float(BETA2)),
+            self.device, batch.rates, (float(BETA1), settings.adam_beta2),
             float(image_epsilon(settings.adam_epsilon, batch.view.camera)), settings.ema_share,
             (settings.scale_weight, settings.distance_weight, opacity_weight),
             statistics=batch.accumulate, triangles=self._triangles,

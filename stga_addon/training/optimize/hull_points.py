@@ -61,9 +61,7 @@ def hull_points(
     mesh = capture.mesh(views[0].timestep)
     voxel = voxel_size(mesh)
     points = _hull_surface(mesh, capture.faces, views, voxel)
-    distance, face = _nearest_triangle(points, mesh, capture.faces)
-    if torso:
-        face = _carried(capture, views[0].timestep, points, face)
+    distance, face = _followed(capture, views[0].timestep, points, torso)
     outside = distance > MIN_MESH_DISTANCE_M
     world = _new_splats(points[outside], voxel, sh_degree)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
@@ -118,14 +116,12 @@ def flat_points(
     if not len(centers):
         return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
     points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
-    _, face = _nearest_triangle(points, mesh, capture.faces)
-    if torso:
-        face = _carried(capture, view.timestep, points, face)
+    _, face = _followed(capture, view.timestep, points, torso)
     frames = face_frames(mesh, capture.faces, capture.neutral, convention)
     splats = _new_splats(points, voxel, sh_degree)
     if neck is None:
         return to_local(splats, frames, face)
-    cut = ~in_image(points, camera)
+    cut = ~pixels_of(points, camera)[2]
     splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
     splats.log_scale[cut], splats.opacity[cut] = np.log(voxel), CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
@@ -140,27 +136,25 @@ def voxel_size(mesh: np.ndarray) -> float:
 def _nearest_triangle(
     points: np.ndarray, mesh: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (N,) to the mesh and nearest triangle (N,), approximated by samples of every
-    triangle."""
+    """Distance (N,) to the mesh and nearest triangle (N,), by samples of every triangle."""
     samples = _mesh_samples(mesh, faces)
     distance, nearest = cKDTree(samples).query(points)
     return distance, nearest // (len(samples) // len(faces))
 
 
-def _carried(
-    capture: Capture, timestep: int, points: np.ndarray, nearest: np.ndarray
-) -> np.ndarray:
-    """Triangle (N,) of each point: for those below the base of the neck, the nearest of the torso
-    instead of all."""
-    if capture.flame is None:
-        return nearest
-    torso = np.flatnonzero(torso_faces(capture.flame.model))
-    below = below_neck(capture.flame, timestep, points)
-    found = nearest.copy()
-    if len(torso) and below.any():
-        _, among = _nearest_triangle(points[below], capture.mesh(timestep), capture.faces[torso])
-        found[below] = torso[among]
-    return found
+def _followed(
+    capture: Capture, timestep: int, points: np.ndarray, torso: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) to the mesh, and triangle (N,) of each point: the nearest, of those below the
+    base of the neck with `torso` the nearest of the torso."""
+    mesh = capture.mesh(timestep)
+    distance, face = _nearest_triangle(points, mesh, capture.faces)
+    if torso and capture.flame is not None:
+        own = np.flatnonzero(torso_faces(capture.flame.model))
+        below = below_neck(capture.flame, timestep, points)
+        if len(own) and below.any():
+            face[below] = own[_nearest_triangle(points[below], mesh, capture.faces[own])[1]]
+    return distance, face
 
 
 def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -234,11 +228,6 @@ def _foreground(view: View) -> np.ndarray:
     if mask is not None:
         return np.asarray(mask > 127)
     return np.asarray((read_image(view) < WHITE_LEVEL).any(axis=2))
-
-
-def in_image(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """(N,) bool: whether world points (N, 3) lie in the camera's image."""
-    return pixels_of(points, camera)[2]
 
 
 def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,27 +1,36 @@
 """What is done to the captured images before they are trained on or compared with: the backdrop is
-taken away, and exposure and white balance of the training cameras are corrected."""
+taken away by masks or, without masks, by the tracked mesh, and exposure and white balance of the
+training cameras are corrected."""
 
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from ...capture.loader import Preparation
+from ...capture.mesh_geometry import silhouette
 from ...capture.model import Capture, View, ViewExposure
-from ..backdrop import without_backdrop
 from ..settings import TrainingSettings
 
 Correction = Callable[[View, np.ndarray, np.ndarray | None], np.ndarray]
 """(view, image (H, W, 3) uint8, mask (H, W) uint8 or None) -> corrected image (H, W, 3) uint8."""
+BLUR_SHARES = (0.01, 0.05)
+"""Standard deviations of the neighborhoods that a pixel's backdrop is the mean of, as shares of the
+image's height: the larger one counts where the smaller one holds no backdrop."""
+FAR_WEIGHT = 1e-3
+NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+"""Gain and offset by channel."""
+MAX_GAIN = 4.0
+EXPOSURE_PRIOR, EXPOSURE_SCALE, EXPOSURE_ITERATIONS = 1e-3, 0.08, 4
+"""Weight of the usual exposure as a share of the pixels, which decides where all have one color;
+and the difference in 0…1 beyond which pixels are outliers."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
     """Takes away the settings' `backdrop`, then inverts their `exposure`; None where neither
     changes anything."""
-    correct, backdrop, background = (
-        exposure_correction(settings),
-        settings.backdrop,
-        settings.background,
-    )
+    backdrop, background = settings.backdrop, settings.background
+    correct = exposure_correction(settings)
     if correct is None and backdrop == "plain":
         return None
 
@@ -34,10 +43,54 @@ def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparati
     return prepare
 
 
-MAX_GAIN = 4.0
-EXPOSURE_PRIOR, EXPOSURE_SCALE, EXPOSURE_ITERATIONS = 1e-3, 0.08, 4
-"""Weight of the usual exposure as a share of the pixels, which decides where all have one color;
-and the difference in 0…1 beyond which pixels are outliers."""
+def without_backdrop(
+    capture: Capture,
+    view: View,
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    backdrop: str,
+    background: Sequence[float],
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Image (H, W, 3) uint8 and mask (H, W) uint8 as training sees them: over the color
+    `background` (0…1).
+
+    view: with a camera of the image's size; backdrop: one of `settings.BACKDROPS`. "plain" images
+    are returned as they are.
+    """
+    if backdrop == "plain" or (mask is None and backdrop == "masked"):
+        return image, mask
+    if mask is None:
+        mesh = np.asarray(capture.mesh(view.timestep))
+        mask = 255 * silhouette(mesh, capture.faces, view.camera).astype(np.uint8)
+    return over_color(image, mask, background), mask
+
+
+def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> np.ndarray:
+    """The masked part of an image (H, W, 3) uint8 over a color (0…1); mask (H, W) uint8 coverage.
+
+    image = coverage · foreground + (1 − coverage) · backdrop, where the backdrop of a pixel is the
+    mean of those pixels around it that show nothing else; only this second term is exchanged. A
+    mask's soft edge thus keeps no rim of the backdrop's color.
+    """
+    cover = mask[..., None].astype(np.float32) / 255
+    rest = (1 - cover) * 255 * np.asarray(color, np.float32)
+    found = cover * image
+    edge = (mask > 0) & (mask < 255)
+    if edge.any() and not mask.all():
+        margin = round(3 * BLUR_SHARES[1] * len(image))
+        spans = [np.flatnonzero(edge.any(axis=axis)) for axis in (1, 0)]
+        box = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in spans)
+        part, share, clear = image[box].astype(np.float32), cover[box], mask[box] == 0
+        total, weight = np.zeros_like(part), np.full_like(share, 1e-12)
+        shown = np.where(clear[..., None], part, 0)
+        for blur, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
+            sigma = max(1.0, blur * len(image))
+            total += importance * gaussian_filter(shown, (sigma, sigma, 0), truncate=3.0)
+            near = gaussian_filter(clear.astype(np.float32), sigma, truncate=3.0)
+            weight += importance * near[..., None]
+        foreground = np.clip(part - (1 - share) * (total / weight), 0, 255 * share)
+        found[box][edge[box]] = foreground[edge[box]]
+    return np.asarray(np.clip(found + rest, 0, 255) + 0.5).astype(np.uint8)
 
 
 def fit_exposure(
@@ -51,23 +104,35 @@ def fit_exposure(
     In 0…1; robust (Geman-McClure). usual: what is expected (None: gain 1, offset 0), with the
     weight of a share of the pixels.
     """
-    usual = np.array([[1.0] * 3, [0.0] * 3]) if usual is None else usual
-    if not drawn.size:
-        return usual
+    usual = NO_CORRECTION if usual is None else usual
     found = usual
-    for _ in range(EXPOSURE_ITERATIONS):
-        columns = []
-        for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
-            residual = y - found[0, channel] * x - found[1, channel]
-            weight = (1 + (residual / EXPOSURE_SCALE) ** 2) ** -2.0
-            system = np.stack([x, np.ones_like(x)])
-            matrix = (weight * system) @ system.T
-            prior = share * weight.sum() * np.diag([x.var() + 1e-4, 1.0])
-            right = system @ (weight * y) + prior @ usual[:, channel]
-            columns.append(np.linalg.solve(matrix + prior, right))
-        found = np.stack(columns, axis=1)
+    for _ in range(EXPOSURE_ITERATIONS if drawn.size else 0):
+        gain, offset = found[..., None]
+        weight = (1 + ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2) ** -2.0
+        prior = share * weight.sum(1) * np.stack([drawn.var(1) + 1e-4, np.ones(3)])
+        found = fit_lines(drawn, seen, prior, usual, weight)
         found[0] = np.clip(found[0], 1 / MAX_GAIN, MAX_GAIN)
     return found
+
+
+def fit_lines(
+    x: np.ndarray,
+    y: np.ndarray,
+    prior: np.ndarray,
+    usual: np.ndarray = NO_CORRECTION,
+    weight: np.ndarray | None = None,
+) -> np.ndarray:
+    """(2, 3) gain and offset of each channel by least squares, y ≈ gain · x + offset of samples (3,
+    N) with a weight (3, N).
+
+    prior: (2, 3), or what broadcasts to it, the weight in samples of the `usual` (2, 3).
+    """
+    system = np.stack([x, np.ones_like(x)], axis=1)
+    weighted = system if weight is None else system * weight[:, None]
+    prior = np.broadcast_to(np.asarray(prior), (2, 3)).T
+    right = np.einsum("cin,cn->ci", weighted, y) + prior * usual.T
+    inner = weighted @ system.swapaxes(1, 2) + prior[:, :, None] * np.eye(2)
+    return np.asarray(np.linalg.solve(inner, right[..., None])[..., 0].T)
 
 
 def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
@@ -76,28 +141,22 @@ def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
     listed: dict[int, list[Sequence[float]]] = {}
     for row in rows:
         listed.setdefault(int(row[0]), []).append(row[1:])
-    curves = {
-        camera: np.array(sorted(((*row, 0.0)[6], *row[:6]) for row in own)).T
-        for camera, own in listed.items()
-    }
+    rows_of = {n: sorted(((*row, 0.0)[6], *row[:6]) for row in own) for n, own in listed.items()}
+    curves = {camera: np.array(own).T for camera, own in rows_of.items()}
 
     def exposure(view: View) -> np.ndarray | None:
         if view.camera_index not in curves:
             return None
         timesteps, *columns = curves[view.camera_index]
-        return np.array(
-            [np.interp(view.timestep, timesteps, column) for column in columns]
-        ).reshape(2, 3)
+        found = [np.interp(view.timestep, timesteps, column) for column in columns]
+        return np.array(found).reshape(2, 3)
 
     return exposure
 
 
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
-    """The correction that inverts the settings' `exposure`; None if there is none.
-
-    It applies to the foreground only, because the background is constant whatever the camera.
-    Images of cameras that the settings do not list stay unchanged.
-    """
+    """The correction that inverts the settings' `exposure`, of the foreground only, in images of
+    the cameras that it lists; None if there is none."""
     if not settings.exposure:
         return None
     exposure = view_exposure(settings.exposure)

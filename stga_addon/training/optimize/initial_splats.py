@@ -14,7 +14,7 @@ from ...capture.images import read_view
 from ...capture.mesh_geometry import connected_parts, rasterize
 from ...capture.model import Capture, View, evenly_spread
 from ..settings import TrainingSettings
-from .hull_points import flat_points, hull_points, in_image
+from .hull_points import flat_points, hull_points, pixels_of
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -65,7 +65,7 @@ def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarra
     views = [view for view in capture.views["train"] if view.timestep == first]
     frames = face_frames(capture.mesh(first), capture.faces, capture.neutral, convention)
     points = to_world(splats.rows(unbound), frames).xyz.astype(np.float64)
-    share[unbound] = 1 - np.mean([in_image(points, view.camera) for view in views], axis=0)
+    share[unbound] = 1 - np.mean([pixels_of(points, view.camera)[2] for view in views], axis=0)
     return share
 
 

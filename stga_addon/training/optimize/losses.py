@@ -26,12 +26,8 @@ def _bands(height: int, count: int) -> int:
 
 def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
     """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
-    thread's work.
-
-    bands: how many, over the whole width: what lies beyond the left and right edge of narrower ones
-    would cost more than what lies above and below. By default, so many that the threads are done
-    soonest.
-    """
+    thread's work. bands: how many, over the whole width, because pixels beyond left and right edges
+    cost more; by default, so many that the threads are done soonest."""
     count = min(bands or _bands(height, threads()), height)
     tops = [height * n // count for n in range(count + 1)]
     return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
@@ -39,11 +35,7 @@ def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray
 
 def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
     """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
-    the largest first.
-
-    Groups of more than BAND_TILES rows are cut into bands, which are narrower and more evenly
-    distributed to threads.
-    """
+    the largest first; those of more than BAND_TILES rows are cut, for the threads."""
     return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
 
 
@@ -55,11 +47,9 @@ def image_gradient(
     out: np.ndarray,
 ) -> tuple[float, float]:
     """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within
-    the rectangles.
+    the rectangles; of means over the whole image. Returns L1 and SSIM within the rectangles.
 
-    image, out (3, H, W) float32; target (H, W, 3) uint8. The loss is the mean over the whole image
-    whatever the rectangles are. Returns L1 and SSIM, which are the image's only if the rectangles
-    tile it.
+    image, out (3, H, W) float32; target (H, W, 3) uint8.
     """
     sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
     share = 1.0 / image.size

@@ -38,7 +38,7 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the
     cache is empty, a second process compiles rendering at the same time (`raster.cpu.precompile`).
-    While a process compiles ahead (`jobs.preparation`), this one waits for it, unless it has
+    While a process compiles ahead (`jobs.perform`), this one waits for it, unless it has
     kernels that are bundled (`raster.cpu.bundled`).
     """
     end = time.monotonic() + HELPER_TIMEOUT_S
@@ -95,7 +95,8 @@ def _step() -> None:
     add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient, state.gradient_count)
     adam.step_offsets(
         with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
-        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 1.0, adam.EPSILON,
+        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 0.99, 1.0,
+        adam.EPSILON,
     )  # fmt: skip
 
 

@@ -13,13 +13,12 @@ from ..schedule import learning_rates, sh_degree
 from ..settings import TrainingSettings
 from .avatar_tracking import RefinedTracking
 from .cpu_backend import CpuBackend
-from .density import MAX_SPLIT_SHARE, control_density, reset_strays
+from .density import control_density, reset_strays
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .outlines import Outline, prune_outside, read_outlines
+from .post_step import Outline, UnseenSides, prune_outside, read_outlines, unseen_sides
 from .state import Batch, TrainState, new_state, with_offsets
 from .strategies import Strategy
-from .unseen_sides import UnseenSides, unseen_sides
 
 if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend
@@ -152,7 +151,7 @@ class Trainer:
             reset_strays(state, limit, settings.stray_reset_share)
         if splits:
             budget = round(self.initial_count * (1 + settings.growth)) - len(state)
-            share = MAX_SPLIT_SHARE if region is None else MAX_REGION_SPLIT_SHARE
+            share = settings.split_share if region is None else MAX_REGION_SPLIT_SHARE
             rng = np.random.default_rng([settings.seed, count])
             state = control_density(state, budget, rng, share, region)
         if prunes:

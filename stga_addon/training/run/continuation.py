@@ -17,7 +17,7 @@ from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
 from ...schema import validate
 from ...selection import select_capture
-from ..evaluate.evaluation_views import (
+from ..evaluate.metrics import (
     MAX_EVALUATION_VIEWS,
     MIN_REGION_PIXELS,
     EvaluationView,
@@ -29,10 +29,9 @@ from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState, new_offset, new_state, with_added, with_offsets
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
-from .checkpoint import read_checkpoint
+from .checkpoint import read_checkpoint, require_color_range
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
-from .strain_range import require_color_range
 
 START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""

@@ -16,8 +16,8 @@ world.ply       what stands still behind the person, in world space; only where 
 """
 
 import re
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -32,13 +32,20 @@ from ...flame.forward import FlameFrame, frame_of
 from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
 from ...schema import from_json, setting, to_json
-from ...worker.lock import hold_lock, lock_owner
-from ..effect_decisions import EffectDecision
+from ...worker.lock import hold_folder
+from ..effect_catalog import EffectDecision
 from ..settings import TrainingSettings
-from .identity import LATER_SETTINGS, RunIdentity, difference, identity_of, version_4_identity
+from .identity import (
+    LATER_SETTINGS,
+    RunIdentity,
+    difference,
+    earlier_identity,
+    identity_of,
+    settings_since,
+)
 
-FORMAT, VERSION = "stga-run", 5
-OLDEST_VERSION = 4
+FORMAT, VERSION = "stga-run", max(LATER_SETTINGS)
+VERSIONS = range(min(LATER_SETTINGS) - 1, VERSION + 1)
 """Read as well: LATER_SETTINGS are all that it lacks."""
 RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
 WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
@@ -120,13 +127,12 @@ def read_run(folder: Path) -> Run:
     if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
     version = values.pop("version", None)
-    if version not in (OLDEST_VERSION, VERSION):
-        reads = f"{OLDEST_VERSION} and {VERSION}"
+    if version not in VERSIONS:
+        reads = f"{VERSIONS[0]} to {VERSION}"
         found = f"has run format version {shorten(version)}"
         raise StgaError(f"{path}: {found}, this add-on reads {reads}")
-    if version == OLDEST_VERSION and isinstance(values.get("settings"), dict):
-        later = {name: getattr(TrainingSettings, name) for name in LATER_SETTINGS}
-        values["settings"].update(later)
+    if isinstance(values.get("settings"), dict):
+        values["settings"].update(settings_since(version))
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:
@@ -148,20 +154,9 @@ def next_folder(run: Path) -> Path:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder for one process, and clear away what a killed one left half written.
-
-    Raises StgaError while another process holds the folder.
-    """
-    path = folder / "run.lock"
-    with ExitStack() as lock:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock.enter_context(hold_lock(path))
-        except BlockingIOError as error:
-            text = f"another run is working in this folder (process {lock_owner(path)})"
-            raise StgaError(f"{folder}: {text}") from error
-        except OSError as error:
-            raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    """Hold the folder for one process, and clear away what a killed one left half written. Raises
+    StgaError while another process holds it."""
+    with hold_folder(folder, "run.lock", "run is working in this folder"):
         remove_leftovers(folder)
         yield
 
@@ -211,6 +206,12 @@ def open_run(
     return OpenedRun(run, opened, tuple(takes))
 
 
+def avatar_version(run: Path) -> list[str]:
+    """A run's avatar, and when it was written; of a run that has one."""
+    file = (run / AVATAR).resolve()
+    return [str(file), str(file.stat().st_mtime_ns)]
+
+
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
     """The capture of a run, with the FLAME parameters that the run refined. Errors as of
     `open_run`."""
@@ -232,7 +233,7 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     trained = stored.identity
     if trained is None or trained == given:  # None: the run was prepared, but has not begun
         return given
-    if trained == version_4_identity(given, run.settings):
+    if trained in (earlier_identity(given, run.settings, version) for version in VERSIONS):
         return trained
     changed = difference(trained, given)
     if trained.principal_point != given.principal_point:
@@ -250,12 +251,9 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
 
 
 def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
-    """The device to continue a run on, and why: its own, unless `requested` names another
-    (`choose_device`).
-
-    A run of a GPU that this machine lacks continues on the first one.
-    Raises StgaError where that device does not work or cannot train this run.
-    """
+    """The device to continue a run on, and why: its own, or the first GPU where this machine lacks
+    that one, unless `requested` names another (`choose_device`). Raises StgaError where it does not
+    work or cannot train this run."""
     trained_on, has_adapter = run.device, False
     with suppress(StgaError):  # where there is no GPU at all
         named = trained_on.removeprefix(GPU)
@@ -291,12 +289,9 @@ def write_tracking(
 
 
 def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
-    """The capture with the parameters that the run in `folder` refined; unchanged if it refined
-    none.
-
-    A timestep is replaced only if the capture's tracked parameters are those that the run started
-    from, so that another capture stays unchanged. Raises StgaError if the run's file is damaged.
-    """
+    """The capture with the parameters that the run in `folder` refined, in the timesteps whose
+    tracked parameters are those that the run started from: another capture stays unchanged. Raises
+    StgaError if the run's file is damaged."""
     path, sequence = folder / TRACKING, capture.flame
     if sequence is None or not path.exists():
         return capture
@@ -322,8 +317,7 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
 
 
 def write_residuals(folder: Path, mean: np.ndarray) -> None:
-    """Write mean (F,): mean absolute error (0…1) of what each triangle's splats show, NaN where
-    that is unknown."""
+    """Write mean (F,): mean absolute error (0…1) by triangle, NaN where that is unknown."""
     write_npz(folder / RESIDUALS, {"residual": mean.astype(np.float32)}, compressed=True)
 
 
@@ -331,8 +325,15 @@ def read_residuals(folder: Path, faces: int) -> np.ndarray:
     """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another
     mesh."""
     path = folder / RESIDUALS
-    residual = read_npz(path).get("residual")
-    if residual is None or residual.dtype != np.float32 or residual.shape != (faces,):
-        found = "no such array" if residual is None else f"{residual.dtype} {residual.shape}"
-        raise StgaError(f"{path}: expected 'residual', float32 ({faces},), found {found}")
-    return residual
+    return float_array(path, read_npz(path), "residual", (faces,))
+
+
+def float_array(
+    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
+) -> np.ndarray:
+    """A float32 array of this shape among those of a file. Raises StgaError where it is not."""
+    array = arrays.get(name)
+    if array is None or array.dtype != np.float32 or array.shape != shape:
+        found = "no such array" if array is None else f"{array.dtype} {array.shape}"
+        raise StgaError(f"{path}: expected '{name}', float32 {shape}, found {found}")
+    return array

@@ -18,8 +18,12 @@ QUANTUM = 1e-6 * 0.5**0.5
 """Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines
 compute other last bits. It is irrational, so that neither decimals nor binary fractions lie at the
 edge between two multiples."""
-LATER_SETTINGS = ("torso",)
-"""Settings that runs of format version 4 do not have; they were trained as with the defaults."""
+LATER_SETTINGS: dict[int, dict[str, Any]] = {
+    5: {"torso": False},
+    6: {"adam_beta2": 0.999, "split_share": 0.02},
+}
+"""Format version of runs -> settings that earlier ones do not have, with what these were trained
+with."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +80,21 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     )
 
 
-def version_4_identity(identity: RunIdentity, settings: TrainingSettings) -> RunIdentity:
-    """The identity as a run of format version 4 recorded it; the same where the settings are not
-    those of one."""
-    if any(getattr(settings, name) != getattr(TrainingSettings, name) for name in LATER_SETTINGS):
+def settings_since(version: int) -> dict[str, Any]:
+    """The settings that runs of this format version do not have, with what they were trained
+    with."""
+    later = (values for since, values in LATER_SETTINGS.items() if since > version)
+    return {name: value for values in later for name, value in values.items()}
+
+
+def earlier_identity(
+    identity: RunIdentity, settings: TrainingSettings, version: int
+) -> RunIdentity:
+    """The identity as a run of an earlier format version recorded it; the same where the settings
+    are not those of one."""
+    later, known = settings_since(version), to_json(settings)
+    if any(known.pop(name) != value for name, value in later.items()):
         return identity
-    known = {name: value for name, value in to_json(settings).items() if name not in LATER_SETTINGS}
     return replace(identity, settings=_settings_digest(known))
 
 

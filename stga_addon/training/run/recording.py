@@ -9,13 +9,13 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar
 from ...capture.images import read_view
-from ...capture.mesh_geometry import Similarity, silhouette
+from ...capture.mesh_geometry import Similarity
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
-from ...flame.forward import joint_positions, shaped_vertices
 from ...flame.sequence import torso_offset, torso_shapes, with_identity
+from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar
 from ...tracking.fit import HeadFit
 from ...tracking.folder import (
@@ -28,10 +28,10 @@ from ...tracking.folder import (
 from ...tracking.head_model import HeadModel
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
-from ..optimize.avatar_tracking import ROOT, AvatarTracking, track_by_avatar
-from ..optimize.image_preparation import fit_exposure
+from ..optimize.avatar_tracking import AvatarTracking, normal_images, track_by_avatar
+from ..optimize.image_preparation import EXPOSURE_SCALE, fit_exposure
 from ..settings import TrainingSettings
-from .folder import AVATAR, open_refined, read_run
+from .folder import AVATAR, avatar_version, open_refined, read_run
 
 EXPOSURE_VIEWS, EXPOSURE_HEIGHT_PX = 24, 160
 """Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
@@ -39,6 +39,8 @@ CAMERA_WEIGHT = 0.2
 """Of the camera's exposure in that of a view, as a share of the view's pixels."""
 MIN_COVER = 250
 """Of a mask, of 255, from which a pixel shows the person alone."""
+SHADING_PRIOR, SHADING_ITERATIONS = 0.01, 6
+"""Weight of the light that the avatar was trained in, as a share of the pixels."""
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 PART_TIMESTEPS = 16
@@ -77,16 +79,18 @@ def track_recording(
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
     avatar, settings, capture = _open(*source)
     assert capture.flame is not None
-    rows = _exposure(avatar, settings, capture)
+    light = _light(avatar, settings, capture)
     parts = [
-        (*source, rows, timesteps[first : first + PART_TIMESTEPS], False)
+        (*source, *light, timesteps[first : first + PART_TIMESTEPS], False)
         for first in range(0, len(timesteps), PART_TIMESTEPS)
     ]
     found = helpers.map(
         _track_part, parts, lambda done: report(min(done, len(timesteps)), len(timesteps)), True
     )
     columns = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    tracked = AvatarTracking(timesteps, **columns)
+    tracked, stored = AvatarTracking(timesteps, **columns), read_json(root / REPORT_FILE)
+    if stored["in_order"]:
+        tracked = tracked.smoothed(capture.flame.model)
     frame, torso = capture.flame.frame, torso_shapes(capture.flame.model)
     for timestep, values, shift in zip(timesteps, tracked.parameters, tracked.shift, strict=True):
         path = root / PARAMETERS / f"{timestep:05d}.npz"
@@ -95,8 +99,8 @@ def track_recording(
         if offset is not None:
             arrays["dynamic_offset"] = offset[None].astype(np.float32)
         write_npz(path, arrays)
-    stored = read_json(root / REPORT_FILE)
     shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
+    stored["avatar"] = avatar_version(run)
     stored["image_misfit"][AVATAR_MISFIT] = {str(t): round(share, 3) for t, share in shares}
     write_json(root / REPORT_FILE, stored)
     return tracked
@@ -108,6 +112,7 @@ def _track_part(
     root: Path,
     factor: float,
     exposure: Sequence[Sequence[float]],
+    shading: np.ndarray,
     timesteps: Sequence[int],
     scales: bool,
     step: Step,
@@ -120,9 +125,11 @@ def _track_part(
             step()
         return False
 
-    found = track_by_avatar(avatar, settings, capture, timesteps, None, report, True, scales)
+    found = track_by_avatar(
+        avatar, settings, capture, timesteps, None, report, True, scales, shading
+    )
     step()
-    names = ("parameters", "before", "after", "misfit", "shift", "scale")
+    names = ("parameters", "before", "after", "misfit", "shift", "scale", "information")
     return {name: getattr(found, name) for name in names}
 
 
@@ -135,8 +142,8 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
     if len(cameras) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
-    rows = _exposure(avatar, settings, capture)
-    parts = [(*source, rows, [timestep], True) for timestep in chosen]
+    light = _light(avatar, settings, capture)
+    parts = [(*source, *light, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
     scale_capture(root, read_run(run).flame, factor)
@@ -153,12 +160,9 @@ def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= factor
         write_json(root / name, document)
-    model = capture.flame.model
     for timestep in capture.timesteps:
-        frame = capture.flame.frame(timestep)
-        joints = joint_positions(model, shaped_vertices(model, capture.flame.shape, frame.expr))
         arrays = read_npz(root / PARAMETERS / f"{timestep:05d}.npz")
-        moved = arrays["translation"] + (factor - 1) * (joints[ROOT] + frame.translation)
+        moved = arrays["translation"] + (factor - 1) * capture.mesh(timestep).mean(0)
         arrays["translation"] = moved.astype(np.float32)
         write_npz(root / PARAMETERS / f"{timestep:05d}.npz", arrays)
     torso = read_torso_points(root)
@@ -181,35 +185,54 @@ def _open(
     return read_avatar(run / AVATAR), stored.settings, capture
 
 
-def _exposure(
+def _light(
     avatar: Avatar, settings: TrainingSettings, capture: Capture
-) -> tuple[tuple[float, ...], ...]:
-    """`TrainingSettings.exposure` of a capture that the avatar was not trained on."""
+) -> tuple[tuple[tuple[float, ...], ...], np.ndarray]:
+    """`TrainingSettings.exposure` of a capture that the avatar was not trained on, and harmonics
+    (9, 3) of its light's ratio to that of the training, by the surface's normal."""
     by_camera: dict[int, list[View]] = {}
     for view in (view for views in capture.views.values() for view in views):
         by_camera.setdefault(view.camera_index, []).append(view)
-    rows = []
+    rows, lit = [], []
     for camera, views in by_camera.items():
         chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
         pixels = [_head_colors(avatar, settings, capture, view) for view in chosen]
-        both = [np.concatenate(side, axis=1) for side in zip(*pixels, strict=True)]
-        usual = fit_exposure(both[0], both[1])
-        for view, (drawn, seen) in zip(chosen, pixels, strict=True):
-            own = fit_exposure(drawn, seen, usual, CAMERA_WEIGHT)
+        drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
+        usual = fit_exposure(drawn, seen)
+        for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
+            own = fit_exposure(own_drawn, own_seen, usual, CAMERA_WEIGHT)
             scaled = own * np.array([[1.0], [255.0]])
             rows.append((float(camera), *scaled.ravel().tolist(), float(view.timestep)))
-    return tuple(rows)
+        lit.append((drawn, (seen - usual[1][:, None]) / usual[0][:, None], normals))
+    return tuple(rows), _fit_shading(*(np.concatenate(side, 1) for side in zip(*lit, strict=True)))
+
+
+def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Harmonics (9, 3) of a factor by the normal (3, N) that takes colors (3, N) to those seen;
+    robust."""
+    by_normal, usual = basis(normals.T), uniform(1.0)
+    found = usual.copy()
+    for _ in range(SHADING_ITERATIONS):
+        for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
+            residual = y - x * (by_normal @ found[:, channel])
+            weight = (1 + (residual / EXPOSURE_SCALE) ** 2) ** -2.0
+            system = by_normal * x[:, None]
+            prior = SHADING_PRIOR * (weight @ x**2 + 1e-9)
+            matrix = (weight * system.T) @ system + prior * np.eye(len(found))
+            right = system.T @ (weight * y) + prior * usual[:, channel]
+            found[:, channel] = np.linalg.solve(matrix, right)
+    return found
 
 
 def _head_colors(
     avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colors (3, N) in 0…1 of the avatar and of the image, on the head."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colors (3, N) in 0…1 of the avatar and of the image, and normals (3, N), on the head."""
     levels = [round(255 * part) for part in settings.background]
     scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
     view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
     mesh = capture.mesh(view.timestep)
     drawn = render_avatar(avatar, mesh, view.camera, settings.background)
-    head = silhouette(mesh, capture.faces, view.camera) > 0
+    head, normals = normal_images(mesh, capture.faces, view.camera)
     head &= True if mask is None else mask >= MIN_COVER
-    return drawn[:, head].astype(np.float64), image[head].T / 255
+    return drawn[:, head].astype(np.float64), image[head].T / 255, normals[head].T

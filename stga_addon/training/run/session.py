@@ -28,11 +28,14 @@ from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
 from ..evaluate import lpips
-from ..evaluate.evaluation_views import choose_evaluation_views, read_evaluation_view
 from ..evaluate.evaluator import Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
-from ..evaluate.match_exposure import known_exposure
-from ..evaluate.metrics import peak_memory_mb
+from ..evaluate.metrics import (
+    choose_evaluation_views,
+    known_exposure,
+    peak_memory_mb,
+    read_evaluation_view,
+)
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import RefinedTracking, track_by_avatar
 from ..optimize.image_preparation import image_preparation
@@ -43,9 +46,13 @@ from ..schedule import image_scale, view_order
 from ..settings import TrainingSettings
 from .checkpoint import (
     OTHER_RUN,
+    STRAIN_RANGE,
     Checkpoint,
     read_checkpoint,
     read_selection,
+    require_color_range,
+    strain_range_of,
+    trained_strain_range,
     write_checkpoint,
     write_selection,
 )
@@ -67,7 +74,6 @@ from .folder import (
     write_tracking,
 )  # fmt: skip
 from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
-from .strain_range import STRAIN_RANGE, require_color_range, strain_range_of, trained_strain_range
 
 _log = logging.getLogger(__name__)
 CHECKPOINT_S = 30.0
@@ -288,9 +294,9 @@ class _Session:
             limits = self.strain_range
         with self.trainer.frames.strain_within(limits):
             render = partial(self.trainer.render, progress=share)
-            evaluation = self.evaluator.evaluate(render, perceptual)
+            quality, is_kept = self.evaluator.evaluate(render, perceptual)
         self._require_folder()
-        if evaluation.is_kept:
+        if is_kept:
             self._write_avatar()
         now = perf_counter()
         line = {
@@ -298,12 +304,12 @@ class _Session:
             "seconds": round(self.elapsed_s, 3),
             "splats": len(self.trainer),
             **({"loss": float(np.mean(self.losses))} if self.losses else {}),
-            **evaluation.quality,
+            **quality,
             "evaluation_s": round(now - begin, 3),
             "wall_s": round(now - self.began, 3),
             "peak_memory_mb": peak_memory_mb(),
         }
-        append_metrics(self.folder, self.evaluator.record(evaluation, line, self._spent()))
+        append_metrics(self.folder, self.evaluator.record(is_kept, line, self._spent()))
 
     def _spent(self) -> Spent:
         settings, iterations = self.run.settings, self.trainer.iteration
@@ -525,10 +531,8 @@ def _asked_interval_s() -> float | None:
 
 @contextmanager
 def interrupt_requests() -> Iterator[list[int]]:
-    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt.
-
-    Without effect off the main thread and in Blender, which handles Ctrl-C itself.
-    """
+    """A list that receives the first Ctrl-C; the second one raises KeyboardInterrupt. Without
+    effect off the main thread and in Blender, which handles Ctrl-C itself."""
     requests: list[int] = []
 
     def request(number: int, _frame: object) -> None:

@@ -22,8 +22,7 @@ from stga_addon.development.benchmark.variants import (
 )
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
-from stga_addon.jobs.folder import request_folder, write_request
-from stga_addon.jobs.perform import perform
+from stga_addon.jobs.perform import perform, request_folder, write_request
 from stga_addon.jobs.table import Benchmark
 from stga_addon.jobs.train import Train
 from stga_addon.progress import Cancelled, Progress
@@ -73,9 +72,8 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     first, second, last = (json.loads(line) for line in replies.getvalue().splitlines())
     assert (first["iteration"], second["share"], last) == (1, 0.5, {"done": True})
     quality = json.loads((run.out / QUALITY).read_text())
-    assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality["val"]) & set(
-        quality["test"]
-    )
+    for split in ("val", "test"):
+        assert {"psnr", "ssim", "psnr_mask", "psnr_moving"} <= set(quality[split])
     assert run.finished
     assert "psnr_unmatched" not in quality["val"]
     work(run.out, io.StringIO(), io.StringIO(), fits_exposure=True)
@@ -111,9 +109,8 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
     said.clear()
     shares: list[float] = []
     perform(request, lambda progress: bool(shares.append(progress.share)), said.append)
-    assert [text for text in said if "Starting" in text] == [
-        f"Starting {name}" for name in VARIANTS
-    ]
+    starts = [text for text in said if "Starting" in text]
+    assert starts == [f"Starting {name}" for name in VARIANTS]
     assert shares == sorted(shares)
     report = write_report([request], tmp_path)
     for name in VARIANTS:
@@ -123,9 +120,8 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
         assert [line["iteration"] for line in lines] == sorted(line["iteration"] for line in lines)
         assert read_run(tmp_path / name).settings.seed == 4
     assert (tmp_path / "report.txt").read_text() == report + "\n"
-    assert {
-        run["variant"] for run in json.loads((tmp_path / "benchmark.json").read_text())["runs"]
-    } == set(VARIANTS)
+    runs = json.loads((tmp_path / "benchmark.json").read_text())["runs"]
+    assert {run["variant"] for run in runs} == set(VARIANTS)
     assert (tmp_path / "benchmark.csv").read_text().startswith("variant,seed,iteration,seconds,")
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     said.clear()
@@ -135,16 +131,13 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
         perform(replace(request, seconds=3.0))
 
 
-def test_exposure_is_fitted_for_all_or_none(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_exposure_is_fitted_for_all_or_none(toy, tmp_path, monkeypatch):
     """Catches variants with the effect that are measured with fitted exposure beside others without
     it."""
     request = Benchmark(tmp_path, toy.root, 2.0)
     rows = ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
-    plain = {
-        name: {**changes, "effects": {"exposure": "off"}} for name, changes in VARIANTS.items()
-    }
+    off = {"effects": {"exposure": "off"}}
+    plain = {name: {**changes, **off} for name, changes in VARIANTS.items()}
     with_rows = {
         "paper": {**TINY, "schedule": "paper"},
         "corrected": {**TINY, "exposure": rows, "effects": None},
@@ -170,9 +163,7 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
 
 
-def test_ended_workers_are_reaped(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stand_in: None
-) -> None:
+def test_ended_workers_are_reaped(toy, tmp_path, monkeypatch, stand_in):
     """Catches processes that have ended but are left unreaped until all other runs are trained."""
     started: list[subprocess.Popen[str]] = []
 
@@ -184,9 +175,11 @@ def test_ended_workers_are_reaped(
     ended: list[list[bool]] = []
     monkeypatch.setattr(subprocess, "Popen", Recorded)
     runs = [run_in(toy, tmp_path / name, seconds=1.0) for name in ("first", "second")]
-    train_in_turns(
-        runs, lambda text: ended.append([process.returncode is not None for process in started])
-    )
+
+    def look(text: str) -> None:
+        ended.append([process.returncode is not None for process in started])
+
+    train_in_turns(runs, look)
     assert ended == [[], [False], [False, False], [True, True]]  # two starts, two turns
 
 
@@ -202,9 +195,7 @@ def test_variants() -> None:
     standard."""
     for table in (MAIN_VARIANTS, SETTING_VARIANTS):
         made = [make_settings(**{"seconds": 1.0, **changes}) for changes in table.values()]
-        assert len({json.dumps(str(replace(settings, preset=None))) for settings in made}) == len(
-            table
-        )
+        assert len({str(replace(settings, preset=None)) for settings in made}) == len(table)
         assert "standard" in table
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
     with pytest.raises(StgaError, match="--only: 'fast' is not one of draft, standard"):

@@ -13,11 +13,8 @@ from stga_addon.development.benchmark.statistics import (
     Spread,
     mean_curves,
     pareto_front,
-    spread_of,
     summarize,
-    within_spread,
 )
-from stga_addon.report import evaluation_share
 
 
 def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:
@@ -46,15 +43,6 @@ def test_summary_over_seeds() -> None:
     assert table["a"]["ms_per_iteration"].mean == pytest.approx(100.0)
     assert table["b"]["val_psnr"].mean == 20.0
     assert np.isnan(table["b"]["val_psnr"].spread)
-
-
-def test_within_spread() -> None:
-    """Catches a difference claimed between runs that scatter as much."""
-    a, b = spread_of([30.0, 30.4]), spread_of([30.3, 30.9])
-    assert within_spread(a, b)
-    assert not within_spread(a, Spread(31.0, 0.1, 2))
-    # nothing is known
-    assert not within_spread(Spread(30.0, float("nan"), 1), Spread(30.0, float("nan"), 1))
 
 
 def test_mean_curves() -> None:
@@ -147,8 +135,3 @@ def test_the_report_says_what_is_not_shown() -> None:
     assert "One seed gives no spread" in report_text(one, mean_curves(one), 10.0, Path("head"))
     none = [outcome("a", 0, 30.0, finished=False)]
     assert report_text(none, {}, 10.0, Path("head")) == "head: no run is finished yet"
-
-
-def test_the_last_evaluation_comes_after_training() -> None:
-    """Catches the share of short runs being blamed on the evaluation that any run ends with."""
-    assert evaluation_share([line(5.0, 1.0), line(10.0, 2.0)]) == 0.05

@@ -8,12 +8,9 @@ import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.cli.main import main
 from stga_addon.development.demo import run
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.files import read_json, write_json
-from stga_addon.training.run.folder import read_run
-from stga_addon.training.run.metrics_log import read_metrics
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
@@ -64,24 +61,6 @@ def test_demo_writes_its_files(demo):
     gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
     assert colored.sum() > 50, "no selected splat is shown in color"
     assert gray.sum() > 50, "no frozen splat is shown gray"
-
-
-@pytest.mark.nightly
-@pytest.mark.needs("adapter")
-def test_demo_trains_on_the_device_that_is_asked_for(tmp_path, monkeypatch, capsys):
-    """Catches `stga demo --device gpu` that trains on the CPU, or whose files need it."""
-    from raster import gpu_device
-
-    adapter = gpu_device.device().name
-    monkeypatch.setattr(run, "unpack_capture", unpack_few)
-    assert (
-        main(["demo", "--out", str(tmp_path), "--iterations", "4", "--device", f"gpu:{adapter}"])
-        == 0
-    )
-    assert f"Training on {adapter}" in capsys.readouterr().out
-    assert read_run(tmp_path / "run").device == f"gpu:{adapter}"
-    assert read_metrics(tmp_path / "run")[-1]["iteration"] == 4
-    assert (tmp_path / "demo.blend").exists()
 
 
 @pytest.mark.slow

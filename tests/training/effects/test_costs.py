@@ -125,10 +125,6 @@ def test_exposure_is_taken_away(painted):
         assert (correct(view, image, mask)[mask == 0] == image[mask == 0]).all()
     stranger = replace(view, camera_index=99)
     assert correct(stranger, image, mask) is image
-
-
-def test_no_exposure_is_no_pass():
-    """Catches images that are copied although nothing is corrected."""
     assert exposure_correction(make_settings(iterations=1)) is None
 
 

@@ -17,8 +17,13 @@ from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.ply import read_ply
 from stga_addon.training.effect_catalog import EFFECTS, Effect
-from stga_addon.training.effects.plan import add_effects, describe_effects, plan_effects
-from stga_addon.training.effects.rules import RULES, Verdict
+from stga_addon.training.effects.plan import (
+    RULES,
+    Verdict,
+    add_effects,
+    describe_effects,
+    plan_effects,
+)
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state

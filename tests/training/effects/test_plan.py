@@ -12,8 +12,7 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects import plan as planning
-from stga_addon.training.effects.plan import add_effects, plan_effects
-from stga_addon.training.effects.rules import Verdict
+from stga_addon.training.effects.plan import Verdict, add_effects, plan_effects
 from stga_addon.training.run.folder import Run, read_run, write_run
 from stga_addon.training.settings import make_settings
 

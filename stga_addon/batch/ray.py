@@ -12,12 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
-from ...errors import StgaError
-from ...worker.helpers import processors
-from ...worker.launch import PACKAGES_FOLDER
-from ...worker.status import LOG_FILE, inspect_worker, read_status
-from ...worker.training_python import PYTHON_VARIABLE
-from ..plan import Ended, Job, job_command
+from ..errors import StgaError
+from ..worker.helpers import processors
+from ..worker.launch import PACKAGES_FOLDER
+from ..worker.status import LOG_FILE, inspect_worker, read_status
+from ..worker.training_python import PYTHON_VARIABLE
+from .plan import Ended, Engine, Job, job_command
 
 MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory
 NODE_RETRIES = 5  # How often Ray begins a task again elsewhere whose machine has gone
@@ -25,10 +25,9 @@ TOKEN_MODE, TOKEN = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"
 """Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
 
 
-class RayEngine:
+class RayEngine(Engine):
     """Submits each job when what it comes after is finished; Ray minds resources."""
 
-    takes_all = False
     interval_s = 0.2
 
     def __init__(self, address: str) -> None:
@@ -44,12 +43,10 @@ class RayEngine:
 
         try:
             # "local": also where another cluster is running on this machine
-            own: dict[str, Any] = (
-                {} if address else {"num_cpus": processors(), "include_dashboard": False}
-            )
-            ray.init(
-                address=address or "local", log_to_driver=False, logging_level=logging.ERROR, **own
-            )
+            options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+            if not address:
+                options |= {"num_cpus": processors(), "include_dashboard": False}
+            ray.init(address=address or "local", **options)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             problem = f"Ray cannot be reached ({error})"
             raise StgaError(f"--address {address or 'local'}: {problem}") from error
@@ -90,26 +87,22 @@ class RayEngine:
             ready, _ = self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=0)
             for task in ready:
                 job = self._jobs.pop(task)
-                end = self._end(task, job)
-                if end.snapshot.state.is_alive:  # on a machine that Ray had given up
+                try:
+                    code = self._ray.get(task)
+                # its machine or Ray's worker has gone, more often than NODE_RETRIES
+                except self._ray.exceptions.RayError:
+                    code = -1
+                snapshot = inspect_worker(job.request_folder)
+                if snapshot.state.is_alive:  # on a machine that Ray had given up
                     self.adopt(job)
                 else:
-                    found[job.name] = end
+                    found[job.name] = Ended(snapshot, code < 0)
         return found
-
-    def _end(self, task: Any, job: Job) -> Ended:
-        try:
-            code = self._ray.get(task)
-        # its machine or Ray's worker has gone, more often than NODE_RETRIES
-        except self._ray.exceptions.RayError:
-            code = -1
-        return Ended(inspect_worker(job.request_folder), code < 0)
 
     def withdraw(self) -> Sequence[str]:
         """Take back the tasks that have not begun."""
-        waiting = [
-            task for task, job in self._jobs.items() if read_status(job.request_folder) is None
-        ]
+        jobs = self._jobs.items()
+        waiting = [task for task, job in jobs if read_status(job.request_folder) is None]
         for task in waiting:
             self._ray.cancel(task)
         return [self._jobs.pop(task).name for task in waiting]

@@ -1,25 +1,35 @@
-"""Splats of the world: begun as blocks of the clean plates on a shell around the person, then
-trained on the plates."""
+"""World: splats of what stands still behind the person. They begin as blocks of clean plates, on a
+shell around the person, and are trained on these."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
-from ...avatar.embedding import face_frames, to_local, to_world
-from ...avatar.splats import SH_C0, Splats, joined
-from ...capture.camera import Camera
-from ...capture.model import Capture, View
-from ...flame.quaternions import from_matrices
-from ...progress import Progress, Report, counted, ignore
-from ..optimize.hull_points import pixels_of
-from ..optimize.image_preparation import exposure_correction
-from ..optimize.state import new_state
-from ..optimize.trainer import Trainer
-from ..settings import Rates, TrainingSettings
-from .clean_plates import CleanPlate, clean_plates
+from ..avatar.embedding import face_frames, to_local, to_world
+from ..avatar.splats import SH_C0, Splats, joined
+from ..capture.camera import Camera
+from ..capture.images import read_view
+from ..capture.model import Capture, View, evenly_spread
+from ..flame.quaternions import from_matrices
+from ..progress import Progress, Report, counted, ignore
+from .optimize.hull_points import pixels_of
+from .optimize.image_preparation import Correction, exposure_correction
+from .optimize.state import new_state
+from .optimize.trainer import Trainer
+from .settings import Rates, TrainingSettings
 
+MAX_PLATE_VIEWS = 24
+"""Views of a camera that its plate is the median of."""
+MAX_PLATE_PIXELS = 500_000
+"""Larger images are read smaller."""
+MATTE_MARGIN_SHARE = 0.008
+"""Around the person nothing is taken from a view, where a matte is uncertain; share of the image's
+height."""
+PERSON = 256
+"""Above every level of a pixel: sorts behind them."""
 RADII, NEAREST_RADIUS, FARTHEST_RADIUS = 24, 0.3, 12.0
 """Shells that are tried, and the smallest and the largest, in distances of the cameras from the
 person."""
@@ -55,6 +65,62 @@ TRIANGLE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
 """Meters: what the splats are bound to, around the person."""
 SH_DEGREE = 1
 """Walls shine a little, and cameras differ."""
+
+
+@dataclass(frozen=True)
+class CleanPlate:
+    """A camera, and what it shows without the person.
+
+    image  (H, W, 3) float32 in 0…1
+    seen   (H, W) bool: pixels that some view shows; the others are filled from around
+    """
+
+    camera: Camera
+    image: np.ndarray
+    seen: np.ndarray
+
+
+def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
+    """The plate of each camera that has masks, of the training views; correct: their exposure.
+    Raises StgaError where a file cannot be read."""
+    by_camera: dict[int, list[View]] = {}
+    for view in capture.views.get("train", ()):
+        if view.mask is not None:
+            by_camera.setdefault(view.camera_index, []).append(view)
+    plates = []
+    for _, views in sorted(by_camera.items()):
+        camera, stack = views[0].camera, []
+        scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)
+        for full_size in evenly_spread(views, MAX_PLATE_VIEWS):
+            view, image, mask = read_view(full_size, scale)
+            if correct is not None:
+                image = correct(view, image, None)
+            assert mask is not None
+            margin = max(1, round(MATTE_MARGIN_SHARE * len(mask)))
+            person = binary_dilation(mask > 0, iterations=margin)
+            stack.append(np.where(person[..., None], PERSON, image).astype(np.uint16))
+        levels = np.sort(np.stack(stack, axis=-1), axis=-1)
+        count = (levels[:, :, 0] < PERSON).sum(axis=-1)
+        middle = np.maximum(count - 1, 0)[..., None, None] // 2
+        middle = np.broadcast_to(middle, (*count.shape, 3, 1))
+        image = np.take_along_axis(levels, middle, axis=-1)[..., 0].astype(np.float32) / 255
+        plates.append(CleanPlate(view.camera, filled(image, count > 0), count > 0))
+    return plates
+
+
+def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The image (H, W, 3) float32 with smooth colors where it is not `seen` (H, W) bool: those of
+    the image at half the size, whose pixels are means of those that have one (push and pull)."""
+    if seen.all() or not seen.any():
+        return image
+    height, width = seen.shape
+    weighted = np.zeros((height + height % 2, width + width % 2, 4), np.float32)
+    weighted[:height, :width, :3], weighted[:height, :width, 3] = image * seen[..., None], seen
+    half = weighted.reshape(len(weighted) // 2, 2, -1, 2, 4).mean(axis=(1, 3))
+    known = half[..., 3] > 0
+    smaller = filled(half[..., :3] / np.maximum(half[..., 3:], 1e-6), known)
+    larger = zoom(smaller, (2, 2, 1), order=1, mode="nearest", grid_mode=True)
+    return np.where(seen[..., None], image, larger[:height, :width])
 
 
 def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Splats:
@@ -102,8 +168,6 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
     """Meters from the person's center (3,) to the shell on which plates of different cameras look
     most alike."""
-    from scipy.ndimage import gaussian_filter
-
     details = []  # without coarse colors, which light and exposure change, and without noise
     for plate in plates:
         sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]

@@ -1,4 +1,5 @@
-"""Engine of this machine: as many workers at once as its processors and memory allow."""
+"""The engines that there are: this machine, with as many workers at once as its processors and
+memory allow, and those that have a file each."""
 
 import math
 import os
@@ -7,27 +8,25 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...jobs.folder import worker_arguments
-from ...worker.helpers import processors
-from ...worker.launch import start_worker
-from ...worker.status import inspect_worker
-from ..plan import Ended, Job, training_python
+from ..errors import StgaError
+from ..jobs.perform import worker_arguments
+from ..worker.helpers import processors
+from ..worker.launch import start_worker
+from ..worker.status import inspect_worker
+from .plan import Ended, Engine, Job, training_python
 
 MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use
 GPUS = 1  # Jobs at once that need a GPU to themselves
 IS_WINDOWS = os.name == "nt"  # There, a kill is an exit status like others: 1 by the task manager
 
 
-class LocalEngine:
+class LocalEngine(Engine):
     """Starts a worker process per job, as Blender's panel does; a worker outlives the batch's
     process.
 
     cores, memory_gb   for all workers together; by default what this process may use, and what is
                        free
     """
-
-    takes_all = False
-    interval_s = 0.1
 
     def __init__(
         self, cores: int | None = None, memory_gb: float | None = None, python: str | None = None
@@ -49,10 +48,9 @@ class LocalEngine:
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
-            arguments = worker_arguments(
-                job.request_folder, job.resources.threads or None, resume=True
-            )
-            self._jobs[job.name] = job, start_worker(job.request_folder, self._python, arguments)
+            folder, threads = job.request_folder, job.resources.threads or None
+            arguments = worker_arguments(folder, threads, resume=True)
+            self._jobs[job.name] = job, start_worker(folder, self._python, arguments)
 
     def adopt(self, job: Job) -> None:
         self._jobs[job.name] = job, None
@@ -74,12 +72,6 @@ class LocalEngine:
                 found[name] = Ended(snapshot, is_lost)
         return found
 
-    def withdraw(self) -> Sequence[str]:
-        return ()
-
-    def close(self) -> None:
-        """Workers go on; nothing is held."""
-
 
 def free_memory_gb() -> float:
     """Memory that is available, in GB; infinite where the system does not say (Windows, macOS)."""
@@ -89,3 +81,25 @@ def free_memory_gb() -> float:
         return math.inf
     found = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
     return float(next(found, "inf")) * 1024 / 1e9
+
+
+ENGINES = {
+    "local": "this machine, as many jobs as its processors and memory allow",
+    "ray": "a Ray cluster at --address, or one started here",
+    "slurm": "a SLURM cluster, as arrays of sbatch",
+}
+
+
+def make_engine(name: str, address: str = "") -> Engine:
+    """Raises StgaError where the engine is not there; an address is that of a Ray cluster."""
+    if address and name != "ray":
+        raise StgaError(f"--address: is that of a Ray cluster; expected --engine ray, got {name}")
+    if name == "ray":
+        from .ray import RayEngine
+
+        return RayEngine(address)
+    if name == "slurm":
+        from .slurm import SlurmEngine
+
+        return SlurmEngine()
+    return LocalEngine()

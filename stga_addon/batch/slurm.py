@@ -16,11 +16,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from ...errors import StgaError
-from ...files import read_json, replacing, write_json
-from ...worker.launch import PACKAGES_FOLDER
-from ...worker.status import LOG_FILE, WorkerState, inspect_worker
-from ..plan import Ended, Job, Resources, job_command, kind_name
+from ..errors import StgaError
+from ..files import read_json, replacing, write_json
+from ..worker.launch import PACKAGES_FOLDER
+from ..worker.status import LOG_FILE, WorkerState, inspect_worker
+from .plan import Ended, Engine, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0
 MAX_ARRAY = 1000  # Jobs of an array: SLURM's default MaxArraySize is 1001
@@ -41,7 +41,7 @@ class _Submitted:
     since: float
 
 
-class SlurmEngine:
+class SlurmEngine(Engine):
     """Submits every job at once; SLURM's scheduler minds resources and dependencies."""
 
     takes_all = True
@@ -49,9 +49,8 @@ class SlurmEngine:
 
     def __init__(self) -> None:
         """Raises StgaError where SLURM's programs are missing."""
-        missing = next(
-            (name for name in ("sbatch", "squeue", "scancel") if shutil.which(name) is None), None
-        )
+        programs = "sbatch", "squeue", "scancel"
+        missing = next((name for name in programs if shutil.which(name) is None), None)
         if missing is not None:
             problem = f"the program {missing} was not found; start it where SLURM is installed"
             raise StgaError(f"--engine slurm: {problem}")
@@ -59,9 +58,6 @@ class SlurmEngine:
         self._names: dict[str, str] | None = None
         self._states: dict[str, tuple[str, str]] | None = None
         self._answered_s = time.monotonic()
-
-    def has_room(self, job: Job) -> bool:
-        return True
 
     def submit(self, jobs: Sequence[Job]) -> None:
         """Submit the jobs but those that are in the queue since an earlier start. Raises StgaError
@@ -96,9 +92,8 @@ class SlurmEngine:
                 log = shlex.quote(str(job.request_folder / LOG_FILE))
                 lines.append(f"{index}) exec {shlex.join(job_command(job))} >>{log} 2>&1 ;;")
             partial.write_text("\n".join([*lines, "esac", ""]), encoding="utf-8")
-        names = {
-            self._jobs[other].name for job in jobs for other in job.after if other in self._jobs
-        }
+        others = {other for job in jobs for other in job.after if other in self._jobs}
+        names = (self._jobs[other].name for other in others)
         waits = sorted({_array(name) for name in names if name})
         command = [
             "sbatch", "--parsable", "--requeue", "--output=/dev/null", f"--job-name=stga-{kind}",
@@ -110,19 +105,16 @@ class SlurmEngine:
         array = _call(command).strip().partition(";")[0]
         for index, job in enumerate(jobs):
             self._jobs[job.name] = _Submitted(job, f"{array}_{index}", time.monotonic())
-        self._names = {
-            **(self._names or {}),
-            **{job.name: self._jobs[job.name].name for job in jobs},
-        }
+        submitted = {job.name: self._jobs[job.name].name for job in jobs}
+        self._names = {**(self._names or {}), **submitted}
         write_json(script.with_name(SUBMITTED), self._names)
 
     def adopt(self, job: Job) -> None:
         self._jobs[job.name] = _Submitted(job, self._name(job), time.monotonic())
 
     def running(self) -> Mapping[str, str]:
-        found = {
-            name: (self._states or {}).get(one.name, ("", "")) for name, one in self._jobs.items()
-        }
+        states = self._states or {}
+        found = {name: states.get(one.name, ("", "")) for name, one in self._jobs.items()}
         return {name: machine for name, (state, machine) in found.items() if state in ON_MACHINE}
 
     def _ask(self) -> bool:
@@ -145,9 +137,8 @@ class SlurmEngine:
                 continue
             snapshot = inspect_worker(one.job.request_folder)
             is_new = one.name and time.monotonic() - one.since < GRACE_S
-            if snapshot.state.is_alive or (
-                is_new and snapshot.state in (WorkerState.NONE, WorkerState.LOST)
-            ):
+            has_not_begun = snapshot.state in (WorkerState.NONE, WorkerState.LOST)
+            if snapshot.state.is_alive or (is_new and has_not_begun):
                 continue
             del self._jobs[name]
             found[name] = Ended(snapshot, is_lost=True)
@@ -164,9 +155,6 @@ class SlurmEngine:
         for name in waiting:
             del self._jobs[name]
         return waiting
-
-    def close(self) -> None:
-        """The queue goes on by itself."""
 
 
 def _array(name: str) -> str:
@@ -189,9 +177,8 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
 
 def _queue() -> dict[str, tuple[str, str]]:
     """Job in SLURM -> state and machine, of this user's jobs."""
-    lines = _call(
-        ["squeue", "--me", "--noheader", "--array", f"--format={QUEUE_FORMAT}"]
-    ).splitlines()
+    command = ["squeue", "--me", "--noheader", "--array", f"--format={QUEUE_FORMAT}"]
+    lines = _call(command).splitlines()
     rows = [line.split("|") for line in lines if line.count("|") == 2]
     return {job: (state, machine) for job, state, machine in rows if re.fullmatch(r"\d+_\d+", job)}
 

@@ -1,0 +1,47 @@
+"""Time that a finished avatar takes to track its person, by timestep and camera.
+
+    python benchmarks/avatar_tracking.py RUN [--timesteps 16]
+
+Tracks timesteps of the run's capture, from where landmarks and dense tracking left them, once in
+each of two ways: as training does, and as `stga track --avatar` does, which begins in small images.
+Prints a row in Markdown for each: processor seconds, and seconds of wall time, by timestep and
+camera, in one process, without reading the avatar and compiling kernels. On two processors that
+have nothing else to do, wall time is about half of the processor seconds.
+"""
+
+import argparse
+from pathlib import Path
+from time import perf_counter, process_time
+
+import numpy as np
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.model import evenly_spread
+from stga_addon.training.optimize.avatar_tracking import track_by_avatar
+from stga_addon.training.run.folder import AVATAR, open_run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--timesteps", type=int, default=16)
+    options = parser.parse_args()
+    opened, avatar = open_run(options.run), read_avatar(options.run / AVATAR)
+    capture, settings = opened.capture, opened.run.settings
+    chosen = evenly_spread(capture.timesteps, options.timesteps)
+    views = [view for split in capture.views.values() for view in split]
+    count = sum(view.timestep in chosen for view in views)
+    track_by_avatar(avatar, settings, capture, chosen[:1])  # compiles
+    size = f"{views[0].camera.width}x{views[0].camera.height}"
+    print("| images | tracked | processor s | s | unexplained |\n| --- | --- | --- | --- | --- |")
+    for how, is_far in (("in training", False), ("a recording", True)):
+        begin, busy = perf_counter(), process_time()
+        found = track_by_avatar(avatar, settings, capture, chosen, is_far=is_far)
+        busy, taken = (process_time() - busy) / count, (perf_counter() - begin) / count
+        print(f"| {size} | {how} | {busy:.2f} | {taken:.2f} | {np.median(found.misfit):.0%} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,1 +1,0 @@
-"""World: what stands still behind the person, as splats of its own."""

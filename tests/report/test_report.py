@@ -1,0 +1,265 @@
+"""The lines at the end of a run, its charts, and the commands around time and accuracy."""
+
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stga_addon import report
+from stga_addon.capture.model import Capture
+from stga_addon.cli.main import main
+from stga_addon.development.benchmark.benchmark import benchmark_chart
+from stga_addon.development.benchmark.statistics import MeanCurve
+from stga_addon.format import describe_figures
+from stga_addon.report import (
+    CURVE,
+    CurveUpdater,
+    report_run,
+    run_chart,
+    summarize_continuation,
+    summarize_run,
+)
+from stga_addon.training import preset_timing
+from stga_addon.training.evaluate.forecast import describe_forecast
+from stga_addon.training.run.folder import Run, read_run
+from stga_addon.training.run.session import train
+from stga_addon.training.settings import make_settings
+
+
+def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
+    return [
+        {
+            "seconds": 10.0 * n, "psnr": psnr, "ssim": 0.9, "detail_difference": 1 / psnr,
+            "iteration": n, "evaluation_s": 0.2, **more,
+        }
+        for n, psnr in enumerate(values, 1)
+    ]  # fmt: skip
+
+
+def test_summary_of_a_run() -> None:
+    """Catches the last evaluation given for the best one, and figures that were not measured."""
+    lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
+    assert lines[0] == (
+        "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
+        "0.0323, after 20 s"
+        " (the saved avatar)"
+    )
+    assert (
+        lines[-1]
+        == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
+    )
+    assert len(lines) == 2
+    assert summarize_run([], None) == []
+
+
+def test_summary_of_a_continuation() -> None:
+    """Catches before and after exchanged, and a fitted PSNR that is not called so."""
+    before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
+    lines = summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
+    assert lines == [
+        "splats: 9 before, 12 after",
+        "held-out views (exposure fitted): 30.00 dB before, 32.00 dB after (+2.00)",
+        "held-out views (exposure not fitted): 15.00 dB before, 15.00 dB after (+0.00)",
+        "take 2 (exposure fitted): 20.00 dB before, 19.50 dB after (-0.50)",
+    ]
+
+
+def test_fitted_exposure_is_said() -> None:
+    """Catches a PSNR that six numbers a view were fitted for, shown like one without: in the
+    summary, beside the target, in the forecast and in the panel."""
+    values = metrics([20.0, 31.0, 30.0], psnr_unmatched=25.0)
+    summary = summarize_run(values, 30.5)
+    assert summary[0].startswith(
+        "held-out views: 31.00 dB (exposure fitted; 25.00 dB without), SSIM"
+    )
+    assert summary[1] == "30.5 dB was reached (exposure fitted)"
+    assert "(exposure fitted)" in summarize_run(values, 40.0)[1]
+    rising = metrics([20.0, 25.0, 27.0, 28.0, 28.5], psnr_unmatched=25.0)
+    assert "PSNR with exposure fitted" in describe_forecast(rising, 50.0, 100.0, None)
+    assert "at the end, exposure fitted" in describe_forecast(rising, 50.0, 100.0, 60.0)
+    assert "PSNR 31.00 dB (exposure fitted)   25.00 dB without" in describe_figures(
+        {"psnr": 31.0, "psnr_unmatched": 25.0}
+    )
+    assert "PSNR 31.00 dB" in " ".join(describe_figures({"psnr": 31.0}))
+
+
+def test_targets_and_plateaus() -> None:
+    """Catches a target that is reached and said to be missed, or the other way round."""
+    assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
+    missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
+    assert missed.startswith(
+        "30 dB was not reached (best 28.00 dB): extrapolating the curve, it would take about"
+    )
+    level = summarize_run(metrics([20.0, 25.0, *[24.0] * 10]), 30.0)
+    assert "nothing was gained after 20 s, so more time would not help" in level[1]
+    assert "nothing was gained after 20 s" in level[2]
+    late = metrics([29.0, 31.0])
+    late[1]["detail_difference"] = 0.9  # worse than before, but it is the avatar that was asked for
+    assert summarize_run(late, 30.0)[0].startswith("held-out views: 31.00 dB")
+
+
+def test_report_of_a_finished_run(toy: Capture, tmp_path: Path) -> None:
+    """Catches metrics that a run writes and the summary cannot read, and a missing picture."""
+    train(
+        toy,
+        tmp_path,
+        Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)),
+    )
+    assert report_run(tmp_path)[0].startswith("held-out views: ")
+    assert (tmp_path / CURVE).stat().st_size > 1000
+
+
+def test_the_reason_for_no_curve(toy, tmp_path, monkeypatch):
+    """Catches a missing library blamed where there was nothing to draw, and the other way round."""
+    run = Run(toy.root, None, "vhap", make_settings(iterations=3, hull_points=False, lattice=0))
+    train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
+    assert (
+        report_run(tmp_path / "bare")[-1]
+        == f"{CURVE} was not drawn: no held-out views (split 'val') were evaluated"
+    )
+    train(toy, tmp_path / "run", run)
+    monkeypatch.setattr(report, "find_spec", lambda name: None)
+    assert report_run(tmp_path / "run")[-1] == f"{CURVE} was not drawn: matplotlib is not installed"
+
+
+def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a picture that comes only at the end, is drawn again without need, or takes more than
+    its share."""
+    now, drawn = [0.0], []
+
+    def draw(folder: Path) -> None:
+        drawn.append(now[0])
+        now[0] += 0.05
+
+    monkeypatch.setattr(report, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(report, "write_curve", draw)
+    keep = CurveUpdater(tmp_path)
+    for second in range(51):
+        now[0] = float(second)
+        if second in (0, 31, 46):
+            with (tmp_path / "metrics.jsonl").open("a") as out:
+                out.write("{}\n")
+        keep()
+    assert drawn == [30.0, 36.0, 46.0]
+
+
+def evaluations(count: int) -> list[dict[str, Any]]:
+    return [
+        {"seconds": 2.0 + n, "psnr": 20.0 + n, "psnr_mask": 18.0, "psnr_moving": 17.0}
+        for n in range(count)
+    ]
+
+
+def test_run_chart_shows_regions_and_the_forecast() -> None:
+    """Catches swapped axes, a missing region, and a forecast that does not start at the latest
+    evaluation."""
+    lines = evaluations(4)
+    lines[-1]["forecast"] = {"seconds": 8.0, "psnr": 24.0, "error": 0.5}
+    (axes,) = run_chart(lines).axes
+    drawn = {str(line.get_label()): np.asarray(line.get_xydata()) for line in axes.lines}
+    assert list(drawn) == ["whole image", "head mask", "moving region", "forecast"]
+    np.testing.assert_array_equal(drawn["whole image"], [[2, 20], [3, 21], [4, 22], [5, 23]])
+    np.testing.assert_array_equal(drawn["forecast"], [[5, 23], [8, 24]])
+    band = axes.collections[0].get_paths()[0].vertices
+    assert {(8.0, 23.5), (8.0, 24.5)} <= set(map(tuple, band))
+
+
+def test_a_run_of_any_length_is_rendered() -> None:
+    """Catches a chart that fails before the second evaluation, or on a capture without masks, and
+    an empty picture."""
+    for lines in (
+        [],
+        evaluations(1),
+        [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}],
+    ):
+        stream = BytesIO()
+        run_chart(lines).savefig(stream, format="png")
+        picture = Image.open(stream)
+        assert picture.size == (900, 540)
+        assert np.ptp(np.asarray(picture.convert("L"))) > 200
+
+
+def test_the_steep_start_is_cut_off() -> None:
+    """Catches an axis on which the first evaluation of a long run flattens all others."""
+    lines = [{"seconds": float(s), "psnr": 36 - 30 / s**0.5} for s in (1, 10, 20, 50, 100)]
+    (axes,) = run_chart(lines).axes
+    assert 25 < axes.get_ylim()[0] < lines[1]["psnr"]
+
+
+def test_a_curve_that_ends_before_a_tenth_of_the_time() -> None:
+    """Catches a benchmark without a chart because one of its variants was stopped soon."""
+    long, short = np.linspace(1, 100, 50), np.linspace(1, 5, 5)
+    curves = {n: MeanCurve(x, x, x, x) for n, x in (("long", long), ("short", short))}
+    (axes,) = benchmark_chart(curves, "title").axes
+    assert axes.get_ylim()[0] <= 5
+
+
+def test_the_pareto_front_is_bold_and_bands_belong_to_their_curves() -> None:
+    """Catches a front on the wrong curve, and a band of another variant or color."""
+    x = np.linspace(1, 10, 50)
+    high = MeanCurve(x, np.linspace(29, 30, 50), np.full(50, 28.0), np.full(50, 31.0))
+    low = MeanCurve(x, np.full(50, 26.0), np.full(50, 25.9), np.full(50, 26.1))
+    (axes,) = benchmark_chart({"high": high, "low": low}, "title").axes
+    (bold,) = [line for line in axes.lines if line.get_linewidth() > 3]
+    assert np.asarray(bold.get_ydata()).min() >= 29
+    for band, curve, name in zip(axes.collections, (high, low), ("high", "low"), strict=True):
+        vertices = band.get_paths()[0].vertices
+        assert (vertices[:, 1].min(), vertices[:, 1].max()) == (curve.low[0], curve.high[0])
+        (line,) = [line for line in axes.lines if line.get_label() == name]
+        assert band.get_facecolor()[0, :3].tolist() == [
+            int(str(line.get_color())[n : n + 2], 16) / 255 for n in (1, 3, 5)
+        ]
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every preset takes a millisecond an iteration."""
+    monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 0.001)
+
+
+def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches presets that are not told, or without their time, or without what was timed."""
+    assert main(["presets", str(toy_root), "--device", "cpu"]) == 0
+    device, *lines = capsys.readouterr().out.splitlines()
+    assert device == "Training on the CPU (--device cpu)"
+    assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
+    assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
+
+
+def test_what_is_timed_is_what_will_train(toy_root, tmp_path, capsys, monkeypatch):
+    """Catches a GPU that is given the minutes of the CPU."""
+    timed: list[str] = []
+    monkeypatch.setattr(
+        preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3
+    )
+    for module in ("jobs.analyze", "render.device"):
+        monkeypatch.setattr(
+            f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why")
+        )
+    device = ["--device", "gpu"]
+    assert main(["presets", str(toy_root), *device]) == 0
+    assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
+    assert timed == ["gpu:Card"] * 6
+
+
+def test_a_preset_brings_its_iterations(toy_root, tmp_path, capsys, monkeypatch):
+    """Catches a preset that changes nothing, and one that cannot be overruled."""
+    train = ["train", str(toy_root), "--out"]
+    assert main([*train, str(tmp_path / "preset"), "--preset", "draft", "--target-psnr", "5"]) == 0
+    out = capsys.readouterr().out
+    assert "Preset draft: 800 iterations\n" in out
+    assert "5 dB was reached" in out
+    assert "held-out views: " in out
+    settings = read_run(tmp_path / "preset").settings
+    assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
+        "draft", 800, 1, 5.0,
+    )  # fmt: skip
+    assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
+    settings = read_run(tmp_path / "counted").settings
+    assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
+    assert main([*train, str(tmp_path / "counted"), "--resume", "--preset", "draft"]) == 2
+    assert "--preset: this run began with final" in capsys.readouterr().err

@@ -1,0 +1,11 @@
+"""The head that most takes here are of."""
+
+import pytest
+from flame.small_head import small_head
+
+from stga_addon.tracking.head_model import HeadModel
+
+
+@pytest.fixture(scope="session")
+def head():
+    return HeadModel(small_head(0), "flame")
