@@ -52,15 +52,8 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
     arriving = arriving + Bounce(neutral, faces, occlusion).light(arriving)
     eye = lashes & (np.linalg.norm(neutral - neutral[neutral[:, 2].argmax()], axis=1) < 0.012)
     wet = np.where((neutral[:, 0] > 0.05) | eye, 0.2, 0).astype(np.float32)
-    light = AvatarLight(
-        radiance.astype(np.float32),
-        transfer,
-        occlusion,
-        arriving.astype(np.float32),
-        wet,
-        0.05,
-        damping,
-    )
+    radiance, arriving = radiance.astype(np.float32), arriving.astype(np.float32)
+    light = AvatarLight(radiance, transfer, occlusion, arriving, wet, 0.05, damping)
     splats = with_lashes(head.avatar, eye) if lashes else head.avatar.splats
     return replace(head, avatar=replace(head.avatar, light=light, splats=splats))
 
@@ -69,9 +62,8 @@ def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
     """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around
     an eye (V,) bool."""
     middle, centers = avatar.neutral[eye].mean(0), avatar.neutral[avatar.faces].mean(1)
-    around = np.flatnonzero(
-        ~eye[avatar.faces].any(1) & (np.linalg.norm(centers - middle, axis=1) < 0.02)
-    )
+    near = np.linalg.norm(centers - middle, axis=1) < 0.02
+    around = np.flatnonzero(~eye[avatar.faces].any(1) & near)
     unit = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
     splats = avatar.splats.rows(np.arange(len(avatar.splats)))
     chosen = np.resize(around, LASHES)
@@ -91,10 +83,8 @@ def harmonics() -> np.ndarray:
     return world
 
 
-def set_lighting(browser: Browser, lighting: str) -> None:
-    browser.evaluate(
-        f"(() => {{ document.querySelector('stga-avatar').lighting = {lighting}; }})()"
-    )
+def set_lighting(browser: Browser, lighting: object) -> None:
+    browser.evaluate(f"{{ document.querySelector('stga-avatar').lighting = {lighting}; }}")
 
 
 @pytest.mark.parametrize(
@@ -115,13 +105,10 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     show(browser, tmp_path, head.data(exact=exact))
     world, sun_light = harmonics(), SUN
     if alike:
-        world, sun_light = (
-            head.avatar.light.radiance * np.array([1.2, 1.0, 0.8]),
-            {**SUN, "color": [0.6, 0.45, 0.3]},
-        )
-    set_lighting(
-        browser, str({"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5})
-    )
+        world = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8])
+        sun_light = {**SUN, "color": [0.6, 0.45, 0.3]}
+    lighting = {"harmonics": world.ravel().tolist(), "sun": sun_light, "exposure": 0.5}
+    set_lighting(browser, lighting)
     relighter = Relighter(head.avatar)
     order = np.lexsort((relighter.face, head.avatar.splats.face))
     assert len(relighter.lashes.face) == LASHES
@@ -129,9 +116,8 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     share = relighter.distant_in_head(head.meshes[0], Lighting(world, (sun,)))[1].share
     assert 0.3 < share < 0.95 if alike else share < 0.1
     for frame in (0, 2):
-        colors = relighter.colors(
-            head.meshes[frame], head.camera.position, Lighting(world, (sun,), exposure=0.5)
-        )
+        lighting = Lighting(world, (sun,), exposure=0.5)
+        colors = relighter.colors(head.meshes[frame], head.camera.position, lighting)
         shown = picture(browser, frame)
         found = np.reshape(browser.evaluate(COLORS), (-1, 4))[:, :3]
         error = np.abs(found - colors[order]).max(1)
@@ -173,18 +159,13 @@ def test_environments_stand_upright_and_turn(up, browser, tmp_path):
     for turn in (0.0, np.pi / 2):
         set_lighting(browser, f"{{ environment: 'sunset', turn: {turn} }}")
         picture(browser, 0)
-        light = browser.evaluate(
-            "(({ world, sun }) => ({ world: [...world], sun }))"
-            "(document.querySelector('stga-avatar').player.lightPass.light)"
-        )
-        found.append((np.reshape(light["world"], (9, 3)), np.array(light["sun"]["toward"])))
+        light = "document.querySelector('stga-avatar').player.lightPass.light"
+        world, toward = browser.evaluate(f"[[...{light}.world], {light}.sun.toward]")
+        found.append((np.reshape(world, (9, 3)), np.array(toward)))
     (world, toward), (turned_world, turned_toward) = found
     assert toward @ up == pytest.approx(0.28, abs=0.03)
     # x ↦ up × x, and what lies along `up` stays
-    quarter = np.cross(np.eye(3), up).T + np.outer(up, up)
-    quarter = np.array(
-        [np.cross(up, axis) + np.array(up) * (np.array(up) @ axis) for axis in np.eye(3)]
-    ).T
+    quarter = np.cross(up, np.eye(3)).T + np.outer(up, up)
     np.testing.assert_allclose(turned_toward, quarter @ toward, atol=1e-9)
     np.testing.assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
 
@@ -195,15 +176,17 @@ def test_light_controls(browser, tmp_path):
     head = lit_head()
     show(browser, tmp_path, head.data())
     assert not browser.evaluate("document.getElementById('light').hidden")
-    choose = "(() => {{ const list = document.querySelector('#light select'); list.value = '{}';"
-    choose += " list.dispatchEvent(new Event('change'));"
-    choose += " return document.querySelector('stga-avatar').lighting; }})()"
-    assert browser.evaluate(choose.format("studio")) == {
-        "environment": "studio",
-        "turn": 0,
-        "exposure": 0,
-    }
-    dragged = browser.evaluate(choose.format("dragged"))
+
+    def choose(kind: str) -> dict[str, object] | None:
+        return browser.evaluate(f"""{{
+          const list = document.querySelector('#light select');
+          list.value = '{kind}';
+          list.dispatchEvent(new Event('change'));
+          document.querySelector('stga-avatar').lighting;
+        }}""")
+
+    assert choose("studio") == {"environment": "studio", "turn": 0, "exposure": 0}
+    dragged = choose("dragged")
     assert set(dragged) == {"even", "sun", "exposure"}
     assert browser.evaluate("document.querySelector('#light-dragged').hidden") is False
 
@@ -211,14 +194,15 @@ def test_light_controls(browser, tmp_path):
         """Brightness of the right half of the picture over the left."""
         levels = picture(browser, 0)
         covered = levels.min(2) < 250
-        left, right = np.hsplit(np.where(covered, levels.mean(2), 0), 2)
-        return float(
-            right.sum()
-            / np.hsplit(covered, 2)[1].sum()
-            / (left.sum() / np.hsplit(covered, 2)[0].sum())
-        )
+        half, shown = covered.shape[1] // 2, levels.mean(2)
+        left, right = (shown[:, k][covered[:, k]].mean() for k in np.s_[:half, half:])
+        return float(right / left)
 
-    box = browser.evaluate("""(() => {
+    def mouse(kind: str, x: float, y: float, **keys: int) -> None:
+        at = {"type": f"mouse{kind}", "x": x, "y": y, "button": "left", "clickCount": 1}
+        browser.send("Input.dispatchMouseEvent", **at, **keys)
+
+    left, top, width = browser.evaluate("""(() => {
       document.getElementById('panel').hidden = false;
       const pad = document.getElementById('light-pad');
       pad.scrollIntoView({ block: 'center' });
@@ -227,40 +211,24 @@ def test_light_controls(browser, tmp_path):
     })()""")
     shares = []
     for x in (0.15, 0.85):
-        at = {
-            "x": box[0] + x * box[2],
-            "y": box[1] + 0.5 * box[2],
-            "button": "left",
-            "clickCount": 1,
-        }
-        browser.send("Input.dispatchMouseEvent", type="mousePressed", **at)
-        browser.send("Input.dispatchMouseEvent", type="mouseReleased", **at)
+        for kind in ("Pressed", "Released"):
+            mouse(kind, left + x * width, top + 0.5 * width)
         shares.append(side_of_light())
     assert shares[1] > 1.2 * shares[0]
     browser.evaluate("document.getElementById('panel').hidden = true")
-    before = browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()")
-    for kind, x in (("mousePressed", 200), ("mouseMoved", 100), ("mouseReleased", 100)):
-        browser.send(
-            "Input.dispatchMouseEvent",
-            type=kind,
-            x=x,
-            y=150,
-            button="left",
-            buttons=1,
-            modifiers=1,
-            clickCount=1,
-        )
+    camera = "document.querySelector('stga-avatar').camera.matrix.join()"
+    before = browser.evaluate(camera)
+    for kind, x in (("Pressed", 200), ("Moved", 100), ("Released", 100)):
+        mouse(kind, x, 150, buttons=1, modifiers=1)  # Alt
     assert side_of_light() < shares[1]
-    assert browser.evaluate("document.querySelector('stga-avatar').camera.matrix.join()") == before
-    assert (
-        browser.evaluate(
-            "getComputedStyle(document.getElementById('light-pad')).getPropertyValue('--x')"
-        )
-        != "85%"
-    )
-    refused = "(() => {{ try {{ document.querySelector('stga-avatar').lighting = {}; }}"
-    refused += " catch (error) {{ return error.message; }} }})()"
-    assert "no environment" in browser.evaluate(refused.format("{ environment: 'toString' }"))
-    assert "finite numbers" in browser.evaluate(refused.format("{ harmonics: [1, 2] }"))
-    assert browser.evaluate(choose.format("recorded")) is None
+    assert browser.evaluate(camera) == before
+    place = "document.getElementById('light-pad').style.getPropertyValue('--x')"
+    assert browser.evaluate(place) != "85%"
+    for lighting, problem in (
+        ("{ environment: 'toString' }", "no environment"),
+        ("{ harmonics: [1, 2] }", "finite numbers"),
+    ):
+        with pytest.raises(AssertionError, match=problem):
+            set_lighting(browser, lighting)
+    assert choose("recorded") is None
     assert browser.errors == []

@@ -77,24 +77,15 @@ window.playFor = (pictures, rate) => {
 
 def touch(browser: Browser, *paths: list[tuple[float, float]]) -> None:
     """Fingers that go along `paths` of equal length together (pixels)."""
-    for step in range(len(paths[0])):
-        points = [
-            {"x": path[step][0], "y": path[step][1], "id": finger}
-            for finger, path in enumerate(paths)
-        ]
-        browser.send(
-            "Input.dispatchTouchEvent",
-            type="touchMove" if step else "touchStart",
-            touchPoints=points,
-        )
+    for step, places in enumerate(zip(*paths, strict=True)):
+        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
+        kind = "touchMove" if step else "touchStart"
+        browser.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
     browser.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
 
 def line(start: tuple[float, float], end: tuple[float, float]) -> list[tuple[float, float]]:
-    return [
-        (start[0] + s * (end[0] - start[0]), start[1] + s * (end[1] - start[1]))
-        for s in np.linspace(0, 1, 6)
-    ]
+    return [tuple(place) for place in np.linspace(start, end, 6).tolist()]
 
 
 def press(browser: Browser, key: str) -> None:
@@ -105,6 +96,11 @@ def press(browser: Browser, key: str) -> None:
 
 def of_avatar(browser: Browser, member: str) -> Any:
     return browser.evaluate(f"document.querySelector('stga-avatar').{member}")
+
+
+def forward(head: Head, frame: FlameFrame) -> np.ndarray:
+    sequence = head.sequence
+    return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
 
 
 def test_touch(browser, head, tmp_path):
@@ -153,11 +149,9 @@ def test_keyboard(browser, head, tmp_path):
         state = browser.evaluate(expression)
         press(browser, key)
         assert browser.evaluate(expression) != state, key
-    browser.evaluate("document.querySelector('stga-avatar').setExpression(0, 0.5)")
+    of_avatar(browser, "setExpression(0, 0.5)")
     press(browser, "x")
-    assert browser.evaluate(
-        "[...document.querySelector('stga-avatar').player.motion.pinnedCoefficients].every(isNaN)"
-    )
+    assert of_avatar(browser, "player.motion.pinnedCoefficients.every(isNaN)")
     assert browser.errors == []
 
 
@@ -180,48 +174,36 @@ def test_sliders_are_flames(browser, head, tmp_path):
       return Array.from(avatar.player.rig.vertices);
     }})()""")
     recorded = head.sequence.frame(0)
-    wanted = FlameFrame(
-        expr=expressions,
-        rotation=recorded.rotation,
-        neck_pose=recorded.neck_pose,
-        jaw_pose=np.array(jaw),
-        translation=recorded.translation,
-        eyes_pose=recorded.eyes_pose,
-    )
-    expected = flame_forward(
-        head.sequence.model, head.sequence.shape, wanted, head.sequence.static_offset
-    )
-    assert np.abs(np.reshape(found, (-1, 3)) - expected).max() < 1e-5
+    wanted = replace(recorded, expr=expressions, jaw_pose=np.array(jaw))
+    assert np.abs(np.reshape(found, (-1, 3)) - forward(head, wanted)).max() < 1e-5
 
 
 def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     """Catches a blank page, or another camera and pose, after the graphics driver was restarted."""
     show(browser, tmp_path, head.data())
-    message = "document.querySelector('stga-avatar').shadowRoot.querySelector('p')"
-    browser.evaluate("document.querySelector('stga-avatar').setExpression(1, 0.9)")
+    of_avatar(browser, "setExpression(1, 0.9)")
+    message = "shadowRoot.querySelector('p')"
     player = "document.querySelector('stga-avatar').player"
-    pictures = f"{player}.read({player}.camera)"
-    before = browser.evaluate(f"Array.from({pictures})")
-    event = "new Promise((done) => avatar.shadowRoot.querySelector('canvas')"
-    event += ".addEventListener('webglcontext%s', %s))"
-    browser.evaluate(f"""(async () => {{
-      const avatar = document.querySelector('stga-avatar');
-      window.extension = avatar.player.gl.getExtension('WEBGL_lose_context');
-      const lost = {event % ("lost", "done")};
-      window.extension.loseContext();
-      await lost;
-    }})()""")
-    assert "restarted" in browser.evaluate(f"{message}.textContent")
-    assert not browser.evaluate(f"{message}.hidden")
-    browser.evaluate(f"""(async () => {{
-      const avatar = document.querySelector('stga-avatar');
-      const restored = {event % ("restored", "done")};
-      window.extension.restoreContext();
-      await restored;
-    }})()""")
-    assert browser.evaluate(f"{message}.hidden")
-    assert browser.evaluate(f"Array.from({pictures})") == before
-    browser.evaluate("document.querySelector('stga-avatar').release()")
+    pictures = f"Array.from({player}.read({player}.camera))"
+    before = browser.evaluate(pictures)
+    context = "player.gl.getExtension('WEBGL_lose_context')"
+    browser.evaluate(f"{{ window.extension = document.querySelector('stga-avatar').{context}; }}")
+
+    def send(kind: str, action: str) -> None:
+        """Lose or restore the context, and wait for its event."""
+        browser.evaluate(f"""new Promise((done) => {{
+          const canvas = document.querySelector('stga-avatar').shadowRoot.querySelector('canvas');
+          canvas.addEventListener('webglcontext{kind}', done);
+          window.extension.{action}Context();
+        }}).then(() => null)""")
+
+    send("lost", "lose")
+    assert "restarted" in of_avatar(browser, f"{message}.textContent")
+    assert not of_avatar(browser, f"{message}.hidden")
+    send("restored", "restore")
+    assert of_avatar(browser, f"{message}.hidden")
+    assert browser.evaluate(pictures) == before
+    of_avatar(browser, "release()")
     assert psnr(browser, head, 0) > 50
     assert browser.errors == []
 
@@ -245,16 +227,11 @@ def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
 
     def played(pictures: int) -> tuple[int, int, int]:
         """Rounds of the motion, WebGL objects alive and bytes of JavaScript afterwards."""
-        rounds = sum(
-            browser.evaluate(f"window.playFor({BATCH}, {PLAY_RATE})")
-            for _ in range(pictures // BATCH)
-        )
+        play = f"window.playFor({BATCH}, {PLAY_RATE})"
+        rounds = sum(browser.evaluate(play) for _ in range(pictures // BATCH))
         browser.send("HeapProfiler.collectGarbage")
-        return (
-            rounds,
-            browser.evaluate("window.alive"),
-            browser.send("Runtime.getHeapUsage")["usedSize"],
-        )
+        used = browser.send("Runtime.getHeapUsage")["usedSize"]
+        return rounds, browser.evaluate("window.alive"), used
 
     _, alive_before, heap_before = played(4 * BATCH)  # compiled by then
     rounds, alive, heap = played(PLAY_S * PLAY_RATE)
@@ -273,9 +250,8 @@ def server(tmp_path: Path) -> Iterator[str]:
     class Quiet(SimpleHTTPRequestHandler):
         def log_message(self, format: str, *values: Any) -> None: ...
 
-    made = ThreadingHTTPServer(
-        ("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path / "site"))
-    )
+    handler = functools.partial(Quiet, directory=str(tmp_path / "site"))
+    made = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=made.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{made.server_port}"
     made.shutdown()
@@ -288,9 +264,7 @@ def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
     site = tmp_path / "site"
     write_web(site / "anna.stga", head.avatar, Playback(title="Anna"), sequence=head.sequence)
     text = (ROOT / "docs/web.md").read_text(encoding="utf-8")
-    markup, script = (
-        re.search(rf"```{kind}\n(.*?)```", text, re.DOTALL)[1] for kind in ("html", "js")
-    )
+    markup, script = (re.search(rf"```{k}\n(.*?)```", text, re.DOTALL)[1] for k in ("html", "js"))
     own = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><h1>Our team</h1>'
     (site / "index.html").write_text(f"{own}{markup}<script>{script}</script>", encoding="utf-8")
     browser.open(f"{server}/index.html")
@@ -317,17 +291,12 @@ def driven_mesh(head: Head, weights: np.ndarray, angles: np.ndarray | None = Non
     """Where ARKit weights (52,) put the head in its first recorded place; angles: yaw, pitch, roll
     of the neck."""
     turned = None if angles is None else angles[None]
-    (found,) = head_map(head.sequence, "head").frames(
-        Performance(np.zeros(1), weights[None], turned, 60.0)
-    )
+    performance = Performance(np.zeros(1), weights[None], turned, 60.0)
+    (found,) = head_map(head.sequence, "head").frames(performance)
     first = head.sequence.frame(0)
     neck = first.neck_pose if angles is None else found.neck_pose
-    frame = replace(
-        first, expr=found.expr, jaw_pose=found.jaw_pose, eyes_pose=found.eyes_pose, neck_pose=neck
-    )
-    return flame_forward(
-        head.sequence.model, head.sequence.shape, frame, head.sequence.static_offset
-    )
+    frame = replace(found, rotation=first.rotation, translation=first.translation, neck_pose=neck)
+    return forward(head, frame)
 
 
 def vertices(browser: Browser, script: str) -> np.ndarray:
@@ -348,27 +317,22 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
     open jaw, rows of a CSV that come at the wrong time, and a recording that does not come back."""
     show(browser, tmp_path, head.data(exact=True, controls=page_controls(head.sequence)))
     before = vertices(browser, "avatar.frame = 0;")
-    weights = np.random.default_rng(2).random(COUNT) * (
-        np.random.default_rng(3).random(COUNT) < 0.5
-    )
+    rng = np.random.default_rng(2)
+    weights = rng.random(COUNT) * (rng.random(COUNT) < 0.5)
     weights[[COLUMN["jawOpen"], COLUMN["mouthClose"]]] = 0.4, 0.9
     chosen = dict(zip(ARKIT_SHAPES, weights.tolist(), strict=True))
-    found = vertices(
-        browser,
-        f"""for (const [name, value] of Object.entries({chosen})) {{
-          const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
-          input.value = value;
-          input.dispatchEvent(new Event('input'));
-        }}""",
-    )
+    script = f"""for (const [name, value] of Object.entries({chosen})) {{
+        const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
+        input.value = value;
+        input.dispatchEvent(new Event('input'));
+      }}"""
+    found = vertices(browser, script)
     np.testing.assert_allclose(found, driven_mesh(head, weights), atol=1e-5)
     np.testing.assert_allclose(vertices(browser, "avatar.release();"), before, atol=1e-12)
 
-    rows = np.random.default_rng(4).random((4, COUNT)) * 0.5
-    turns = np.random.default_rng(5).normal(0, 0.2, (4, 3))
-    write_performance(
-        tmp_path / "take.csv", Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0)
-    )
+    rows, turns = rng.random((4, COUNT)) * 0.5, rng.normal(0, 0.2, (4, 3))
+    take = Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0)
+    write_performance(tmp_path / "take.csv", take)
     text = json.dumps((tmp_path / "take.csv").read_text())
     for frame, row, turn in (
         (0, rows[0], turns[0]),
@@ -378,15 +342,9 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
     ):
         found = vertices(browser, f"avatar.setPerformance({text}); avatar.frame = {frame};")
         np.testing.assert_allclose(found, driven_mesh(head, row, turn), atol=1e-5)
-    assert browser.evaluate("document.querySelector('stga-avatar').fps") == pytest.approx(
-        30, rel=1e-3
-    )
+    assert of_avatar(browser, "fps") == pytest.approx(30, rel=1e-3)
     assert browser.evaluate("document.querySelector('#scrub').max") == "4"
-    refused = browser.evaluate(
-        "(() => { try { document.querySelector('stga-avatar').setPerformance('a,b'); }"
-        " catch (error) { return error.message; } })()"
-    )
-    assert refused.startswith("This file is no table of face shapes")
-    np.testing.assert_allclose(
-        vertices(browser, "avatar.setPerformance(null);"), before, atol=1e-12
-    )
+    with pytest.raises(AssertionError, match="This file is no table of face shapes"):
+        of_avatar(browser, "setPerformance('a,b')")
+    found = vertices(browser, "avatar.setPerformance(null);")
+    np.testing.assert_allclose(found, before, atol=1e-12)

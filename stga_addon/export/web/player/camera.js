@@ -111,7 +111,7 @@ function turned(camera, pivot, axis, angle) {
 }
 
 /** @type {(v: Vector, axis: Vector, angle: number) => Vector} */
-function rotatedAbout(v, axis, angle) {
+export function rotatedAbout(v, axis, angle) {
   const [cosine, sine] = [Math.cos(angle), Math.sin(angle)];
   const side = crossed(axis, v);
   const along = dotProduct(axis, v) * (1 - cosine);
@@ -119,12 +119,11 @@ function rotatedAbout(v, axis, angle) {
 }
 
 /** @type {(matrix: Float64Array, k: number) => Vector} */
-const row = (matrix, k) => vector(c => matrix[4 * k + c]);
+export const row = (matrix, k) => vector(c => matrix[4 * k + c]);
 
 /** @type {(matrix: Float64Array, point: Vector) => Vector} */
-function inCamera(matrix, point) {
-  return vector(k => dotProduct(row(matrix, k), point) + matrix[4 * k + 3]);
-}
+const inCamera = (matrix, point) =>
+  vector(k => dotProduct(row(matrix, k), point) + matrix[4 * k + 3]);
 
 const ORBIT_PER_PIXEL = 0.008; // radians
 const ZOOM_PER_WHEEL_PIXEL = 0.0012;
@@ -134,10 +133,7 @@ const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 // Let pointers on `element` move the camera of the player that `player()` gives, and with Alt its
 // sun; `changed` hears of "camerachange" and "lightchange". Of two fingers, the middle pans and the
 // distance zooms.
-/**
- * @type {(element: HTMLElement, player: () => Player | null,
- *   changed: (event: string) => void) => void}
- */
+/** @type {(element: HTMLElement, player: () => ?Player, changed: (name: string) => void) => void} */
 export function addControls(element, player, changed) {
   /** @type {Map<number, Point>} */
   const pointers = new Map();
@@ -194,6 +190,4 @@ function middle(points) {
 }
 
 /** @param {Point[]} points two, or more */
-function distance([a, b]) {
-  return Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));
-}
+const distance = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));

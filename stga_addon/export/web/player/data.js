@@ -1,7 +1,7 @@
 // @ts-check
 // Reading of web data files: container, arrays, and checks of everything that the player relies on.
 
-/** @import { Data, DataArray } from './types.js' */
+/** @import { Data, DataArray, Values } from './types.js' */
 
 import { SIGNALS } from './face_frames.js';
 
@@ -86,10 +86,7 @@ function readArrays(header, payload) {
   return arrays;
 }
 
-/**
- * @type {(name: string, entry: any, block: Uint8Array, count: number) => Float32Array |
- *   Int32Array}
- */
+/** @type {(name: string, entry: any, block: Uint8Array, count: number) => Values} */
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;
@@ -114,9 +111,8 @@ function decoded(name, entry, block, count) {
 // Throw a DataError unless header and arrays fit each other and hold usable values.
 /** @type {(header: any, arrays: Record<string, DataArray>) => void} */
 function checkData(header, arrays) {
-  const [splats, vertices, faces, shapes, frames] = [
-    ...['xyz', 'base', 'faces', 'basis', 'coefficients'].map(name => size(arrays, name, 0)),
-  ];
+  const counted = ['xyz', 'base', 'faces', 'basis', 'coefficients'];
+  const [splats, vertices, faces, shapes, frames] = counted.map(name => size(arrays, name, 0));
   const joints = list(header.parents, 'parents').length;
   const isEmpty = !vertices || !faces || !joints || !frames;
   require(!isEmpty, 'number of vertices, triangles, joints or frames');
@@ -184,8 +180,8 @@ function checkData(header, arrays) {
   for (const [name, past] of Object.entries(limits)) {
     require(arrays[name].values.every(value => isIndex(value, past)), name);
   }
-  const counted = arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0);
-  require(counted === splats, 'splats_per_face');
+  const sum = arrays.splats_per_face.values.reduce((sum, count) => sum + count, 0);
+  require(sum === splats, 'splats_per_face');
   for (const [joint, parent] of header.parents.entries())
     require(parent === -1 || isIndex(parent, joint), 'parents');
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
@@ -215,9 +211,7 @@ function checkData(header, arrays) {
 }
 
 /** @type {(value: any, past: number) => boolean} */
-function isIndex(value, past) {
-  return Number.isInteger(value) && value >= 0 && value < past;
-}
+const isIndex = (value, past) => Number.isInteger(value) && value >= 0 && value < past;
 
 /** @type {(arrays: Record<string, DataArray>, name: string, axis: number) => number} */
 function size(arrays, name, axis) {
@@ -226,9 +220,8 @@ function size(arrays, name, axis) {
 }
 
 /** @type {(value: unknown, count: number) => boolean} */
-function numbers(value, count) {
-  return Array.isArray(value) && value.length === count && value.every(Number.isFinite);
-}
+const numbers = (value, count) =>
+  Array.isArray(value) && value.length === count && value.every(Number.isFinite);
 
 /** @type {(value: any, name: string) => any[]} */
 function list(value, name) {

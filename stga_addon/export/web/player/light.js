@@ -4,19 +4,18 @@
 // light/.
 
 /**
- * @import { Arrays, Data, LightOfCapture, Lighting, LitBy } from './types.js'
+ * @import { Arrays, Data, GL, LightOfCapture, Lighting, LitBy } from './types.js'
  * @import { Program, Sun, Values, Vector } from './types.js'
  */
 
-import { bounds } from './camera.js';
+import { bounds, rotatedAbout } from './camera.js';
 import { FaceFrames } from './face_frames.js';
 import { bindTexture, deleteTarget, floatTexture, makeTarget } from './renderer.js';
 import { paddedLength, program, updateTexture } from './renderer.js';
 import { LIFT_M, MAP_SIZE, SURFACE_TEXELS, TEXTURE_WIDTH, VERTEX_TEXELS } from './shaders.js';
 import { OVER_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER, SHADOW_VERTEX_SHADER } from './shaders.js';
 import { lightFragmentShader } from './shaders.js';
-import { box, crossed, difference, dotProduct, scaled, unit } from './vector.js';
-import { matrixFromAxisAngle, vector } from './vector.js';
+import { box, crossed, difference, dotProduct, scaled, unit, vector } from './vector.js';
 
 // Built-in environments, y up and the face towards z: even radiance, lobes of radiance that falls
 // with the cosine, and a sun of irradiance `color` that throws shadows.
@@ -51,45 +50,39 @@ export const ENVIRONMENTS = {
 
 // What the player computes with. Throws RangeError where the lighting is none (types.d.ts).
 /** @type {(lighting: Lighting, up: Vector) => LitBy} */
-export function litBy(lighting, up) {
-  const { even = [0, 0, 0], environment, turn = 0, harmonics, exposure = 0 } = lighting;
+export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
+  const { turn = 0, harmonics, exposure = 0 } = lighting;
+  let sun = lighting.sun ?? null;
   check([...even, turn, exposure], 5, 'even, turn and exposure');
-  const world = evenLight(even);
-  const added =
-    environment === undefined ? null : addEnvironment(world, environment, fromUpright(up, turn));
+  const world = new Float64Array(3 * HARMONICS);
+  addEven(world, even);
+  if (environment !== undefined) {
+    if (!Object.hasOwn(ENVIRONMENTS, environment))
+      throw new RangeError(`There is no environment "${environment}".`);
+    const { even, lobes, sun: own } = ENVIRONMENTS[environment];
+    const turned = fromUpright(up, turn);
+    addEven(world, even);
+    for (const { toward, color } of lobes)
+      addPoint(world, turned(unit(toward)), color, COSINE_LOBE);
+    if (own) sun ??= { toward: turned(own.toward), color: own.color };
+  }
   if (harmonics) {
     check(harmonics, 3 * HARMONICS, 'harmonics');
     for (let k = 0; k < world.length; k++) world[k] += harmonics[k];
   }
-  const sun = lighting.sun ?? added;
   if (sun) check([...sun.toward, ...sun.color], 6, 'sun');
-  const copy = sun && { toward: unit(sun.toward), color: sun.color };
-  return { world, sun: copy, factor: 2 ** exposure };
+  sun = sun && { toward: unit(sun.toward), color: sun.color };
+  return { world, sun, factor: 2 ** exposure };
 }
 
-// Add an environment whose axes a rotation takes to those of the head; returns its sun.
-/** @type {(world: Float64Array, name: string, rotation: ArrayLike<number>) => Sun | null} */
-function addEnvironment(world, name, rotation) {
-  if (!Object.hasOwn(ENVIRONMENTS, name))
-    throw new RangeError(`There is no environment "${name}".`);
-  const { even, lobes, sun } = ENVIRONMENTS[name];
-  evenLight(even).forEach((value, k) => (world[k] += value));
-  for (const { toward, color } of lobes)
-    addLobe(world, turnedVector(rotation, unit(toward)), color);
-  return sun ? { toward: turnedVector(rotation, sun.toward), color: sun.color } : null;
-}
-
-// The rotation from axes in which y is up, turned about it by an angle, to those in which `up` is.
-/** @type {(up: Vector, turn: number) => number[]} */
+// How directions turn from axes in which y is up, by an angle about it, to those in which `up` is.
+/** @type {(up: Vector, turn: number) => (direction: Vector) => Vector} */
 function fromUpright(up, turn) {
-  const [tilt, spin] = [new Float64Array(9), new Float64Array(9)];
-  matrixFromAxisAngle(scaled(unit(up), turn), 0, spin, 0);
   const axis = crossed([0, 1, 0], unit(up));
   const sine = Math.hypot(...axis);
   const angle = Math.atan2(sine, unit(up)[1]);
-  matrixFromAxisAngle(sine > 1e-9 ? scaled(axis, angle / sine) : [angle, 0, 0], 0, tilt, 0);
-  const columns = [0, 1, 2].map(k => turnedVector(spin, [tilt[k], tilt[k + 3], tilt[k + 6]]));
-  return [0, 1, 2].flatMap(row => columns.map(column => column[row]));
+  const about = sine > 1e-9 ? scaled(axis, 1 / sine) : vector(k => Number(k === 0));
+  return v => rotatedAbout(rotatedAbout(v, about, angle), unit(up), turn);
 }
 
 /** @type {(values: ArrayLike<number>, count: number, name: string) => void} */
@@ -106,9 +99,8 @@ function check(values, count, name) {
 const HARMONICS = 9;
 const DEGREE_0 = 0.28209479177387814;
 const DEGREE_1 = 0.4886025119029199;
-const MIXED = 1.0925484305920792; // xy, yz, xz
+const DEGREE_2 = 1.0925484305920792; // xy, yz, xz; half of it: x² − y²
 const UPRIGHT = 0.31539156525252005; // 3z² − 1
-const CROSSED = 0.5462742152960396; // x² − y²
 // Of each coefficient in a lobe max(0, cosine), over its value in the lobe's direction (Ramamoorthi
 // and Hanrahan).
 const COSINE_LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 0.25, 0.25, 0.25, 0.25, 0.25].map(k => k * Math.PI);
@@ -119,68 +111,46 @@ const COSINE_LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 0.25, 0.25, 0.25, 0.25, 0.25].map(k
 function harmonicsOf(direction) {
   const [x, y, z] = [direction[0], direction[1], direction[2]];
   const linear = [DEGREE_0, DEGREE_1 * y, DEGREE_1 * z, DEGREE_1 * x];
-  const square = [UPRIGHT * (3 * z * z - 1), MIXED * x * z, CROSSED * (x * x - y * y)];
-  return [...linear, MIXED * x * y, MIXED * y * z, ...square];
+  const [xy, yz, xz, sides] = [x * y, y * z, x * z, (x * x - y * y) / 2].map(v => DEGREE_2 * v);
+  return [...linear, xy, yz, UPRIGHT * (3 * z * z - 1), xz, sides];
 }
 
-// Light of a color from everywhere.
-/** @param {ArrayLike<number>} color */
-function evenLight(color) {
-  const light = new Float64Array(3 * HARMONICS);
-  for (let c = 0; c < 3; c++) light[c] = color[c] / DEGREE_0;
-  return light;
+// Add light of a color from everywhere.
+/** @type {(light: Float64Array, color: ArrayLike<number>) => void} */
+function addEven(light, color) {
+  for (let c = 0; c < 3; c++) light[c] += color[c] / DEGREE_0;
 }
 
-// Add radiance of a color that falls with the cosine around a direction.
-/** @type {(light: Float64Array, toward: Vector, color: ArrayLike<number>) => void} */
-function addLobe(light, toward, color) {
-  const values = harmonicsOf(toward);
-  for (let k = 0; k < HARMONICS; k++) {
-    for (let c = 0; c < 3; c++) light[3 * k + c] += COSINE_LOBE[k] * values[k] * color[c];
-  }
+// Add light of an irradiance from one direction; COSINE_LOBE as `lobe`: radiance that falls with
+// the cosine around it.
+/** @type {(light: Float64Array, toward: Vector, color: Vector, lobe?: number[]) => void} */
+function addPoint(light, toward, color, lobe) {
+  harmonicsOf(toward).forEach((value, k) => {
+    for (let c = 0; c < 3; c++) light[3 * k + c] += (lobe?.[k] ?? 1) * value * color[c];
+  });
 }
+
+// An icosahedron's corners, over which sums of degrees up to 5 are integrals over the sphere.
+const GOLDEN = (1 + Math.sqrt(5)) / 2;
+const CORNERS = [-1, 1].flatMap(one =>
+  [-GOLDEN, GOLDEN].flatMap(other =>
+    [0, 1, 2].map(axis => unit(vector(k => [0, one, other][(k + axis) % 3]))),
+  ),
+);
 
 // The same light in other axes: the rotation (3×3, row by row) takes old coordinates to new ones.
-// Degree 1 turns as a vector, degree 2 as a symmetric matrix.
-/** @type {(light: ArrayLike<number>, rotation: ArrayLike<number>) => Float64Array<ArrayBuffer>} */
+/** @type {(light: ArrayLike<number>, rotation: number[]) => Float64Array<ArrayBuffer>} */
 function rotatedLight(light, rotation) {
   const turned = new Float64Array(3 * HARMONICS);
-  for (let c = 0; c < 3; c++) {
-    const part = (/** @type {number} */ k) => light[3 * k + c];
-    const [x, y, z] = turnedVector(rotation, [part(3), part(1), part(2)]);
-    const [xy, yz, xz] = [part(4), part(5), part(7)].map(value => (MIXED / 2) * value);
-    const [up, across] = [UPRIGHT * part(6), CROSSED * part(8)];
-    const m = turnedMatrix(rotation, [across - up, xy, xz, xy, -across - up, yz, xz, yz, 2 * up]);
-    const mixed = [m[1], m[5], m[2]].map(value => (2 * value) / MIXED);
-    const rest = [m[8] / (2 * UPRIGHT), mixed[2], (m[0] - m[4]) / (2 * CROSSED)];
-    const values = [part(0), y, z, x, mixed[0], mixed[1], ...rest];
-    for (const [k, value] of values.entries()) turned[3 * k + c] = value;
+  for (const corner of CORNERS) {
+    const column = (/** @type {number} */ k) => [rotation[k], rotation[k + 3], rotation[k + 6]];
+    const values = harmonicsOf(vector(k => dotProduct(column(k), corner)));
+    const radiance = vector(c =>
+      values.reduce((sum, value, k) => sum + value * light[3 * k + c], 0),
+    );
+    addPoint(turned, corner, scaled(radiance, (4 * Math.PI) / CORNERS.length));
   }
   return turned;
-}
-
-/** @type {(rotation: ArrayLike<number>, v: ArrayLike<number>) => Vector} */
-function turnedVector(rotation, v) {
-  const part = (/** @type {number} */ k) =>
-    rotation[k] * v[0] + rotation[k + 1] * v[1] + rotation[k + 2] * v[2];
-  return [part(0), part(3), part(6)];
-}
-
-// R · M · Rᵀ of 3×3 matrices, row by row.
-/** @type {(rotation: ArrayLike<number>, m: number[]) => number[]} */
-function turnedMatrix(rotation, m) {
-  // (R · row)ᵀ: rows of M · Rᵀ.
-  const rows = [0, 3, 6].map(k => turnedVector(rotation, m.slice(k, k + 3)));
-  const columns = [0, 1, 2].map(k => turnedVector(rotation, [rows[0][k], rows[1][k], rows[2][k]]));
-  return [0, 1, 2].flatMap(row => columns.map(column => column[row]));
-}
-
-// Add light of an irradiance from one direction.
-/** @type {(light: Float64Array, toward: ArrayLike<number>, color: ArrayLike<number>) => void} */
-function addPoint(light, toward, color) {
-  harmonicsOf(toward).forEach((value, k) => {
-    for (let c = 0; c < 3; c++) light[3 * k + c] += value * color[c];
-  });
 }
 
 // What arrives at a head, and how much of its recorded colors that keeps
@@ -305,14 +275,13 @@ const UNLIKE_LIGHT = 0.2;
 // harmonics each, in the same axes; lamps as if they were far away).
 /** @type {(recorded: ArrayLike<number>, shown: ArrayLike<number>) => number[]} */
 function keptColors(recorded, shown) {
-  const gain = [0, 0, 0];
   const weight = (/** @type {number} */ k) => COSINE_LOBE[Math.floor(k / 3)] ** 2;
   const [product, square] = [new Float64Array(3), new Float64Array(3).fill(1e-12)];
   for (let k = 0; k < 3 * HARMONICS; k++) {
     product[k % 3] += weight(k) * recorded[k] * shown[k];
     square[k % 3] += weight(k) * recorded[k] ** 2;
   }
-  for (let c = 0; c < 3; c++) gain[c] = Math.max(0, product[c] / square[c]);
+  const gain = vector(c => Math.max(0, product[c] / square[c]));
   let [off, whole] = [0, 1e-24];
   for (let k = 0; k < 3 * HARMONICS; k++) {
     const same = gain[k % 3] * recorded[k];
@@ -334,7 +303,7 @@ const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 
 export class LightPass {
   // For data of an avatar whose light is known.
-  /** @param {WebGL2RenderingContext} gl @param {Data} data */
+  /** @param {GL} gl @param {Data} data */
   constructor(gl, data) {
     this.gl = gl;
     const { arrays, header } = data;
@@ -352,21 +321,17 @@ export class LightPass {
     this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
     this.lashCorners = light('lash_corners');
     this.lashes = light('lash_face').length;
-    const lashFaces = Array.from(light('lash_face'), face => [
-      ...this.faces.subarray(3 * face, 3 * face + 3),
-    ]);
-    const lashes = { shape: [lashFaces.length, 3], values: Int32Array.from(lashFaces.flat()) };
+    const corners = (/** @type {number} */ face) => this.faces.subarray(3 * face, 3 * face + 3);
+    const lashFaces = Array.from(light('lash_face')).flatMap(face => [...corners(face)]);
+    const lashes = { shape: [this.lashes, 3], values: Int32Array.from(lashFaces) };
     this.lashFrames = new FaceFrames({ faces: lashes, neutral: arrays.neutral }, convention);
     const vertices = this.neutral.length / 3;
-    this.vertexValues = new Float32Array(
-      paddedLength((vertices + 4 * this.lashes) * VERTEX_TEXELS),
-    );
+    const texels = (vertices + 4 * this.lashes) * VERTEX_TEXELS;
+    this.vertexValues = new Float32Array(paddedLength(texels));
     this.vertexTexture = floatTexture(gl, gl.RGBA32F, this.vertexValues);
-    const cards = Array.from(
-      { length: 6 * this.lashes },
-      (_, k) => 4 * Math.floor(k / 6) + [0, 1, 2, 0, 2, 3][k % 6],
-    );
-    this.casters = Uint32Array.from([...this.faces, ...cards.map(corner => vertices + corner)]);
+    const card = (/** @type {number} */ k) => 4 * Math.floor(k / 6) + [0, 1, 2, 0, 2, 3][k % 6];
+    const cards = Array.from({ length: 6 * this.lashes }, (_, k) => vertices + card(k));
+    this.casters = Uint32Array.from([...this.faces, ...cards]);
     this.shadows = makeTarget(gl, gl.DEPTH_COMPONENT32F, MAP_SIZE, MAP_SIZE, gl.DEPTH_ATTACHMENT);
     this.vertexArray = gl.createVertexArray();
     this.indexBuffer = gl.createBuffer();
@@ -448,21 +413,17 @@ export class LightPass {
   }
 
   // Compute the colors seen from a camera (world to camera, row-major); returns their texture.
-  // Textures are the renderer's, and the framebuffer and viewport are others afterwards.
-  /**
-   * @type {(camera: Float64Array, splats: WebGLTexture, tail: WebGLTexture, frames: WebGLTexture)
-   *   => WebGLTexture}
-   */
-  draw(camera, splats, tail, frames) {
+  // Textures: the renderer's splats, tail and frames. Framebuffer and viewport are others afterwards.
+  /** @type {(camera: Float64Array, textures: WebGLTexture[]) => WebGLTexture} */
+  draw(camera, textures) {
     const { gl, colors, view, light } = this;
     const { program, uniforms } = this.program;
     gl.bindFramebuffer(gl.FRAMEBUFFER, colors.framebuffer);
     gl.viewport(0, 0, colors.width, colors.height);
     gl.useProgram(program);
-    const { surfaceTexture, vertexTexture, shadows } = this;
     const names = ['uSplats', 'uTail', 'uFaces', 'uSurface', 'uVertices', 'uShadows'];
-    const textures = [splats, tail, frames, surfaceTexture, vertexTexture, shadows.texture];
-    for (const [unit, bound] of textures.entries())
+    const own = [this.surfaceTexture, this.vertexTexture, this.shadows.texture];
+    for (const [unit, bound] of [...textures, ...own].entries())
       bindTexture(gl, unit, bound, uniforms[names[unit]]);
     this.setSun(uniforms);
     gl.uniform1f(uniforms.uTexel, view.texel);
@@ -472,9 +433,8 @@ export class LightPass {
     gl.uniform1f(uniforms.uFactor, light.factor);
     gl.uniform4fv(uniforms.uKept, this.kept);
     gl.uniform4fv(uniforms.uTypical, this.typical);
-    const eye = vector(
-      k => -camera[k] * camera[3] - camera[4 + k] * camera[7] - camera[8 + k] * camera[11],
-    );
+    const at = [-camera[3], -camera[7], -camera[11]];
+    const eye = vector(k => dotProduct([camera[k], camera[4 + k], camera[8 + k]], at));
     gl.uniform3f(uniforms.uEye, ...eye);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     return colors.texture;
@@ -515,9 +475,8 @@ function sunView(vertices, toward) {
 function surfaceTexels(arrays, frames) {
   const { faces, neutral, splats_per_face, xyz } = arrays;
   const names = ['face', 'irradiance', 'occlusion', 'roughness'];
-  const [face, irradiance, occlusion, roughness] = names.map(
-    name => arrays[`light_${name}`].values,
-  );
+  const light = names.map(name => arrays[`light_${name}`].values);
+  const [face, irradiance, occlusion, roughness] = light;
   const normals = vertexNormals(faces.values, frames.sides, neutral.values.length);
   const least = [0, 0, 0];
   for (let k = 0; k < irradiance.length; k++)

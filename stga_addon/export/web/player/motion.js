@@ -79,21 +79,23 @@ function replacePinned(values, pinned) {
 export class Rig {
   /** @param {Data} data */
   constructor({ header, arrays }) {
-    this.parents = header.parents;
+    const joints = header.parents.length;
+    this.parents = header.parents.map(parent => (parent < 0 ? joints : parent));
     this.base = arrays.base.values;
     this.basis = arrays.basis.values;
     this.correctives = arrays.correctives.values;
     this.weights = arrays.weights.values;
     this.jointRest = arrays.joint_rest.values;
     this.jointBasis = arrays.joint_basis.values;
-    const joints = this.parents.length;
     this.shaped = new Float64Array(this.base.length);
     this.vertices = new Float64Array(this.base.length);
-    this.joints = new Float64Array(3 * joints);
     this.local = new Float64Array(9 * joints);
+    // After the joints, one that rests at the origin: the parent of the root.
+    this.joints = new Float64Array(3 * joints + 3);
+    this.placed = new Float64Array(3 * joints + 3);
     // Per joint: rotation and offset, rows of a 3×4 matrix.
-    this.skin = new Float64Array(12 * joints);
-    this.placed = new Float64Array(3 * joints);
+    this.skin = new Float64Array(12 * joints + 12);
+    for (let row = 0; row < 3; row++) this.skin[12 * joints + 5 * row] = 1;
   }
 
   // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
@@ -102,7 +104,7 @@ export class Rig {
     this.shaped.set(this.base);
     this.joints.set(this.jointRest);
     addShapes(this.shaped, this.basis, coefficients);
-    addShapes(this.joints, this.jointBasis, coefficients);
+    addShapes(this.joints.subarray(0, -3), this.jointBasis, coefficients);
     for (let j = 0; j < this.parents.length; j++)
       matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
     // Correctives follow the entries of the rotations of joints 1… minus identity.
@@ -139,29 +141,20 @@ export class Rig {
     for (let j = 0; j < parents.length; j++) {
       const parent = parents[j];
       for (let row = 0; row < 3; row++) {
-        const to = 12 * j + 4 * row;
-        if (parent < 0) {
-          for (let c = 0; c < 3; c++) skin[to + c] = local[9 * j + 3 * row + c];
-          placed[3 * j + row] = joints[3 * j + row];
-        } else {
-          const from = 12 * parent + 4 * row;
-          for (let c = 0; c < 3; c++) {
-            const at = 9 * j + c;
-            skin[to + c] =
-              skin[from] * local[at] +
-              skin[from + 1] * local[at + 3] +
-              skin[from + 2] * local[at + 6];
-          }
-          let sum = placed[3 * parent + row];
-          for (let c = 0; c < 3; c++)
-            sum += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
-          placed[3 * j + row] = sum;
+        const [to, from] = [12 * j + 4 * row, 12 * parent + 4 * row];
+        let place = placed[3 * parent + row];
+        for (let c = 0; c < 3; c++) {
+          const at = 9 * j + c;
+          const [x, y, z] = [local[at], local[at + 3], local[at + 6]];
+          skin[to + c] = skin[from] * x + skin[from + 1] * y + skin[from + 2] * z;
+          place += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
         }
+        placed[3 * j + row] = place;
         const turned =
           skin[to] * joints[3 * j] +
           skin[to + 1] * joints[3 * j + 1] +
           skin[to + 2] * joints[3 * j + 2];
-        skin[to + 3] = placed[3 * j + row] - turned;
+        skin[to + 3] = place - turned;
       }
     }
   }
@@ -301,22 +294,17 @@ const MIN_SHAPES = 10; // of a table that holds a performance
 // one sentence.
 /** @type {(text: string, names: string[]) => Performance} */
 export function readPerformance(text, names) {
-  const lines = text
-    .replace(/^\uFEFF/, '')
-    .split(/\r?\n/)
-    .filter(line => line.trim());
+  const all = text.replace(/^\uFEFF/, '').split(/\r?\n/);
+  const lines = all.filter(line => line.trim());
   const header = (lines[0] ?? '').split(',').map(cell => cell.trim());
   const plain = header.map(plainName);
   const columns = names.map(name => plain.indexOf(name.toLowerCase()));
   if (columns.filter(column => column >= 0).length < MIN_SHAPES)
-    throw new DataError(
-      'This file is no table of face shapes (CSV of Live Link Face or Audio2Face).',
-    );
+    throw new DataError('This file is no table of face shapes (Live Link Face or Audio2Face CSV).');
   const counts = header.findIndex(name => name.toLowerCase() === 'blendshapecount');
-  const cells = lines
-    .slice(1, MAX_ROWS + 1)
-    .map(line => line.split(','))
-    .filter(row => row.length === header.length && (counts < 0 || Number(row[counts]) > 0));
+  const rowsOfCells = lines.slice(1, MAX_ROWS + 1).map(line => line.split(','));
+  const hasFace = (/** @type {string[]} */ row) => counts < 0 || Number(row[counts]) > 0;
+  const cells = rowsOfCells.filter(row => row.length === header.length && hasFace(row));
   if (!cells.length) throw new DataError('The performance has no row with a face.');
   const rows = cells.map(row => Float64Array.from(row, Number));
   const used = columns.filter(column => column >= 0);
@@ -346,10 +334,9 @@ function times(header, cells) {
     const numbers = texts.map(Number);
     return numbers.every(Number.isFinite) ? numbers.map(time => time - numbers[0]) : null;
   }
-  const seconds = found.map(
-    match => 3600 * Number(match?.[1]) + 60 * Number(match?.[2]) + Number(match?.[3]),
-  );
-  const frames = found.map(match => Number(match?.[4]) + Number(match?.[5] ?? 0));
+  const fields = found.map(match => Array.from(match ?? [], part => Number(part ?? 0)));
+  const seconds = fields.map(([, hour, minute, second]) => 3600 * hour + 60 * minute + second);
+  const frames = fields.map(([, , , , frame, part]) => frame + part);
   const largest = Math.max(...frames);
   const spread = (/** @type {number} */ base) =>
     unevenness(seconds.map((second, row) => second + frames[row] / base));
@@ -376,9 +363,8 @@ function unevenness(values) {
 }
 
 /** @param {number[]} values */
-function median(values) {
-  return [...values].sort((one, other) => one - other)[Math.floor(values.length / 2)];
-}
+const median = values =>
+  [...values].sort((one, other) => one - other)[Math.floor(values.length / 2)];
 
 // The performance at even times, with rows that are missing interpolated.
 /** @type {(performance: Performance, seconds: number[] | null) => Performance} */

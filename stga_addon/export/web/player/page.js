@@ -1,167 +1,18 @@
 // @ts-check
 // The page's controls. Everything that they do is in the public interface of <stga-avatar>.
 
-/**
- * @import { Camera, Lighting, Vector } from './types.js'
- * @typedef {'recorded' | 'dragged' | string} Kind the name of an environment, or one of these
- */
+/** @import { Camera, Lighting, Vector } from './types.js' */
 
+import { row } from './camera.js';
 import { DataError } from './data.js';
 import { ENVIRONMENTS } from './light.js';
 import { StgaAvatar, hexOf } from './stga-avatar.js';
-import { scaled, vector } from './vector.js';
+import { dotProduct, scaled, vector } from './vector.js';
 
 const fixed = (/** @type {number} */ value) => value.toFixed(2);
 const degrees = (/** @type {number} */ value) => `${Math.round(value)}°`;
 const signed = (/** @type {number} */ value) =>
   `${value < 0 ? '−' : '+'}${Math.abs(value).toFixed(1)}`;
-// Radians from the camera's own direction at the rim of the pad: the light comes from behind.
-const PAD_ANGLE = 2.6;
-const DRAGGED = 'dragged';
-// Label, kinds that have it ("*": all environments), range, first value and format of each slider.
-const RANGES = {
-  strength: { label: 'Strength', kinds: DRAGGED, low: 0, high: 8, value: 3, format: fixed },
-  even: { label: 'Even light', kinds: DRAGGED, low: 0, high: 1, value: 0.15, format: fixed },
-  turn: { label: 'Turn', kinds: '*', low: -180, high: 180, value: 0, format: degrees },
-  exposure: { label: 'Exposure', kinds: `${DRAGGED}*`, low: -3, high: 3, value: 0, format: signed },
-};
-
-export class LightControls {
-  // Fill and show `section` for an avatar whose light is known.
-  /** @param {HTMLElement} section @param {StgaAvatar} avatar */
-  constructor(section, avatar) {
-    this.avatar = avatar;
-    /** @type {Kind} */
-    this.kind = 'recorded';
-    /** @type {Vector} towards the light */
-    this.toward = fromPad(avatar.camera, -0.25, -0.22);
-    this.select = /** @type {HTMLSelectElement} */ (section.querySelector('select'));
-    this.pad = /** @type {HTMLElement} */ (section.querySelector('#light-pad'));
-    this.color = /** @type {HTMLInputElement} */ (section.querySelector('input[type="color"]'));
-    this.dragged = /** @type {HTMLElement} */ (section.querySelector('#light-dragged'));
-    section.hidden = false;
-    this.select.add(new Option('As recorded', 'recorded'));
-    this.select.add(new Option('A light to drag', DRAGGED));
-    for (const [name, { label }] of Object.entries(ENVIRONMENTS))
-      this.select.add(new Option(label, name));
-    this.select.addEventListener('change', () => {
-      this.kind = this.select.value;
-      this.showKind();
-      this.apply();
-    });
-    this.rows = Object.entries(RANGES).map(([name, range]) => this.addRange(section, name, range));
-    this.color.addEventListener('input', () => this.apply());
-    for (const name of ['pointerdown', 'pointermove']) {
-      this.pad.addEventListener(name, event => this.drag(/** @type {PointerEvent} */ (event)));
-    }
-    avatar.addEventListener('camerachange', () => this.showDirection());
-    avatar.addEventListener('lightchange', () => {
-      const sun = avatar.lighting?.sun;
-      // It may have been dragged over the head.
-      if (sun && this.kind === DRAGGED) this.toward = sun.toward;
-      this.showDirection();
-    });
-    this.showKind();
-  }
-
-  /** @param {HTMLElement} section @param {string} name @param {typeof RANGES['turn']} range */
-  addRange(section, name, { label, kinds, low, high, value, format }) {
-    const [row, output, input] = sliderRow(section, 'range', label, low, high);
-    [input.value, input.name] = [String(value), name];
-    const show = () => {
-      output.textContent = format(Number(input.value));
-      fillTrack(input);
-    };
-    input.addEventListener('input', () => {
-      show();
-      this.apply();
-    });
-    show();
-    return { name, row, input, kinds };
-  }
-
-  showKind() {
-    this.dragged.hidden = this.kind !== DRAGGED;
-    const isEnvironment = Object.hasOwn(ENVIRONMENTS, this.kind);
-    for (const { row, kinds } of this.rows) {
-      row.hidden = !(isEnvironment
-        ? kinds.endsWith('*')
-        : this.kind === DRAGGED && kinds.startsWith(DRAGGED));
-    }
-    this.showDirection();
-  }
-
-  apply() {
-    this.avatar.lighting = this.lighting();
-  }
-
-  /** @returns {Lighting | null} */
-  lighting() {
-    if (this.kind === 'recorded') return null;
-    const value = Object.fromEntries(
-      this.rows.map(({ name, input }) => [name, Number(input.value)]),
-    );
-    const { strength, even, exposure } = value;
-    if (this.kind !== DRAGGED)
-      return { environment: this.kind, turn: (Math.PI / 180) * value.turn, exposure };
-    const color = scaled(linearColor(this.color.value), strength);
-    return { even: [even, even, even], sun: { toward: this.toward, color }, exposure };
-  }
-
-  /** @param {PointerEvent} event */
-  drag(event) {
-    if (event.type === 'pointerdown') this.pad.setPointerCapture(event.pointerId);
-    else if (!this.pad.hasPointerCapture(event.pointerId)) return;
-    const { left, top, width, height } = this.pad.getBoundingClientRect();
-    const x = (2 * (event.clientX - left)) / width - 1;
-    const y = (2 * (event.clientY - top)) / height - 1;
-    this.toward = fromPad(this.avatar.camera, x, y);
-    this.apply();
-  }
-
-  showDirection() {
-    if (this.kind !== DRAGGED) return;
-    const [x, y] = onPad(this.avatar.camera, this.toward);
-    this.pad.style.setProperty('--x', `${50 + 50 * x}%`);
-    this.pad.style.setProperty('--y', `${50 + 50 * y}%`);
-  }
-}
-
-// The direction in the world of a place on the pad, whose middle is where the camera looks from.
-/**
- * @param {Camera | null} camera
- * @param {number} x from -1 to 1, to the right
- * @param {number} y from -1 to 1, down
- * @returns {Vector}
- */
-function fromPad(camera, x, y) {
-  const reach = Math.hypot(x, y);
-  const angle = PAD_ANGLE * Math.min(1, reach);
-  const side = reach > 0 ? Math.sin(angle) / reach : 0;
-  const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  return vector(k => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle));
-}
-
-// The reverse, within the pad.
-/** @type {(camera: Camera | null, toward: Vector) => number[]} */
-function onPad(camera, toward) {
-  const m = camera?.matrix ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const [x, y, z] = vector(
-    k => m[4 * k] * toward[0] + m[4 * k + 1] * toward[1] + m[4 * k + 2] * toward[2],
-  );
-  const side = Math.hypot(x, y);
-  const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
-  return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
-}
-
-// "#rrggbb" in linear light.
-/** @type {(hex: string) => Vector} */
-function linearColor(hex) {
-  return vector(k => {
-    const value = parseInt(hex.slice(2 * k + 1, 2 * k + 3), 16) / 255;
-    return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
-  });
-}
 
 const SLIDERS_SHOWN = 8;
 // The last comes first.
@@ -203,9 +54,7 @@ function info() {
 }
 
 /** @type {(button: HTMLElement, pressed: boolean) => void} */
-function setPressed(button, pressed) {
-  button.setAttribute('aria-pressed', String(pressed));
-}
+const setPressed = (button, pressed) => button.setAttribute('aria-pressed', String(pressed));
 
 /** @param {HTMLInputElement} input */
 function fillTrack(input) {
@@ -333,16 +182,13 @@ function toggleTheme() {
  */
 function sliderRow(parent, kind, label, low, high) {
   const row = Object.assign(document.createElement('label'), { className: kind });
-  const shown =
-    kind === 'slider' ? '<button class="value" title="Release"></button>' : '<output></output>';
+  const button = '<button class="value" title="Release"></button>';
+  const shown = kind === 'slider' ? button : '<output></output>';
   row.innerHTML = `<span></span>${shown}<input type="range" step="any">`;
-  const [name, value, input] = /** @type {[HTMLElement, HTMLElement, HTMLInputElement]} */ ([
-    ...row.children,
-  ]);
-  name.textContent = label;
-  [input.min, input.max] = [String(low), String(high)];
+  element('span', HTMLElement, row).textContent = label;
+  const input = Object.assign(element('input', HTMLInputElement, row), { min: low, max: high });
   parent.append(row);
-  return [row, value, input];
+  return [row, element('.value, output', HTMLElement, row), input];
 }
 
 // A slider that shows what `read` says plays, and writes; null: as recorded.
@@ -387,9 +233,8 @@ function addExpressions() {
   const rows = info().sliders.map(({ name, reach }) => {
     const label = name.replace(/^expr_0*(\d+)$/, 'Expression $1');
     const read = () => avatar.getExpression(name);
-    return addSlider(list, name, label, -reach, reach, read, value =>
-      avatar.setExpression(name, value),
-    );
+    const write = (/** @type {number | null} */ value) => avatar.setExpression(name, value);
+    return addSlider(list, name, label, -reach, reach, read, write);
   });
   section.hidden = !rows.length;
   showFirst(rows, byId('more'));
@@ -450,9 +295,7 @@ async function playFile(file) {
 }
 
 function addPose() {
-  const known = POSE_SLIDERS.filter(([, joints]) =>
-    joints.every(joint => info().joints.includes(joint)),
-  );
+  const known = POSE_SLIDERS.filter(([, joints]) => joints.every(j => info().joints.includes(j)));
   const list = element('.sliders', HTMLElement, byId('pose'));
   for (const [label, joints, axis, low, high] of known) {
     const read = () => avatar.getPose(joints[0])[axis];
@@ -478,6 +321,122 @@ function releaseAll() {
   avatar.release();
 }
 
+// Light: as recorded, of an environment, or a sun that is dragged over a pad.
+
+// Radians from the camera's own direction at the rim of the pad: the light comes from behind.
+const PAD_ANGLE = 2.6;
+const DRAGGED = 'dragged';
+// Label, kinds that have it ("*": all environments), range, first value and format of each slider.
+const RANGES = {
+  strength: { label: 'Strength', kinds: DRAGGED, low: 0, high: 8, value: 3, format: fixed },
+  even: { label: 'Even light', kinds: DRAGGED, low: 0, high: 1, value: 0.15, format: fixed },
+  turn: { label: 'Turn', kinds: '*', low: -180, high: 180, value: 0, format: degrees },
+  exposure: { label: 'Exposure', kinds: `${DRAGGED}*`, low: -3, high: 3, value: 0, format: signed },
+};
+
+/** For an avatar whose light is known. */
+function addLight() {
+  const section = byId('light');
+  const select = element('select', HTMLSelectElement, section);
+  const color = element('input[type="color"]', HTMLInputElement, section);
+  const pad = byId('light-pad');
+  let toward = fromPad(-0.25, -0.22);
+  section.hidden = false;
+  select.add(new Option('As recorded', 'recorded'));
+  select.add(new Option('A light to drag', DRAGGED));
+  for (const [name, { label }] of Object.entries(ENVIRONMENTS)) select.add(new Option(label, name));
+  /** @returns {Lighting | null} */
+  const lighting = () => {
+    if (select.value === 'recorded') return null;
+    const values = Object.fromEntries(rows.map(({ name, input }) => [name, Number(input.value)]));
+    const { strength, even, exposure } = values;
+    if (select.value !== DRAGGED)
+      return { environment: select.value, turn: (Math.PI / 180) * values.turn, exposure };
+    const sun = { toward, color: scaled(linearColor(color.value), strength) };
+    return { even: [even, even, even], sun, exposure };
+  };
+  const apply = () => (avatar.lighting = lighting());
+  const showDirection = () => {
+    const [x, y] = onPad(toward);
+    pad.style.setProperty('--x', `${50 + 50 * x}%`);
+    pad.style.setProperty('--y', `${50 + 50 * y}%`);
+  };
+  const showKind = () => {
+    const isDragged = select.value === DRAGGED;
+    const isEnvironment = Object.hasOwn(ENVIRONMENTS, select.value);
+    byId('light-dragged').hidden = !isDragged;
+    for (const { shown, kinds } of rows)
+      shown.hidden = !(isEnvironment
+        ? kinds.endsWith('*')
+        : isDragged && kinds.startsWith(DRAGGED));
+  };
+  const rows = Object.entries(RANGES).map(([name, { label, kinds, low, high, value, format }]) => {
+    const [shown, output, input] = sliderRow(section, 'range', label, low, high);
+    Object.assign(input, { name, value });
+    const show = () => {
+      output.textContent = format(Number(input.value));
+      fillTrack(input);
+    };
+    input.addEventListener('input', show);
+    input.addEventListener('input', apply);
+    show();
+    return { name, shown, input, kinds };
+  });
+  select.addEventListener('change', showKind);
+  select.addEventListener('change', apply);
+  color.addEventListener('input', apply);
+  /** @param {PointerEvent} event */
+  const drag = event => {
+    if (event.type === 'pointerdown') pad.setPointerCapture(event.pointerId);
+    else if (!pad.hasPointerCapture(event.pointerId)) return;
+    const { left, top, width, height } = pad.getBoundingClientRect();
+    const x = (2 * (event.clientX - left)) / width - 1;
+    toward = fromPad(x, (2 * (event.clientY - top)) / height - 1);
+    apply();
+  };
+  pad.addEventListener('pointerdown', drag);
+  pad.addEventListener('pointermove', drag);
+  avatar.addEventListener('camerachange', showDirection);
+  avatar.addEventListener('lightchange', () => {
+    const sun = avatar.lighting?.sun;
+    if (sun && select.value === DRAGGED) toward = sun.toward; // dragged over the head, maybe
+    showDirection();
+  });
+  showKind();
+  showDirection();
+}
+
+const cameraMatrix = () => /** @type {Camera} */ (avatar.camera).matrix;
+
+// The direction in the world of a place on the pad (x right, y down, from -1 to 1), whose middle is
+// where the camera looks from.
+/** @type {(x: number, y: number) => Vector} */
+function fromPad(x, y) {
+  const reach = Math.hypot(x, y);
+  const angle = PAD_ANGLE * Math.min(1, reach);
+  const side = reach > 0 ? Math.sin(angle) / reach : 0;
+  const m = cameraMatrix();
+  return vector(k => m[k] * x * side + m[4 + k] * y * side - m[8 + k] * Math.cos(angle));
+}
+
+// The reverse, within the pad.
+/** @param {Vector} toward */
+function onPad(toward) {
+  const [x, y, z] = vector(k => dotProduct(row(cameraMatrix(), k), toward));
+  const side = Math.hypot(x, y);
+  const reach = Math.min(1, Math.atan2(side, -z) / PAD_ANGLE);
+  return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
+}
+
+// "#rrggbb" in linear light.
+/** @type {(hex: string) => Vector} */
+function linearColor(hex) {
+  return vector(k => {
+    const value = parseInt(hex.slice(2 * k + 1, 2 * k + 3), 16) / 255;
+    return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+  });
+}
+
 // Keyboard, panel and facts
 
 /** @type {Record<string, () => unknown>} */
@@ -500,10 +459,9 @@ const KEYS = {
 
 /** @param {KeyboardEvent} event */
 function press(event) {
-  const isArrow = event.key.startsWith('Arrow');
-  const isTyping =
-    event.target instanceof Element && event.target.matches(isArrow ? 'select, input' : 'select');
-  if (isTyping || event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
+  const typing = event.key.startsWith('Arrow') ? 'select, input' : 'select';
+  if (event.target instanceof Element && event.target.matches(typing)) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const action = /^[1-9]$/.test(key) ? () => showView(Number(key) - 1) : KEYS[key];
   if (!action) return;
@@ -534,7 +492,7 @@ function start() {
   addTransport();
   addViews();
   addBackgrounds();
-  if (avatar.hasLight) new LightControls(byId('light'), avatar);
+  if (avatar.hasLight) addLight();
   addFaceShapes();
   addExpressions();
   addPose();
@@ -577,8 +535,4 @@ async function embeddedData() {
   }
 }
 
-try {
-  await avatar.load(embeddedData());
-} catch (error) {
-  console.error(error);
-}
+avatar.load(embeddedData()).catch(console.error);

@@ -4,7 +4,7 @@
 
 /**
  * @import { LightPass } from './light.js'
- * @import { Arrays, Camera, Color, Data, Program, Target, Values } from './types.js'
+ * @import { Arrays, Camera, Data, GL, Look, Program, Target, Values } from './types.js'
  */
 
 import { FACE_FLOATS } from './face_frames.js';
@@ -18,11 +18,10 @@ const SH_C0 = 0.28209479177387814;
 export class RendererError extends Error {}
 
 /** @param {number} texels */
-export function paddedLength(texels) {
-  return 4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
-}
+export const paddedLength = texels =>
+  4 * TEXTURE_WIDTH * Math.max(1, Math.ceil(texels / TEXTURE_WIDTH));
 
-/** @type {(gl: WebGL2RenderingContext, vertex: string, fragment: string) => Program} */
+/** @type {(gl: GL, vertex: string, fragment: string) => Program} */
 export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const kind of [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER]) {
@@ -37,9 +36,8 @@ export function program(gl, vertex, fragment) {
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) {
     const logs = (gl.getAttachedShaders(made) ?? []).map(shader => gl.getShaderInfoLog(shader));
-    throw new RendererError(
-      `The graphics driver rejects a shader: ${logs.join(' ')} ${gl.getProgramInfoLog(made)}`,
-    );
+    const log = `${logs.join(' ')} ${gl.getProgramInfoLog(made)}`;
+    throw new RendererError(`The graphics driver rejects a shader: ${log}`);
   }
   /** @type {Program['uniforms']} */
   const uniforms = {};
@@ -51,7 +49,7 @@ export function program(gl, vertex, fragment) {
   return { program: made, uniforms };
 }
 
-/** @type {(gl: WebGL2RenderingContext, format: number, values: Float32Array) => WebGLTexture} */
+/** @type {(gl: GL, format: number, values: Float32Array) => WebGLTexture} */
 export function floatTexture(gl, format, values) {
   const height = values.length / (4 * TEXTURE_WIDTH);
   if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
@@ -66,7 +64,7 @@ export function floatTexture(gl, format, values) {
 }
 
 // Replace all of a texture of `floatTexture`.
-/** @type {(gl: WebGL2RenderingContext, texture: WebGLTexture, values: Float32Array) => void} */
+/** @type {(gl: GL, texture: WebGLTexture, values: Float32Array) => void} */
 export function updateTexture(gl, texture, values) {
   gl.activeTexture(gl.TEXTURE0);
   gl.bindTexture(gl.TEXTURE_2D, texture);
@@ -74,21 +72,15 @@ export function updateTexture(gl, texture, values) {
   gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXTURE_WIDTH, rows, gl.RGBA, gl.FLOAT, values);
 }
 
-/**
- * @type {(gl: WebGL2RenderingContext, unit: number, bound: WebGLTexture,
- *   uniform: WebGLUniformLocation | null) => void}
- */
+/** @type {(gl: GL, unit: number, bound: WebGLTexture, uniform: ?WebGLUniformLocation) => void} */
 export function bindTexture(gl, unit, bound, uniform) {
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(gl.TEXTURE_2D, bound);
   gl.uniform1i(uniform, unit);
 }
 
-/**
- * @type {(gl: WebGL2RenderingContext, format: number, width: number, height: number,
- *   attachment?: number) => Target}
- */
-export function makeTarget(gl, format, width, height, attachment = gl.COLOR_ATTACHMENT0) {
+/** @type {(gl: GL, format: number, width: number, height: number, kind?: number) => Target} */
+export function makeTarget(gl, format, width, height, kind = gl.COLOR_ATTACHMENT0) {
   const made = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0);
   gl.bindTexture(gl.TEXTURE_2D, made);
@@ -97,11 +89,11 @@ export function makeTarget(gl, format, width, height, attachment = gl.COLOR_ATTA
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
   const framebuffer = gl.createFramebuffer();
   gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, attachment, gl.TEXTURE_2D, made, 0);
+  gl.framebufferTexture2D(gl.FRAMEBUFFER, kind, gl.TEXTURE_2D, made, 0);
   return { texture: made, framebuffer, format, width, height };
 }
 
-/** @type {(gl: WebGL2RenderingContext, target: Target) => void} */
+/** @type {(gl: GL, target: Target) => void} */
 export function deleteTarget(gl, target) {
   gl.deleteFramebuffer(target.framebuffer);
   gl.deleteTexture(target.texture);
@@ -110,7 +102,7 @@ export function deleteTarget(gl, target) {
 export class Renderer {
   // Upload the splats of `data` (readData). Throws RendererError where the browser cannot draw
   // them.
-  /** @param {WebGL2RenderingContext} gl @param {Data} data */
+  /** @param {GL} gl @param {Data} data */
   constructor(gl, data) {
     if (!gl.getExtension('EXT_color_buffer_float'))
       throw new RendererError('This browser cannot draw to float textures, as the avatar needs.');
@@ -145,15 +137,13 @@ export class Renderer {
     this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
-  // Draw `order` (back to front) of the splats on the frames in `frameValues`. framebuffer: null
-  // for the canvas; format: of the target in which they are blended.
-  /**
-   * @type {(order: Uint32Array, camera: Camera, background: Color, showSelection: boolean,
-   *   framebuffer?: WebGLFramebuffer | null, format?: number) => void}
-   */
-  draw(order, camera, background, showSelection, framebuffer = null, format = this.gl.RGBA16F) {
+  // Draw `order` (back to front) of the splats on the frames in `frameValues` into a framebuffer, or
+  // the canvas, where they are blended in half precision.
+  /** @type {(order: Uint32Array, camera: Camera, look: Look, into?: ?WebGLFramebuffer) => void} */
+  draw(order, camera, { background, showSelection }, into = null) {
     const gl = this.gl;
     const [width, height] = camera.size;
+    const format = into ? this.finest : gl.RGBA16F;
     let { target } = this;
     if (target?.width !== width || target.height !== height || target.format !== format) {
       if (target) deleteTarget(gl, target);
@@ -164,7 +154,8 @@ export class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
     const { splatTexture, tailTexture, frameTexture } = this;
-    const colors = this.lightPass?.draw(camera.matrix, splatTexture, tailTexture, frameTexture);
+    const textures = [splatTexture, tailTexture, frameTexture];
+    const colors = this.lightPass?.draw(camera.matrix, textures);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
@@ -188,7 +179,7 @@ export class Renderer {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
     gl.disable(gl.BLEND);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into);
     gl.useProgram(this.overProgram.program);
     bindTexture(gl, 0, target.texture, this.overProgram.uniforms.uPicture);
     const [red, green, blue, alpha] = background;
@@ -199,15 +190,12 @@ export class Renderer {
 
   // The pixels of one drawing, rows from the top: Uint8ClampedArray (4·width·height), premultiplied
   // with alpha.
-  /**
-   * @type {(order: Uint32Array, camera: Camera, background: Color, showSelection: boolean) =>
-   *   Uint8ClampedArray<ArrayBuffer>}
-   */
-  read(order, camera, background, showSelection) {
+  /** @param {Uint32Array} order @param {Camera} camera @param {Look} look */
+  read(order, camera, look) {
     const gl = this.gl;
     const [width, height] = camera.size;
     const copy = makeTarget(gl, gl.RGBA8, width, height);
-    this.draw(order, camera, background, showSelection, copy.framebuffer, this.finest);
+    this.draw(order, camera, look, copy.framebuffer);
     const flipped = new Uint8Array(4 * width * height);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, flipped);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);

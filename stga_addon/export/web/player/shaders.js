@@ -28,14 +28,11 @@ const SH = '{{harmonics}}'.split('; ');
 
 // Texels a splat needs for its view-dependent and strain-dependent colors.
 /** @type {(harmonics: number, strains: number) => number} */
-export function tailTexels(harmonics, strains) {
-  return Math.ceil((3 * (harmonics + strains)) / 4);
-}
+export const tailTexels = (harmonics, strains) => Math.ceil((3 * (harmonics + strains)) / 4);
 
 /** @param {number} k */
-function tailTriple(k) {
-  return `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map(at => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
-}
+const tailTriple = k =>
+  `vec3(${[3 * k, 3 * k + 1, 3 * k + 2].map(at => `t${at >> 2}.${'xyzw'[at & 3]}`)})`;
 
 // Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
 // are slow on many GPUs.
@@ -54,10 +51,7 @@ function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
 
 // Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
 // to `byStrain`.
-/**
- * @type {(harmonics: number, strains: number, direction: string, byView?: string,
- *   byStrain?: string) => string}
- */
+/** @param {number} harmonics @param {number} strains @param {string} direction */
 function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
   const texels = tailTexels(harmonics, strains);
   const lines = [];

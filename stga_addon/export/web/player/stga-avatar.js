@@ -23,9 +23,8 @@ export class Player {
   constructor(canvas, data) {
     const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
     const gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
-    const problem =
-      'This page needs WebGL 2, which this browser or graphics driver does not offer.';
-    if (!gl) throw new RendererError(problem);
+    const problem = 'needs WebGL 2, which this browser or graphics driver does not offer.';
+    if (!gl) throw new RendererError(`This page ${problem}`);
     this.gl = gl;
     const { header, arrays } = data;
     this.canvas = canvas;
@@ -66,7 +65,7 @@ export class Player {
     const begin = performance.now();
     const camera = fitted(this.camera, this.canvas.width, this.canvas.height);
     const order = this.prepare(camera);
-    this.renderer.draw(order, camera, this.background, this.showSelection);
+    this.renderer.draw(order, camera, this);
     const spent = performance.now() - begin;
     this.milliseconds += (this.milliseconds ? TIMING_SHARE : 1) * (spent - this.milliseconds);
   }
@@ -74,7 +73,7 @@ export class Player {
   // Pixels of the current frame from `camera`, which has its own size (Renderer.read).
   /** @param {Camera} camera */
   read(camera) {
-    return this.renderer.read(this.prepare(camera), camera, this.background, this.showSelection);
+    return this.renderer.read(this.prepare(camera), camera, this);
   }
 
   /** Forget the pose, because pinned values have changed. */
@@ -173,10 +172,7 @@ export class StgaAvatar extends HTMLElement {
 
   // Show the data file at a URL, or one held in memory (ArrayBuffer or Uint8Array, or a promise of
   // one). Rejects, and says why on the page.
-  /**
-   * @param {string | ArrayBuffer | ArrayLike<number> | Promise<ArrayBuffer | ArrayLike<number>>}
-   *   source
-   */
+  /** @param {string | ArrayBuffer | Uint8Array | Promise<ArrayBuffer | Uint8Array>} source */
   async load(source) {
     const loading = ++this.#loading;
     try {
@@ -454,8 +450,7 @@ export class StgaAvatar extends HTMLElement {
       const kept = { camera, pivot, background, showSelection, lighting, motion };
       this.#player = Object.assign(new Player(this.#canvas, data), kept);
     } catch (error) {
-      this.#fail(error);
-      return;
+      return this.#fail(error);
     }
     this.#player.invalidate();
     this.#message.hidden = true;

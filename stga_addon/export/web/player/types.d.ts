@@ -104,6 +104,11 @@ export interface LitBy {
 /** Red, green, blue and alpha, 0 to 1. */
 export type Color = [number, number, number, number];
 
+/** Behind the splats; and whether those on triangles that the frame did not train are gray. */
+export type Look = { background: Color; showSelection: boolean };
+
+export type GL = WebGL2RenderingContext;
+
 export interface Program {
   program: WebGLProgram;
   uniforms: Record<string, WebGLUniformLocation | null>;

@@ -10,29 +10,23 @@ const SMALL_ANGLE = 1e-8;
 export const vector = part => [part(0), part(1), part(2)];
 
 /** @type {(a: ArrayLike<number>, b: ArrayLike<number>) => Vector} */
-export function crossed(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-}
+export const crossed = (a, b) => [
+  a[1] * b[2] - a[2] * b[1],
+  a[2] * b[0] - a[0] * b[2],
+  a[0] * b[1] - a[1] * b[0],
+];
 
 /** @type {(a: ArrayLike<number>, b: ArrayLike<number>) => number} */
-export function dotProduct(a, b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
+export const dotProduct = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 /** @type {(a: ArrayLike<number>, b: ArrayLike<number>) => Vector} */
-export function difference(a, b) {
-  return [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-}
+export const difference = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 
 /** @type {(v: ArrayLike<number>, factor: number) => Vector} */
-export function scaled(v, factor) {
-  return [v[0] * factor, v[1] * factor, v[2] * factor];
-}
+export const scaled = (v, factor) => [v[0] * factor, v[1] * factor, v[2] * factor];
 
 /** @type {(v: ArrayLike<number>) => Vector} */
-export function unit(v) {
-  return scaled(v, 1 / Math.hypot(v[0], v[1], v[2]));
-}
+export const unit = v => scaled(v, 1 / Math.hypot(v[0], v[1], v[2]));
 
 // Least and largest coordinates of points (3·V).
 /** @type {(points: ArrayLike<number>) => [Vector, Vector]} */
