@@ -124,14 +124,13 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
         frames = scene_frames(scene)
         path, write = self._writer(context, head, frames)
         if FORMATS[self.format].source != "range":
-            write(iter([(scene.frame_current, evaluated_vertices(head))]))
-        elif not self._is_invoked:
-            write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
-        else:
+            frames = range(scene.frame_current, scene.frame_current + 1)
+        if self._is_invoked:
             self._range, manager = RangeExport(head, frames, write), context.window_manager
             self._timer = manager.event_timer_add(STEP_INTERVAL_S, window=context.window)
             manager.modal_handler_add(self)
             return {"RUNNING_MODAL"}
+        write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         self.inform(f"Exported to {path}")
         return None
 
@@ -168,8 +167,8 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
         assert job is not None
         if event.type in ("ESC", "TIMER"):
             is_running = event.type == "TIMER" and job.step()
-            progress = f"Exporting frame {job.done} of {job.total}   Esc: Cancel"
-            context.workspace.status_text_set(progress)
+            posed = f" frame {job.done} of {job.total}" if job.total > 1 else ""
+            context.workspace.status_text_set(f"Exporting{posed}   Esc: Cancel")
             if not is_running:
                 return self._end(context)
         return {"RUNNING_MODAL"}
@@ -186,7 +185,7 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
         if job.finish():
-            self.inform(f"Exported {job.total} frames to {self.filepath}")
+            self.inform(f"Exported to {self.filepath}")
             return {"FINISHED"}
         self.report({"WARNING"}, f"Export cancelled after {job.done} of {job.total} frames")
         return {"CANCELLED"}

@@ -15,6 +15,10 @@ must not coincide."""
 MIN_SPACING_M = 1e-6  # the scale of splats on a triangle without area still needs a logarithm
 
 
+def splats_per_triangle(order: int) -> int:
+    return (order + 1) * (order + 2) // 2
+
+
 def lattice_splats(
     neutral: np.ndarray,
     faces: np.ndarray,

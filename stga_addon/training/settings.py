@@ -101,7 +101,8 @@ class TrainingSettings:
                           (`with_budget`)
     seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA,
-                   embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES
+                   embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES,
+                   and one less at the start, where density control adds the others
     convention     embedding convention
     views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the
                      paper's batches)
@@ -133,7 +134,8 @@ class TrainingSettings:
     density_interval  iterations between density control, 0 never; it works during `density_span` of
                       the budget
     split_share    largest share of the splats that one round of density control splits
-    growth         most splats that density control may add, as a share of the initial number
+    growth         most splats that density control may add, as a share of the whole lattice and the
+                   hull points
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration,
                        so that splats
@@ -241,10 +243,17 @@ class TrainingSettings:
         return self.strain_color or bool(self.driven_offsets)
 
     def lattice_order(self, triangles: int) -> int:
-        """Order of the lattice on a mesh of so many triangles."""
+        """Order of the lattice on a mesh of so many triangles, which decides how many splats there
+        will be."""
         if self.lattice is not None:
             return self.lattice
         return 2 if triangles <= MAX_FINE_TRIANGLES else 1
+
+    def first_lattice_order(self, triangles: int) -> int:
+        """Order of the lattice that training begins with: one less than `lattice_order` where
+        density control is to find the places of the other splats."""
+        begins_coarse = self.lattice is None and self.density_interval > 0
+        return self.lattice_order(triangles) - begins_coarse
 
     def check(self) -> None:
         """Raise StgaError for settings at odds with each other, and for rows and names that types

@@ -227,7 +227,7 @@ def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     device, *lines = capsys.readouterr().out.splitlines()
     assert device == "Training on the CPU (--device cpu)"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
-    assert lines[1].split()[1:6] == ["3000", "iterations", "about", "3", "s"]
+    assert lines[1].split()[1:6] == ["1900", "iterations", "about", "2", "s"]
 
 
 def test_what_is_timed_is_what_will_train(toy_root, tmp_path, capsys, monkeypatch):
@@ -251,12 +251,12 @@ def test_a_preset_brings_its_iterations(toy_root, tmp_path, capsys, monkeypatch)
     train = ["train", str(toy_root), "--out"]
     assert main([*train, str(tmp_path / "preset"), "--preset", "draft", "--target-psnr", "5"]) == 0
     out = capsys.readouterr().out
-    assert "Preset draft: 800 iterations\n" in out
+    assert "Preset draft: 500 iterations\n" in out
     assert "5 dB was reached" in out
     assert "held-out views: " in out
     settings = read_run(tmp_path / "preset").settings
     assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
-        "draft", 800, 1, 5.0,
+        "draft", 500, 1, 5.0,
     )  # fmt: skip
     assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
     settings = read_run(tmp_path / "counted").settings

@@ -187,6 +187,7 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     """Catches maintenance that never runs, runs outside its span, or grows beyond what was
     allowed."""
     options = {
+        "lattice": 2,
         "density_interval": 2,
         "density_span": (0.2, 0.6),
         "growth": 0.05,
@@ -244,14 +245,20 @@ def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("triangles", "splats"), [(MAX_FINE_TRIANGLES, 6), (MAX_FINE_TRIANGLES + 1, 3)]
+    ("triangles", "first", "whole"), [(MAX_FINE_TRIANGLES, 3, 6), (MAX_FINE_TRIANGLES + 1, 1, 3)]
 )
-def test_splats_of_a_triangle_by_the_mesh(toy: Capture, triangles: int, splats: int) -> None:
-    """Catches a fine mesh that starts with twice the splats, and a lattice that was chosen and is
-    not used."""
+def test_splats_of_a_triangle_by_the_mesh(
+    toy: Capture, triangles: int, first: int, whole: int
+) -> None:
+    """Catches a fine mesh that starts with twice the splats, a lattice that was chosen and is not
+    used, and one that stays coarse because density control does not know or is off."""
     rows = np.resize(np.arange(len(toy.faces)), triangles)
     fine = replace(toy, faces=toy.faces[rows])
-    assert len(initial_splats(fine, quick_settings(lattice=None))) == splats * triangles
+    settings = quick_settings(lattice=None, density_interval=10)
+    trainer = Trainer(fine, settings, {})
+    assert (len(trainer), trainer.initial_count) == (first * triangles, whole * triangles)
+    even = replace(settings, density_interval=0)
+    assert len(initial_splats(fine, even)) == whole * triangles
     assert len(initial_splats(fine, quick_settings(lattice=0))) == triangles
 
 

@@ -5,6 +5,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from ...avatar.lattice import splats_per_triangle
 from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
 from ...capture.camera import Camera
 from ...capture.model import Capture, evenly_spread
@@ -124,7 +125,7 @@ class CaptureFacts:
         """Percentile over the visible triangles, in trained images; 0 where none is visible."""
         lattice = self.settings.lattice_order(len(self.capture.faces))
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
-        splats = (lattice + 1) * (lattice + 2) / 2
+        splats = splats_per_triangle(lattice)
         return float(np.percentile(pixels, percentile)) / splats if len(pixels) else 0.0
 
     @cached_property

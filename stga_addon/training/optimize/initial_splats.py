@@ -35,7 +35,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
     convention, degree, views = settings.convention, settings.sh_degree, capture.views["train"]
-    order = settings.lattice_order(len(capture.faces))
+    order = settings.first_lattice_order(len(capture.faces))
     lattice = lattice_splats(capture.neutral, capture.faces, order, degree, convention=convention)
     if not settings.teeth and capture.flame is not None:
         teeth = capture.flame.model.masks.get("teeth", ())

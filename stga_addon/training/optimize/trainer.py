@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...avatar.lattice import splats_per_triangle
 from ...capture.model import Capture, View
 from ...errors import StgaError
 from ...render.device import adapter_name
@@ -36,7 +37,7 @@ class Trainer:
     iteration      steps made so far
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
-    initial_count  splats at the start of the run, which density control counts from
+    initial_count  splats of the whole lattice and hull points, which density control counts from
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Trainer:
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
+        begins = state is None
         if state is None:
             splats = initial_splats(capture, settings)
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
@@ -72,6 +74,11 @@ class Trainer:
         cameras = {view.camera_index for view in capture.views["train"]}
         self._has_one_camera = len(cameras) == 1
         self.initial_count = len(self)
+        if begins:
+            orders = settings.lattice_order, settings.first_lattice_order
+            whole, first = (splats_per_triangle(order(len(capture.faces))) for order in orders)
+            bound = int((~self.state.unbound).sum())
+            self.initial_count += bound * whole // first - bound
 
     def __len__(self) -> int:
         """How many splats there are."""
