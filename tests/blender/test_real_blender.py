@@ -62,11 +62,12 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
     return build_zip(out, edition=complete(target), demo=demo, kernels=kernels)
 
 
-def blender(command: list[str], home: Path, *arguments: object) -> None:
-    """Run a Blender in a home folder of its own, without a network."""
+def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
+    """Run a Blender in a home folder of its own, without a network; with a window if not in the
+    background."""
     others = ("PYTHON", "BLENDER", "STGA", "NUMBA")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
-    full = [*offline(), *command, "--background", *map(str, arguments)]
+    full = [*offline(), *command, *["--background"] * background, *map(str, arguments)]
     how = {"env": {**kept, "HOME": str(home)}, "timeout": TIMEOUT_S}
     done = subprocess.run(full, cwd=ROOT, capture_output=True, text=True, **how)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
