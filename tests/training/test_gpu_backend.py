@@ -48,6 +48,7 @@ def settings_of(**changes: Any) -> TrainingSettings:
         "distance_weight": 0.1,
         "distance_limit": 0.3,
         "unseen_opacity_weight": 0.5,
+        "lattice": 2,
     }
     effects = {"strain_color": True, "antialiased": True, "driven_offsets": ("strain_position",)}
     return quick_settings("selective", **{**limits, **effects, **changes})

@@ -149,7 +149,7 @@ def test_no_splats_on_teeth(painted):
     )
     for kept in (True, False):
         splats = initial_splats.initial_splats(
-            toothed, make_settings(iterations=1, hull_points=False, teeth=kept)
+            toothed, make_settings(iterations=1, hull_points=False, lattice=2, teeth=kept)
         )
         on_teeth = (splats.face >= len(capture.faces)).sum()
         assert on_teeth == (6 * TEETH_FACES if kept else 0)

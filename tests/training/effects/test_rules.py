@@ -245,7 +245,7 @@ def test_a_room_without_masks(painted):
     assert "sampled images have no mask" in plan["background"].reason
     with pytest.raises(StgaError, match="hull-points=on: is not possible, because without masks"):
         planned(capture, hull_points="on")
-    assert len(initial_splats(capture, settings)) == len(capture.faces) * 6
+    assert len(initial_splats(capture, settings)) == len(capture.faces) * 3
 
 
 def test_something_beside_the_mesh_of_one_camera(painted):
