@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
+import av
 import numpy as np
 import pytest
 from capture.factory import ball, edit, write_avatar_of, write_mesh_capture
@@ -258,10 +259,21 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
         process = start_worker(folder, sys.executable, worker_arguments(folder))
         assert process.wait(300) == 0, log_lines(folder, 50)
         assert read_result(folder) == Written(tmp_path / name)
-        there = contents(tmp_path / name)
-        assert main([*words, str(tmp_path / "here" / name)]) == 0
-        assert contents(tmp_path / "here" / name) == there
-        assert there
+        here, there = tmp_path / "here" / name, tmp_path / name
+        assert main([*words, str(here)]) == 0
+        assert contents(there)
+        if name.endswith(".mp4"):  # kernels of another process may round another way
+            found, expected = film(here), film(there)
+            assert found.shape == expected.shape and len(found) == 4
+            assert np.abs(found.astype(int) - expected).max() <= 3
+        else:
+            assert contents(here) == contents(there)
+
+
+def film(path: Path) -> np.ndarray:
+    """The images (N, H, W, 3) of a video."""
+    with av.open(str(path)) as container:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
 
 
 def contents(path: Path) -> dict[str, bytes]:
