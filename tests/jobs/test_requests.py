@@ -264,7 +264,8 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
         assert contents(there)
         if name.endswith(".mp4"):  # kernels of another process may round another way
             found, expected = film(here), film(there)
-            assert found.shape == expected.shape and len(found) == 4
+            assert found.shape == expected.shape
+            assert len(found) == 4
             assert np.abs(found.astype(int) - expected).max() <= 3
         else:
             assert contents(here) == contents(there)
