@@ -64,8 +64,9 @@ def imports(path: Path) -> tuple[tuple[str, int], ...]:
 @cache
 def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
     """The same for every string that is the name of a module, whatever reads it: `import_module`,
-    `find_spec`, a table of them, or another Python after `-m`."""
+    `find_spec`, a table of them, or another Python after `-m`; without NAMED_WHERE_THERE."""
     named: list[tuple[str, int]] = []
+    optional = NAMED_WHERE_THERE.get(name_of(path))
     depth = len(path.relative_to(ROOT).parts)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         text = node.value if isinstance(node, ast.Constant) else None
@@ -79,7 +80,7 @@ def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
             named.append(
                 (module.removeprefix("stga_addon."), level - 1) if inside else (module, level)
             )
-    return tuple(named)
+    return tuple(each for each in named if each[0].split(".")[0] != optional)
 
 
 def module_file(path: Path) -> Path | None:
@@ -153,9 +154,7 @@ def test_imports_run_one_way(path):
     """Catches cycles, and an engine that knows of the scene or the command line."""
     parts = path.relative_to(ROOT / "stga_addon").with_suffix("").parts
     own = layer(parts[0])
-    optional = NAMED_WHERE_THERE.get(name_of(path))
-    named = [each for each in imports_by_name(path) if each[0].split(".")[0] != optional]
-    for module, level in (*imports(path), *named):
+    for module, level in (*imports(path), *imports_by_name(path)):
         # level 1 from stga_addon/x.py, level 2 from stga_addon/x/y.py, 3 from stga_addon/x/y/z.py
         # reach stga_addon
         if level == 0 or level < len(parts):

@@ -22,6 +22,7 @@ Paths are relative to the plan's folder; where a request writes, to the job's ow
 import os
 import re
 import sys
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -163,7 +164,7 @@ class Ended:
     is_lost: bool = False
 
 
-class Engine:
+class Engine(ABC):
     """Carries out jobs.
 
     takes_all    it is given all jobs at once, and minds what they come after itself; else each when
@@ -178,27 +179,27 @@ class Engine:
         """Whether the job can be submitted now."""
         return True
 
+    @abstractmethod
     def submit(self, jobs: Sequence[Job]) -> None:
         """Carry out jobs, each after those it comes after. Raises StgaError if it cannot begin."""
-        raise NotImplementedError
 
+    @abstractmethod
     def adopt(self, job: Job) -> None:
         """Watch the worker that an earlier start of the batch left running."""
-        raise NotImplementedError
 
+    @abstractmethod
     def running(self) -> Mapping[str, str]:
         """Name of each job that a machine carries out -> the machine, "" where unknown."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ended(self) -> Mapping[str, Ended]:
         """The jobs whose workers have ended since this was called last."""
-        raise NotImplementedError
 
     def withdraw(self) -> Sequence[str]:
         """Take back what was submitted and has not begun; returns the names of these jobs."""
         return ()
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 (most engines hold nothing)
         """Leave the engine; the work of running jobs is not touched."""
 
 

@@ -101,8 +101,9 @@ class TrainingSettings:
                           (`with_budget`)
     seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA,
-                   embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES,
-                   and one less at the start, where density control adds the others
+                   embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES
+    coarse_lattice  without a given `lattice`, begin one order lower, where density control adds the
+                   other splats
     convention     embedding convention
     views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the
                      paper's batches)
@@ -180,6 +181,7 @@ class TrainingSettings:
     )
     seed: int = option("fixes every random choice", 0, 0, (1 << 63) - 1)
     lattice: int | None = setting(None, 0, 16)
+    coarse_lattice: bool = True
     convention: str = setting("stga", choices=CONVENTIONS)
     views_per_visit: int = setting(1, 0, MAX_COUNT)
     global_interval: int = setting(1, 1, MAX_COUNT)
@@ -252,7 +254,7 @@ class TrainingSettings:
     def first_lattice_order(self, triangles: int) -> int:
         """Order of the lattice that training begins with: one less than `lattice_order` where
         density control is to find the places of the other splats."""
-        begins_coarse = self.lattice is None and self.density_interval > 0
+        begins_coarse = self.coarse_lattice and self.lattice is None and self.density_interval > 0
         return self.lattice_order(triangles) - begins_coarse
 
     def check(self) -> None:

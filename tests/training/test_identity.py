@@ -36,7 +36,7 @@ from stga_addon.training.settings import TrainingSettings
 from .toys import quick_settings
 
 ITERATIONS = 12
-OLD = {"adam_beta2": 0.999, "split_share": 0.02}
+OLD = {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False}
 """What runs of format version 5 were trained with, and lack."""
 
 

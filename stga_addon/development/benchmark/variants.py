@@ -25,6 +25,7 @@ SETTING_VARIANTS: dict[str, Changes] = {
     STANDARD: {},
     "scale-0.5": {"scale": 0.5},
     "full-size": {"coarse_share": 0.0},
+    "whole-lattice": {"coarse_lattice": False},
     "splats-3": {"lattice": 1},
     "splats-10": {"lattice": 3},
     "splats-15": {"lattice": 4},

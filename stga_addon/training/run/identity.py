@@ -20,7 +20,7 @@ compute other last bits. It is irrational, so that neither decimals nor binary f
 edge between two multiples."""
 LATER_SETTINGS: dict[int, dict[str, Any]] = {
     5: {"torso": False},
-    6: {"adam_beta2": 0.999, "split_share": 0.02},
+    6: {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False},
 }
 """Format version of runs -> settings that earlier ones do not have, with what these were trained
 with."""
