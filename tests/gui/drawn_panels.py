@@ -80,7 +80,8 @@ def draw(panel: Any) -> Layout:
     own = {name: thing for name, thing in vars(panel).items() if name[:2] != "__"}
     stand_in = type("StandIn", (), own)()
     stand_in.layout = Layout()
-    stand_in.draw(bpy.context)
+    with in_viewport("UI"):  # which has a width
+        stand_in.draw(bpy.context)
     return stand_in.layout  # type: ignore[no-any-return]
 
 

@@ -47,7 +47,7 @@ def picture(file: Path) -> None:
     subprocess.run(["import", "-window", "root", str(file)], check=True)
 
 
-def play(steps: Iterator[Any], result: Path, patience_s: float = 600.0) -> None:
+def play(steps: Iterator[Any], result: Path, patience_s: float = 180.0) -> None:
     """Take steps, each when the condition has come true, or the seconds are over, that the one
     before has yielded; then write what was `seen`, and quit Blender."""
     until, since = None, time.monotonic()

@@ -202,7 +202,7 @@ def open_demo() -> Iterator[Any]:
     shot("demo")
 
 
-def misunderstand() -> Iterator[Any]:
+def misunderstand() -> None:
     """Train into a folder that a file never saved does not have."""
     click("Train without a folder", bpy.ops.stga.train, directory="//run")
     seen["error in the panel"] = bpy.context.window_manager.stga_message
@@ -233,6 +233,7 @@ def pose() -> Iterator[Any]:
     shot("posed")
     click("Done Posing", bpy.ops.stga.pose_head)
     mouth.value = 0.0
+    bpy.context.scene.frame_set(bpy.context.scene.frame_current)  # the neck, which has no keyframe
 
 
 def packet(number: int, opening: float) -> bytes:
@@ -495,7 +496,7 @@ pressed duplicate delete append render drop disable"""
 def steps() -> Iterator[Any]:
     for name in ARGUMENTS[1:] or STEPS.split():
         print(f"STEP {name} {time.monotonic() - STARTED:.0f} s", flush=True)
-        yield from globals()[name]()
+        yield from globals()[name]() or ()
     seen["seconds"]["all"] = round(time.monotonic() - STARTED, 2)
 
 
