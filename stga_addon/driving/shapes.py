@@ -71,6 +71,8 @@ EYEBALL_RADIUS_M = 0.012
 ITERATIONS = 12
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
+NEIGHBOURS, MAX_MOVE_M = 200, 0.01
+"""Triangles that are looked at for a point, and its move from which on others are."""
 MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
 FAR_M = 1.0  # Added to the distance of triangles that face another way
 MAX_MATCH_M, MEDIANS = 0.003, 4.0
@@ -116,15 +118,23 @@ class _Surface:
         self.centers = self.corners.mean(axis=1)
         first, second = (self.corners[:, k] - self.corners[:, 0] for k in (1, 2))
         self.normals = unit(np.cross(first, second), 1e-20)
+        self._seen: np.ndarray | None = None
 
     def nearest(
         self, points: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Triangle, barycentric, position and distance of the nearest points that face alike."""
-        squared = (self.centers**2).sum(1) - 2 * points @ self.centers.T
-        squared += np.where(normals @ self.normals.T < MIN_COSINE, FAR_M, 0.0)
-        count = min(CANDIDATES, len(self.centers))
-        near = np.argpartition(squared, count - 1, axis=1)[:, :count]
+        if self._seen is None or abs(points - self._seen).max() > MAX_MOVE_M:
+            middle = points.mean(0)  # about which single precision is enough
+            centers = (self.centers - middle).astype(np.float32)
+            squared = (points - middle).astype(np.float32) @ (-2 * centers.T)
+            squared += (centers**2).sum(1)
+            self._seen, self._around = points, _least(squared, NEIGHBOURS)
+            self._centers, self._normals = self.centers[self._around], self.normals[self._around]
+        away = self._centers - points[:, None]
+        squared = np.einsum("nkc,nkc->nk", away, away)
+        squared += FAR_M * (np.einsum("nkc,nc->nk", self._normals, normals) < MIN_COSINE)
+        near = np.take_along_axis(self._around, _least(squared, CANDIDATES), axis=1)
         barycentric = _closest(self.corners[near], points)
         positions = np.einsum("nkb,nkbc->nkc", barycentric, self.corners[near])
         distance = np.linalg.norm(positions - points[:, None], axis=2)
@@ -132,6 +142,12 @@ class _Surface:
         best = (distance + FAR_M * turned).argmin(axis=1)
         at = np.arange(len(points)), best
         return near[at], barycentric[at], positions[at], distance[at]
+
+
+def _least(values: np.ndarray, count: int) -> np.ndarray:
+    """(N, at most count): indices of the least of each row, in any order."""
+    count = min(count, values.shape[1])
+    return np.argpartition(values, count - 1, axis=1)[:, :count]
 
 
 def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -183,7 +199,8 @@ def _aligned(
     deviation = IDENTITY_DEVIATION_M * np.sqrt(skin.sum() / count)
     prior[9 + np.arange(count), 12 + np.arange(count)] = deviation
     for _ in range(ITERATIONS):
-        face, _, target, distance = surface.nearest(points[skin], normals[skin])
+        found = surface.nearest(points, normals)
+        face, _, target, distance = (values[skin] for values in found)
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
         moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
         towards = np.einsum("na,nak->nk", normal, moved)
@@ -205,7 +222,7 @@ def _warped(
     """The points (478, 3) moved towards the surface by a smooth warp."""
     warped = points
     for smoothing in SMOOTHINGS:
-        _, _, target, distance = surface.nearest(warped[skin], normals[skin])
+        _, _, target, distance = (values[skin] for values in surface.nearest(warped, normals))
         kept = distance < MAX_WARP_MATCH_M
         fixed = np.concatenate([points[skin][kept], points[list(PUPILS)]])
         moved = np.concatenate([target[kept], pupils]) - fixed

@@ -7,8 +7,9 @@ its first corner. Shape, size, place and rigging of the teeth are this project's
 from the mesh.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -67,11 +68,24 @@ def flame_model(path: Path | None) -> FlameModel:
     Raises StgaError."""
     if path is None:
         return _bundled_head()
+    with suppress(OSError):  # which reading it names
+        state, masks = path.stat(), path.parent.stat()  # its masks may lie beside it
+        return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
+    return _read_with_teeth(path)
+
+
+def _read_with_teeth(path: Path) -> FlameModel:
     model = read_flame(path)
     return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
 _bundled_head = cache(partial(read_flame, BUNDLED_HEAD))
+
+
+@lru_cache(maxsize=1)
+def _remembered(path: Path, *state: int) -> FlameModel:
+    """The file in that state: every button that needs the head asks for it again."""
+    return _read_with_teeth(path)
 
 
 def with_teeth(model: FlameModel) -> FlameModel:

@@ -1,9 +1,9 @@
 """Lights of a scene at a posed head: shadow maps of what they see, and what they add."""
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -141,9 +141,11 @@ class ShadowMap:
 
 
 def kernels(name: str) -> Any:
-    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), or NumPy's."""
-    has_numba = find_spec("numba") is not None
-    return import_module(f"...raster.cpu.{name}", __name__) if has_numba else array_kernels
+    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`) where something
+    else has loaded Numba, else NumPy's: to load and compile takes longer than many images."""
+    if "numba" in sys.modules:
+        return import_module(f"...raster.cpu.{name}", __name__)
+    return array_kernels
 
 
 FEW, SOME, MANY = 1, 2, 3

@@ -121,6 +121,8 @@ def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
 
 def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
     """(F,) bool per group index: triangles with three selected vertices."""
+    if not groups:
+        return []
     members = [vertex.groups for vertex in head.data.vertices]
     counts = np.array([len(each) for each in members], np.int64)
     indices, weights = np.empty(counts.sum(), np.int32), np.empty(counts.sum(), np.float32)

@@ -101,12 +101,15 @@ def panels_unfolded(state: str) -> Iterator[Any]:
         seen["texts"] |= {f"{name}: {leaf.text}": leaf.kind for leaf in leaves}
 
 
+RUN_IN_WORK = "training_run"  # noted when a job's first report arrives, whatever is undone
+
+
 def digest() -> dict[str, Any]:
     """What undo is to bring back."""
     scene = bpy.context.scene
     found: dict[str, Any] = {"frame": scene.frame_current, "engine": scene.render.engine}
     for owner in (chosen(), scene.stga_lighting):
-        names = {*owner.bl_rna.properties.keys()} - {"rna_type", "name"}
+        names = {*owner.bl_rna.properties.keys()} - {"rna_type", "name", RUN_IN_WORK}
         found |= {name: getattr(owner, name) for name in names}
     plain = bool | int | float | str
     found = {name: what for name, what in found.items() if isinstance(what, plain)}
