@@ -280,6 +280,7 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
         sides = [(end, 2 + k, 2 + (k + 1) % 4) for end in (0, 1) for k in range(4)]
         mesh.from_pydata([(0, 0, 0), (0, 1, 0), *ring], [], sides)
         shape = bpy.data.objects.new(BONE_SHAPE, mesh)  # in no collection
+        shape.hide_viewport = shape.hide_render = True  # but in one where the head is appended
     for name in ("jaw", "left_eye", "right_eye"):
         joint, bone = JOINTS.index(name), rig.pose.bones[name]
         moved = basis[weights[:, joint] > 0.5] - joints[joint]
