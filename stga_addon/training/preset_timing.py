@@ -74,9 +74,10 @@ def seconds_per_iteration(
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
-    order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
+    trained = capture.views["train"]
+    order = view_order(trained, settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
-    scales = image_scale(settings, 0.0), settings.scale
+    scales = image_scale(settings, 0.0, trained), settings.scale
     red, green, blue = (round(255 * c) for c in settings.background)
     loader = ViewLoader(
         [*views, *views],
@@ -90,7 +91,7 @@ def seconds_per_iteration(
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
-        view, image, mask, mesh = next(loaded[image_scale(settings, progress)])
+        view, image, mask, mesh = next(loaded[image_scale(settings, progress, trained)])
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)

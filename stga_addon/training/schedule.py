@@ -9,9 +9,10 @@ import numpy as np
 from ..capture.model import View
 from .settings import Rates, TrainingSettings
 
-COARSE_SCALE = 0.5
+COARSE_SCALE, MIN_COARSE_SIDE_PX = 0.5, 200
 """Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at
-afterwards."""
+afterwards; not where their shorter side would be less than MIN_COARSE_SIDE_PX: splats are what
+takes time there, and half of so few pixels show too little."""
 
 
 def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0) -> Iterator[View]:
@@ -49,6 +50,10 @@ def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}
 
 
-def image_scale(settings: TrainingSettings, progress: float) -> float:
-    """Size of the images trained on at a share of the budget, as a share of the captured size."""
-    return settings.scale * (COARSE_SCALE if progress < settings.coarse_share else 1.0)
+def image_scale(settings: TrainingSettings, progress: float, views: Sequence[View]) -> float:
+    """Size of the views' images trained on at a share of the budget, as a share of the captured
+    size."""
+    least = min(min(view.camera.width, view.camera.height) for view in views)
+    is_coarse = COARSE_SCALE * settings.scale * least >= MIN_COARSE_SIDE_PX
+    is_coarse = is_coarse and progress < settings.coarse_share
+    return settings.scale * (COARSE_SCALE if is_coarse else 1.0)

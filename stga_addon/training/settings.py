@@ -120,6 +120,7 @@ class TrainingSettings:
                    that few cameras see fade, unless nothing else explains what these cameras see
     adam_beta2     decay of Adam's second moment: at 0.999 it is an average over more iterations
                    than a detail takes to be learned
+    adam_nesterov  Adam with Nesterov's momentum (Dozat 2016)
     adam_epsilon   Adam's ε as a share of the weight of one of an image's values in the loss: splats
                    that hardly show in an image, and whose gradients are below it, hardly move
     ema_share      share of the latest step in each splat's exponential moving average, which the
@@ -197,6 +198,7 @@ class TrainingSettings:
     distance_weight: float = setting(0.0, 0, MAX_WEIGHT)
     distance_limit: float = setting(1.0, 0, MAX_WEIGHT)
     adam_beta2: float = setting(0.99, 0.5, 0.9999)
+    adam_nesterov: bool = True
     adam_epsilon: float = setting(0.003, maximum=1.0, above=0)
     ema_share: float = setting(0.015, 0, 1)
     stray_reset_interval: int = setting(200, 0, MAX_COUNT)
@@ -284,6 +286,7 @@ class TrainingSettings:
 
 _PUBLISHED = {
     "adam_beta2": 0.999,
+    "adam_nesterov": False,
     "adam_epsilon": 1e-9,  # 3D Gaussian Splatting's 1e-15, at an image of 600 by 550
     "ema_share": 1.0,
     "hull_points": False,

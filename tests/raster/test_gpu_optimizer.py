@@ -8,14 +8,15 @@ import pytest
 
 from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.optimizer import AdamOptions
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import VIEW, split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
-from stga_addon.training.optimize.adam import BETA1, EPSILON
+from stga_addon.training.optimize.adam import PLAIN
 
 pytestmark = pytest.mark.needs("adapter")
 
-BETA2 = 0.99
+OPTIONS = PLAIN._replace(beta2=np.float32(0.99), ema_share=np.float32(0.05))
 RATES = {name: 0.01 * (n + 1) for n, name in enumerate((*Parameters._fields, "sh_rest"))}
 COEFFICIENTS, STRAINS = 4, 2
 STRIDE = 11 + 3 * COEFFICIENTS + 3 * STRAINS
@@ -69,7 +70,7 @@ def random_state(count: int = 700, seed: int = 1) -> State:
 def on_device(
     device: Device, state: State, weights: tuple[float, float, float] = (0, 0, 0),
     statistics: bool = False,
-    ema_share: float = 0.05, epsilon: float = EPSILON,
+    options: AdamOptions = OPTIONS,
 ) -> State:  # fmt: skip
     """The state after a step; weights: of scale, distance, opacity."""
     n, upload = len(state.steps), device.upload
@@ -83,7 +84,7 @@ def on_device(
     )  # fmt: skip
     splats = upload("test splats", state.splats)
     gradients = upload("test gradients", state.gradients)
-    upload_step(device, RATES, (BETA1, BETA2), epsilon, ema_share, weights, statistics)
+    upload_step(device, RATES, options, weights, statistics)
     with device.record() as work:
         optimize(
             work, n, STRIDE, any(weights[:2]), tables, view=upload("view", view, "uniform"),
@@ -125,18 +126,23 @@ def test_a_broken_gradient_leaves_its_field(device: Device, value: float) -> Non
         np.testing.assert_array_equal(getattr(got, field), want, err_msg=field)
 
 
+@pytest.mark.parametrize("ahead", [0.0, 0.1])
 @pytest.mark.parametrize("steps", [0, 1, 2, 10, 100, 499, 500, 10_000, 2**31 - 2])
-def test_a_step_at_any_age(device: Device, steps: int) -> None:
-    """Catches 1 − βⁿ computed as a difference of nearly equal numbers; compared with float64."""
+def test_a_step_at_any_age(device: Device, steps: int, ahead: float) -> None:
+    """Catches 1 − βⁿ computed as a difference of nearly equal numbers, and Nesterov's momentum that
+    gets into the moments; compared with float64."""
     state = random_state(64)
     state.wanted[:], state.steps[:] = True, steps
-    got = on_device(device, state, ema_share=0.0)
-    n, beta1, beta2 = steps + 1.0, float(BETA1), BETA2
+    options = OPTIONS._replace(ahead=np.float32(ahead), ema_share=np.float32(0))
+    got = on_device(device, state, options=options)
+    n, beta1, beta2 = steps + 1.0, float(OPTIONS.beta1), float(OPTIONS.beta2)
     first = beta1 * state.first.astype(float) + (1 - beta1) * state.gradients
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2
-    correct = -1 / np.expm1(n * np.log(beta1)), 1 / np.sqrt(-np.expm1(n * np.log(beta2)))
+    correct = 1 / (1 - (1 - ahead) * beta1**n), 1 / np.sqrt(-np.expm1(n * np.log(beta2)))
     step = state.splats.astype(float) - got.splats
-    expected = first * correct[0] / (np.sqrt(second) * correct[1])
+    np.testing.assert_allclose(got.first, first, rtol=1e-5, atol=1e-6)
+    along = first + ahead * (state.gradients - first)
+    expected = along * correct[0] / (np.sqrt(second) * correct[1])
     rate = RATES["rotation"]
     np.testing.assert_allclose(step[:, 3:7], rate * expected[:, 3:7], rtol=2e-5, atol=1e-6)
     share = 4 / (n + 3)

@@ -8,6 +8,7 @@ import torch
 from stga_addon.capture.camera import Camera
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.state import TrainState, new_state
+from stga_addon.training.settings import TrainingSettings
 
 from .toys import bits, random_splats, random_state
 
@@ -15,6 +16,9 @@ RATES = {
     "xyz": 1e-3, "rotation": 5e-3, "log_scale": 2e-2, "opacity": 5e-2, "sh": 1e-2, "sh_rest": 1e-3,
     "strain_color": 4e-3,
 }  # fmt: skip
+OPTIONS = adam.PLAIN._replace(
+    beta2=np.float32(0.99), ema_share=np.float32(0.2), epsilon=np.float32(1e-5)
+)
 
 
 def set_gradients(state: TrainState, rng: np.random.Generator, scale: float = 1.0) -> None:
@@ -62,7 +66,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
                     gradient = gradient[1:] if name == "sh_rest" else gradient[:1]
                 value.grad = gradient.clone() if n in listed else None
         theirs.step()
-        adam.step(state, listed, RATES, 0.99, ema_share=0.2, epsilon=np.float32(1e-5))
+        adam.step(state, listed, RATES, OPTIONS)
         for n in listed:
             history[n].append(rows[n]["xyz"].detach().clone())
     for n, values in enumerate(history):
@@ -110,9 +114,11 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
     )
 
 
-def test_many_rows() -> None:
+@pytest.mark.parametrize("ahead", [0.0, 0.1])
+def test_many_rows(ahead: float) -> None:
     """Catches rows that take their neighbours' step counts where the work is cut into blocks for
-    the threads, and steps of harmonics above the degree in use."""
+    the threads, steps of harmonics above the degree in use, and Nesterov's momentum that gets into
+    the moments."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
     state.steps[:] = rng.integers(0, 50, 1500)
@@ -125,12 +131,16 @@ def test_many_rows() -> None:
         if n != "sh_rest"
     }
     before = {name: array[rows].astype(float) for name, array in state.parameters._asdict().items()}
-    adam.step(state, rows, RATES, sh_degree=1)
+    adam.step(state, rows, RATES, adam.PLAIN._replace(ahead=np.float32(ahead)), sh_degree=1)
     np.testing.assert_array_equal(state.steps[rows], counts)
     for name, value in before.items():
         gradient = getattr(state.gradients, name)[rows].astype(float)
         per_row = counts.reshape(-1, *[1] * (value.ndim - 1))
-        mean = (0.9 * old[f"first/{name}"] + 0.1 * gradient) / (1 - 0.9**per_row)
+        first = 0.9 * old[f"first/{name}"] + 0.1 * gradient
+        in_use = (..., slice(4), slice(None)) if name == "sh" else ...
+        kept = getattr(state.first, name)[rows]
+        np.testing.assert_allclose(kept[in_use], first[in_use], rtol=1e-5, atol=1e-6)
+        mean = ((1 - ahead) * first + ahead * gradient) / (1 - (1 - ahead) * 0.9**per_row)
         square = (0.999 * old[f"second/{name}"] + 0.001 * gradient**2) / (1 - 0.999**per_row)
         rate = np.full(value.shape[1:], RATES[name])
         if name == "sh":
@@ -145,4 +155,5 @@ def test_many_rows() -> None:
 def test_epsilon_is_the_same_share_at_every_image_size() -> None:
     """Catches splats that hardly show learning at another speed on images of another size."""
     camera = Camera(200, 100, 300.0, 300.0, 100.0, 50.0, np.eye(4))
-    assert adam.image_epsilon(0.003, camera) == np.float32(0.003 / 60_000)
+    epsilon = adam.adam_options(TrainingSettings(adam_epsilon=0.003), camera).epsilon
+    assert epsilon == np.float32(0.003 / 60_000)

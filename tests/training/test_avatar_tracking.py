@@ -231,7 +231,7 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
         train(
             capture,
             tmp_path / str(on),
-            make_run(capture, tracking=on, iterations=300, coarse_share=0.0),
+            make_run(capture, tracking=on, iterations=300),
         )
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
     before, after = (

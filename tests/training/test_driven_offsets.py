@@ -56,7 +56,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
 
     loss(before)
     stepped, first = position.value.copy(), position.first.copy()
-    gradient = first / (1 - float(adam.BETA1))
+    gradient = first / (1 - float(adam.PLAIN.beta1))
     assert position.steps.max() == 1
     touched = np.flatnonzero(position.steps)
     assert len(touched)
@@ -95,7 +95,7 @@ def test_the_step_is_adam_in_float64() -> None:
         adam.step_offsets(
             {"strain_position": state}, rows, face, gradient,
             {"strain_position": smoothed}.__getitem__, rate,
-            0.999, ema_share, epsilon,
+            adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon)),
         )  # fmt: skip
         for f in np.unique(face[rows]):
             steps[f] += 1

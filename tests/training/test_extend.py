@@ -60,7 +60,7 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     out = tmp_path_factory.mktemp("parent") / "run"
     capture = open_capture(takes[0])
     settings = quick_settings(
-        "global", iterations=60, lattice=1, strain_color=True, density_interval=0, coarse_share=0.0
+        "global", iterations=60, lattice=1, strain_color=True, density_interval=0
     )
     train(capture, out, Run(capture.root, None, "vhap", settings))
     return out

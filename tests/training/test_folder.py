@@ -56,7 +56,7 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 4 to 6$"),
+        ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 4 to 7$"),
         ({"version": None}, r"run\.json: has run format version None"),
         ({"format": "stga-avatar"}, r"run\.json: is not a run"),
         ({"capture": None}, r"run\.json: setting capture: expected a path, got None"),

@@ -12,6 +12,7 @@ import pytest
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.progress import Progress
+from stga_addon.training import schedule
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.evaluator import EVALUATION_SHARE
 from stga_addon.training.evaluate.forecast import checked_forecasts
@@ -169,5 +170,10 @@ def test_images_grow_where_settings_say_so(
         return step(trainer, view, target, *rest)
 
     monkeypatch.setattr(session.Trainer, "step", note)
-    train(toy, tmp_path, run_of(toy, iterations=20, scale=0.5, coarse_share=0.25))
+    settings = {"iterations": 20, "scale": 0.5, "coarse_share": 0.25}
+    train(toy, tmp_path / "small", run_of(toy, **settings))
+    assert seen == [(30, 20)] * 20  # half of so few pixels shows too little
+    seen.clear()
+    monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 10)
+    train(toy, tmp_path / "large", run_of(toy, **settings))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

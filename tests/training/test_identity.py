@@ -36,7 +36,12 @@ from stga_addon.training.settings import TrainingSettings
 from .toys import quick_settings
 
 ITERATIONS = 12
-OLD = {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False}
+OLD = {
+    "adam_beta2": 0.999,
+    "adam_nesterov": False,
+    "split_share": 0.02,
+    "coarse_lattice": False,
+}
 """What runs of format version 5 were trained with, and lack."""
 
 
@@ -148,7 +153,9 @@ def test_moved_captures_and_refined_meshes_are_accepted(
     assert read_run(copy).capture == other
 
 
-@pytest.mark.parametrize(("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD))])
+@pytest.mark.parametrize(
+    ("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD)), (6, {"adam_nesterov"})]
+)
 def test_runs_of_earlier_format_versions_are_resumed(
     toy: Capture,
     tmp_path: Path,

@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.training import preset_timing
+from stga_addon.training import preset_timing, schedule
 from stga_addon.training.preset_timing import (
     WARM_UP_ITERATIONS,
     seconds_per_iteration,
@@ -42,6 +42,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     monkeypatch.setattr(preset_timing, "perf_counter", watch)
     monkeypatch.setattr(preset_timing, "Trainer", Trainer)
+    monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 0)
     return seen
 
 

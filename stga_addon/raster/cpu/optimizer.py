@@ -38,12 +38,19 @@ class AdamTables(NamedTuple):
 
 
 class AdamOptions(NamedTuple):
-    """Adam's constants, and the least share of a step in the exponential moving average; all
-    float32."""
+    """Adam's constants, all float32.
+
+    ahead      by how much of the way from the first moment to the gradient a step goes; 0: Adam;
+               1 − beta1: Nesterov's momentum (Dozat 2016), where the first step is as long as
+               Adam's here
+    ema_share  least share of a step in the exponential moving average; with 1, the average is the
+               row
+    """
 
     beta1: np.float32
     beta2: np.float32
     epsilon: np.float32
+    ahead: np.float32
     ema_share: np.float32
 
 
@@ -69,7 +76,7 @@ def adam_rows(work, rows, steps, parameters, options):
             if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
                 latest = steps[rows[n]]
                 count = np.float64(latest)
-                first = np.float32(1.0 / (1.0 - math.exp(count * log1)))
+                first = np.float32(1.0 / (1.0 - (1.0 - options.ahead) * math.exp(count * log1)))
                 second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
                 share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
             correct1[n - begin], correct2[n - begin], ema_shares[n - begin] = first, second, share
@@ -83,7 +90,7 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
     """Adam on a few rows of one parameter; a function of its own so that LLVM sees plain arrays and
     vectorizes."""
     values, gradient, first, second, average, rates = parameter
-    beta1, beta2, epsilon, _ = options
+    beta1, beta2, epsilon, ahead, _ = options
     width = len(rates)
     for n in range(len(rows)):
         i = rows[n]
@@ -99,6 +106,7 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
             v = beta2 * second[i, c] + (ONE - beta2) * g * g
             first[i, c] = m
             second[i, c] = v
+            m += ahead * (g - m)
             value = values[i, c] - rates[c] * m * scale1 / (math.sqrt(v) * scale2 + epsilon)
             values[i, c] = value
             average[i, c] += share * (value - average[i, c])

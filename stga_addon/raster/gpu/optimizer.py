@@ -9,6 +9,7 @@ import numpy as np
 
 from ...avatar.offsets import OFFSETS
 from ..cpu.layout import Parameters
+from ..cpu.optimizer import AdamOptions
 from ..cpu.rasterize import tile_grid
 from .device import Device, Recording
 from .frames import SIGNALS
@@ -34,11 +35,11 @@ KERNELS = {
 RATES = (*Parameters._fields, "sh_rest")
 """Learning rates in the order of the kernels; the last is that of the harmonics above the constant
 one."""
-_NUMBERS = "beta1 beta2 log_beta1 log_beta2 epsilon ema_share scale_weight distance_weight"
+_NUMBERS = "beta1 beta2 log_beta1 log_beta2 epsilon ahead ema_share scale_weight distance_weight"
 STEP = np.dtype(
     [("rates", np.float32, 8)]
     + [(name, np.float32) for name in (*_NUMBERS.split(), "opacity_weight")]
-    + [(name, np.uint32) for name in ("statistics", "triangles", "padding")]
+    + [(name, np.uint32) for name in ("statistics", "triangles")]
 )
 """The uniform `step` of optimizer.wgsl."""
 LOSS = np.dtype(
@@ -117,25 +118,23 @@ class OptimizerTables(NamedTuple):
 def upload_step(
     device: Device,
     rates: Mapping[str, float],
-    betas: tuple[float, float],
-    epsilon: float,
-    ema_share: float,
+    options: AdamOptions,
     weights: tuple[float, float, float],
     statistics: bool,
     triangles: int = 0,
 ) -> None:
     """Send the numbers of the next step.
 
-    rates by name; ema_share: least share of a step in the exponential moving average; weights: of
-    the limits of scale, distance and, divided by the number of splats, opacity; statistics: collect
-    the screen gradients; triangles: whose splats driven offsets move.
+    rates by name; weights: of the limits of scale, distance and, divided by the number of
+    splats, opacity; statistics: collect the screen gradients; triangles: whose splats driven
+    offsets move.
     """
     step = np.zeros(1, STEP)
     step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
-    step["beta1"], step["beta2"] = betas
-    step["log_beta1"], step["log_beta2"] = (math.log(beta) for beta in betas)
-    step["epsilon"], step["ema_share"], step["statistics"] = epsilon, ema_share, statistics
-    step["triangles"] = triangles
+    for name, value in options._asdict().items():
+        step[name] = value
+    step["log_beta1"], step["log_beta2"] = map(math.log, options[:2])
+    step["statistics"], step["triangles"] = statistics, triangles
     step["scale_weight"], step["distance_weight"], step["opacity_weight"] = weights
     device.upload("step", step, "uniform")
 

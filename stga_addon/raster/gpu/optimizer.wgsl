@@ -40,13 +40,13 @@ struct Step {
   log_beta1: f32,
   log_beta2: f32,
   epsilon: f32,
+  ahead: f32, // by how much of the way from the first moment to the gradient a step goes
   ema_share: f32, // least share of a step in the exponential moving average
   scale_weight: f32,
   distance_weight: f32,
   opacity_weight: f32, // already divided by the number of splats
   statistics: u32, // 1: collect what density control asks for
   triangles: u32, // whose splats driven offsets move
-  padding: u32,
 }
 
 // Number of the parameter that a column of a row belongs to: in the order of `cpu.layout.Parameters`.
@@ -70,7 +70,7 @@ fn field_of(view: View, column: u32) -> u32 {
 fn corrections_at(step: Step, count: u32) -> vec3f {
   let n = f32(count);
   return vec3f(
-    1.0 / one_minus_exp(n * step.log_beta1),
+    1.0 / one_minus_exp(n * step.log_beta1 + log(1.0 - step.ahead)),
     1.0 / sqrt(one_minus_exp(n * step.log_beta2)),
     max(step.ema_share, 4.0 / (n + 3.0)),
   );
@@ -239,7 +239,8 @@ fn adam_step(n: u32, gradient: f32, rate: f32, correct: vec3f) -> f32 {
   let v = step.beta2 * second[n] + (1.0 - step.beta2) * gradient * gradient;
   first[n] = m;
   second[n] = v;
-  return rate * m * correct.x / (sqrt(v) * correct.y + step.epsilon);
+  let along = m + step.ahead * (gradient - m);
+  return rate * along * correct.x / (sqrt(v) * correct.y + step.epsilon);
 }
 
 // One step of Adam on the wanted rows, a thread a value.

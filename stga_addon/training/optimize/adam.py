@@ -8,33 +8,34 @@ from ...avatar.offsets import OFFSETS
 from ...avatar.splats import MAX_SH_DEGREE
 from ...capture.camera import Camera
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
+from ..settings import TrainingSettings
 from .state import OffsetState, TrainState
 
-BETA1, EPSILON = np.float32(0.9), np.float32(1e-15)
+PLAIN = AdamOptions(*map(np.float32, (0.9, 0.999, 1e-15, 0.0, 1.0)))
+"""3D Gaussian Splatting's, without an average."""
 
 
-def image_epsilon(share: float, camera: Camera) -> np.float32:
-    """Adam's ε for gradients of a mean over an image's values, as a share of the weight of one of
-    them."""
-    return np.float32(share / (3 * camera.width * camera.height))
+def adam_options(settings: TrainingSettings, camera: Camera) -> AdamOptions:
+    """For gradients of a mean over the values of a camera's image: ε is a share of the weight of
+    one of them."""
+    return PLAIN._replace(
+        beta2=np.float32(settings.adam_beta2),
+        epsilon=np.float32(settings.adam_epsilon / (3 * camera.width * camera.height)),
+        ahead=np.float32(1) - PLAIN.beta1 if settings.adam_nesterov else np.float32(0),
+        ema_share=np.float32(settings.ema_share),
+    )
 
 
 def step(
     state: TrainState,
     rows: np.ndarray,
     rates: Mapping[str, float],
-    beta2: float = 0.999,
-    ema_share: float = 1.0,
-    epsilon: np.float32 = EPSILON,
+    options: AdamOptions = PLAIN,
     sh_degree: int = MAX_SH_DEGREE,
 ) -> None:
     """Step the listed rows (M,) int32 of every parameter along its gradient.
 
     rates      learning rate by parameter name; "sh_rest" is that of the view-dependent part of `sh`
-    beta2      decay of the second moment
-    ema_share  least share of the stepped row in its exponential moving average; with 1, the average
-               is the row
-    epsilon    added to the root of the second moment; `image_epsilon` in training
     sh_degree  in use: coefficients of higher ones have no gradient, and memory is left alone
 
     Steps are counted per row, because rows are trained unequally often (STGA, selective training).
@@ -45,7 +46,6 @@ def step(
     sh_rates = tables["sh"].rates
     sh_rates[3:] = rates["sh_rest"]
     tables["sh"] = tables["sh"]._replace(rates=sh_rates[: 3 * (sh_degree + 1) ** 2])
-    options = AdamOptions(BETA1, np.float32(beta2), epsilon, np.float32(ema_share))
     adam_rows(rows, state.steps, tuple(tables.values()), options)
 
 
@@ -56,15 +56,13 @@ def step_offsets(
     xyz_gradient: np.ndarray,
     signal: Callable[[str], np.ndarray],
     position_rate: float,
-    beta2: float,
-    ema_share: float,
-    epsilon: np.float32,
+    options: AdamOptions,
 ) -> None:
     """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have
     xyz_gradient (N, 3).
 
-    signal: name of an offset -> (F, S); position_rate: the splats'; beta2, ema_share, epsilon: as
-    in `step`. A triangle moves all its splats alike, so its gradient is their sum.
+    signal: name of an offset -> (F, S); position_rate: the splats'. A triangle moves all its
+    splats alike, so its gradient is their sum.
     """
     for name, state in states.items():
         count = len(state.steps)
@@ -74,5 +72,4 @@ def step_offsets(
         rates = np.full(gradient[0].size, OFFSETS[name].rate_share * position_rate, np.float32)
         arrays = (state.value, gradient, state.first, state.second, state.average)
         tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rates])
-        options = AdamOptions(BETA1, np.float32(beta2), epsilon, np.float32(ema_share))
         adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)

@@ -56,11 +56,10 @@ class CpuBackend:
         rows, screen, loss = self._backward(
             batch.view, target, batch.background, batch.sh_degree, focus
         )
-        epsilon = adam.image_epsilon(settings.adam_epsilon, batch.view.camera)
+        options = adam.adam_options(settings, batch.view.camera)
         adam.step_offsets(  # before the limits' gradients are added
             state.driven_offsets, rows, face, gradients.xyz,
-            self._frames.signals(batch.view.timestep), batch.rates["xyz"], settings.adam_beta2,
-            settings.ema_share, epsilon,
+            self._frames.signals(batch.view.timestep), batch.rates["xyz"], options,
         )  # fmt: skip
         # what keeps splats near what they cover, and unbound ones out of the air
         if settings.scale_weight:
@@ -74,8 +73,7 @@ class CpuBackend:
             limit = np.float32(settings.distance_limit) * self._frames.units
             xyz, weight = state.parameters.xyz, settings.distance_weight
             distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
-        decays = settings.adam_beta2, settings.ema_share
-        adam.step(state, rows, batch.rates, *decays, epsilon, batch.sh_degree)
+        adam.step(state, rows, batch.rates, options, batch.sh_degree)
         if batch.accumulate:
             add_screen_gradients(rows, screen, state.screen_gradient, state.gradient_count)
         return loss

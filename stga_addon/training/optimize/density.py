@@ -9,10 +9,10 @@ from ...avatar.splats import joined
 from ...flame.quaternions import to_matrices
 from .state import TrainState, join, keep_rows, new_state
 
-MIN_OPACITY = 0.005
+MIN_OPACITY = 0.02
 """Splats with a lower opacity are pruned."""
-SPLIT_LOG_SCALE = np.log(1.6)
-"""Reduction of the log scale of both halves of a split splat along the axis it is split on."""
+SPLIT_SCALE = 1.6
+"""By which both halves of a split splat are narrower along the axis it is split on."""
 
 
 def control_density(
@@ -43,10 +43,9 @@ def control_density(
     length = np.exp(parents.log_scale[n, longest])[:, None]
     offset = to_matrices(parents.rotation)[n, :, longest] * length * 0.5
     jitter = 1 + 0.1 * rng.standard_normal((len(parents), 1))
-    parents.log_scale[n, longest] -= SPLIT_LOG_SCALE
-    # Two splats of opacity a cover as one of opacity o where 1 − (1 − a)² = o.
-    opacity = 1 - np.sqrt(1 - np.clip(_sigmoid(parents.opacity), 0, 0.999))
-    opacity = np.maximum(opacity, 2 * MIN_OPACITY)
+    parents.log_scale[n, longest] -= np.log(SPLIT_SCALE)
+    # of two Gaussians beside each other, so much narrower, that cover as much as one
+    opacity = np.maximum(SPLIT_SCALE / 2 * _sigmoid(parents.opacity), 2 * MIN_OPACITY)
     parents.opacity[:] = np.log(opacity / (1 - opacity))
     sides = [(parents.xyz + side * offset * jitter).astype(np.float32) for side in (-1, 1)]
     halves = joined([replace(parents, xyz=xyz) for xyz in sides])

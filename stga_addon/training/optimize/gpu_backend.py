@@ -25,7 +25,7 @@ from ...raster.gpu.rasterize import (
     upload_splats,
 )
 from ..settings import TrainingSettings
-from .adam import BETA1, image_epsilon
+from .adam import adam_options
 from .frames import FrameStore
 from .state import Batch, OffsetState, TrainState
 
@@ -179,8 +179,7 @@ class GpuBackend:
         upload_target(self.device, batch.target, settings.ssim_weight, batch.mask, change)
         opacity_weight = settings.unseen_opacity_weight / max(len(self), 1)
         optimizer.upload_step(
-            self.device, batch.rates, (float(BETA1), settings.adam_beta2),
-            float(image_epsilon(settings.adam_epsilon, batch.view.camera)), settings.ema_share,
+            self.device, batch.rates, adam_options(settings, batch.view.camera),
             (settings.scale_weight, settings.distance_weight, opacity_weight),
             statistics=batch.accumulate, triangles=self._triangles,
         )  # fmt: skip

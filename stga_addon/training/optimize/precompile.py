@@ -95,8 +95,8 @@ def _step() -> None:
     add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient, state.gradient_count)
     adam.step_offsets(
         with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
-        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, 0.99, 1.0,
-        adam.EPSILON,
+        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3,
+        adam.PLAIN,
     )  # fmt: skip
 
 

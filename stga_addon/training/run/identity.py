@@ -21,6 +21,7 @@ edge between two multiples."""
 LATER_SETTINGS: dict[int, dict[str, Any]] = {
     5: {"torso": False},
     6: {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False},
+    7: {"adam_nesterov": False},
 }
 """Format version of runs -> settings that earlier ones do not have, with what these were trained
 with."""

@@ -262,7 +262,7 @@ class _Session:
             """Of the captured size; by the clock, a few images ahead of it."""
             total = settings.iterations
             share = self._spent().share if total is None else (first + position) / total
-            return image_scale(settings, share)
+            return image_scale(settings, share, capture.views["train"])
 
         prepare = image_preparation(capture, settings)
         # refined meshes change with every step
