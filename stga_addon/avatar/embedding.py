@@ -106,18 +106,17 @@ def frame_backward(
     vertices: np.ndarray,
     faces: np.ndarray,
     frames: FaceFrames,
-    force: np.ndarray,
-    torque: np.ndarray,
-    growth: np.ndarray,
+    by_frame: np.ndarray,
 ) -> np.ndarray:
     """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to
     "stga" frames.
 
-    The reverse of `face_frames`, with all vectors in the frame's own axes: force (F, 3) is the
-    gradient with respect to the origin, torque (F, 3) to a small rotation of the frame, growth (F,)
-    to the logarithm of its scale. Strain passes no gradient on, and a line (see MIN_AREA_RATIO)
+    The reverse of `face_frames`, with all vectors in the frame's own axes: by_frame (F, 7) are the
+    gradients with respect to the origin (3), to a small rotation of the frame (3) and to the
+    logarithm of its scale. Strain passes no gradient on, and a line (see MIN_AREA_RATIO)
     only its force.
     """
+    force, torque, growth = by_frame[:, :3], by_frame[:, 3:6], by_frame[:, 6]
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])

@@ -196,7 +196,7 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
         Parameters(*(t.detach().numpy() for t in ts), None, None) for ts in (leaves, gradients)
     )
     parts = frame_gradient(splats, face, asked, np.arange(len(face)), frames())
-    by_vertex = frame_backward(tracking.mesh(3), capture.faces, frames(), *parts)
+    by_vertex = frame_backward(tracking.mesh(3), capture.faces, frames(), parts)
     assert capture.flame is not None
     found = parameters_gradient(with_identity(capture.flame).model, tracking.frame(3), by_vertex)
     expected = differences(tracking, 3, lambda: loss().item(), 1e-6)

@@ -137,6 +137,29 @@ def sum_by_triangle(rows, face, gradient, total, trained):
             total[f, c] += gradient[i, c]
 
 
+@jit
+def add_frame_gradients(rows, face, xyz, rotation, v_xyz, v_rotation, v_log_scale, total):
+    """Add to total (F, 7) float64, of the listed rows' (M,) triangles, the gradient that moving all
+    splats of a triangle alike has: of their translation (3) and rotation (3) in the triangle's
+    axes and local units, and of the logarithm of their scale."""
+    for n in range(len(rows)):
+        i = rows[n]
+        f = face[i]
+        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
+        fx, fy, fz = v_xyz[i, 0], v_xyz[i, 1], v_xyz[i, 2]
+        q0, q1, q2, q3 = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
+        v0, v1, v2, v3 = v_rotation[i, 0], v_rotation[i, 1], v_rotation[i, 2], v_rotation[i, 3]
+        total[f, 0] += fx
+        total[f, 1] += fy
+        total[f, 2] += fz
+        # of position (cross product), plus of orientation (half of the quaternion's gradient)
+        total[f, 3] += y * fz - z * fy + (q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2) / 2
+        total[f, 4] += z * fx - x * fz + (q0 * v2 - q2 * v0 + q3 * v1 - q1 * v3) / 2
+        total[f, 5] += x * fy - y * fx + (q0 * v3 - q3 * v0 + q1 * v2 - q2 * v1) / 2
+        scaled = v_log_scale[i, 0] + v_log_scale[i, 1] + v_log_scale[i, 2]
+        total[f, 6] += x * fx + y * fy + z * fz + scaled
+
+
 def scale_limit(
     rows: np.ndarray, log_scale: np.ndarray, face: np.ndarray, unbound: np.ndarray,
     limits: np.ndarray, weight: float, gradient: np.ndarray,

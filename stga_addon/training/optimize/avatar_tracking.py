@@ -17,7 +17,7 @@ import numpy as np
 from ...avatar.file import Avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
-from ...capture.mesh_geometry import rasterize, silhouette, vertex_normals
+from ...capture.mesh_geometry import rasterize, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -73,9 +73,9 @@ hardly lower the loss."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to
 it."""
-PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200, 400), 20
-"""Heights of the images in which the first timestep of another recording is tracked, from small
-ones on, as a pattern on clothes leads astray by more than its width, and renderings in each."""
+PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 20
+"""Heights of the images in which the first timestep of another recording is tracked before, as a
+pattern on clothes leads astray by more than its width, and renderings in each."""
 ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
@@ -306,19 +306,21 @@ class _Tracker:
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
         if not views:
             return tracked, np.diag(self._precision()), 0.0, 0.0, 0.0
-        heights: tuple[int, ...] = (MAX_HEIGHT_PX,)
+        shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
-        found = tracked
+        found, first = tracked, None
         if self._change is not None:
-            shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
             starts = tracked, tracked + self._change
-            found = min(starts, key=lambda start: self._loss(start, timestep, shots)[0])
+            losses = [self._loss(start, timestep, shots) for start in starts]
+            best = min((0, 1), key=lambda number: losses[number][0])
+            found, first = starts[best], losses[best]
         elif self._is_far:
-            heights, renderings = PYRAMID_PX, PYRAMID_RENDERINGS
-        energies: list[float] = []
-        for height in heights:
-            shots = [self._read(view, height) for view in views]
-            found, known, *energies = self._minimize(timestep, shots, tracked, found, renderings)
+            renderings = PYRAMID_RENDERINGS
+            for height in PYRAMID_PX:
+                small = [self._read(view, height) for view in views]
+                found, *_ = self._minimize(timestep, small, tracked, found, renderings)
+        sought = timestep, shots, tracked, found, renderings, first
+        found, known, *energies = self._minimize(*sought)
         self._change = found - tracked
         return found, known, energies[0], energies[1], self._misfit(found, shots)
 
@@ -329,9 +331,10 @@ class _Tracker:
         tracked: np.ndarray,
         start: np.ndarray,
         renderings: int,
+        first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Parameters from `start` on, their inverse covariance, and what was minimized before and
-        after."""
+        after; first: `_loss` of the start where it is known."""
         from scipy.linalg import solve_triangular
         from scipy.optimize import minimize
 
@@ -339,16 +342,18 @@ class _Tracker:
         known = self._gauss_newton(start, timestep, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)
 
-        def energy(whitened: np.ndarray) -> tuple[float, np.ndarray]:
+        def energy(
+            whitened: np.ndarray, known: tuple[float, np.ndarray] | None = None
+        ) -> tuple[float, np.ndarray]:
             values = start + solve_triangular(root, whitened, lower=True, trans=1)
-            loss, gradient = self._loss(values, timestep, shots)
+            loss, gradient = known or self._loss(values, timestep, shots)
             change, excess = values - tracked, self._excess(values)
-            gradient += precision * change + excess / WEIGHT_EXCESS_SIGMA**2
+            gradient = gradient + precision * change + excess / WEIGHT_EXCESS_SIGMA**2
             prior = precision @ change**2 + (excess**2).sum() / WEIGHT_EXCESS_SIGMA**2
             return loss + prior / 2, solve_triangular(root, gradient, lower=True)
 
         zero = np.zeros(len(tracked))
-        before, slope = energy(zero)
+        before, slope = energy(zero, first)
         scale = FIRST_STEP * max(float(np.linalg.norm(slope)), 1e-9)
 
         def scaled(values: np.ndarray) -> tuple[float, np.ndarray]:
@@ -364,7 +369,7 @@ class _Tracker:
         self._posed.values = values
         mesh, missed, count = self._posed.mesh(shots[0][0].timestep), 0, 0
         for view, image in shots:
-            head = silhouette(mesh, self._capture.faces, view.camera) > 0
+            head = rasterize(mesh, self._capture.faces, view.camera)[0] >= 0
             drawn = render_avatar(self._avatar, mesh, view.camera, self._settings.background)
             away = np.abs(255 * drawn.transpose(1, 2, 0) - image).mean(2)
             missed, count = missed + int((away[head] > MISS_LEVELS).sum()), count + int(head.sum())
@@ -417,15 +422,10 @@ class _Tracker:
         """The images' loss in the points' units, and its gradient (E + 18,)."""
         self._posed.values = values
         self._frames.clear()
-        total, by_vertex = 0.0, np.zeros_like(self._capture.neutral)
         background = np.array(self._settings.background, np.float32)
-        for view, image in shots:
-            weight = POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255)
-            loss, gradient = self._backend.mesh_gradient(
-                view, image, background, sh_degree(self._settings, 1.0)
-            )
-            total += weight * loss
-            by_vertex += weight * gradient
+        weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
+        degree = sh_degree(self._settings, 1.0)
+        total, by_vertex = self._backend.mesh_gradient(shots, weights, background, degree)
         offset = self._sequence.frame(timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
 

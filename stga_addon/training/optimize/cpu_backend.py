@@ -1,5 +1,7 @@
 """Training backend on the CPU (Numba kernels)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
@@ -8,6 +10,7 @@ from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import (
+    add_frame_gradients,
     add_screen_gradients,
     distance_limit,
     opacity_weight,
@@ -128,21 +131,27 @@ class CpuBackend:
         )  # fmt: skip
 
     def mesh_gradient(
-        self, view: View, target: np.ndarray, background: np.ndarray, sh_degree: int
+        self,
+        shots: Sequence[tuple[View, np.ndarray]],
+        weights: Sequence[float],
+        background: np.ndarray,
+        sh_degree: int,
     ) -> tuple[float, np.ndarray]:
-        """The image loss of a view, and its gradient (V, 3) with respect to the timestep's mesh;
-        nothing is stepped."""
-        rows, _, loss = self._backward(view, target, background, sh_degree, None)
-        assert loss is not None
-        store, state = self._frames, self.state
-        frames, splats, face = store.of(view.timestep), state.parameters, state.face
+        """The weighted sum of the image losses of a timestep's views and images, and its gradient
+        (V, 3) with respect to the timestep's mesh; nothing is stepped."""
+        store, state, timestep = self._frames, self.state, shots[0][0].timestep
+        frames, splats, face = store.of(timestep), state.parameters, state.face
         for name, offset in state.driven_offsets.items():
-            shift = offset_of(offset.value, store.signals(view.timestep)(name))
+            shift = offset_of(offset.value, store.signals(timestep)(name))
             splats = splats._replace(xyz=splats.xyz + shift[face])
-        by_frame = frame_gradient(splats, face, state.gradients, rows, frames)
-        return loss, frame_backward(
-            store.mesh(view.timestep), store.capture.faces, frames, *by_frame
-        )
+        total, by_frame = 0.0, np.zeros((len(frames.scale), 7))
+        for (view, image), weight in zip(shots, weights, strict=True):
+            rows, _, loss = self._backward(view, image, background, sh_degree, None)
+            assert loss is not None
+            total += weight * loss
+            by_frame += weight * frame_gradient(splats, face, state.gradients, rows, frames)
+        mesh, faces = store.mesh(timestep), store.capture.faces
+        return total, frame_backward(mesh, faces, frames, by_frame)
 
 
 def frame_gradient(
@@ -151,22 +160,12 @@ def frame_gradient(
     gradients: Parameters,
     rows: np.ndarray,
     frames: FaceFrames,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gradients of the face frames from those of their splats `rows` (M,), as `frame_backward`
-    takes them.
-
-    Returns those of translation (F, 3), rotation (F, 3) and scale (F,). A frame translates, rotates
-    and scales all its splats alike, so each is a sum over its splats.
-    """
-    (x, y, z), (fx, fy, fz) = splats.xyz[rows].T, gradients.xyz[rows].T
-    (q0, q1, q2, q3), (v0, v1, v2, v3) = splats.rotation[rows].T, gradients.rotation[rows].T
-    # of position (cross product), plus of orientation (half of the quaternion's gradient)
-    rotation = (
-        y * fz - z * fy + (q0 * v1 - q1 * v0 + q2 * v3 - q3 * v2) / 2,
-        z * fx - x * fz + (q0 * v2 - q2 * v0 + q3 * v1 - q1 * v3) / 2,
-        x * fy - y * fx + (q0 * v3 - q3 * v0 + q1 * v2 - q2 * v1) / 2,
-    )
-    scale = x * fx + y * fy + z * fz + gradients.log_scale[rows].sum(1)
-    on, count = face[rows], len(frames.origin)
-    sums = [np.bincount(on, column, count) for column in (fx, fy, fz, *rotation, scale)]
-    return np.stack(sums[:3], -1) / frames.scale[:, None], np.stack(sums[3:6], -1), sums[6]
+) -> np.ndarray:
+    """(F, 7): gradients of the face frames from those of their splats `rows` (M,), as
+    `frame_backward` takes them. A frame moves all its splats alike, so each is a sum over its
+    splats."""
+    found = np.zeros((len(frames.scale), 7))
+    moved = gradients.xyz, gradients.rotation, gradients.log_scale
+    add_frame_gradients(rows, face, splats.xyz, splats.rotation, *moved, found)
+    found[:, :3] /= frames.scale[:, None]
+    return found
