@@ -143,7 +143,7 @@ ADAM = numba.types.void(
     numba.typeof(np.zeros(2, np.int32)),
     numba.typeof(optimizer.AdamTables(*[TABLE] * 5, TABLE[0])),
     *[numba.types.Array(numba.float32, 1, "C")] * 3,
-    numba.typeof(optimizer.AdamOptions(*np.zeros(4, np.float32))),
+    numba.typeof(optimizer.AdamOptions(*np.zeros(5, np.float32))),
 )
 LOOPS = {
     "falloff": (blend._falloff, f"void(u8, {LIST}, {STATE}, b1, {STATE})", 1, 8),
@@ -159,7 +159,7 @@ LOOPS = {
         1,
         4,
     ),
-    "Adam": (optimizer._adam_block, ADAM, 2, 0),
+    "Adam": (optimizer._adam_block, ADAM, 2, 1),
     "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 80),
     "bounds in tiles": (splat_block.project_bounds, f"void({STATE}, f4, f4)", 1, 12),
     "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),
