@@ -32,11 +32,13 @@ Poll = Callable[[Any, Any], bool]
 
 def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, Any], set[str]]:
     """Decorator: a StgaError becomes the operator's error report, without a traceback, and nothing
-    that is returned becomes FINISHED; the pointer says that Blender is busy."""
+    that is returned becomes FINISHED; the pointer says that Blender is busy, and how far it is
+    (`Action.advance`)."""
 
     def guarded(self: Any, context: Any) -> set[str]:
-        context.window_manager.stga_message = ""
-        window = context.window
+        manager, window = context.window_manager, context.window
+        manager.stga_message = ""
+        manager.progress_begin(0, 100)
         if window is not None:
             window.cursor_modal_set("WAIT")
         try:
@@ -45,6 +47,7 @@ def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, 
             self.tell("ERROR", str(error))
             return {"CANCELLED"}
         finally:
+            manager.progress_end()
             if window is not None:
                 window.cursor_modal_restore()
 
@@ -72,6 +75,10 @@ class Action:
     @reporting
     def execute(self, context: Any) -> set[str] | None:
         return self.run(context)
+
+    def advance(self, share: float) -> None:
+        """Show at the pointer how much is done, where a click takes longer than a moment."""
+        bpy.context.window_manager.progress_update(100 * share)
 
     def inform(self: Any, sentence: str) -> None:
         self.report({"INFO"}, sentence)

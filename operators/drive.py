@@ -116,7 +116,9 @@ class DriveLive(Action, bpy.types.Operator):
         found = trained = None
         if pose.takes_frames:
             own = own_motion(head)
+            self.advance(0.1)
             found = head_map(own, head.name)
+            self.advance(0.9)
             trained = stored_range(head) or own_range(head, own)
         receiver = Receiver(source, settings.address, settings.port, settings.phone)
         live_session.start(Target(context.scene.name, pose, found, trained), receiver)

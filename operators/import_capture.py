@@ -145,8 +145,10 @@ def bring_in(
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
+    operator.advance(0.5)
     is_first = not any(is_head(thing) for thing in scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
+    operator.advance(0.8)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(capture.flame_file or "")
     head[tags.PRINCIPAL_POINT] = principal_point

@@ -67,6 +67,7 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         path, head = file_path(self.filepath, "avatar"), head_of(context)
         settings = context.scene.stga
         avatar = read_avatar(path)
+        self.advance(0.3)
         settings.splats = show_avatar(avatar, head, f"{head.name} {path.stem}")
         if self.hide_head:
             hide_object(head, context.scene)
