@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.mesh_geometry import nearest_in_triangles
 from ..errors import StgaError
 from ..files import read_npz
 from ..flame.forward import joint_positions
@@ -135,7 +136,7 @@ class _Surface:
         squared = np.einsum("nkc,nkc->nk", away, away)
         squared += FAR_M * (np.einsum("nkc,nc->nk", self._normals, normals) < MIN_COSINE)
         near = np.take_along_axis(self._around, _least(squared, CANDIDATES), axis=1)
-        barycentric = _closest(self.corners[near], points)
+        barycentric = nearest_in_triangles(self.corners[near], points)
         positions = np.einsum("nkb,nkbc->nkc", barycentric, self.corners[near])
         distance = np.linalg.norm(positions - points[:, None], axis=2)
         turned = np.einsum("nkc,nc->nk", self.normals[near], normals) < MIN_COSINE
@@ -148,35 +149,6 @@ def _least(values: np.ndarray, count: int) -> np.ndarray:
     """(N, at most count): indices of the least of each row, in any order."""
     count = min(count, values.shape[1])
     return np.argpartition(values, count - 1, axis=1)[:, :count]
-
-
-def _closest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (N, K, 3) of the points of triangles nearest to points (N, 3)."""
-    a, b, c = np.moveaxis(corners, 2, 0)
-    from_a, from_b = points[:, None] - a, points[:, None] - b
-
-    def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.asarray((first * second).sum(axis=-1))
-
-    def along(edge: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        return np.asarray(np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1))
-
-    ab, ac = b - a, c - a
-    d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
-    d20, d21 = dot(from_a, ab), dot(from_a, ac)
-    determinant = np.maximum(d00 * d11 - d01**2, 1e-20)
-    second, third = (d11 * d20 - d01 * d21) / determinant, (d00 * d21 - d01 * d20) / determinant
-    inside = (second >= 0) & (third >= 0) & (second + third <= 1)
-    on_ab, on_ac, on_bc = along(ab, from_a), along(ac, from_a), along(c - b, from_b)
-    zero = np.zeros_like(on_ab)
-    second = np.stack([second, on_ab, zero, 1 - on_bc])
-    third = np.stack([third, zero, on_ac, on_bc])
-    options = np.stack([1 - second - third, second, third], axis=-1)
-    offset = np.einsum("onkb,nkbc->onkc", options, corners) - points[:, None]
-    distance = np.linalg.norm(offset, axis=-1)
-    distance[0] = np.where(inside, distance[0], np.inf)
-    nearest = distance.argmin(axis=0)[None, ..., None]
-    return np.asarray(np.take_along_axis(options, nearest, axis=0)[0])
 
 
 def _aligned(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..capture.camera import Camera, look_at
-from ..capture.mesh_geometry import rasterize, vertex_normals
+from ..capture.mesh_geometry import nearest_in_triangles, rasterize, vertex_normals
 from ..errors import StgaError
 from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
@@ -170,29 +170,11 @@ def nearest_points(
     candidates = min(CANDIDATES, len(faces))
     _, near = cKDTree(corners.mean(1)).query(points, candidates)
     near = near.reshape(len(points), candidates)
-    own = corners[near]
-    away = points[:, None] - own[:, :, 0]
-    one, other = own[:, :, 1] - own[:, :, 0], own[:, :, 2] - own[:, :, 0]
-    aa, ab, bb = (one * one).sum(2), (one * other).sum(2), (other * other).sum(2)
-    pa, pb = (away * one).sum(2), (away * other).sum(2)
-    tiny = np.finfo(np.float64).tiny
-    flat = np.maximum(aa * bb - ab**2, tiny)
-    u, v = (bb * pa - ab * pb) / flat, (aa * pb - ab * pa) / flat
-    within = (u >= 0) & (v >= 0) & (u + v <= 1)
-    third = np.clip((pb - pa + aa - ab) / np.maximum(aa - 2 * ab + bb, tiny), 0, 1)
-    first, second = (np.clip(p / np.maximum(q, tiny), 0, 1) for p, q in ((pa, aa), (pb, bb)))
-    # inside the triangle, or else on one of its edges
-    none = np.zeros_like(u)
-    along = np.stack([np.where(within, u, 0), first, none, 1 - third])
-    across = np.stack([np.where(within, v, 0), none, second, third])
-    shares = np.stack([along, across], axis=-1)
-    inner = shares[..., :1] * one + shares[..., 1:] * other
-    distance = np.linalg.norm(away - inner, axis=3)  # (4, N, candidates)
-    kind, rows = distance.argmin(0), np.arange(len(points))
-    best = distance.min(0).argmin(1)
-    share = shares[kind[rows, best], rows, best]
-    barycentric = np.column_stack([1 - share.sum(1), share])
-    return SurfacePoints(near[rows, best], barycentric), distance.min(0)[rows, best]
+    barycentric = nearest_in_triangles(corners[near], points)
+    found = np.einsum("nkb,nkbd->nkd", barycentric, corners[near])
+    distance = np.linalg.norm(found - points[:, None], axis=2)
+    at = np.arange(len(points)), distance.argmin(1)
+    return SurfacePoints(near[at], barycentric[at]), distance[at]
 
 
 def _with_pupils(
