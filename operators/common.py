@@ -38,8 +38,8 @@ def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, 
     def guarded(self: Any, context: Any) -> set[str]:
         manager, window = context.window_manager, context.window
         manager.stga_message = ""
-        manager.progress_begin(0, 100)
         if window is not None:
+            manager.progress_begin(0, 100)
             window.cursor_modal_set("WAIT")
         try:
             return execute(self, context) or {"FINISHED"}
@@ -47,8 +47,8 @@ def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, 
             self.tell("ERROR", str(error))
             return {"CANCELLED"}
         finally:
-            manager.progress_end()
             if window is not None:
+                manager.progress_end()
                 window.cursor_modal_restore()
 
     return guarded
@@ -78,7 +78,8 @@ class Action:
 
     def advance(self, share: float) -> None:
         """Show at the pointer how much is done, where a click takes longer than a moment."""
-        bpy.context.window_manager.progress_update(100 * share)
+        if not bpy.app.background:  # it ends Blender where a file brought a window
+            bpy.context.window_manager.progress_update(100 * share)
 
     def inform(self: Any, sentence: str) -> None:
         self.report({"INFO"}, sentence)

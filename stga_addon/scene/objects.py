@@ -189,7 +189,8 @@ def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
     try:
         for index, number in enumerate(numbers):
             scene.frame_set(number)
-            manager.progress_update(index)
+            if not bpy.app.background:  # it ends Blender where a file brought a window
+                manager.progress_update(index)
             yield number
     finally:
         manager.progress_end()
