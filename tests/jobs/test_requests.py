@@ -262,11 +262,14 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
         here, there = tmp_path / "here" / name, tmp_path / name
         assert main([*words, str(here)]) == 0
         assert contents(there)
-        if name.endswith(".mp4"):  # kernels of another process may round another way
+        # Kernels of another process may round another way, and the encoder then chooses another.
+        if name.endswith(".mp4"):
             found, expected = film(here), film(there)
             assert found.shape == expected.shape
             assert len(found) == 4
-            assert np.abs(found.astype(int) - expected).max() <= 3
+            difference = np.abs(found.astype(int) - expected)
+            assert difference.mean() < 0.5
+            assert difference.max() < 30
         else:
             assert contents(here) == contents(there)
 
