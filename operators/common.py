@@ -33,13 +33,13 @@ Poll = Callable[[Any, Any], bool]
 def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, Any], set[str]]:
     """Decorator: a StgaError becomes the operator's error report, without a traceback, and nothing
     that is returned becomes FINISHED; the pointer says that Blender is busy, and how far it is
-    (`Action.advance`)."""
+    (`show_progress`)."""
 
     def guarded(self: Any, context: Any) -> set[str]:
         manager, window = context.window_manager, context.window
         manager.stga_message = ""
         if window is not None:
-            manager.progress_begin(0, 100)
+            manager.progress_begin(0, 1)
             window.cursor_modal_set("WAIT")
         try:
             return execute(self, context) or {"FINISHED"}
@@ -75,11 +75,6 @@ class Action:
     @reporting
     def execute(self, context: Any) -> set[str] | None:
         return self.run(context)
-
-    def advance(self, share: float) -> None:
-        """Show at the pointer how much is done, where a click takes longer than a moment."""
-        if not bpy.app.background:  # it ends Blender where a file brought a window
-            bpy.context.window_manager.progress_update(100 * share)
 
     def inform(self: Any, sentence: str) -> None:
         self.report({"INFO"}, sentence)

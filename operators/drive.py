@@ -19,6 +19,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
 from ..stga_addon.training.run.folder import has_run, read_run
@@ -116,9 +117,9 @@ class DriveLive(Action, bpy.types.Operator):
         found = trained = None
         if pose.takes_frames:
             own = own_motion(head)
-            self.advance(0.1)
+            show_progress(0.1)
             found = head_map(own, head.name)
-            self.advance(0.9)
+            show_progress(0.9)
             trained = stored_range(head) or own_range(head, own)
         receiver = Receiver(source, settings.address, settings.port, settings.phone)
         live_session.start(Target(context.scene.name, pose, found, trained), receiver)

@@ -14,7 +14,13 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
-from ..stga_addon.scene.objects import COLLECTIONS, capture_root, leave_edit_mode, show_kind
+from ..stga_addon.scene.objects import (
+    COLLECTIONS,
+    capture_root,
+    leave_edit_mode,
+    show_kind,
+    show_progress,
+)
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
 from ..stga_addon.training.run.folder import has_run
@@ -145,10 +151,10 @@ def bring_in(
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
-    operator.advance(0.5)
+    show_progress(0.5)
     is_first = not any(is_head(thing) for thing in scene.objects)
     head = import_head(capture, warn=warn, correctives=correctives)
-    operator.advance(0.8)
+    show_progress(0.8)
     cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
     head[tags.FLAME_MODEL] = str(capture.flame_file or "")
     head[tags.PRINCIPAL_POINT] = principal_point

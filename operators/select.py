@@ -10,6 +10,7 @@ from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.vertex_groups import (
     RESIDUAL,
     has_heat_map,
@@ -59,9 +60,9 @@ class Select(Edit, bpy.types.Operator):
         names = given or key_regions(head)
         capture = _with_painted(open_capture(*capture_source(head)), head, names)
         options = SelectionOptions(self.threshold, self.zero_pose, tuple(names))
-        self.advance(0.3)
+        show_progress(0.3)
         selection = select_capture(capture, options)
-        self.advance(0.6)
+        show_progress(0.6)
         write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
         count_selected(context.scene, head)

@@ -26,6 +26,7 @@ from ..stga_addon.scene.display.splat_object import (
     view_transform_hint,
 )
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
+from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import options
@@ -67,7 +68,7 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         path, head = file_path(self.filepath, "avatar"), head_of(context)
         settings = context.scene.stga
         avatar = read_avatar(path)
-        self.advance(0.3)
+        show_progress(0.3)
         settings.splats = show_avatar(avatar, head, f"{head.name} {path.stem}")
         if self.hide_head:
             hide_object(head, context.scene)

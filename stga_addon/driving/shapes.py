@@ -73,7 +73,7 @@ ITERATIONS = 12
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
 NEIGHBOURS, MAX_MOVE_M = 200, 0.01
-"""Triangles that are looked at for a point, and its move from which on others are."""
+"""Triangles around each point that are kept for the next search, until a point has moved so far."""
 MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
 FAR_M = 1.0  # Added to the distance of triangles that face another way
 MAX_MATCH_M, MEDIANS = 0.003, 4.0

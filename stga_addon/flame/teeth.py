@@ -7,7 +7,6 @@ its first corner. Shape, size, place and rigging of the teeth are this project's
 from the mesh.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -68,10 +67,11 @@ def flame_model(path: Path | None) -> FlameModel:
     Raises StgaError."""
     if path is None:
         return _bundled_head()
-    with suppress(OSError):  # which reading it names
+    try:
         state, masks = path.stat(), path.parent.stat()  # its masks may lie beside it
-        return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
-    return _read_with_teeth(path)
+    except OSError:  # which reading it names
+        return _read_with_teeth(path)
+    return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
 
 
 def _read_with_teeth(path: Path) -> FlameModel:
@@ -84,7 +84,8 @@ _bundled_head = cache(partial(read_flame, BUNDLED_HEAD))
 
 @lru_cache(maxsize=1)
 def _remembered(path: Path, *state: int) -> FlameModel:
-    """The file in that state: every button that needs the head asks for it again."""
+    """The model of a file whose times and size are `state`: every button that needs the head reads
+    it again."""
     return _read_with_teeth(path)
 
 

@@ -181,16 +181,22 @@ def go_to_frame(frame: int) -> None:
     bpy.context.view_layer.update()
 
 
+def show_progress(share: float) -> None:
+    """At the mouse pointer, between `progress_begin(0, 1)` and `progress_end`. Nothing without a
+    display, where Blender crashes once a file has brought a window."""
+    if not bpy.app.background:
+        bpy.context.window_manager.progress_update(share)
+
+
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
     """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
     scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
     frame, subframe = scene.frame_current, scene.frame_subframe
-    manager.progress_begin(0, max(len(numbers), 1))
+    manager.progress_begin(0, 1)
     try:
         for index, number in enumerate(numbers):
             scene.frame_set(number)
-            if not bpy.app.background:  # it ends Blender where a file brought a window
-                manager.progress_update(index)
+            show_progress(index / len(numbers))
             yield number
     finally:
         manager.progress_end()

@@ -15,7 +15,7 @@ from .effects.plan import plan_effects
 from .optimize.image_preparation import image_preparation
 from .optimize.precompile import precompile_kernels
 from .optimize.trainer import Trainer
-from .schedule import image_scale, view_order
+from .schedule import image_scales, view_order
 from .settings import PRESETS, TrainingSettings, make_settings
 
 CALIBRATION_S = 2.0
@@ -77,7 +77,7 @@ def seconds_per_iteration(
     trained = capture.views["train"]
     order = view_order(trained, settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
-    scales = image_scale(settings, 0.0, trained), settings.scale
+    scales = image_scales(settings, trained)
     red, green, blue = (round(255 * c) for c in settings.background)
     loader = ViewLoader(
         [*views, *views],
@@ -91,7 +91,7 @@ def seconds_per_iteration(
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
-        view, image, mask, mesh = next(loaded[image_scale(settings, progress, trained)])
+        view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)

@@ -50,10 +50,9 @@ def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
     return {name: rate * ends[name] ** min(1.0, progress) for name, rate in initial.items()}
 
 
-def image_scale(settings: TrainingSettings, progress: float, views: Sequence[View]) -> float:
-    """Size of the views' images trained on at a share of the budget, as a share of the captured
-    size."""
+def image_scales(settings: TrainingSettings, views: Sequence[View]) -> tuple[float, float]:
+    """Size of the views' images during `coarse_share` of the budget, and afterwards, as a share of
+    the captured size."""
     least = min(min(view.camera.width, view.camera.height) for view in views)
-    is_coarse = COARSE_SCALE * settings.scale * least >= MIN_COARSE_SIDE_PX
-    is_coarse = is_coarse and progress < settings.coarse_share
-    return settings.scale * (COARSE_SCALE if is_coarse else 1.0)
+    is_large = COARSE_SCALE * settings.scale * least >= MIN_COARSE_SIDE_PX
+    return settings.scale * (COARSE_SCALE if is_large else 1.0), settings.scale

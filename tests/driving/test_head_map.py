@@ -18,10 +18,11 @@ from stga_addon.driving.inverse import (
 from stga_addon.driving.open_motion import MotionOptions, performed
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
-from stga_addon.driving.shapes import effective_weights, face_points
+from stga_addon.driving.shapes import _Surface, effective_weights, face_points
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import FlameSequence
+from stga_addon.flame.teeth import flame_model
 
 from .heads import generated_flame, random_poses, with_expressions
 
@@ -186,3 +187,18 @@ def test_a_head_without_a_face():
     small = replace(model, v_template=model.v_template * 0.001)
     with pytest.raises(StgaError, match="tiny: its eyes lie 0 mm apart"):
         head_map(sequence_of(small), "tiny")
+
+
+def test_points_that_move_far_find_other_triangles():
+    """Catches neighbors of a search before that are kept where points have left them."""
+    model, rng = flame_model(None), np.random.default_rng(0)
+    surface = _Surface(model.v_template, model.faces)
+    chosen = rng.choice(len(model.faces), 50)
+    points, normals = surface.centers[chosen] + 1e-4 * surface.normals[chosen], surface.normals
+    surface.nearest(points[::-1], normals[chosen[::-1]])
+    found, fresh = (
+        each.nearest(points, normals[chosen])
+        for each in (surface, _Surface(model.v_template, model.faces))
+    )
+    np.testing.assert_array_equal(found[0], fresh[0])
+    assert np.median(found[3]) == pytest.approx(1e-4, rel=0.1)

@@ -19,6 +19,8 @@ from stga_addon.flame.sequence import FlameSequence
 from stga_addon.flame.teeth import flame_model, lip_pairs
 from stga_addon.tracking.solve import LID_SHAPES
 
+from .small_head import small_head, write_flame
+
 MAX_BYTES, MIN_TRIANGLES, MAX_TRIANGLES = 6e6, 20_000, 26_000
 METERS_PER_UNIT, SETBACK_M = 0.01, 0.0007
 
@@ -186,3 +188,14 @@ def test_thinning_keeps_shape_and_topology():
     wanted = 0.05 * np.sin(6 * centers[:, 0]) * np.sin(6 * centers[:, 1])
     assert np.abs(centers[:, 2] - wanted).max() < 0.01
     assert (centers[:, 0] < 0.5).mean() > 0.55
+
+
+def test_a_changed_model_file_is_read_again(tmp_path):
+    """Catches a model that is remembered although its file has changed, and one that every button
+    reads again."""
+    path = tmp_path / "model.npz"
+    write_flame(small_head(0), path)
+    first = flame_model(path)
+    assert flame_model(path) is first
+    write_flame(small_head(1), path)
+    assert not np.array_equal(flame_model(path).v_template, first.v_template)

@@ -1,5 +1,8 @@
 """NumPy's kernels against Numba's."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -24,6 +27,21 @@ LIGHTS = (
         shape="ellipse", diffuse=0.7,
     ),
 )  # fmt: skip
+
+
+def test_a_light_loads_no_numba():
+    """Catches seconds of compiling at the first light in Blender, whose window stands still."""
+    script = (
+        "import sys, numpy as np\n"
+        "from stga_addon.light.lamps import Lamps\n"
+        "from stga_addon.light.values import Light, Lighting\n"
+        "sun = Light('sun', np.ones(3), direction=(0.0, 0.0, -1.0))\n"
+        "mesh, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)\n"
+        "lamps = Lamps(Lighting(np.zeros((9, 3)), (sun,)), mesh, faces)\n"
+        "assert lamps.irradiance(mesh, np.eye(3)).any()\n"
+        "assert 'numba' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_lights():

@@ -41,8 +41,8 @@ class AdamOptions(NamedTuple):
     """Adam's constants, all float32.
 
     ahead      by how much of the way from the first moment to the gradient a step goes; 0: Adam;
-               1 − beta1: Nesterov's momentum (Dozat 2016), where the first step is as long as
-               Adam's here
+               1 − beta1: Nesterov's momentum (Dozat 2016); bias correction makes the first step
+               as long as Adam's
     ema_share  least share of a step in the exponential moving average; with 1, the average is the
                row
     """

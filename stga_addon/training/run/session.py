@@ -42,7 +42,7 @@ from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
-from ..schedule import image_scale, view_order
+from ..schedule import image_scales, view_order
 from ..settings import TrainingSettings
 from .checkpoint import (
     OTHER_RUN,
@@ -258,11 +258,13 @@ class _Session:
             region = _refined_region(self.run, self.trainer)
             order = continued_order(self.run.continuation, capture, region, settings.seed, first)
 
+        coarse, full = image_scales(settings, capture.views["train"])
+
         def scale(position: int) -> float:
             """Of the captured size; by the clock, a few images ahead of it."""
             total = settings.iterations
             share = self._spent().share if total is None else (first + position) / total
-            return image_scale(settings, share, capture.views["train"])
+            return coarse if share < settings.coarse_share else full
 
         prepare = image_preparation(capture, settings)
         # refined meshes change with every step
