@@ -29,14 +29,11 @@ TRAININGS = ("stga_addon/raster/", "stga_addon/training/")
 LAYERS = (
     {"errors", "__version__"}, {"files", "format", "schema"}, {"options", "progress"}, {"worker"},
     {"flame"}, {"capture"}, {"avatar", "selection"}, {"raster"}, {"light"}, {"export"}, {"render"},
-    {"tracking"}, {"driving"}, {"training"}, {"report"}, {"jobs"}, {"batch"}, {"scene"}, {"cli"},
+    {"tracking"}, {"driving"}, {"training"}, {"report"}, {"jobs"}, {"scene"}, {"cli"},
     {"development"}, {"__main__", "__init__"},
 )  # fmt: skip
-NAMED_WHERE_THERE = dict.fromkeys(
-    ("stga_addon/cli/main.py", "stga_addon/jobs/table.py"), "development"
-)
-"""Files that name modules of a room after their own, because the extension's zip leaves that room
-out."""
+NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development"}
+"""The file that loads a room after its own, which the extension's zip leaves out."""
 LIGHT = (
     "errors", "files", "flame", "capture", "capture.open", "avatar", "avatar.file", "export.ply",
     "selection", "jobs.perform", "jobs.monitor_state", "jobs.python_check",

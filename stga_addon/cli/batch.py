@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..batch.engines import ENGINES
-from ..batch.plan import Plan, plan_of_captures, read_plan
 from ..errors import StgaError
+from ..jobs.batch.engines import ENGINES
+from ..jobs.batch.plan import Plan, plan_of_captures, read_plan
 from ..jobs.train import Train
 from ..options import flag_of, given_options, like, option, option_fields
 from ..training.settings import TrainingSettings
@@ -63,9 +63,9 @@ def run_batch_command(options: Namespace, head: object = None) -> None:
     if chosen.dry_run:
         print_plan(plan)
     elif options.commands:
-        from ..batch.folder import hold_batch, prepare
-        from ..batch.plan import job_command
-        from ..batch.run import Batch
+        from ..jobs.batch.folder import hold_batch, prepare
+        from ..jobs.batch.plan import job_command
+        from ..jobs.batch.run import Batch
 
         with hold_batch(plan.out):
             batch = Batch(plan)
@@ -119,8 +119,8 @@ def with_threads(plan: Plan, threads: int) -> Plan:
 
 def print_plan(plan: Plan) -> None:
     """Print the jobs, and how long they are expected to take."""
-    from ..batch.report import plan_lines
-    from ..batch.run import Batch, forecast_seconds
+    from ..jobs.batch.report import plan_lines
+    from ..jobs.batch.run import Batch, forecast_seconds
 
     batch = Batch(plan)
     batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
@@ -130,10 +130,10 @@ def print_plan(plan: Plan) -> None:
 def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") -> None:
     """Carry out what is not finished, with table and report. Raises StgaError where a job failed,
     KeyboardInterrupt after Ctrl-C when the running jobs have stopped."""
-    from ..batch.engines import make_engine
-    from ..batch.folder import hold_batch
-    from ..batch.report import LiveTable, summary_line, write_report
-    from ..batch.run import Batch, forecast_seconds, run_batch
+    from ..jobs.batch.engines import make_engine
+    from ..jobs.batch.folder import hold_batch
+    from ..jobs.batch.report import LiveTable, summary_line, write_report
+    from ..jobs.batch.run import Batch, forecast_seconds, run_batch
 
     with hold_batch(plan.out) as lease:
         batch = Batch(plan)

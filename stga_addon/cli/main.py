@@ -20,9 +20,6 @@ from ..errors import StgaError, one_line
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
 from .commands import COMMANDS, Command
 
-DEVELOPMENT = {"benchmark": "..development.benchmark.command", "demo": "..development.demo.command"}
-"""Commands of `development`, which the extension's zip leaves out: each COMMAND of a module."""
-
 
 class _Parser(argparse.ArgumentParser):
     """Its messages quote the command line, which may be long or hold control characters."""
@@ -97,10 +94,11 @@ def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
 
 
 def all_commands() -> dict[str, Command]:
-    """The commands of this installation."""
-    found = DEVELOPMENT if find_spec("..development", __package__) is not None else {}
-    own = {name: import_module(module, __package__).COMMAND for name, module in found.items()}
-    return {**COMMANDS, **own}
+    """The commands of this installation; `development`, which the extension's zip leaves out, adds
+    its own, and its requests, when it is loaded."""
+    if find_spec("..development", __package__) is not None:
+        import_module("..development.commands", __package__)
+    return COMMANDS
 
 
 # Standard streams

@@ -31,7 +31,7 @@ from ..worker.launch import PREPARING, cache_folder, prepare_status_folder
 from ..worker.lock import hold_lock
 from ..worker.status import StatusWriter, remove_status_folder, status_writer
 from .blender import RenderRecording
-from .table import JOBS, Request, Result
+from .table import JOBS, Request, Result, request_hint
 from .track import MakeAvatar, SolveAgain, Track, check_inputs
 from .train import Extend, Refine, Resume, Train, refuse_run, resumed
 
@@ -79,14 +79,14 @@ def write_request(folder: Path, request: Request) -> None:
     prepare_status_folder(folder)
     for stale in FILES:
         (folder / stale).unlink(missing_ok=True)
-    _write(folder / REQUEST, folder / REQUEST_ARRAYS, request, Request)
+    _write(folder / REQUEST, folder / REQUEST_ARRAYS, request, request_hint())
 
 
 def read_request(folder: Path) -> Request:
     """Raises StgaError where the folder holds no request, or a damaged one."""
     if not (folder / REQUEST).is_file():
         raise StgaError(f"{folder}: holds no request ({REQUEST} is missing)")
-    request: Request = _read(folder / REQUEST, folder / REQUEST_ARRAYS, Request)
+    request: Request = _read(folder / REQUEST, folder / REQUEST_ARRAYS, request_hint())
     return request
 
 

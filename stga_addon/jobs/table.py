@@ -3,15 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
+from typing import Any, Union
 
-from ..errors import StgaError
-from ..options import like, option
-from ..progress import Report, Say, Written
-from ..schema import setting
+from ..progress import Written
 from .analyze import Analyze, Analyzed, Select, TimePresets, analyze, select, time_each_preset
 from .blender import RenderBlend, RenderRecording, render_blend, render_recording
 from .convert_motion import ConvertMotion, convert_motion
@@ -21,32 +15,10 @@ from .render import Render, render
 from .track import MakeAvatar, SolveAgain, Track, make_avatar, solve_again, track
 from .train import Extend, Refine, Resume, Selected, SelectForTake, Train, select_for_take, train
 
-
-@dataclass(frozen=True)
-class Benchmark:
-    """Train variants of the settings in turns, so that other load on the machine slows all of them
-    alike, and measure their avatars. Exists in a checkout only.
-
-    out             folder; each variant's run is in a folder of its name
-    seconds         of training for each variant
-    knobs           compare single settings instead of presets and strategies
-    only            names of some of the variants; empty: all
-    """
-
-    out: Path
-    capture: Path = like(Train, "capture")
-    seconds: float = setting(above=0)
-    flame: Path | None = like(Train, "flame")
-    principal_point: str = like(Train, "principal_point")
-    seed: int = setting(0, 0)
-    knobs: bool = option("compare single settings instead", False)
-    only: tuple[str, ...] = ()
-
-
 Request = (
     Train | Resume | Refine | Extend | Select | SelectForTake | Track | MakeAvatar | SolveAgain
     | Render | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets
-    | Evaluate | Benchmark | Relight
+    | Evaluate | Relight
 )  # fmt: skip
 Result = Written | Selected | Analyzed
 Work = Callable[..., Result]
@@ -66,16 +38,6 @@ class Kind(StrEnum):
     VIDEO = "video"
 
 
-def train_benchmark(request: Benchmark, report: Report, say: Say) -> Result:
-    """Carry out a benchmark. Raises StgaError where `development` is not installed."""
-    if find_spec("..development", __package__) is None:
-        raise StgaError("Benchmark: can be carried out in a checkout only")
-    # by name, because `development`, which the extension's zip leaves out, imports this room
-    module: Any = import_module("..development.benchmark.slice", __package__)
-    result: Result = module.train_slice(request, report, say)
-    return result
-
-
 @dataclass(frozen=True)
 class Job:
     """The work of a request, and what Blender knows of it.
@@ -88,7 +50,7 @@ class Job:
     subject: str = ""
 
 
-JOBS: dict[type[Request], Job] = {
+JOBS: dict[type[Any], Job] = {
     Train: Job(train, Kind.TRAINING, "run"), Resume: Job(train, Kind.TRAINING, "run"),
     Refine: Job(train, Kind.TRAINING, "run"), Extend: Job(train, Kind.TRAINING, "run"),
     SelectForTake: Job(select_for_take, Kind.SELECTION, "capture"),
@@ -101,8 +63,13 @@ JOBS: dict[type[Request], Job] = {
     RenderRecording: Job(render_recording, Kind.VIDEO, "output"),
     RenderBlend: Job(render_blend), Export: Job(export),
     ConvertMotion: Job(convert_motion, Kind.PERFORMANCE, "output"),
-    Benchmark: Job(train_benchmark),
 }  # fmt: skip
+"""Every request; `development.commands` adds its own in a checkout."""
+
+
+def request_hint() -> Any:
+    """The type hint of a field that holds any request there is."""
+    return Union[tuple(JOBS)]  # noqa: UP007 (of a tuple)
 
 
 @dataclass(frozen=True)

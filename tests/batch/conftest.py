@@ -6,7 +6,7 @@ from functools import cache
 
 import pytest
 
-from stga_addon.batch.plan import Plan
+from stga_addon.jobs.batch.plan import Plan
 from stga_addon.jobs.perform import perform
 
 from .tiny import ITERATIONS, tiny_plan

@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from stga_addon.batch.folder import hold_batch
-from stga_addon.batch.plan import Ended, Engine, Job, Plan, make_plan
-from stga_addon.batch.run import Batch, run_batch
+from stga_addon.jobs.batch.folder import hold_batch
+from stga_addon.jobs.batch.plan import Ended, Engine, Job, Plan, make_plan
+from stga_addon.jobs.batch.run import Batch, run_batch
 from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 

@@ -16,11 +16,11 @@ pytest.importorskip("numba")
 from capture.factory import write_avatar_of, write_mesh_capture
 from PIL import Image
 
-from stga_addon.batch.engines import LocalEngine
-from stga_addon.batch.plan import read_plan
-from stga_addon.batch.run import JobState
 from stga_addon.capture.open import open_capture
 from stga_addon.development.package import build_zip
+from stga_addon.jobs.batch.engines import LocalEngine
+from stga_addon.jobs.batch.plan import read_plan
+from stga_addon.jobs.batch.run import JobState
 
 from .simulated import carry_out
 

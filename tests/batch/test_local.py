@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
-from stga_addon.batch.engines import LocalEngine
-from stga_addon.batch.plan import read_plan
-from stga_addon.batch.run import Batch, JobState
 from stga_addon.cli.main import main
+from stga_addon.jobs.batch.engines import LocalEngine
+from stga_addon.jobs.batch.plan import read_plan
+from stga_addon.jobs.batch.run import Batch, JobState
 from stga_addon.training.run.folder import CHECKPOINT, read_run
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE
@@ -104,7 +104,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     """Catches options that are forgotten where captures are given, or silently ignored where a plan
     is."""
-    monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())
+    monkeypatch.setattr("stga_addon.jobs.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
     options = [

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch.folder import job_digests
-from stga_addon.batch.plan import Plan, Resources, make_plan, plan_of_captures, read_plan
 from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.errors import StgaError
+from stga_addon.jobs.batch.folder import job_digests
+from stga_addon.jobs.batch.plan import Plan, Resources, make_plan, plan_of_captures, read_plan
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate
 from stga_addon.jobs.render import Render

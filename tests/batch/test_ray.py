@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from capture.factory import write_mesh_capture
 
-from stga_addon.batch import ray as ray_engine
-from stga_addon.batch.engines import make_engine
 from stga_addon.errors import StgaError
+from stga_addon.jobs.batch import ray as ray_engine
+from stga_addon.jobs.batch.engines import make_engine
 
 from .conftest import TrainedHere
 from .tiny import (
@@ -30,8 +30,8 @@ import os, subprocess, sys
 sys.path[:0] = [sys.argv[1], sys.argv[1] + "/tests"]
 from pathlib import Path
 from batch.simulated import carry_out
-from stga_addon.batch.engines import make_engine
-from stga_addon.batch.plan import make_plan
+from stga_addon.jobs.batch.engines import make_engine
+from stga_addon.jobs.batch.plan import make_plan
 
 engine = make_engine("ray")
 assert os.environ["RAY_AUTH_MODE"] == "token"
@@ -58,7 +58,7 @@ from pathlib import Path
 from ray.cluster_utils import Cluster
 from batch.simulated import carry_out
 from batch.tiny import tiny_plan
-from stga_addon.batch.engines import make_engine
+from stga_addon.jobs.batch.engines import make_engine
 from stga_addon.training.run.folder import CHECKPOINT
 from stga_addon.worker.lock import is_locked
 from stga_addon.worker.status import LOCK_FILE

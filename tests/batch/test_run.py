@@ -14,13 +14,13 @@ from typing import Any
 
 import pytest
 
-from stga_addon.batch import engines
-from stga_addon.batch.engines import LocalEngine
-from stga_addon.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
-from stga_addon.batch.plan import Ended, Job, Resources, make_plan
-from stga_addon.batch.report import plan_lines, table_lines
-from stga_addon.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.errors import StgaError
+from stga_addon.jobs.batch import engines
+from stga_addon.jobs.batch.engines import LocalEngine
+from stga_addon.jobs.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
+from stga_addon.jobs.batch.plan import Ended, Job, Resources, make_plan
+from stga_addon.jobs.batch.report import plan_lines, table_lines
+from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.worker import lock

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from stga_addon.batch import slurm
-from stga_addon.batch.engines import make_engine
-from stga_addon.batch.run import JobState
-from stga_addon.batch.slurm import SlurmEngine
 from stga_addon.errors import StgaError
+from stga_addon.jobs.batch import slurm
+from stga_addon.jobs.batch.engines import make_engine
+from stga_addon.jobs.batch.run import JobState
+from stga_addon.jobs.batch.slurm import SlurmEngine
 from stga_addon.worker.lock import lock_owner
 from stga_addon.worker.status import LOCK_FILE, StatusWriter, WorkerState
 

@@ -13,8 +13,8 @@ from typing import Any
 from capture.factory import write_mesh_capture
 
 from stga_addon.avatar.file import read_avatar
-from stga_addon.batch.plan import Plan, make_plan
 from stga_addon.files import read_npz
+from stga_addon.jobs.batch.plan import Plan, make_plan
 from stga_addon.training.run.folder import AVATAR
 from stga_addon.worker.status import read_status
 

@@ -2,11 +2,12 @@
 
 import random
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
+import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.jobs import table as ask
 
-REQUESTS = tuple(kind.__name__ for kind in get_args(ask.Request))
+REQUESTS = tuple(kind.__name__ for kind in ask.JOBS)
 NUMBERS = [
     "0", "1", "2", "-1", "nan", "inf", "-inf", "1e308", "1e-320", "0x10", "1_0", "٣", " 1", "",
     "9" * 400, "many",

@@ -27,6 +27,7 @@ from tracking.recording import record
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
+from stga_addon.development.benchmark.variants import Benchmark
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
 from stga_addon.jobs import table as ask
@@ -127,7 +128,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
         ask.TimePresets(capture),
         ask.Relight(case / "run", flame=None),
         ask.RenderBlend(case / "take.blend", case / "asked", (1, 2)),
-        ask.Benchmark(case / "asked", capture, 1.0, only=("draft",)),
+        Benchmark(case / "asked", capture, 1.0, only=("draft",)),
     )
     return {type(request).__name__: request for request in requests}
 
@@ -135,11 +136,11 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
 @pytest.fixture(autouse=True)
 def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_, **__: 1e-5)
-    monkeypatch.setattr("stga_addon.development.benchmark.command.carry_out_plan", lambda *_: None)
+    monkeypatch.setattr("stga_addon.development.commands.carry_out_plan", lambda *_: None)
     monkeypatch.setattr("stga_addon.development.benchmark.benchmark.write_report", lambda *_: "")
     monkeypatch.setattr("stga_addon.development.benchmark.slice.train_in_turns", lambda *_: {})
     monkeypatch.setenv("STGA_BLENDER", "no-such-blender")
-    monkeypatch.setattr("stga_addon.development.demo.command.run", lambda _: None)
+    monkeypatch.setattr("stga_addon.development.demo.run.run_demo", lambda *_, **__: None)
 
 
 def call(arguments: list[Any]) -> tuple[Any, str, str]:

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+import stga_addon.development.commands  # noqa: F401 (adds its requests)
+from stga_addon.development.benchmark.variants import Benchmark
 from stga_addon.driving.open_motion import MotionOptions
 from stga_addon.jobs.analyze import Analyze, Analyzed, Select, TimePresets
 from stga_addon.jobs.avatar_source import Played
@@ -12,7 +14,7 @@ from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.finished_run import Evaluate, Relight
 from stga_addon.jobs.render import Render
-from stga_addon.jobs.table import Benchmark, Request, Result
+from stga_addon.jobs.table import Request, Result
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
 from stga_addon.jobs.train import Extend, Refine, Resume, Selected, SelectForTake, Train
 from stga_addon.progress import Written

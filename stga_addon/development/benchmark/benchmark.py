@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...batch.plan import Plan
 from ...errors import StgaError
 from ...files import replacing, write_json
 from ...format import format_duration
-from ...jobs.table import Benchmark
+from ...jobs.batch.plan import Plan
 from ...report import evaluation_share, finish_axes, psnr_axes
 from ...schema import to_json
 from .statistics import (
@@ -27,7 +26,7 @@ from .statistics import (
     summarize,
     within_spread,
 )
-from .variants import STANDARD, variants_of
+from .variants import STANDARD, Benchmark, variants_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,12 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from ...errors import StgaError
-from ...jobs.table import Benchmark
 from ...jobs.train import Train, prepare
 from ...progress import Progress, Report, Say, Written, ignore
 from ...training.settings import TrainingSettings
 from .scheduler import BenchmarkRun, train_in_turns
-from .variants import settings_of, variants_of, without_choices
+from .variants import Benchmark, settings_of, variants_of, without_choices
 
 
 def train_slice(request: Benchmark, report: Report, say: Say) -> Written:

@@ -1,12 +1,36 @@
 """Variants that a benchmark compares: presets and strategies, or single settings."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ...errors import StgaError
-from ...jobs.table import Benchmark
+from ...jobs.train import Train
+from ...options import like, option
+from ...schema import setting
 from ...selection import SelectionOptions
 from ...training.settings import PRESETS, STRATEGIES, TrainingSettings, make_settings
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Train variants of the settings in turns, so that other load on the machine slows all of them
+    alike, and measure their avatars.
+
+    out             folder; each variant's run is in a folder of its name
+    seconds         of training for each variant
+    only            names of some of the variants; empty: all
+    """
+
+    out: Path
+    capture: Path = like(Train, "capture")
+    seconds: float = setting(above=0)
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    seed: int = setting(0, 0)
+    knobs: bool = option("compare single settings instead of presets and strategies", False)
+    only: tuple[str, ...] = ()
+
 
 Changes = dict[str, Any]
 """Arguments of `make_settings`."""

@@ -46,7 +46,7 @@ def test_slices_are_jobs_of_a_batch(
     printed = capsys.readouterr().out
     assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 1 GB +1 s\n", printed)
     assert "2 jobs, 2 to do; 2 s of work" in printed
-    monkeypatch.setattr("stga_addon.batch.engines.make_engine", lambda *_: InProcessEngine())
+    monkeypatch.setattr("stga_addon.jobs.batch.engines.make_engine", lambda *_: InProcessEngine())
     assert main(command) == 0
     printed = capsys.readouterr().out
     assert "2 of 2 jobs finished" in printed

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.capture.model import Capture
 from stga_addon.development.benchmark import scheduler, variants
 from stga_addon.development.benchmark.benchmark import write_report
@@ -18,12 +19,12 @@ from stga_addon.development.benchmark.slice import runs_of
 from stga_addon.development.benchmark.variants import (
     MAIN_VARIANTS,
     SETTING_VARIANTS,
+    Benchmark,
     select_variants,
 )
 from stga_addon.development.benchmark.worker import QUALITY, Turns, work
 from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import perform, request_folder, write_request
-from stga_addon.jobs.table import Benchmark
 from stga_addon.jobs.train import Train
 from stga_addon.progress import Cancelled, Progress
 from stga_addon.progress import Progress as WorkProgress

@@ -11,10 +11,10 @@ from statistics import median
 
 from filelock import SoftFileLease
 
-from ..errors import StgaError
-from ..jobs.train import Extend, Refine, Train
-from ..training.settings import PRESETS
-from ..worker.status import WorkerState, WorkerStatus, read_status, request_cancel
+from ...errors import StgaError
+from ...training.settings import PRESETS
+from ...worker.status import WorkerState, WorkerStatus, read_status, request_cancel
+from ..train import Extend, Refine, Train
 from .folder import is_done, is_running, job_digests, prepare, read_record, write_record
 from .plan import Engine, Job, Plan
 
@@ -352,11 +352,11 @@ def pace(job: Job, request: Train) -> float | None:
     """Measured seconds per iteration of a training here; None where it cannot be trained yet."""
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
-    from ..capture.open import open_capture
-    from ..raster.cpu.threads import set_threads, threads
-    from ..render.device import choose_device
-    from ..training.effects.plan import plan_effects
-    from ..training.preset_timing import seconds_per_iteration
+    from ...capture.open import open_capture
+    from ...raster.cpu.threads import set_threads, threads
+    from ...render.device import choose_device
+    from ...training.effects.plan import plan_effects
+    from ...training.preset_timing import seconds_per_iteration
 
     before = threads()
     set_threads(job.resources.threads or before)

@@ -16,10 +16,10 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from ..errors import StgaError
-from ..files import read_json, replacing, write_json
-from ..worker.launch import PACKAGES_FOLDER
-from ..worker.status import LOG_FILE, WorkerState, inspect_worker
+from ...errors import StgaError
+from ...files import read_json, replacing, write_json
+from ...worker.launch import PACKAGES_FOLDER
+from ...worker.status import LOG_FILE, WorkerState, inspect_worker
 from .plan import Ended, Engine, Job, Resources, job_command, kind_name
 
 TIMEOUT_S = 60.0

@@ -8,11 +8,11 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..errors import StgaError
-from ..jobs.perform import worker_arguments
-from ..worker.helpers import processors
-from ..worker.launch import start_worker
-from ..worker.status import inspect_worker
+from ...errors import StgaError
+from ...worker.helpers import processors
+from ...worker.launch import start_worker
+from ...worker.status import inspect_worker
+from ..perform import worker_arguments
 from .plan import Ended, Engine, Job, training_python
 
 MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use

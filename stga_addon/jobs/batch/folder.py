@@ -15,16 +15,16 @@ from pathlib import Path
 
 from filelock import SoftFileLease
 
-from ..errors import StgaError
-from ..files import naming, read_json, write_json
-from ..jobs.perform import has_request, write_request
-from ..jobs.table import Request
-from ..schema import from_json, setting, to_json
-from ..training.run.folder import AVATAR, RUN, has_run
-from ..training.run.identity import file_digest
-from ..worker.launch import prepare_status_folder
-from ..worker.lock import hold_folder, is_locked
-from ..worker.status import LOCK_FILE, WorkerState, read_status
+from ...errors import StgaError
+from ...files import naming, read_json, write_json
+from ...schema import from_json, setting, to_json
+from ...training.run.folder import AVATAR, RUN, has_run
+from ...training.run.identity import file_digest
+from ...worker.launch import prepare_status_folder
+from ...worker.lock import hold_folder, is_locked
+from ...worker.status import LOCK_FILE, WorkerState, read_status
+from ..perform import has_request, write_request
+from ..table import request_hint
 from .plan import REPLACED, Job, Plan, input_paths, output_field
 
 
@@ -44,7 +44,7 @@ def job_digests(plan: Plan) -> dict[str, str]:
         read = [path for path in paths if not any(path.is_relative_to(folder) for folder in made)]
         inputs |= {path: _input_digest(path, written) for path in read if path not in inputs}
         parts = {
-            "request": to_json(job.request, {}, Request),
+            "request": to_json(job.request, {}, request_hint()),
             "after": {name: found[name] for name in job.after},
             "inputs": {str(path): inputs[path] for path in read},
         }

@@ -7,7 +7,7 @@ which carries them out.
     threads = 1
 
     [job.anna]
-    request = "train"                  # a request (`KINDS`); the other keys are its fields
+    request = "train"                  # a request (`request_kinds`); the other keys are its fields
     capture = "captures/anna"
     settings = { preset = "standard", seed = 1 }
 
@@ -31,18 +31,18 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from ..errors import StgaError, shorten
-from ..files import read_toml
-from ..jobs.blender import RenderBlend
-from ..jobs.perform import request_folder, worker_arguments
-from ..jobs.table import Request
-from ..jobs.track import MakeAvatar
-from ..jobs.train import Extend, Refine, Resume, Train
-from ..schema import IS_PATH, complaint, from_json, setting, to_json
-from ..training.run.folder import AVATAR
-from ..training.settings import TrainingSettings, make_settings
-from ..worker.status import WorkerSnapshot
-from ..worker.training_python import PYTHON_VARIABLE
+from ...errors import StgaError, shorten
+from ...files import read_toml
+from ...schema import IS_PATH, complaint, from_json, setting, to_json
+from ...training.run.folder import AVATAR
+from ...training.settings import TrainingSettings, make_settings
+from ...worker.status import WorkerSnapshot
+from ...worker.training_python import PYTHON_VARIABLE
+from ..blender import RenderBlend
+from ..perform import request_folder, worker_arguments
+from ..table import JOBS, Request
+from ..track import MakeAvatar
+from ..train import Extend, Refine, Resume, Train
 
 # Jobs
 
@@ -57,11 +57,10 @@ def kind_name(kind: type[Any]) -> str:
     return "".join(f"-{c.lower()}" if c.isupper() else c for c in kind.__name__).lstrip("-")
 
 
-KINDS: dict[str, type[Any]] = {
-    kind_name(kind): kind for kind in get_args(Request) if kind not in (Resume, MakeAvatar)
-}
-"""Name of a request in a plan -> its dataclass: every request but Resume, which is how an
-interrupted one continues, and MakeAvatar, which is two jobs."""
+def request_kinds() -> dict[str, type[Any]]:
+    """Name of a request in a plan -> its dataclass: every request but Resume, which is how an
+    interrupted one continues, and MakeAvatar, which is two jobs."""
+    return {kind_name(kind): kind for kind in JOBS if kind not in (Resume, MakeAvatar)}
 
 
 @dataclass(frozen=True)
@@ -302,9 +301,10 @@ def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Reso
         raise StgaError(f"{where}: {problem}")
     if not isinstance(table, dict):
         raise StgaError(f"{where}: expected a table, got {shorten(table)}")
-    kind = KINDS.get(table["request"]) if isinstance(table.get("request"), str) else None
+    kinds = request_kinds()
+    kind = kinds.get(table["request"]) if isinstance(table.get("request"), str) else None
     if kind is None:
-        problem = f"expected one of {', '.join(KINDS)}, got {shorten(table.get('request'))}"
+        problem = f"expected one of {', '.join(kinds)}, got {shorten(table.get('request'))}"
         raise StgaError(f"{where}: request: {problem}")
     after, minutes = table.get("after", []), table.get("minutes")
     if not isinstance(after, list) or not all(isinstance(other, str) for other in after):

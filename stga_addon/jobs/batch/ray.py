@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from typing import Any
 
-from ..errors import StgaError
-from ..worker.helpers import processors
-from ..worker.launch import PACKAGES_FOLDER
-from ..worker.status import LOG_FILE, inspect_worker, read_status
-from ..worker.training_python import PYTHON_VARIABLE
+from ...errors import StgaError
+from ...worker.helpers import processors
+from ...worker.launch import PACKAGES_FOLDER
+from ...worker.status import LOG_FILE, inspect_worker, read_status
+from ...worker.training_python import PYTHON_VARIABLE
 from .plan import Ended, Engine, Job, job_command
 
 MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory

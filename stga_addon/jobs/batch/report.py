@@ -12,14 +12,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from ..capture.model import evenly_spread
-from ..errors import StgaError, one_line
-from ..files import replacing
-from ..format import format_duration
-from ..training.evaluate.forecast import curve_of, saved_line
-from ..training.run.folder import has_run, read_run
-from ..training.run.metrics_log import read_metrics
-from ..worker.status import log_lines
+from ...capture.model import evenly_spread
+from ...errors import StgaError, one_line
+from ...files import replacing
+from ...format import format_duration
+from ...training.evaluate.forecast import curve_of, saved_line
+from ...training.run.folder import has_run, read_run
+from ...training.run.metrics_log import read_metrics
+from ...worker.status import log_lines
 from .run import Batch, Entry, JobState
 
 MAX_LIVE_ROWS = 20  # Jobs that the live table shows: the running ones, then those that failed
@@ -226,7 +226,7 @@ def _chart(runs: Sequence[Run]) -> str:
     shown = [run for run in evenly_spread(runs, MAX_CURVES) if curve_of(run[1])]
     if not shown or find_spec("matplotlib") is None:
         return ""
-    from ..report import finish_axes, psnr_axes
+    from ...report import finish_axes, psnr_axes
 
     figure, axes = psnr_axes("PSNR on held-out views")
     for entry, metrics in reversed(shown):
@@ -264,11 +264,11 @@ def _pictures(runs: Sequence[Run]) -> str:
 def held_out_pair(run: Path) -> np.ndarray | None:
     """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None without one. Raises
     StgaError where the run or its capture cannot be opened."""
-    from ..avatar.file import read_avatar
-    from ..capture.images import read_image
-    from ..render.render import render_avatar
-    from ..training.evaluate.metrics import choose_evaluation_views
-    from ..training.run.folder import AVATAR, open_refined
+    from ...avatar.file import read_avatar
+    from ...capture.images import read_image
+    from ...render.render import render_avatar
+    from ...training.evaluate.metrics import choose_evaluation_views
+    from ...training.run.folder import AVATAR, open_refined
 
     capture = open_refined(run)
     views = choose_evaluation_views(capture)

@@ -1,0 +1,106 @@
+"""What `development` adds to the tables of commands and requests: `demo`, and `benchmark`, each
+seed of which is a job of a batch (docs/batch.md): one after another on this machine, at once on
+several."""
+
+from argparse import Namespace
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..capture.open import open_capture
+from ..cli.batch import EngineOptions, carry_out_plan, print_plan, with_threads
+from ..cli.commands import COMMANDS, Command
+from ..errors import StgaError
+from ..jobs.batch.plan import make_plan
+from ..jobs.table import JOBS, Job
+from ..jobs.train import Train
+from ..options import duration, given_options, like, option
+from ..training.settings import TrainingSettings
+from ..worker.helpers import processors
+from .benchmark.slice import train_slice
+from .benchmark.variants import Benchmark
+
+DEMO_SECONDS = 12.0
+"""Of a training; with it, the demo takes less than a minute on two cores that have compiled nothing
+yet."""
+SLICES = "benchmark"
+"""How the names of a benchmark's jobs, and of their folders, begin."""
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    out: Path = option("folder of what is made", Path("out/demo"), metavar="DIR")
+    seconds: float | None = like(TrainingSettings, "seconds", help="training time (default 12s)")
+    iterations: int | None = like(
+        TrainingSettings, "iterations", help="number of iterations instead, of the first training"
+    )
+    device: str = like(Train, "device")
+    footage: bool = option("make an avatar from the capture's images alone as well", False)
+
+
+def run_demo_command(options: Namespace, head: object) -> None:
+    from ..render.device import choose_device
+    from .demo.run import avatar_from_footage, run_demo
+
+    given = DemoOptions(**given_options(options, DemoOptions))
+    device, why = choose_device(given.device)
+    print(why)
+    seconds = given.seconds or DEMO_SECONDS
+    budget = {"seconds": seconds} if given.iterations is None else {"iterations": given.iterations}
+    run_demo(given.out, budget, device=device)
+    if given.footage:
+        avatar_from_footage(given.out, seconds, given.device)
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    capture: Path = like(Train, "capture")
+    flame: Path | None = like(Train, "flame")
+    principal_point: str = like(Train, "principal_point")
+    seconds: float = option(
+        "of each run (default 3m)", 180.0, flag="--budget", metavar="TIME", parse=duration
+    )
+    seeds: int = option("runs of each variant", 3, 1)
+    knobs: bool = like(Benchmark, "knobs")
+    only: tuple[str, ...] = option("one of the variants; may be repeated", (), metavar="VARIANT")
+    out: Path = option("keeps the runs, to be continued", Path("out/benchmark"), metavar="DIR")
+
+
+def run_benchmark_command(options: Namespace, head: object) -> None:
+    from .benchmark.benchmark import benchmark_jobs, slices_of, write_report
+
+    given = BenchmarkOptions(**given_options(options, BenchmarkOptions))
+    engine = EngineOptions(**given_options(options, EngineOptions))
+    capture = open_capture(given.capture, given.flame, given.principal_point)
+    for split, purpose in (("train", "train on"), ("val", "measure with")):
+        if not capture.views.get(split):
+            raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
+    flame = None if given.flame is None else given.flame.resolve()
+    out, root = given.out.resolve(), given.capture.resolve()
+    request = Benchmark(
+        out, root, given.seconds, flame, given.principal_point, knobs=given.knobs, only=given.only
+    )  # fmt: skip
+    values = {"out": str(out), "job": benchmark_jobs(SLICES, request, given.seeds)}
+    plan = with_threads(make_plan(values, out, "stga benchmark"), engine.threads or processors())
+    if engine.dry_run:
+        print_plan(plan)
+        return
+    try:
+        carry_out_plan(plan, engine.engine, engine.address)
+    finally:
+        report = write_report(slices_of(plan, SLICES), out)
+    print(report)
+
+
+JOBS[Benchmark] = Job(train_slice)
+COMMANDS["demo"] = Command(
+    "Train an avatar on a capture of a generated person and show it in Blender.",
+    run_demo_command,
+    (DemoOptions,),
+)
+COMMANDS["benchmark"] = Command(
+    "Compare accuracy and training time of strategies and presets on the CPU. "
+    "Variants train in turns.",
+    run_benchmark_command,
+    (BenchmarkOptions, EngineOptions),
+    uses_head=True,
+)
