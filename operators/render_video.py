@@ -17,6 +17,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.blender import RenderRecording
 from ..stga_addon.jobs.render import Render
 from ..stga_addon.jobs.table import Kind
+from ..stga_addon.progress import Progress
 from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
@@ -204,7 +205,7 @@ class _Recording:
             self._recorder = Recorder(self.folder / RECORDING)
             background = srgb_background(context.scene)
             self._drawn = DrawnVideo(self.folder, output, background) if drawn else None
-            self._status.update(0.0, "Recording")
+            self._status.report(Progress(stage="Recording"))
             monitor.follow(context.scene, Kind.VIDEO, output, self.folder)
             monitor.check_now(context.scene, Kind.VIDEO)
             failed.pop_all()
@@ -227,7 +228,8 @@ class _Recording:
         else:
             self._drawn.add(self._layers, camera)
         self._recorded += 1
-        self.is_cancelled = self._status.update(self._recorded / len(self._frames), "Recording")
+        share = self._recorded / len(self._frames)
+        self.is_cancelled = self._status.report(Progress(share, "Recording"))
         return self._recorded < len(self._frames)
 
     def render(self, python: str | None) -> None:

@@ -47,9 +47,7 @@ class EngineOptions:
     threads: int | None = option("threads of each job that names none", None, 1, metavar="N")
     dry_run: bool = option("print the jobs, and how long they are expected to take", False)
     engine: str = option(
-        "; ".join(f"{name}: {what}" for name, what in ENGINES.items()),
-        "local",
-        choices=ENGINES,
+        "; ".join(f"{name}: {what}" for name, what in ENGINES.items()), "local", choices=ENGINES
     )
     address: str = option("of a running cluster (ray)", "")
 
@@ -120,10 +118,10 @@ def with_threads(plan: Plan, threads: int) -> Plan:
 def print_plan(plan: Plan) -> None:
     """Print the jobs, and how long they are expected to take."""
     from ..jobs.batch.report import plan_lines
-    from ..jobs.batch.run import Batch, forecast_seconds
+    from ..jobs.batch.run import Batch, set_forecasts
 
     batch = Batch(plan)
-    batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
+    set_forecasts(batch)
     print("\n".join(plan_lines(batch, processors())))
 
 
@@ -133,15 +131,15 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
     from ..jobs.batch.engines import make_engine
     from ..jobs.batch.folder import hold_batch
     from ..jobs.batch.report import LiveTable, summary_line, write_report
-    from ..jobs.batch.run import Batch, forecast_seconds, run_batch
+    from ..jobs.batch.run import Batch, BatchRun, set_forecasts
 
     with hold_batch(plan.out) as lease:
         batch = Batch(plan)
         engine = make_engine(engine_name, address)
-        batch.set_forecasts(forecast_seconds(batch.unfinished, batch.finished))
+        set_forecasts(batch)
         table = LiveTable(sys.stderr, shutil.get_terminal_size().columns)
         try:
-            run_batch(batch, engine, lease, table, table.say)
+            BatchRun(batch, engine, lease, table, table.say).run()
         finally:
             path = write_report(batch)
             print(f"{summary_line(batch)}\nreport: {path}")

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..training.run.folder import AVATAR
-from ..worker.status import WorkerSnapshot, WorkerState
-from .perform import PREVIEW
+from ..worker.status import PREVIEW, WorkerSnapshot, WorkerState
 from .table import DISMISSIBLE, STORED, TRAINS, TRANSIENT, Kind
 from .track import CAPTURE_FOLDER, RUN_FOLDER
 

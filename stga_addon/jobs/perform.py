@@ -1,11 +1,8 @@
 """Carrying out requests, in this process or as the worker of a folder, which holds
 
-request.json   the request
-request.npz    its arrays
+request.json   the request; request.npz: its arrays
 result.json    what was found, where the request asks for something other than files; result.npz:
                its arrays
-preview.npz    of a training: the avatar of a few seconds ago
-picture.npz    of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
 besides the files of the worker's status (`worker.status`). `python -m` this module compiles ahead
 of a training, which Blender starts with a capture.
 """
@@ -15,7 +12,6 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
-from time import monotonic
 from typing import Any
 
 from ..errors import StgaError
@@ -29,21 +25,18 @@ from ..tracking.folder import is_written
 from ..training.run.folder import has_run, read_run
 from ..worker.launch import PREPARING, cache_folder, prepare_status_folder
 from ..worker.lock import hold_lock
-from ..worker.status import StatusWriter, remove_status_folder, status_writer
+from ..worker.status import PICTURE, PREVIEW, remove_status_folder, status_writer
 from .blender import RenderRecording
 from .table import JOBS, Request, Result, request_hint
 from .track import MakeAvatar, SolveAgain, Track, check_inputs
 from .train import Extend, Refine, Resume, Train, refuse_run, resumed
 
 FORMAT, VERSION = "stga-request", 1
-REQUEST, REQUEST_ARRAYS = "request.json", "request.npz"
-RESULT, RESULT_ARRAYS = "result.json", "result.npz"
-PREVIEW, PICTURE = "preview.npz", "picture.npz"
-FILES = (REQUEST, REQUEST_ARRAYS, RESULT, RESULT_ARRAYS, PREVIEW, PICTURE)
+REQUEST, RESULT = "request.json", "result.json"
+FILES = (REQUEST, "request.npz", RESULT, "result.npz", PREVIEW, PICTURE)
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""
 TORCH_MODULES = ("raster.cpu.autograd",)  # Modules in them that import torch, which takes seconds
-PREVIEW_INTERVAL_S = 4.0  # Seconds between two previews of a training
 
 
 def request_folder(subject: Path) -> Path:
@@ -79,14 +72,14 @@ def write_request(folder: Path, request: Request) -> None:
     prepare_status_folder(folder)
     for stale in FILES:
         (folder / stale).unlink(missing_ok=True)
-    _write(folder / REQUEST, folder / REQUEST_ARRAYS, request, request_hint())
+    _write(folder / REQUEST, request, request_hint())
 
 
 def read_request(folder: Path) -> Request:
     """Raises StgaError where the folder holds no request, or a damaged one."""
-    if not (folder / REQUEST).is_file():
+    if not has_request(folder):
         raise StgaError(f"{folder}: holds no request ({REQUEST} is missing)")
-    request: Request = _read(folder / REQUEST, folder / REQUEST_ARRAYS, request_hint())
+    request: Request = _read(folder / REQUEST, request_hint())
     return request
 
 
@@ -103,29 +96,30 @@ def remove_request(folder: Path) -> None:
 
 def write_result(folder: Path, result: Result) -> None:
     """Raises StgaError on a full disk."""
-    _write(folder / RESULT, folder / RESULT_ARRAYS, result, Result)
+    _write(folder / RESULT, result, Result)
 
 
 def read_result(folder: Path) -> Result:
     """Raises StgaError where the folder holds no result, or a damaged one."""
-    result: Result = _read(folder / RESULT, folder / RESULT_ARRAYS, Result)
+    result: Result = _read(folder / RESULT, Result)
     return result
 
 
-def _write(path: Path, arrays_path: Path, value: Any, kinds: Any) -> None:
+def _write(path: Path, value: Any, kinds: Any) -> None:
     arrays: Arrays = {}
     values = to_json(value, arrays, kinds)
     if arrays:
-        write_npz(arrays_path, arrays, compressed=True)
+        write_npz(path.with_suffix(".npz"), arrays, compressed=True)
     write_json(path, {"format": FORMAT, "version": VERSION, **values})
 
 
-def _read(path: Path, arrays_path: Path, kinds: Any) -> Any:
+def _read(path: Path, kinds: Any) -> Any:
     values = read_json(path)
     named = isinstance(values, dict) and (values.pop("format", 0), values.pop("version", 0))
     if named != (FORMAT, VERSION):
         known = f"(format '{FORMAT}', version {VERSION})"
         raise StgaError(f"{path}: is not a request that this version reads {known}")
+    arrays_path = path.with_suffix(".npz")
     arrays = read_npz(arrays_path) if os.path.exists(arrays_path) else {}
     try:
         return from_json(kinds, values, arrays=arrays)
@@ -155,13 +149,19 @@ def perform_in_folder(
     was cancelled.
 
     also: reported to as well. resume: what the request's output folder holds is what this request
-    began (`remaining`). Raises as `perform` does; the message is in the final status, too.
+    began: a training is resumed, other work is done anew. Raises as `perform` does; the message is
+    in the final status, too.
     """
     # before anything is written into a folder that may be of something else
     if not has_request(folder):
         raise StgaError(f"{folder}: holds no request")
     with status_writer(folder) as writer:
-        writer.update(0.0, "Starting")
+
+        def report(progress: Progress) -> bool:
+            stop = writer.report(progress)
+            return also(progress) or stop
+
+        writer.report(Progress(stage="Starting"))
         try:
             request = read_request(folder)
             if isinstance(request, Train | Resume | Refine | Extend | MakeAvatar):
@@ -169,12 +169,13 @@ def perform_in_folder(
 
                 begin_compiling()
                 load_ahead()
+            if resume and isinstance(request, Train | Refine | Extend) and has_run(request.run):
+                request = resumed(request)
             # ended before it wrote its result
             if resume and isinstance(request, Track) and is_written(request.out):
                 result: Result = Written(request.out)
             else:
-                left = remaining(request) if resume else request
-                result = perform(left, _StatusReport(writer, also), say)
+                result = perform(request, report, say)
         except Cancelled:
             return None
         write_result(folder, result)
@@ -190,33 +191,6 @@ def load_ahead() -> None:
                 # a package that not every Python has, and that nothing here needs
                 with suppress(ImportError):
                     import_module(module.name)
-
-
-def remaining(request: Request) -> Request:
-    """What is left of an interrupted request: trainings are resumed, others write anew."""
-    if isinstance(request, Train | Refine | Extend) and has_run(request.run):
-        return resumed(request)
-    return request
-
-
-class _StatusReport:
-    """Writes the status, and a preview every few seconds, into the folder of a request."""
-
-    def __init__(self, writer: StatusWriter, also: Report) -> None:
-        self._writer, self._also = writer, also
-        self._previewed_s = monotonic()
-
-    def __call__(self, progress: Progress) -> bool:
-        said = progress.stage, progress.detail
-        stop = self._writer.update(progress.share, *said, progress.figures)
-        if progress.preview is not None and monotonic() - self._previewed_s > PREVIEW_INTERVAL_S:
-            progress.preview(self._writer.folder / PREVIEW)
-            self._previewed_s = monotonic()
-        picture = progress.picture() if progress.picture is not None else None
-        if picture is not None:
-            with suppress(StgaError):  # a full disk, which the work reports itself
-                write_npz(self._writer.folder / PICTURE, {"rgb": picture})
-        return self._also(progress) or stop
 
 
 def prepare() -> None:

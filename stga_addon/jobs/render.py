@@ -141,8 +141,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
             for index, view in cameras
         ]
     timesteps = set(_timesteps(request, tuple({view.timestep for view in views})))
-    shown = [view for view in views if view.timestep in timesteps]
-    _write_pictures(request.output, subject, shown, report)
+    _pictures(request, subject, [view for view in views if view.timestep in timesteps], report)
     return Written(request.output)
 
 
@@ -164,14 +163,15 @@ class _Subject:
     views: Sequence[View] = ()
 
 
-def _write_pictures(folder: Path, subject: _Subject, views: Sequence[View], report: Report) -> None:
+def _pictures(request: Render, subject: _Subject, views: Sequence[View], report: Report) -> None:
+    """Write a PNG for each view."""
     from PIL import Image
 
     from ..render.render import to_uint8
 
-    names = unique_names([view.name for view in views])
-    captured, target = {view.image for view in views}, folder.resolve()
-    overwritten = next((name for name in names if target / name in captured), None)
+    folder, names = request.output, unique_names([view.name for view in views])
+    captured = {view.image for view in views}
+    overwritten = next((name for name in names if folder.resolve() / name in captured), None)
     if overwritten is not None:
         raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
     for view, name in counted(
@@ -237,12 +237,11 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
     """An avatar with its capture or moved by another person's motion, or a world-space PLY."""
     source = request.source
     if is_ply(source):
-        refused = (
+        for given, why in (
             (request.motion, "splats are bound to no mesh that a motion could move"),
             (request.light, "light is not known; --light needs an avatar"),
             (request.world, "folder is not that of a run, which --world needs"),
-        )
-        for given, why in refused:
+        ):
             if given:
                 raise StgaError(f"{source}: is a PLY, whose {why}")
         from ..render.render import render
@@ -316,10 +315,9 @@ def _middle(vertices: np.ndarray) -> np.ndarray:
 def unique_names(paths: list[str]) -> list[str]:
     """Names ending in .png; where entries share one, with their folders, then numbered."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
-    names = [png.name for png in pngs]
+    names, unique = [png.name for png in pngs], dict[str, None]()
     if len(set(names)) < len(names):
         names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
-    unique: dict[str, None] = {}
     for name in names:
         numbered = (f"{PurePosixPath(name).stem}_{n}.png" for n in itertools.count(2))
         unique[next(c for c in itertools.chain((name,), numbered) if c not in unique)] = None

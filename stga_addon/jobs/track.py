@@ -161,11 +161,10 @@ MAX_MISFIT = 0.5
 TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 FOCAL_SOURCES = {
-    "given": "as given",
-    "file": "as the file says",
-    "solved": "solved from the turns of the head",
+    "given": "as given", "file": "as the file says", "solved": "solved from the turns of the head",
     "usual": "a guess, that of a phone",
-}  # What a person reads of where a focal length is from (`Footage.focal`)
+}  # fmt: skip
+"""Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
 
 def track(request: Track, report: Report, say: Say) -> Written:
@@ -179,9 +178,8 @@ def track(request: Track, report: Report, say: Say) -> Written:
 
     steps, out = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE), request.out
     steps.report("Opening the footage", 0, 1)
-    frames = FrameRange(
-        request.start, request.stop, request.step, dict(request.offset or {}), request.sync
-    )
+    offset = dict(request.offset or {})
+    frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
     person, model = None, request.model
@@ -207,8 +205,8 @@ def track(request: Track, report: Report, say: Say) -> Written:
         lines.append(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
         if share > MAX_MISFIT:
             lines.append("warning: the avatar does not look like the person of this footage")
-    where = "by camera and timestep in tracking.json"
-    lines.append(f"reprojection error: {pixels:.2f} px (median); {where}")
+    error = f"reprojection error: {pixels:.2f} px (median)"
+    lines.append(f"{error}; by camera and timestep in tracking.json")
     report(Progress(1.0, "Tracked", f"Reprojection error {pixels:.1f} px (median)"))
     return Written(out, (*lines, f"capture: {out}"))
 
@@ -263,7 +261,9 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
         return report(replace(progress, share=share))
 
     begin = perf_counter()
-    _track(request.track, report_tracking, say)
+    check_inputs(request.track)
+    if not is_written(capture):
+        _track(request.track, report_tracking, say)
     tracked = perf_counter()
     new = replace(request.train, flame=request.track.model if is_flame(capture) else None)
     trained = train(resumed(new) if has_run(run) else new, report_training, say)
@@ -291,9 +291,6 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
 
 
 def _track(request: Track, report: Report, say: Say) -> None:
-    check_inputs(request)
-    if is_written(request.out):
-        return
     out = request.out.parent
     new = not out.exists()
     write_json(out / INPUTS, _inputs(request))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -89,11 +89,10 @@ class Resume:
 
 def resumed(request: "Train | Refine | Extend") -> Resume:
     """What continues the run of a request that was interrupted."""
-    resume = Resume(request.run, flame=request.flame, device=request.device)
-    if not isinstance(request, Train):
-        return resume
-    point, selection = request.principal_point, request.selection
-    return replace(resume, capture=request.capture, principal_point=point, selection=selection)
+    names: tuple[str, ...] = ("run", "flame", "device")
+    if isinstance(request, Train):
+        names = (*names, "capture", "principal_point", "selection")
+    return Resume(**{name: getattr(request, name) for name in names})
 
 
 @dataclass(frozen=True)
@@ -101,10 +100,9 @@ class _Continue:
     """Continue a finished run in a run of its own. seconds, iterations: one of the two."""
 
     run: Path = option(
-        "folder of the run that continues it (default: RUN_2, RUN_3, …)",
-        flag="--out",
+        "folder of the run that continues it (default: RUN_2, RUN_3, …)", flag="--out",
         metavar="NEW",
-    )
+    )  # fmt: skip
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
@@ -184,11 +182,14 @@ class SelectForTake:
 # Work
 
 
+Training = Train | Resume | Refine | Extend
+
+
 @dataclass(frozen=True)
 class Prepared:
     """A run that can be trained: the capture of all its takes, and what each timestep trains."""
 
-    request: Train | Resume | Refine | Extend
+    request: Training
     run: Run
     capture: Capture
     selection: Selection | None = None
@@ -197,14 +198,12 @@ class Prepared:
         """The path of the avatar. Raises as `training.run.session.train`."""
         from ..training.run.session import train
 
-        request = self.request
-        resumes, falls_back = isinstance(request, Resume), request.device == "auto"
-        return train(
-            self.capture, request.run, self.run, self.selection, resumes, report, falls_back
-        )
+        folder, resumes = self.request.run, isinstance(self.request, Resume)
+        falls_back = self.request.device == "auto"
+        return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
 
-def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Written:
+def train(request: Training, report: Report, say: Say) -> Written:
     """Train the run that is asked for; its avatar and summary. Raises StgaError, KeyboardInterrupt
     after Ctrl-C."""
     from ..training.effects.plan import describe_effects
@@ -214,6 +213,7 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
         say(f"warning: {warning}")
     for line in format_table(describe_effects(prepared.run.effect_plan)):
         say(line)
+    on = {decision.effect for decision in prepared.run.effect_plan if decision.on}
     draw, latest, is_stopped = CurveUpdater(folder), Progress(), False
 
     def report_training(progress: Progress) -> bool:
@@ -231,7 +231,8 @@ def train(request: Train | Resume | Refine | Extend, report: Report, say: Say) -
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
         lines += _light_of(prepared, avatar, report_afterwards)
-        lines += _world_of(prepared, report_afterwards)
+        if WORLD in on:
+            lines.append(_world_of(prepared, report_afterwards))
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
         lines.append(f"refined meshes: {folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
@@ -252,19 +253,17 @@ def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ..
         return (f"light: not estimated ({error})",)
 
 
-def _world_of(prepared: Prepared, report: Report) -> tuple[str, ...]:
-    """Write what stands still behind the person, where its effect is on; what there is to say."""
-    if not any(decision.effect == WORLD and decision.on for decision in prepared.run.effect_plan):
-        return ()
+def _world_of(prepared: Prepared, report: Report) -> str:
+    """Write what stands still behind the person; what there is to say."""
     from ..training.world import world_of
 
     path = prepared.request.run / WORLD_FILE
     try:
         splats = world_of(prepared.capture, prepared.run.settings, report)
     except Cancelled:
-        return ("world: not made (stopped)",)
+        return "world: not made (stopped)"
     write_ply(path, splats)
-    return (f"world: {path} ({len(splats)} splats)",)
+    return f"world: {path} ({len(splats)} splats)"
 
 
 def refuse_run(folder: Path) -> None:
@@ -273,7 +272,7 @@ def refuse_run(folder: Path) -> None:
         raise StgaError(f"{folder}: already holds a run; resume it, or choose another folder")
 
 
-def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say) -> Prepared:
+def prepare(request: Training, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if isinstance(request, Resume):
         flame, principal_point = request.flame, request.principal_point
@@ -283,8 +282,13 @@ def prepare(request: Train | Resume | Refine | Extend, report: Report, say: Say)
         run = replace(opened.run, device=device)
         return Prepared(request, run, opened.capture, request.selection)
     refuse_run(request.run)
-    begin: Any = {Train: _new_run, Refine: _refinement, Extend: _extension}[type(request)]
-    return cast(Prepared, begin(request, report, say))
+    if isinstance(request, Train):
+        return _new_run(request, report, say)
+    device, why = device_of(read_run(request.parent), request.device)
+    say(f"{why}\nrun: {request.run}")
+    begin: Any = _refinement if isinstance(request, Refine) else _extension
+    prepared: Prepared = begin(request, report, say)
+    return replace(prepared, run=replace(prepared.run, device=device))
 
 
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
@@ -325,7 +329,6 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
     from ..training.run.continuation import continued_settings, is_faced
 
     parent, weights = request.parent, request.weights
-    device = _continuing_device(request, say)
     report(Progress(stage="Opening the run"))
     opened = open_run(parent, flame=request.flame)
     capture = with_refined_tracking(opened.capture, parent)
@@ -352,9 +355,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
     if not is_faced(capture, views, region):
         raise StgaError(f"region '{name}': faces no training camera {between}")
     continuation = _continuation(parent, (first, last))
-    run = replace(
-        opened.run, settings=settings, device=device, identity=None, continuation=continuation
-    )
+    run = replace(opened.run, settings=settings, identity=None, continuation=continuation)
     return Prepared(request, run, capture, {capture.timesteps[0]: region})
 
 
@@ -362,7 +363,6 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     from ..training.effects.plan import add_effects
     from ..training.run.continuation import continued_settings
 
-    device = _continuing_device(request, say)
     report(Progress(stage="Comparing the avatar with the images"))
     opened, capture, selection, run = _joined_takes(request, say)
     needed = np.any(list(selection.values()), axis=0)
@@ -376,7 +376,7 @@ def _extension(request: Extend, report: Report, say: Say) -> Prepared:
     for old, new in zip(run.effect_plan, plan, strict=True):
         if new.on != old.on:
             say(f"{new.effect}  {new}")
-    run = replace(run, settings=settings, effect_plan=plan, device=device)
+    run = replace(run, settings=settings, effect_plan=plan)
     return Prepared(request, run, capture, selection)
 
 
@@ -421,9 +421,3 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
 
 def _continuation(parent: Path, frames: tuple[int, int]) -> Continuation:
     return Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)
-
-
-def _continuing_device(request: Refine | Extend, say: Say) -> str:
-    device, why = device_of(read_run(request.parent), request.device)
-    say(f"{why}\nrun: {request.run}")
-    return device

@@ -34,8 +34,7 @@ SINGLE = dict.fromkeys(
 )  # Environment variables of a helper
 REPORT_INTERVAL_S = 0.2
 STEPS_KEY = "steps"  # In the file of a kept result: how many steps it took
-STEP, RESULT, ERROR = "step", "result", "error"
-"""What a helper's messages are: a pair of this and a value."""
+STEP, RESULT, ERROR = "step", "result", "error"  # A helper's message is a pair of this and a value
 
 Step = Callable[[], None]  # Called by work after each of its steps
 
@@ -70,10 +69,8 @@ class Helpers:
         for process in self._processes:
             process.kill()
         for process in self._processes:
-            process.wait()
-            for pipe in (process.stdin, process.stdout):
-                assert pipe is not None
-                pipe.close()
+            with process:  # closes its pipes, and waits
+                pass
         self._processes = []
 
     def map(

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ..errors import StgaError
@@ -70,47 +71,39 @@ def start_worker(folder: Path, python: str, arguments: Sequence[str]) -> subproc
     Raises StgaError where the interpreter cannot be started; then only the status is removed from
     the folder.
     """
-    path, nothing = folder / LOG_FILE, subprocess.DEVNULL
+    path = folder / LOG_FILE
     with naming(path):
         log = os.open(path, os.O_WRONLY | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0))
-    streams: dict[str, Any] = {"stdin": nothing, "stdout": log, "stderr": subprocess.STDOUT}
+    options: dict[str, Any] = {"stdout": log, "stderr": subprocess.STDOUT, "cwd": folder}
     try:
-        process = start_python(python, arguments, cwd=folder, **streams, **_DETACHED)
+        return start_in_background(python, arguments, NICENESS, **options)
     except StgaError:
         remove_status_folder(folder)
         raise
     finally:
         os.close(log)
-    _give_precedence(process, NICENESS)
-    return process
 
 
-def start_in_background(python: str, arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start `python -m ARGUMENTS…` at low priority, without status and output."""
-    streams = ("stdin", "stdout", "stderr")
-    nothing: dict[str, Any] = dict.fromkeys(streams, subprocess.DEVNULL)
-    process = start_python(python, arguments, **nothing, **_DETACHED)
-    _give_precedence(process, BACKGROUND_NICENESS)
-    return process
-
-
-def _give_precedence(process: subprocess.Popen[bytes], niceness: int) -> None:
-    """Lower the priority of a process on Linux and macOS; Windows starts it with a low one."""
-    if os.name != "nt":
+def start_in_background(
+    python: str, arguments: Sequence[str], niceness: int = BACKGROUND_NICENESS, **options: Any
+) -> subprocess.Popen[bytes]:
+    """Start `python -m ARGUMENTS…` at low priority, without output but for the options of Popen."""
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, **options}
+    process = start_python(python, arguments, stdin=subprocess.DEVNULL, **options, **_DETACHED)
+    if os.name != "nt":  # where it is started with a low one
         with suppress(OSError):  # the process has ended already
             own = os.getpriority(os.PRIO_PROCESS, 0)
             os.setpriority(os.PRIO_PROCESS, process.pid, own + niceness)
+    return process
 
 
 def start_python(
-    python: str,
-    arguments: Sequence[str],
-    variables: Mapping[str, str] | None = None,
+    python: str, arguments: Sequence[str], variables: Mapping[str, str] = MappingProxyType({}),
     **options: Any,
-) -> subprocess.Popen[Any]:
+) -> subprocess.Popen[Any]:  # fmt: skip
     """Start `python -m ARGUMENTS…` in `worker_environment` and `variables`; options are those of
     Popen. Raises StgaError where the interpreter cannot be started."""
-    environment = {**worker_environment(os.environ, python), **(variables or {})}
+    environment = {**worker_environment(os.environ, python), **variables}
     try:
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path

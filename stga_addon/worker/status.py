@@ -1,6 +1,8 @@
 """Status of a worker process, shared through a folder.
 
 status.json   the worker's latest status, replaced atomically
+preview.npz   of a training: the avatar of a few seconds ago
+picture.npz   of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
 worker.log    its standard output and error
 worker.lock   locked while the worker lives
 cancel        exists once the worker was asked to stop
@@ -14,7 +16,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
@@ -22,11 +24,14 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StgaError
-from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json
+from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json, write_npz
+from ..progress import Progress
 from .lock import hold_folder, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
+PREVIEW, PICTURE = "preview.npz", "picture.npz"
 STATUS_INTERVAL_S = 0.5  # Least time between two writes of status.json with the same message
+PREVIEW_INTERVAL_S = 4.0  # Seconds between two previews
 MIN_FREE_BYTES = 1 << 20  # Free space below which a disk counts as full
 LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
 MAX_LOG_LINE_BYTES = 400  # Assumed length of a log line, which bounds how much of the log is read
@@ -51,9 +56,6 @@ class WorkerState(StrEnum):
     @property
     def failed(self) -> bool:
         return self in (WorkerState.FAILED, WorkerState.LOST)
-
-
-ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED)
 
 
 @dataclass(frozen=True)
@@ -110,14 +112,13 @@ def inspect_worker(folder: Path, process: subprocess.Popen[bytes] | None = None)
         state = WorkerState.STARTING if status is None else WorkerState.WORKING
     status = status or WorkerStatus()
     if state == WorkerState.LOST:
-        error = describe_lost_worker(folder, code)
+        error = _why_lost(folder, code)
         status = replace(status, state=WorkerState.LOST, message="", detail="", error=error)
     log_tail = tuple(log_lines(folder, LOG_TAIL_LINES)) if state.failed else ()
     return WorkerSnapshot(state, status, log_tail)
 
 
-def describe_lost_worker(folder: Path, exit_code: int | None = None) -> str:
-    """One sentence on a worker that ended without a final status."""
+def _why_lost(folder: Path, exit_code: int | None) -> str:
     with suppress(OSError):
         if shutil.disk_usage(folder).free < MIN_FREE_BYTES:
             return f"Worker exited unexpectedly: the disk that holds {folder} is full"
@@ -138,7 +139,7 @@ def read_status(folder: Path) -> WorkerStatus | None:
         progress, seconds = float(status.progress), float(status.seconds)
     except (StgaError, TypeError, ValueError, AttributeError):
         return None
-    is_known = status.state in (WorkerState.WORKING, *ENDS)
+    is_known = status.state in ("working", "finished", "cancelled", "failed")
     are_numbers = 0 <= progress <= 1 and 0 <= seconds < math.inf
     if not (is_known and are_numbers and all(isinstance(text, str) for text in texts)):
         return None
@@ -203,21 +204,25 @@ class StatusWriter:
         self.folder = folder
         self.cancel_requested = False
         self._status, self._written_s = WorkerStatus(machine=platform.node()), -math.inf
-        self._began_s = time.monotonic()
+        self._began_s = self._previewed_s = time.monotonic()
 
-    def update(
-        self, progress: float, message: str, detail: str = "",
-        figures: Callable[[], Mapping[str, float]] = dict,
-    ) -> bool:  # fmt: skip
-        """Write the status, at most every STATUS_INTERVAL_S, with the finite `figures`; returns
-        whether to stop and keep what there is."""
+    def report(self, progress: Progress) -> bool:
+        """Write the status, at most every STATUS_INTERVAL_S, with the finite figures, a preview now
+        and then, and each picture; returns whether to stop and keep what there is."""
         self.cancel_requested = (self.folder / CANCEL_FILE).exists()
         now = time.monotonic()
-        if message != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
-            finite = {name: value for name, value in figures().items() if math.isfinite(value)}
-            share, self._written_s = min(max(progress, 0.0), 1.0), now
-            # the next one comes soon
-            self._write(0.0, progress=share, message=message, detail=detail, figures=finite)
+        if progress.stage != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
+            figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
+            said = {"message": progress.stage, "detail": progress.detail, "figures": figures}
+            self._written_s = now
+            self._write(0.0, progress=min(max(progress.share, 0.0), 1.0), **said)
+        if progress.preview is not None and now - self._previewed_s > PREVIEW_INTERVAL_S:
+            progress.preview(self.folder / PREVIEW)
+            self._previewed_s = time.monotonic()
+        picture = None if progress.picture is None else progress.picture()
+        if picture is not None:
+            with suppress(StgaError):  # a full disk, which the work reports itself
+                write_npz(self.folder / PICTURE, {"rgb": picture})
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:
@@ -225,6 +230,7 @@ class StatusWriter:
         self._write(RENAME_PATIENCE_S, state=state, error=error, traceback=trace)
 
     def _write(self, patience_s: float, **changes: Any) -> None:
+        """patience_s: 0 where the next one comes soon."""
         seconds = round(time.monotonic() - self._began_s, 3)
         self._status = replace(self._status, seconds=seconds, **changes)
         # A missing status stops no work, and `inspect_worker` reports a worker that is gone.

@@ -6,7 +6,7 @@ from typing import Any
 
 from stga_addon.jobs.batch.folder import hold_batch
 from stga_addon.jobs.batch.plan import Ended, Engine, Job, Plan, make_plan
-from stga_addon.jobs.batch.run import Batch, run_batch
+from stga_addon.jobs.batch.run import Batch, BatchRun
 from stga_addon.jobs.perform import perform_in_folder
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
@@ -81,5 +81,5 @@ def carry_out(plan: Plan, engine: Engine) -> tuple[Batch, list[str]]:
     said: list[str] = []
     with hold_batch(plan.out) as lease:
         batch = Batch(plan)
-        run_batch(batch, engine, lease, lambda batch: None, said.append)
+        BatchRun(batch, engine, lease, lambda batch: None, said.append).run()
     return batch, said

@@ -23,6 +23,7 @@ from stga_addon.jobs.batch.report import plan_lines, table_lines
 from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
+from stga_addon.progress import Progress
 from stga_addon.worker import lock
 from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
 
@@ -164,7 +165,7 @@ def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
             waited.append(time.sleep(queue_s))
             writer = StatusWriter(job.request_folder)
             time.sleep(work_s)
-            writer.update(0.5, "Working")
+            writer.report(Progress(0.5, "Working"))
             writer.finish(WorkerState.FINISHED)
             return Ended(inspect_worker(job.request_folder))
 
@@ -272,7 +273,8 @@ def test_tables(tmp_path: Path) -> None:
     """Catches a table whose counts, shares or minutes are not those of the jobs."""
     plan = empty_jobs(tmp_path, 30)
     batch = Batch(plan)
-    batch.set_forecasts({entry.name: 60.0 for entry in plan.jobs[:10]})
+    for entry in [*batch.entries.values()][:10]:
+        entry.forecast_s = 60.0
     assert plan_lines(batch, 5)[-1].startswith(
         "30 jobs, 30 to do; 10 min of work, about 2 min on this machine; of 20 "
     )

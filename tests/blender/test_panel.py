@@ -11,6 +11,7 @@ import pytest
 from capture.factory import write_mesh_capture
 
 from stga_addon.jobs.table import Kind
+from stga_addon.progress import Progress
 
 from .test_curve import lines
 from .test_operators import write_ball_avatar
@@ -72,7 +73,7 @@ def trained(extension, tmp_path, monkeypatch):
     jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
     with extension.stga_addon.worker.status.status_writer(folder) as writer:
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
-        writer.update(0.5, "Training")
+        writer.report(Progress(0.5, "Training"))
         (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))
         (run / "tracking.npz").write_bytes(b"")
     write_ball_avatar(run / "avatar.npz")

@@ -16,6 +16,7 @@ from capture.factory import write_flame_capture, write_mesh_capture
 from stga_addon.avatar.file import read_avatar, write_avatar
 from stga_addon.files import write_json
 from stga_addon.jobs.table import Kind
+from stga_addon.progress import Progress
 from stga_addon.scene.display.splat_object import evaluated_splats
 
 from .test_operators import write_ball_avatar
@@ -40,7 +41,7 @@ def worker(extension, head, tmp_path):
         jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
-        writer.update(0.25, "Training")
+        writer.report(Progress(0.25, "Training"))
         writer.run, writer.leave = run, stack.close
         yield writer
 
@@ -174,7 +175,7 @@ def test_running_worker_cannot_be_replaced_or_dismissed(worker):
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss.poll()
     bpy.ops.stga.cancel(request="training")
-    assert worker.update(0.5, "Training")
+    assert worker.report(Progress(0.5, "Training"))
     worker.leave()
     assert not bpy.ops.stga.cancel.poll()
     assert bpy.ops.stga.train.poll()
@@ -266,7 +267,7 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     assert monitor.tick() is None
     bpy.ops.wm.open_mainfile(filepath=path)
     bpy.ops.stga.cancel(request="training")
-    assert worker.update(0.5, "Training")
+    assert worker.report(Progress(0.5, "Training"))
     assert monitor.tick() is not None
     assert not bpy.ops.stga.train.poll()
     bpy.context.scene.stga.training_run = ""

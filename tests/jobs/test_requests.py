@@ -21,7 +21,6 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.format import describe_figures
-from stga_addon.jobs import perform as performing
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import (
     FILES,
@@ -341,7 +340,6 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     assert {"splats", "psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
     assert found.lines[-1] == f"avatar: {request.run / 'avatar.npz'}"
     tracked = Track(tmp_path, tmp_path / "head.npz", tmp_path / "tracked")
-    assert performing.remaining(tracked) == tracked
     tracked.out.mkdir()
     (tracked.out / "transforms_train.json").touch()
     write_request(tracked.out / "job", tracked)
@@ -357,7 +355,7 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     """Catches a preview that never comes, cannot be read, or changes what is trained, and a
     training that ends because it could not be written."""
     pytest.importorskip("torch")
-    monkeypatch.setattr(performing, "PREVIEW_INTERVAL_S", 0.0)
+    monkeypatch.setattr("stga_addon.worker.status.PREVIEW_INTERVAL_S", 0.0)
     run, quiet, previews = tmp_path / "run", tmp_path / "quiet", []
     folder = asked(training(run, capture))
 

@@ -15,6 +15,7 @@ import pytest
 from filelock import FileLock
 
 from stga_addon.errors import StgaError
+from stga_addon.progress import Progress
 from stga_addon.worker import lock
 from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
 from stga_addon.worker.status import WorkerState, inspect_worker, status_writer
@@ -117,7 +118,7 @@ def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
     folder, path = tmp_path / "job", tmp_path / "job/worker.lock"
     lease = path.with_name("worker.lock.lease")
     with status_writer(folder) as writer:
-        writer.update(0.5, "Working")
+        writer.report(Progress(0.5, "Working"))
         assert lock_owner(path) == os.getpid()
         own = lease.read_text()
         time.sleep(1.5)  # longer than a lock without a heartbeat lasts

@@ -11,12 +11,14 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.progress import Progress
 from stga_addon.worker import launch, status
 from stga_addon.worker.launch import (
     prepare_status_folder,
@@ -47,6 +49,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WORKER = """
 import os, sys, time
 from pathlib import Path
+from stga_addon.progress import Progress
 from stga_addon.worker.status import status_writer
 from stga_addon.errors import StgaError
 
@@ -54,8 +57,8 @@ def main():
     with status_writer(Path(sys.argv[1])) as writer:
         print("a line of the log", flush=True)
         for n in range(2000):
-            if writer.update(n / 2000, "counting", "on time",
-                lambda: {"n": n, "nothing": float("nan")}):
+            if writer.report(Progress(n / 2000, "counting", "on time",
+                lambda: {"n": n, "nothing": float("nan")})):
                 return
             if sys.argv[2] == "sentence": raise StgaError("capture: is not a folder")
             if sys.argv[2] == "bug": raise ValueError("a bug\\nof two lines")
@@ -208,7 +211,7 @@ def test_only_own_files_are_removed(tmp_path):
     """Catches a folder removed with a person's files, and one that is not a folder taken for an
     error."""
     with status_writer(tmp_path / "job") as writer:
-        writer.update(0.5, "working")
+        writer.report(Progress(0.5, "working"))
     (tmp_path / "job" / "notes.txt").write_text("mine")
     (tmp_path / "job" / "job.json").write_text("")
     remove_status_folder(tmp_path / "job", ["job.json"])
@@ -236,7 +239,7 @@ def test_symbolic_links_are_not_followed(tmp_path):
     with pytest.raises(StgaError, match=rf"{LOG_FILE}: cannot be written"):
         start_worker(folder, sys.executable, ["this"])
     with status_writer(folder) as writer:
-        writer.update(0.5, "working")
+        writer.report(Progress(0.5, "working"))
     assert target.read_text() == "mine"
 
 
@@ -263,7 +266,7 @@ def test_status_round_trip(tmp_path, monkeypatch):
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
     with status_writer(tmp_path) as writer:
         now += 0.25
-        writer.update(0.25, "training", "enough", lambda: figures)
+        writer.report(Progress(0.25, "training", "enough", lambda: figures))
         with pytest.raises(StgaError, match="another worker"), status_writer(tmp_path):
             pass
         assert read_status(tmp_path) == expected
@@ -278,7 +281,8 @@ def test_status_is_written_rarely(tmp_path, monkeypatch):
     monkeypatch.setattr(status, "write_json", lambda path, value, **_: written.append(value))
     writer = StatusWriter(tmp_path)
     for message in ("a", "a", "b", "b"):
-        writer.update(0, message, "", lambda: {"psnr": math.nan, "loss": math.inf, "n": 1.0})
+        figures = partial(dict, psnr=math.nan, loss=math.inf, n=1.0)
+        writer.report(Progress(0, message, figures=figures))
     assert [value["message"] for value in written] == ["a", "b"]
     assert written[0]["figures"] == {"n": 1.0}
 
@@ -292,7 +296,7 @@ def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
 
     with status_writer(tmp_path) as writer:
         monkeypatch.setattr(status, "write_json", full)
-        assert not writer.update(0.5, "training")
+        assert not writer.report(Progress(0.5, "training"))
     monkeypatch.undo()
     (tmp_path / LOG_FILE).touch()
     assert inspect_worker(tmp_path).state == WorkerState.LOST

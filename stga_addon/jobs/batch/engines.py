@@ -38,13 +38,12 @@ class LocalEngine(Engine):
 
     def has_room(self, job: Job) -> bool:
         """Whether it fits beside what is running; a job larger than the machine runs alone."""
-        if not self._jobs:
-            return True
         wanted = [job.resources, *(other.resources for other, _ in self._jobs.values())]
-        threads = sum(resources.threads or self._cores for resources in wanted)
-        memory = sum(resources.memory_gb for resources in wanted)
-        fits = threads <= self._cores and memory <= self._memory_gb
-        return fits and sum(resources.gpu for resources in wanted) <= GPUS
+        return len(wanted) == 1 or (
+            sum(needs.threads or self._cores for needs in wanted) <= self._cores
+            and sum(needs.memory_gb for needs in wanted) <= self._memory_gb
+            and sum(needs.gpu for needs in wanted) <= GPUS
+        )
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:

@@ -35,7 +35,10 @@ def job_digests(plan: Plan) -> dict[str, str]:
     content of its run file and avatar; what another job makes, by that job's digest; what the batch
     writes into an input, not at all. Raises StgaError where an input cannot be read.
     """
-    folders, written = {job.name: job.folder for job in plan.jobs}, _written(plan)
+    folders = {job.name: job.folder for job in plan.jobs}
+    fields = ((job.request, output_field(type(job.request))) for job in plan.jobs)
+    outputs = (getattr(request, name) for request, name in fields if name is not None)
+    written = {os.path.realpath(path) for path in (plan.out, *outputs) if isinstance(path, Path)}
     found: dict[str, str] = {}
     inputs: dict[Path, str] = {}
     for job in plan.jobs:
@@ -52,15 +55,8 @@ def job_digests(plan: Plan) -> dict[str, str]:
     return found
 
 
-def _written(plan: Plan) -> Set[str]:
-    """The batch's folder, and what its jobs write elsewhere, without symbolic links."""
-    fields = ((job.request, output_field(type(job.request))) for job in plan.jobs)
-    outputs = (getattr(request, name) for request, name in fields if name is not None)
-    return {os.path.realpath(path) for path in (plan.out, *outputs) if isinstance(path, Path)}
-
-
 def _input_digest(path: Path, written: Set[str]) -> str:
-    """Digest of a file, or of a folder without what is `written`."""
+    """Digest of a file, or of a folder without what is `written` (paths without links)."""
     if has_run(path):
         return "".join(file_digest(path / name) for name in (RUN, AVATAR) if (path / name).exists())
     try:
@@ -136,20 +132,20 @@ def read_record(job: Job) -> JobRecord | None:
     return record if named == (FORMAT, VERSION) else None
 
 
+def _is_record_of(job: Job, digest: str) -> bool:
+    record = read_record(job)
+    return record is not None and record.digest == digest
+
+
 def is_done(job: Job, digest: str) -> bool:
     """Whether a worker has finished this very job, and what it wrote is there."""
-    record = read_record(job)
-    if record is None or record.digest != digest:
-        return False
-    status = read_status(job.request_folder)
+    status = read_status(job.request_folder) if _is_record_of(job, digest) else None
     return status is not None and status.state == WorkerState.FINISHED and job.is_written
 
 
 def is_running(job: Job, digest: str) -> bool:
     """Whether a worker of an earlier start is carrying out this very job."""
-    record = read_record(job)
-    is_same = record is not None and record.digest == digest
-    return is_same and is_locked(job.request_folder / LOCK_FILE)
+    return _is_record_of(job, digest) and is_locked(job.request_folder / LOCK_FILE)
 
 
 def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:

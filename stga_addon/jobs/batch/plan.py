@@ -23,17 +23,16 @@ import os
 import re
 import sys
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
-from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from itertools import count
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args
 
 from ...errors import StgaError, shorten
 from ...files import read_toml
-from ...schema import IS_PATH, complaint, from_json, setting, to_json
+from ...schema import IS_PATH, complaint, from_json, setting, to_json, type_hints
 from ...training.run.folder import AVATAR
 from ...training.settings import TrainingSettings, make_settings
 from ...worker.status import WorkerSnapshot
@@ -98,34 +97,21 @@ class Job:
         return request_folder(self.folder)
 
     @property
-    def product(self) -> Path | None:
-        """The file or folder that the request writes; None where its result is all."""
-        if isinstance(self.request, TRAININGS):
-            return self.request.run / AVATAR
-        name = output_field(type(self.request))
-        path = None if name is None else getattr(self.request, name)
-        return path if isinstance(path, Path) else None
-
-    @property
     def is_written(self) -> bool:
-        """Whether what the request writes is there."""
-        if isinstance(self.request, RenderBlend):
-            return all(picture.exists() for picture in self.request.pictures.values())
-        return self.product is None or self.product.exists()
+        """Whether what the request writes, beside its result, is there."""
+        request = self.request
+        if isinstance(request, TRAININGS):
+            return (request.run / AVATAR).exists()
+        if isinstance(request, RenderBlend):
+            return all(picture.exists() for picture in request.pictures.values())
+        path = getattr(request, output_field(type(request)) or "", None)
+        return not isinstance(path, Path) or path.exists()
 
 
 def output_field(kind: type[Any]) -> str | None:
     """The field that says where requests of a kind write; None where they have none."""
-    if kind in TRAININGS:
-        return "run"
-    names = [spec.name for spec in fields(kind)]
-    return next((name for name in OUTPUT_FIELDS if name in names), None)
-
-
-@cache
-def path_fields(kind: type[Any]) -> frozenset[str]:
-    """The fields of a request that hold a path, or several."""
-    return frozenset(name for name, hint in get_type_hints(kind).items() if _holds_path(hint))
+    names = ("run",) if kind in TRAININGS else OUTPUT_FIELDS
+    return next((name for name in names if name in kind.__dataclass_fields__), None)
 
 
 def is_path(kind: type[Any], name: str, value: Any) -> bool:
@@ -133,7 +119,7 @@ def is_path(kind: type[Any], name: str, value: Any) -> bool:
     names_path = kind.__dataclass_fields__[name].metadata.get(IS_PATH)
     if names_path is not None:
         return isinstance(value, str) and value != "" and bool(names_path(value))
-    return name in path_fields(kind)  # type: ignore[arg-type]
+    return _holds_path(type_hints(kind)[name])  # type: ignore[arg-type]
 
 
 def _holds_path(hint: Any) -> bool:
@@ -142,15 +128,11 @@ def _holds_path(hint: Any) -> bool:
 
 def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
     """Field -> the paths that a request reads, of those that are given."""
-    kind = type(request)
-    found: dict[str, tuple[Path, ...]] = {}
-    for spec in fields(kind):
-        value = getattr(request, spec.name)
-        if value is None or spec.name == output_field(kind) or not is_path(kind, spec.name, value):
-            continue
-        items = value if isinstance(value, tuple) else (value,)
-        if items:
-            found[spec.name] = tuple(map(Path, items))
+    kind, found = type(request), dict[str, tuple[Path, ...]]()
+    for name in kind.__dataclass_fields__:
+        value = getattr(request, name)
+        if value is not None and name != output_field(kind) and is_path(kind, name, value):
+            found[name] = tuple(map(Path, value if isinstance(value, tuple) else (value,)))
     return found
 
 
@@ -244,21 +226,16 @@ def plan_of_captures(
 ) -> Plan:
     """A training of each capture; fields: of `Train`, settings: of `make_settings`."""
     folders = [path.resolve() for path in captures]
-    table = {"request": "train", "settings": dict(settings), **fields}
-    names = zip(_names(folders), folders, strict=True)
-    jobs = {f"train-{name}": {**table, "capture": str(path)} for name, path in names}
+    own = [_slug(path.name) for path in folders]
+    jobs: dict[str, Any] = {}
+    for name, path in zip(own, folders, strict=True):
+        # where several share it, with that of the folder above, or numbered
+        job = name if own.count(name) == 1 else _slug("-".join(path.parts[-2:]))
+        numbers = (f"train-{job}" if n == 1 else f"train-{job}_{n}" for n in count(1))
+        unused = next(each for each in numbers if each not in jobs)
+        jobs[unused] = {"request": "train", "settings": dict(settings), **fields}
+        jobs[unused]["capture"] = str(path)
     return make_plan({"out": str(out.resolve()), "job": jobs}, Path.cwd(), "CAPTURES")
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """Job names of folders: their own, with that above where several share it, or numbered."""
-    names = [_slug(path.name) for path in folders]
-    shared = Counter(names)
-    pairs = zip(names, folders, strict=True)
-    names = [_slug("-".join(p.parts[-2:])) if shared[n] > 1 else n for n, p in pairs]
-    counts = [names[: number + 1].count(name) for number, name in enumerate(names)]
-    numbered = zip(names, counts, strict=True)
-    return [name if count == 1 else f"{name}_{count}" for name, count in numbered]
 
 
 def _slug(text: str) -> str:
@@ -277,9 +254,9 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
     shared = _resources(f"{source}: [resources]", values.get("resources", {}), Resources())
     jobs = [_job(source, name, table, base, folder, shared) for name, table in tables.items()]
     by_name = {job.name: job for job in _with_inputs(source, jobs)}
-    after = {name: job.after for name, job in by_name.items()}
     try:
-        order = list(TopologicalSorter(after).static_order())
+        after = {name: job.after for name, job in by_name.items()}
+        order = tuple(TopologicalSorter(after).static_order())
     except CycleError as error:
         circle = " → ".join(map(str, error.args[1]))
         raise StgaError(f"{source}: these jobs wait for each other: {circle}") from error
@@ -335,34 +312,27 @@ def _request(
     where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path
 ) -> Request:
     """The request of a kind from the fields that are given; the others have their defaults."""
-    specs, output = {spec.name: spec for spec in fields(kind)}, output_field(kind)
-    _require_keys(where, values, list(specs))
-    values = dict(values)
-    if output is not None:
-        values.setdefault(output, ".")
+    output = output_field(kind)
+    _require_keys(where, values, list(kind.__dataclass_fields__))
+    values = dict(values) if output is None else {output: ".", **values}
     for name, value in values.items():
         if is_path(kind, name, value):
             values[name] = _resolved(folder if name == output else base, value)
-    if "settings" in specs:
-        _set_training(where, values)
-    plain = {name: _completed(spec, values.get(name)) for name, spec in specs.items()}
-    missing = next((name for name, value in plain.items() if value is MISSING), None)
-    if missing is not None:
-        raise StgaError(f"{where}: {missing}: is missing")
+    if "settings" in kind.__dataclass_fields__:
+        values["settings"] = _training_settings(where, values.get("settings", {}))
+    for spec in fields(kind):
+        value, name = values.get(spec.name), spec.name
+        if spec.default_factory is not MISSING and isinstance(value, dict | None):
+            values[name] = {**to_json(spec.default_factory()), **(value or {})}
+        elif value is None and spec.default is MISSING:
+            raise StgaError(f"{where}: {name}: is missing")
+        elif value is None:
+            values[name] = list(spec.default) if isinstance(spec.default, tuple) else spec.default
     try:
-        request: Request = from_json(kind, plain)
+        request: Request = from_json(kind, values)
     except StgaError as error:
         raise StgaError(f"{where}: {str(error).removeprefix('setting ')}") from error
     return request
-
-
-def _completed(spec: Any, value: Any) -> Any:
-    """A field's value or default as JSON has it, tables completed; MISSING without either."""
-    if spec.default_factory is not MISSING and isinstance(value, dict | None):
-        return {**to_json(spec.default_factory()), **(value or {})}
-    if value is not None:
-        return value
-    return list(spec.default) if isinstance(spec.default, tuple) else spec.default
 
 
 def _resolved(base: Path, value: Any) -> Any:
@@ -375,9 +345,8 @@ def _absolute(base: Path, text: str) -> Path:
     return Path(os.path.abspath(base / os.path.expanduser(text)))
 
 
-def _set_training(where: str, values: dict[str, Any]) -> None:
-    """Replace the changes in `settings` by whole settings, as `stga train` makes them."""
-    changes = values.get("settings", {})
+def _training_settings(where: str, changes: Any) -> Any:
+    """Whole settings as JSON, as `stga train` makes them, from those that differ."""
     if not isinstance(changes, dict):
         raise StgaError(f"{where}: settings: expected a table, got {shorten(changes)}")
     _require_keys(f"{where}: settings", changes, [spec.name for spec in fields(TrainingSettings)])
@@ -386,15 +355,14 @@ def _set_training(where: str, values: dict[str, Any]) -> None:
         changes.setdefault("effects", {})
     nested = {name: changes.pop(name) for name in ("selection", "rates") if name in changes}
     try:
-        # As lists become tuples: the plain form is read back with the nested changes merged into
-        # it.
+        # as lists become tuples: the plain form is read back with the nested changes merged into it
         whole = to_json(make_settings(**{key: _tuples(item) for key, item in changes.items()}))
         for name, change in nested.items():
             whole[name] = {**whole[name], **change} if isinstance(change, dict) else change
         settings = from_json(TrainingSettings, whole)
     except StgaError as error:
         raise StgaError(f"{where}: {str(error).replace('setting ', 'settings.', 1)}") from error
-    values["settings"] = to_json(settings)
+    return to_json(settings)
 
 
 def _tuples(value: Any) -> Any:
@@ -417,12 +385,10 @@ def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
                 if path == job.folder.parent:
                     problem = f"{name}: {path} is the batch's own folder; choose another 'out'"
                     raise StgaError(f"{where}: {problem}")
-                maker = next(
-                    (by_folder[folder] for folder in (path, *path.parents) if folder in by_folder),
-                    None,
-                )
+                makers = (by_folder.get(folder) for folder in (path, *path.parents))
+                maker = next(filter(None, makers), None)
+                if maker is None and not path.exists():
+                    raise StgaError(f"{where}: {name}: {path} does not exist")
                 if maker is not None and maker is not job:
                     after.append(maker.name)
-                elif maker is None and not path.exists():
-                    raise StgaError(f"{where}: {name}: {path} does not exist")
         yield replace(job, after=tuple(dict.fromkeys(after)))

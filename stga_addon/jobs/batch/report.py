@@ -6,6 +6,7 @@ import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TextIO
@@ -66,27 +67,21 @@ def table_lines(batch: Batch) -> list[str]:
 
 
 def summary_line(batch: Batch) -> str:
-    """ "3 of 8 jobs finished, 2 running, 1 failed; about 4 min left"."""
-    counts = Counter(entry.state for entry in batch.entries.values())
+    """ "3 of 8 jobs finished, 2 running, 1 failed; about 4 min left", if as many run at once as
+    now."""
+    entries = batch.entries.values()
+    counts = Counter(entry.state for entry in entries)
     done = counts[JobState.FINISHED] + counts[JobState.KEPT]
-    parts = [f"{done} of {len(batch.entries)} jobs finished"]
+    parts = [f"{done} of {len(entries)} jobs finished"]
     for state in (JobState.RUNNING, JobState.FAILED, JobState.BLOCKED, JobState.CANCELLED):
         parts += [f"{counts[state]} {state}"] if counts[state] else []
-    left = seconds_left(batch.entries.values())
-    return ", ".join(parts) + (f"; about {format_duration(left)} left" if left else "")
-
-
-def seconds_left(entries: Iterable[Entry]) -> float | None:
-    """Seconds until the batch is done, if as many jobs run at once as now; None: unknown."""
-    open_ones = [entry for entry in entries if not entry.state.is_over]
-    each = [entry.left_s for entry in open_ones]
-    known = [seconds for seconds in each if seconds is not None]
-    if not known:
-        return None
-    # others wait in an engine's queue
-    running = max(1, sum(entry.status.seconds > 0 for entry in open_ones))
-    total = sum(known) * len(each) / len(known)
-    return max(total / running, *known)
+    line, left = ", ".join(parts), [entry for entry in entries if not entry.state.is_over]
+    known = [entry.left_s for entry in left if entry.left_s is not None]
+    if not any(known):
+        return line
+    running = max(1, sum(entry.status.seconds > 0 for entry in left))  # others wait in a queue
+    seconds = max(sum(known) * len(left) / len(known) / running, *known)
+    return f"{line}; about {format_duration(seconds)} left"
 
 
 def _row(entry: Entry, width: int) -> str:
@@ -108,7 +103,16 @@ def _row(entry: Entry, width: int) -> str:
 
 def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
-    rows = [_plan_row(entry) for entry in batch.entries.values()]
+    rows = []
+    for entry in batch.entries.values():
+        job, needs = entry.job, entry.job.resources
+        plural = "" if needs.threads == 1 else "s"
+        machine = f"{needs.threads} thread{plural}, {needs.memory_gb:g} GB" + ", GPU" * needs.gpu
+        time = format_duration(entry.forecast_s) if entry.forecast_s else "?"
+        more = f" and {len(job.after) - 1} more" if len(job.after) > 1 else ""
+        after = f"after {job.after[0]}{more}" if job.after else ""
+        state = "finished before" if entry.state.is_done else time
+        rows.append((job.name, type(job.request).__name__, machine, state, after))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
     unfinished = [entry for entry in batch.entries.values() if not entry.state.is_over]
@@ -124,17 +128,6 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     if unknown:
         text += f"; of {unknown} jobs the time is not known before one of their kind is finished"
     return [*lines, text]
-
-
-def _plan_row(entry: Entry) -> Sequence[str]:
-    job, needs = entry.job, entry.job.resources
-    state = "finished before" if entry.state.is_done else ""
-    forecast = format_duration(entry.forecast_s) if entry.forecast_s and not state else ""
-    plural = "" if needs.threads == 1 else "s"
-    machine = f"{needs.threads} thread{plural}, {needs.memory_gb:g} GB" + ", GPU" * needs.gpu
-    more = f" and {len(job.after) - 1} more" if len(job.after) > 1 else ""
-    after = f"after {job.after[0]}{more}" if job.after else ""
-    return job.name, type(job.request).__name__, machine, forecast or state or "?", after
 
 
 REPORT = "report.html"
@@ -155,18 +148,32 @@ pre { background: #f4f4f4; padding: .6rem; overflow-x: auto; font-size: 13px; }
 figure { display: inline-block; margin: 0 1rem 1rem 0; } figcaption { font-size: 13px; }
 svg { max-width: 100%; height: auto; }
 """
-Run = tuple[Entry, list[dict[str, Any]]]
-"""A finished training, and the evaluations of its metrics.jsonl."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished training. metrics: the evaluations of its metrics.jsonl; figures: that of the
+    avatar it keeps, empty without held-out views."""
+
+    entry: Entry
+    metrics: list[dict[str, Any]]
+    figures: dict[str, Any]
 
 
 def write_report(batch: Batch) -> Path:
     """Write report.html into the batch's folder; returns its path. Raises StgaError."""
-    found: list[Run] = []
+    runs: list[Run] = []
     for entry in batch.entries.values():
-        if entry.state.is_done and has_run(entry.job.folder):
+        folder = entry.job.folder
+        if entry.state.is_done and has_run(folder):
             with suppress(StgaError):
-                found.append((entry, read_metrics(entry.job.folder)))
-    runs = sorted(found, key=lambda run: _figures(run).get("psnr", -np.inf))
+                metrics, figures = read_metrics(folder), dict[str, Any]()
+                lines = [line for line in metrics if "psnr" in line]
+                with suppress(StgaError):
+                    target = read_run(folder).settings.target_psnr
+                    figures |= saved_line(lines, target) if lines else {}
+                runs.append(Run(entry, metrics, figures))
+    runs.sort(key=lambda run: run.figures.get("psnr", -np.inf))
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
     title = html.escape(batch.plan.out.name)
     head = '<!doctype html><html lang="en"><meta charset="utf-8">'
@@ -177,16 +184,6 @@ def write_report(batch: Batch) -> Path:
             f"{head}<h1>Batch {title}</h1>{''.join(parts)}</html>\n", encoding="utf-8"
         )
     return path
-
-
-def _figures(run: Run) -> dict[str, Any]:
-    """The evaluation of the avatar that the run keeps; empty without held-out views."""
-    entry, metrics = run
-    lines = [line for line in metrics if "psnr" in line]
-    with suppress(StgaError):
-        target = read_run(entry.job.folder).settings.target_psnr
-        return dict(saved_line(lines, target)) if lines else {}
-    return {}
 
 
 def _summary(batch: Batch) -> str:
@@ -223,14 +220,14 @@ def _failures(batch: Batch) -> str:
 
 def _chart(runs: Sequence[Run]) -> str:
     """PSNR over training time as SVG."""
-    shown = [run for run in evenly_spread(runs, MAX_CURVES) if curve_of(run[1])]
+    shown = [run for run in evenly_spread(runs, MAX_CURVES) if curve_of(run.metrics)]
     if not shown or find_spec("matplotlib") is None:
         return ""
     from ...report import finish_axes, psnr_axes
 
     figure, axes = psnr_axes("PSNR on held-out views")
-    for entry, metrics in reversed(shown):
-        axes.plot(*np.array(curve_of(metrics)).T, marker=".", label=entry.job.name)
+    for run in reversed(shown):
+        axes.plot(*np.array(curve_of(run.metrics)).T, marker=".", label=run.entry.job.name)
     finish_axes(axes)
     drawn = io.StringIO()
     figure.savefig(drawn, format="svg", metadata={"Date": None})
@@ -242,19 +239,19 @@ def _chart(runs: Sequence[Run]) -> str:
 def _pictures(runs: Sequence[Run]) -> str:
     """A held-out image of each run beside its avatar, where its capture has one here."""
     shown = []
-    for entry, metrics in evenly_spread(runs, MAX_PICTURES):
+    for run in evenly_spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
-            pair, figures = held_out_pair(entry.job.folder), _figures((entry, metrics))
+            pair = held_out_pair(run.entry.job.folder)
             if pair is not None:
                 from PIL import Image
 
-                psnr = f", {figures['psnr']:.2f} dB" if "psnr" in figures else ""
+                psnr = f", {run.figures['psnr']:.2f} dB" if "psnr" in run.figures else ""
                 picture, out = Image.fromarray(pair), io.BytesIO()
                 height = min(2 * PICTURE_HEIGHT_PX, picture.height)
                 picture = picture.resize((round(picture.width * height / picture.height), height))
                 picture.save(out, "JPEG", quality=JPEG_QUALITY)
                 source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
-                name = html.escape(entry.job.name)
+                name = html.escape(run.entry.job.name)
                 image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
                 shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
     title = "<h2>Held-out views: image and avatar, from the lowest PSNR</h2>"
@@ -283,29 +280,30 @@ def held_out_pair(run: Path) -> np.ndarray | None:
 
 
 def _table(batch: Batch, runs: Iterable[Run]) -> str:
-    figures = {run[0].job.name: _figures(run) for run in runs}
-    names = ("job", "request", "state", "machine")
+    figures = {run.entry.job.name: run.figures for run in runs}
+    heads = ("job", "request", "state", "machine")
     numbers = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
-    heads = [f"<th>{name}</th>" for name in names]
-    heads += [f'<th class="n">{name}</th>' for name in numbers]
+    rows = [_cells("th", heads, numbers)]
     entries = list(batch.entries.values())
-    rows = [_table_row(entry, figures.get(entry.job.name, {})) for entry in entries[:MAX_ROWS]]
+    for entry in entries[:MAX_ROWS]:
+        off, known = _forecast_error(entry), figures.get(entry.job.name, {})
+        name, kind = entry.job.name, type(entry.job.request).__name__
+        found = (
+            format_duration(entry.seconds) if entry.seconds else "",
+            format_duration(entry.forecast_s) if entry.forecast_s else "",
+            "" if off is None else f"{off:+.0%}",
+            f"{known['psnr']:.2f}" if "psnr" in known else "",
+            f"{known['ssim']:.4f}" if "ssim" in known else "",
+            f"{known['splats']:,}" if "splats" in known else "",
+        )
+        rows.append(_cells("td", (name, kind, str(entry.state), entry.machine), found))
+        if entry.state in (JobState.FAILED, JobState.BLOCKED):
+            rows[-1] = rows[-1].replace("<tr>", '<tr class="failed">')
     more = f"<p>… and {len(entries) - MAX_ROWS} more</p>" if len(entries) > MAX_ROWS else ""
-    return f"<h2>Jobs</h2><table><tr>{''.join(heads)}</tr>{''.join(rows)}</table>{more}"
+    return f"<h2>Jobs</h2><table>{''.join(rows)}</table>{more}"
 
 
-def _table_row(entry: Entry, figures: dict[str, Any]) -> str:
-    off = _forecast_error(entry)
-    texts = (entry.job.name, type(entry.job.request).__name__, str(entry.state), entry.machine)
-    numbers = (
-        format_duration(entry.seconds) if entry.seconds else "",
-        format_duration(entry.forecast_s) if entry.forecast_s else "",
-        "" if off is None else f"{off:+.0%}",
-        f"{figures['psnr']:.2f}" if "psnr" in figures else "",
-        f"{figures['ssim']:.4f}" if "ssim" in figures else "",
-        f"{figures['splats']:,}" if "splats" in figures else "",
-    )
-    kind = ' class="failed"' if entry.state in (JobState.FAILED, JobState.BLOCKED) else ""
-    cells = [f"<td>{html.escape(text)}</td>" for text in texts]
-    cells += [f'<td class="n">{number}</td>' for number in numbers]
-    return f"<tr{kind}>{''.join(cells)}</tr>"
+def _cells(tag: str, texts: Iterable[str], numbers: Iterable[str]) -> str:
+    cells = [f"<{tag}>{html.escape(text)}</{tag}>" for text in texts]
+    cells += [f'<{tag} class="n">{number}</{tag}>' for number in numbers]
+    return f"<tr>{''.join(cells)}</tr>"

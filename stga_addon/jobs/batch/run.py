@@ -1,7 +1,7 @@
 """Running a batch: which jobs are to be done, what each comes after, and what became of it."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -55,7 +55,7 @@ class Entry:
     """
 
     job: Job
-    digest: str = ""
+    digest: str
     state: JobState = JobState.WAITING
     status: WorkerStatus = field(default_factory=WorkerStatus)
     error: str = ""
@@ -80,58 +80,32 @@ class Batch:
 
     def __init__(self, plan: Plan) -> None:
         """Find out what is finished already. Raises StgaError where an input cannot be read."""
-        self.plan = plan
-        self.entries = {job.name: Entry(job) for job in plan.jobs}
-        for name, digest in job_digests(plan).items():
-            entry = self.entries[name]
-            entry.digest = digest
+        self.plan, digests = plan, job_digests(plan)
+        self.entries = {job.name: Entry(job, digests[job.name]) for job in plan.jobs}
+        for entry in self.entries.values():
             kept = all(self.entries[other].state.is_done for other in entry.job.after)
-            if kept and is_done(entry.job, entry.digest):
+            record = read_record(entry.job) if kept and is_done(entry.job, entry.digest) else None
+            if record is not None:
                 entry.state = JobState.KEPT
-                record = read_record(entry.job)
                 entry.status = read_status(entry.job.request_folder) or entry.status
-                if record is not None:
-                    entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
-                    entry.machine = record.machine or entry.status.machine
+                entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
+                entry.machine = record.machine or entry.status.machine
 
     @property
     def unfinished(self) -> list[Job]:
         return [entry.job for entry in self.entries.values() if not entry.state.is_over]
 
     @property
-    def finished(self) -> list[Job]:
-        return [entry.job for entry in self.entries.values() if entry.state.is_done]
-
-    @property
     def failures(self) -> list[Entry]:
         return [e for e in self.entries.values() if e.state in (JobState.FAILED, JobState.BLOCKED)]
 
-    def set_forecasts(self, seconds: Mapping[str, float]) -> None:
-        for name, expected in seconds.items():
-            self.entries[name].forecast_s = expected
 
-
-def run_batch(
-    batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None], say: Say
-) -> None:
-    """Carry out the jobs that are not finished; each that fails fails alone.
+class BatchRun:
+    """Carries out the jobs of a batch that are not finished; each that fails fails alone.
 
     show: called now and then; say: told in lines what happened.
-    Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have, and
-    StgaError where another batch has taken the folder.
     """
-    loop = _Loop(batch, engine, lease, show, say)
-    try:
-        loop.work()
-    except KeyboardInterrupt:
-        say("Stopping: the running jobs save what they have; Ctrl-C again leaves them to it")
-        loop.stop()
-        raise
-    finally:
-        engine.close()
 
-
-class _Loop:
     def __init__(
         self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None],
         say: Say,
@@ -146,11 +120,24 @@ class _Loop:
             {name: [o for o in e.job.after if o in waiting] for name, e in waiting.items()}
         )
         self._order.prepare()
-        # A dictionary as an ordered set: jobs leave it from anywhere.
-        free = set(self._order.get_ready())
-        self._ready = dict.fromkeys(n for n in waiting if engine.takes_all or n in free)
+        # dictionaries as ordered sets: jobs leave them from anywhere
+        free = dict.fromkeys(self._order.get_ready())
+        self._ready = dict.fromkeys(waiting) if engine.takes_all else free
 
-    def work(self) -> None:
+    def run(self) -> None:
+        """Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have,
+        and StgaError where another batch has taken the folder."""
+        try:
+            self._work()
+        except KeyboardInterrupt:
+            said = "the running jobs save what they have; Ctrl-C again leaves them to it"
+            self._say(f"Stopping: {said}")
+            self._stop()
+            raise
+        finally:
+            self._engine.close()
+
+    def _work(self) -> None:
         for name in list(self._ready):  # workers that an earlier start left running
             entry = self._entries[name]
             if is_running(entry.job, entry.digest):
@@ -168,7 +155,7 @@ class _Loop:
                 time.sleep(self._engine.interval_s)
         self._look(now=True)
 
-    def stop(self) -> None:
+    def _stop(self) -> None:
         """Ask the running jobs to stop, and wait until they have."""
         for name in self._engine.withdraw():
             self._over(self._entries[name], JobState.CANCELLED)
@@ -196,23 +183,20 @@ class _Loop:
                 continue
             if not self._engine.has_room(entry.job):
                 misses += 1
-            elif self._prepare(entry):
-                if not self._engine.takes_all:
-                    self._submit([entry])
-                fitting.append(entry)
+                continue
+            try:
+                moved = prepare(entry.job, entry.digest, entry.forecast_s)
+            except StgaError as error:
+                self._over(entry, JobState.FAILED, str(error))
+                continue
+            if moved is not None:
+                self._say(f"{name}: has changed; what it wrote before is in {moved}")
+            if not self._engine.takes_all:
+                self._submit([entry])
+            fitting.append(entry)
         if self._engine.takes_all and fitting:
             self._submit(fitting)
         return bool(fitting)
-
-    def _prepare(self, entry: Entry) -> bool:
-        try:
-            moved = prepare(entry.job, entry.digest, entry.forecast_s)
-        except StgaError as error:
-            self._over(entry, JobState.FAILED, str(error))
-            return False
-        if moved is not None:
-            self._say(f"{entry.job.name}: has changed; what it wrote before is in {moved}")
-        return True
 
     def _submit(self, entries: Sequence[Entry]) -> None:
         try:
@@ -246,8 +230,8 @@ class _Loop:
                     write_record(entry.job, new)
                 except StgaError as error:
                     self._say(f"warning: {error}")
-            undone = (other for other in entry.job.after if not self._entries[other].state.is_done)
-            missing = next(undone, None)
+            after = entry.job.after
+            missing = next((o for o in after if not self._entries[o].state.is_done), None)
             if state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
                 reason = f"it comes after {missing}, which is not finished"
                 self._over(entry, JobState.BLOCKED, reason)
@@ -304,29 +288,31 @@ _OUTCOMES = {WorkerState.FINISHED: JobState.FINISHED, WorkerState.CANCELLED: Job
 # Forecasts
 
 
-def forecast_seconds(jobs: Sequence[Job], done: Sequence[Job]) -> dict[str, float]:
-    """Name -> seconds that a job is expected to take, of the jobs of which that is known.
+def set_forecasts(batch: Batch) -> None:
+    """Set how long the jobs that are not finished are expected to take, where that is known.
 
-    done: jobs that are finished; those of the same kind of request correct the forecast, and stand
-    in where there is none. What a training of so many iterations takes is measured on this machine
-    (`pace`), once for all.
+    Finished jobs of the same kind of request correct the forecast, and stand in where there is
+    none. What a training of so many iterations takes is measured on this machine (`pace`), once for
+    all.
     """
+    # what is to be done first, so that its pace is measured
+    entries = sorted(batch.entries.values(), key=lambda entry: entry.state.is_done)
     paces: list[float] = []
-    stated = {job.name: _stated(job, paces) for job in (*jobs, *done)}
+    stated = {entry.job.name: _stated(entry.job, paces) for entry in entries}
     taken: dict[type, list[tuple[float, float | None]]] = {}
-    for job in done:
-        record = read_record(job)
-        if record is not None and record.seconds:
-            taken.setdefault(type(job.request), []).append((record.seconds, stated[job.name]))
-    found: dict[str, float] = {}
-    for job in jobs:
-        alike, expected = taken.get(type(job.request), []), stated[job.name]
+    for entry in entries:
+        if entry.state.is_done and entry.seconds:
+            alike = taken.setdefault(type(entry.job.request), [])
+            alike.append((entry.seconds, stated[entry.job.name]))
+    for entry in entries:
+        if entry.state.is_over:
+            continue
+        alike, expected = taken.get(type(entry.job.request), []), stated[entry.job.name]
         factors = [seconds / before for seconds, before in alike if before]
         if expected is not None:
-            found[job.name] = expected * median(factors) if factors else expected
+            entry.forecast_s = expected * median(factors) if factors else expected
         elif alike:
-            found[job.name] = median(seconds for seconds, _ in alike)
-    return found
+            entry.forecast_s = median(seconds for seconds, _ in alike)
 
 
 def _stated(job: Job, paces: list[float]) -> float | None:
