@@ -1,7 +1,6 @@
 """What poses an avatar: a capture, a motion, or the head of an open .blend file, or its folder."""
 
 import logging
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +13,12 @@ from ..capture.model import Capture
 from ..capture.open import open_capture, sequence_capture
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..driving.open_motion import Motion, MotionOptions, open_motion, trained_range
-from ..errors import StgaError, shorten
+from ..errors import StgaError
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of
 from ..options import option
 from ..progress import Say
-from ..schema import from_json, setting, to_json
+from ..schema import Arrays, from_json, setting, to_json
 from ..training.run.folder import AVATAR, open_refined, open_run, read_run, with_refined_tracking
 
 
@@ -194,7 +193,7 @@ def findings(motion: Motion) -> list[str]:
 
 
 FOLDER = "STGA_HEAD"  # The environment variable that names the folder
-HEAD, SELECTION, PLAYED = "head.json", "selection.npz", "played.npz"
+HEAD, ARRAYS = "head.json", "head.npz"
 
 
 @dataclass(frozen=True)
@@ -218,11 +217,13 @@ class OpenHead:
 
 @dataclass(frozen=True)
 class _Stored:
-    """What head.json holds; fields as of `OpenHead`."""
+    """What head.json and head.npz hold; fields as of `OpenHead`."""
 
     capture: Path
     flame: Path | None
     avatar: Path | None
+    selection: Mapping[int, np.ndarray] | None
+    played: Played | None
     principal_point: str = setting(choices=PRINCIPAL_POINTS)
     fps: float = setting(above=0)
 
@@ -230,44 +231,21 @@ class _Stored:
 def write_head(folder: Path, head: OpenHead, played: bool) -> None:
     """Write the head into the folder; `played`: with the meshes of the scene's frames. Raises
     StgaError."""
-    stored = _Stored(head.capture, head.flame, head.avatar, head.principal_point, head.fps)
-    write_json(folder / HEAD, to_json(stored))
-    selection = head.selection()
-    if selection is not None:
-        write_npz(folder / SELECTION, {str(frame): faces for frame, faces in selection.items()})
-    if played:
-        meshes = head.played().meshes
-        write_npz(folder / PLAYED, {str(frame): mesh for frame, mesh in meshes.items()})
+    arrays: Arrays = {}
+    stored = _Stored(
+        head.capture, head.flame, head.avatar, head.selection(), head.played() if played else None,
+        head.principal_point, head.fps,
+    )  # fmt: skip
+    write_json(folder / HEAD, to_json(stored, arrays))
+    write_npz(folder / ARRAYS, arrays)
 
 
 def read_head(folder: Path) -> OpenHead:
     """The head that `write_head` wrote. Raises StgaError where there is none or it is damaged."""
-    path, chosen = folder / HEAD, folder / SELECTION
+    path = folder / HEAD
     try:
-        stored: _Stored = from_json(_Stored, read_json(path))
+        stored: _Stored = from_json(_Stored, read_json(path), arrays=read_npz(folder / ARRAYS))
     except StgaError as error:
         raise StgaError(f"{path}: is not the head of an open .blend file ({error})") from error
-
-    def selection() -> dict[int, np.ndarray] | None:
-        if not chosen.exists():
-            return None
-        found = _by_frame(chosen)
-        for frame, faces in found.items():
-            if faces.dtype != bool or faces.ndim != 1:
-                got = f"got {faces.dtype} {faces.shape}"
-                raise StgaError(f"{chosen}: frame {frame}: expected bool (F,), {got}")
-        return found
-
-    return OpenHead(
-        **vars(stored), selection=selection,
-        played=lambda: Played(_by_frame(folder / PLAYED), selection=selection()),
-    )  # fmt: skip
-
-
-def _by_frame(path: Path) -> dict[int, np.ndarray]:
-    """Arrays by the frames that their names are. Raises StgaError for a name that is none."""
-    arrays = read_npz(path)
-    for name in arrays:
-        if not re.fullmatch(r"-?\d{1,9}", name, re.ASCII):
-            raise StgaError(f"{path}: expected frames as names, got {shorten(name)}")
-    return {int(name): array for name, array in arrays.items()}
+    given = {**vars(stored), "played": lambda: stored.played or Played({})}
+    return OpenHead(**{**given, "selection": lambda: stored.selection})

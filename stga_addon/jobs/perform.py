@@ -24,7 +24,7 @@ from ..schema import Arrays, from_json, to_json, validate
 from ..tracking.folder import is_written
 from ..training.run.folder import has_run, read_run
 from ..worker.launch import PREPARING, cache_folder, prepare_status_folder
-from ..worker.lock import hold_lock
+from ..worker.lock import hold_folder
 from ..worker.status import PICTURE, PREVIEW, remove_status_folder, status_writer
 from .blender import RenderRecording
 from .table import JOBS, Request, Result, request_hint
@@ -197,21 +197,18 @@ def prepare() -> None:
     """Compile Numba's kernels and the bytecode of an extension's packages for the first training on
     this machine; no effect while another process does, or without room."""
     os.environ[OWN_KERNELS] = "1"
-    folder = cache_folder()
-    with suppress(OSError):  # BlockingIOError among them
-        folder.mkdir(parents=True, exist_ok=True)
-        with hold_lock(folder / PREPARING):
-            from ..raster.cpu.precompile import rasterizer_helper
+    with suppress(OSError, StgaError), hold_folder(cache_folder(), PREPARING, "preparation"):
+        from ..raster.cpu.precompile import rasterizer_helper
 
-            rasterizer_helper()
-            load_ahead()
-            from ..training.optimize.precompile import compile_for_cpu
+        rasterizer_helper()
+        load_ahead()
+        from ..training.optimize.precompile import compile_for_cpu
 
-            compile_for_cpu()
-            # The first lists the machine's fonts; torch's bytecode is not written by `load_ahead`.
-            for library in ("matplotlib.font_manager", "torch"):
-                with suppress(ImportError):
-                    import_module(library)
+        compile_for_cpu()
+        # The first lists the machine's fonts; torch's bytecode is not written by `load_ahead`.
+        for library in ("matplotlib.font_manager", "torch"):
+            with suppress(ImportError):
+                import_module(library)
 
 
 if __name__ == "__main__":

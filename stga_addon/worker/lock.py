@@ -26,36 +26,29 @@ OWNER_OFFSET = 1  # Of the process number: Windows locks the first byte, which n
 
 
 @contextmanager
-def hold_lock(path: Path, leased: bool = False) -> Iterator[SoftFileLease | None]:
-    """Hold the lock file for this process, and write the process number into it; a lease where
-    there are no locks.
-
-    leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded
-    is the lease: it has a `compromise` once another process has taken it. Raises BlockingIOError
-    while another process holds it, OSError where it cannot be written or is a symbolic link.
-    """
-    with ExitStack() as held:
-        try:
-            held.enter_context(_hold_file_lock(path))
-        except OSError as error:
-            if error.errno not in NO_LOCKS:
-                raise
-            leased = True
-        yield held.enter_context(_hold_lease(_lease_of(path))) if leased else None
-
-
-@contextmanager
 def hold_folder(
     folder: Path, name: str, holder: str, leased: bool = False
 ) -> Iterator[SoftFileLease | None]:
-    """Make the folder and hold its lock file for this process (`hold_lock`). Raises StgaError while
-    another process, `holder`, holds it, and where it cannot be written."""
+    """Make the folder, hold its lock file for this process, and write the process number into it; a
+    lease where there are no locks.
+
+    leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded
+    is the lease: it has a `compromise` once another process has taken it. Raises StgaError while
+    another process, `holder`, holds it, and where it cannot be written or is a symbolic link.
+    """
+    path = folder / name
     with ExitStack() as held:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lease = held.enter_context(hold_lock(folder / name, leased))
+            try:
+                held.enter_context(_hold_file_lock(path))
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+                leased = True
+            lease = held.enter_context(_hold_lease(_lease_of(path))) if leased else None
         except BlockingIOError as error:
-            problem = f"another {holder} (process {lock_owner(folder / name)})"
+            problem = f"another {holder} (process {lock_owner(path)})"
             raise StgaError(f"{folder}: {problem}") from error
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error

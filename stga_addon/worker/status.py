@@ -26,6 +26,7 @@ from typing import Any
 from ..errors import StgaError
 from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json, write_npz
 from ..progress import Progress
+from ..schema import from_json, setting
 from .lock import hold_folder, is_locked, lock_owner
 
 STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
@@ -62,8 +63,6 @@ class WorkerState(StrEnum):
 class WorkerStatus:
     """Content of status.json.
 
-    state     working, finished, cancelled or failed
-    progress  0 to 1
     message   what the worker is doing; detail: a second line about it
     error     one sentence, and the traceback where a bug caused it
     figures   named numbers that depend on the kind of work
@@ -71,15 +70,17 @@ class WorkerStatus:
     seconds   of work so far
     """
 
-    state: str = WorkerState.WORKING
-    progress: float = 0.0
+    state: str = setting(
+        WorkerState.WORKING, choices=("working", "finished", "cancelled", "failed")
+    )
+    progress: float = setting(0.0, 0, 1)
     message: str = ""
     detail: str = ""
     error: str = ""
     traceback: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
     machine: str = ""
-    seconds: float = 0.0
+    seconds: float = setting(0.0, 0)
 
 
 @dataclass(frozen=True)
@@ -133,17 +134,11 @@ def _why_lost(folder: Path, exit_code: int | None) -> str:
 def read_status(folder: Path) -> WorkerStatus | None:
     """The latest status; None where status.json is missing or malformed."""
     try:
-        status = WorkerStatus(**read_json(folder / STATUS_FILE))
-        texts = (status.message, status.detail, status.error, status.traceback, status.machine)
-        figures = {str(name): float(value) for name, value in status.figures.items()}
-        progress, seconds = float(status.progress), float(status.seconds)
-    except (StgaError, TypeError, ValueError, AttributeError):
+        values = {**asdict(WorkerStatus()), **read_json(folder / STATUS_FILE)}
+        status: WorkerStatus = from_json(WorkerStatus, values)
+    except (StgaError, TypeError):
         return None
-    is_known = status.state in ("working", "finished", "cancelled", "failed")
-    are_numbers = 0 <= progress <= 1 and 0 <= seconds < math.inf
-    if not (is_known and are_numbers and all(isinstance(text, str) for text in texts)):
-        return None
-    return replace(status, progress=progress, figures=figures, seconds=seconds)
+    return status
 
 
 def log_lines(folder: Path, count: int) -> list[str]:

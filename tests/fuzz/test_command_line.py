@@ -6,7 +6,6 @@ every run.
 """
 
 import io
-import json
 import os
 import random
 import shutil
@@ -31,7 +30,7 @@ from stga_addon.development.benchmark.variants import Benchmark
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import Performance
 from stga_addon.jobs import table as ask
-from stga_addon.jobs.avatar_source import Played
+from stga_addon.jobs.avatar_source import OpenHead, Played, write_head
 from stga_addon.jobs.perform import write_request
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.training import preset_timing
@@ -77,12 +76,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, request in requests.items():
         write_request(case / "jobs" / name, request)
     assert call(["export", case / "run", "--format", "ply", "--out", case / "splats.ply"])[0] == 0
-    (case / "head").mkdir()
-    head = {
-        "capture": str(capture), "flame": None, "avatar": str(case / "run/avatar.npz"),
-        "principal_point": "vhap", "fps": 24.0,
-    }  # fmt: skip
-    (case / "head/head.json").write_text(json.dumps(head))
+    played = Played({4: open_capture(capture).neutral}, selection={4: np.ones(320, bool)})
+    avatar = case / "run/avatar.npz"
+    head = OpenHead(capture, None, "vhap", avatar, 24.0, lambda: played.selection, lambda: played)
+    write_head(case / "head", head, played=True)
     (case / "take.blend").write_bytes(b"BLENDER")
     write_performance(
         case / "take.csv", Performance(np.arange(3) / 30, np.full((3, 52), 0.3), None, 30.0)

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,13 +17,18 @@ from filelock import FileLock
 from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
 from stga_addon.worker import lock
-from stga_addon.worker.lock import hold_lock, is_locked, lock_owner
+from stga_addon.worker.lock import hold_folder, is_locked, lock_owner
 from stga_addon.worker.status import WorkerState, inspect_worker, status_writer
 
 HOLD = (
-    "import sys; from pathlib import Path; from stga_addon.worker.lock import hold_lock\n"
-    "with hold_lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    "import sys; from pathlib import Path; from stga_addon.worker.lock import hold_folder\n"
+    "with hold_folder(Path(sys.argv[1]), 'worker.lock', 'holder'):\n"
+    "    print('held', flush=True); sys.stdin.read()"
 )
+
+
+def hold(path: Path) -> AbstractContextManager[object]:
+    return hold_folder(path.parent, path.name, "holder")
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
@@ -32,18 +37,19 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
     assert not path.exists()
-    command, pipe = [sys.executable, "-c", HOLD, str(path)], subprocess.PIPE
+    command, pipe = [sys.executable, "-c", HOLD, str(tmp_path)], subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         assert is_locked(path)
         assert lock_owner(path) == other.pid
-        with pytest.raises(BlockingIOError), hold_lock(path):
+        expected = rf"another holder \(process {other.pid}\)"
+        with pytest.raises(StgaError, match=expected), hold(path):
             pass
         other.kill()
     assert path.exists()
     assert not is_locked(path)
-    with hold_lock(path):
+    with hold(path):
         assert is_locked(path)
         assert lock_owner(path) == os.getpid()
     assert not is_locked(path)
@@ -55,7 +61,7 @@ def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     path, target = tmp_path / "run.lock", tmp_path / "target"
     target.write_text("mine")
     path.symlink_to(target)
-    with pytest.raises(OSError, match="symbolic link"), hold_lock(path):
+    with pytest.raises(StgaError, match="cannot be written"), hold(path):
         pass
     assert not is_locked(path)
     assert target.read_text() == "mine"
@@ -87,7 +93,7 @@ def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
     with probed(tmp_path / "worker.lock"):
         assert not is_locked(tmp_path / "worker.lock")
-    with probed(tmp_path / "worker.lock"), hold_lock(tmp_path / "worker.lock"):
+    with probed(tmp_path / "worker.lock"), hold(tmp_path / "worker.lock"):
         pass
 
 
@@ -135,5 +141,5 @@ def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
     assert is_locked(path)
     os.utime(lease, (time.time() - 2, time.time() - 2))
     assert not is_locked(path)
-    with hold_lock(path):
+    with hold(path):
         assert is_locked(path)
