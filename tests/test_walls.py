@@ -131,8 +131,9 @@ def test_the_walls_are_looked_at():
 @pytest.mark.parametrize("path", SOURCES, ids=name_of)
 def test_packages_are_imported_only_where_they_may_be(path):
     """Catches an engine that cannot run or be tested outside Blender, an extension that needs
-    PyTorch to be enabled, to import and to show, and `import stga_addon…`, which is not there once
-    Blender installs it as bl_ext.….stga."""
+    PyTorch to be enabled, to import and to show, operators that only work where the panels are
+    registered, and `import stga_addon…`, which is not there once Blender installs it as
+    bl_ext.….stga."""
     absolute = {module.split(".")[0] for module, level in imports(path) if level == 0}
     assert not absolute & {"stga_addon", "operators", "ui", "stga"}
     assert (
@@ -142,6 +143,14 @@ def test_packages_are_imported_only_where_they_may_be(path):
         name_of(path).startswith(TRAININGS)
         or not {module.split(".")[0] for module, _ in imports(path)} & HEAVY
     )
+    above = {module.split(".")[0] for module, level in imports(path) if level == 2}
+    assert not (path.is_relative_to(ROOT / "operators") and "ui" in above)
+
+
+def layer(name: str) -> int:
+    found = [index for index, names in enumerate(LAYERS) if name in names]
+    assert found, f"stga_addon/{name} has no layer in tests/test_walls.py"
+    return found[0]
 
 
 @pytest.mark.parametrize(
@@ -158,11 +167,8 @@ def test_imports_run_one_way(path):
             continue
         assert level == len(parts), f"{name_of(path)} imports from outside stga_addon"
         other = module.split(".")[0]
-        if other == parts[0]:
-            continue
-        assert layer(other) < own or {parts[0], other} <= {"avatar", "selection"}, (
-            f"{name_of(path)} imports {module}"
-        )
+        is_beside = other == parts[0] or {parts[0], other} <= {"avatar", "selection"}
+        assert is_beside or layer(other) < own, f"{name_of(path)} imports {module}"
 
 
 def test_no_file_imports_itself_by_way_of_others():
@@ -220,72 +226,50 @@ def test_every_way_to_import_is_seen(source, target, tmp_path, monkeypatch):
     assert not any(graph.values())
 
 
-def layer(name: str) -> int:
-    found = [index for index, names in enumerate(LAYERS) if name in names]
-    assert found, f"stga_addon/{name} has no layer in tests/test_walls.py"
-    return found[0]
-
-
-@pytest.mark.parametrize(
-    "path", [p for p in SOURCES if p.is_relative_to(ROOT / "operators")], ids=name_of
-)
-def test_operators_do_not_know_the_panels(path):
-    """Catches operators that only work where the panels are registered."""
-    assert not [
-        module for module, level in imports(path) if level == 2 and module.split(".")[0] == "ui"
-    ]
-
-
-BLOCKED = """
+BLOCK = """
 import sys
+from importlib import import_module
 class Block:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm",
-            "bpy", "smplx"}:
+        if name.split(".")[0] in BLOCKED:
             raise ModuleNotFoundError(f"blocked: {name}", name=name)
 sys.meta_path.insert(0, Block())
-import importlib
 for name in sys.argv[1:]:
-    importlib.import_module(f"stga_addon.{name}" if name else "stga_addon")
+    import_module(f"stga_addon.{name}" if name else "stga_addon")
 """
-
-
-def test_numpy_is_enough_to_import_the_engine():
-    """Catches a top-level import that a plain Blender cannot satisfy."""
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCKED, "", *LIGHT], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-
-
-LOADED = """
+LOAD = """
 import sys
 from stga_addon.jobs.perform import load_ahead
 load_ahead()
 assert "stga_addon.training.run.session" in sys.modules
 assert "torch" not in sys.modules
 """
+OTHERS = {"torch", "numba", "wgpu", "trimesh", "scipy", "PIL", "tqdm", "smplx"}
+"""Packages that a plain Blender lacks."""
 
 
-def test_training_begins_without_torch():
-    """Catches a worker that waits two seconds for what refining the tracking, LPIPS and autograd
-    alone need."""
-    done = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True)
+def run(script: str, *arguments: str) -> None:
+    command = [sys.executable, "-c", script, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-SCENE = BLOCKED.replace('"bpy", ', "")
+def test_numpy_is_enough_to_import_the_engine():
+    """Catches a top-level import that a plain Blender cannot satisfy."""
+    run(BLOCK.replace("BLOCKED", str(OTHERS | {"bpy"})), "", *LIGHT)
 
 
 def test_numpy_is_enough_to_import_the_scene():
     """Catches the same below scene/, with Blender there."""
     pytest.importorskip("bpy")
-    modules = [
-        path.relative_to(ROOT / "stga_addon").with_suffix("").as_posix().replace("/", ".")
-        for path in sorted((ROOT / "stga_addon/scene").rglob("[a-z]*.py"))
-    ]
-    done = subprocess.run(
-        [sys.executable, "-c", SCENE, *modules], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    files = sorted((ROOT / "stga_addon/scene").rglob("[a-z]*.py"))
+    modules = [path.relative_to(ROOT / "stga_addon").with_suffix("") for path in files]
     assert len(modules) > 5
+    names = [module.as_posix().replace("/", ".") for module in modules]
+    run(BLOCK.replace("BLOCKED", str(OTHERS)), *names)
+
+
+def test_training_begins_without_torch():
+    """Catches a worker that waits two seconds for what refining the tracking, LPIPS and autograd
+    alone need."""
+    run(LOAD)

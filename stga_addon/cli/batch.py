@@ -84,10 +84,9 @@ def batch_plan(options: Namespace) -> Plan:
     if sources[0].suffix == PLAN_SUFFIX:
         if len(sources) > 1:
             raise StgaError(f"{sources[1]}: cannot be given beside a plan")
-        for spec in option_fields(BatchOptions):
-            if spec.name in given:
-                problem = "has no effect with a plan, which says that itself"
-                raise StgaError(f"{flag_of(spec)}: {problem}")
+        useless = next((flag_of(s) for s in option_fields(BatchOptions) if s.name in given), None)
+        if useless is not None:
+            raise StgaError(f"{useless}: has no effect with a plan, which says that itself")
         return read_plan(sources[0])
     out = given.pop("out", None)
     if out is None:
@@ -97,22 +96,19 @@ def batch_plan(options: Namespace) -> Plan:
         expected = f"expected that of a capture, or a plan that ends in {PLAN_SUFFIX}"
         raise StgaError(f"{missing}: is not a folder; {expected}")
     named = ("preset", "seconds", "iterations", "seed")
-    settings: dict[str, Any] = {name: given[name] for name in named if name in given}
+    settings: dict[str, Any] = {name: given.pop(name) for name in named if name in given}
     if not {"preset", "seconds", "iterations"} & settings.keys():
         raise StgaError("--preset: is missing; expected it, --budget or --iterations")
-    fields: dict[str, Any] = {name: given[name] for name in given if name not in settings}
-    if "flame" in fields:
-        fields["flame"] = str(fields["flame"].absolute())
-    return plan_of_captures(sources, out, settings, fields)
+    if "flame" in given:
+        given["flame"] = str(given["flame"].absolute())
+    return plan_of_captures(sources, out, settings, given)
 
 
 def with_threads(plan: Plan, threads: int) -> Plan:
     """The plan with so many threads for the jobs that name none."""
-    jobs = []
-    for job in plan.jobs:
-        resources = replace(job.resources, threads=job.resources.threads or threads)
-        jobs.append(replace(job, resources=resources))
-    return replace(plan, jobs=tuple(jobs))
+    resources = (replace(j.resources, threads=j.resources.threads or threads) for j in plan.jobs)
+    jobs = zip(plan.jobs, resources, strict=True)
+    return replace(plan, jobs=tuple(replace(job, resources=needs) for job, needs in jobs))
 
 
 def print_plan(plan: Plan) -> None:
@@ -145,6 +141,5 @@ def carry_out_plan(plan: Plan, engine_name: str = "local", address: str = "") ->
             print(f"{summary_line(batch)}\nreport: {path}")
     failures = batch.failures
     if failures:
-        first = failures[0]
-        problem = f"{first.job.name}: {first.error}"
-        raise StgaError(f"{len(failures)} of {len(plan.jobs)} jobs failed; {problem}")
+        count = f"{len(failures)} of {len(plan.jobs)} jobs failed"
+        raise StgaError(f"{count}; {failures[0].job.name}: {failures[0].error}")

@@ -60,20 +60,17 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
     return result
 
 
-class ProgressBar:
+class ProgressBar(ExitStack[None]):
     """A bar on stderr with stage and figures; what is said or logged goes above it."""
 
-    def __enter__(self) -> "ProgressBar":
-        self._bar: tqdm[Any] | None = None
-        self._stage = ""
-        self._opened = ExitStack()
-        return self
+    _bar: "tqdm[Any] | None" = None
+    _stage = ""
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *details: Any) -> None:
         if self._bar is not None:
             # a bar of work that failed before it began would stand above the reason
             self._bar.leave = self._bar.n > 0
-        self._opened.close()
+        super().__exit__(*details)
 
     def report(self, progress: Progress) -> bool:
         if self._bar is None:
@@ -81,8 +78,8 @@ class ProgressBar:
             from tqdm.contrib.logging import logging_redirect_tqdm
 
             bar = tqdm(total=1.0, bar_format=LAYOUT, mininterval=0.5, dynamic_ncols=True)
-            self._bar = self._opened.enter_context(bar)
-            self._opened.enter_context(logging_redirect_tqdm())
+            self._bar = self.enter_context(bar)
+            self.enter_context(logging_redirect_tqdm())
         self._bar.set_description(progress.stage, refresh=progress.stage != self._stage)
         self._stage = progress.stage
         figures = progress.figures()
@@ -144,7 +141,7 @@ class Command:
 
 def _about(kind: Any) -> str:
     """A request's docstring without its fields."""
-    return str(kind.__doc__).partition("\n\n")[0].partition("; other fields")[0]
+    return str(kind.__doc__).partition("\n\n")[0]
 
 
 def _asking(kind: Any, with_bar: bool = True, **more: Any) -> Command:
@@ -157,15 +154,9 @@ def _asking(kind: Any, with_bar: bool = True, **more: Any) -> Command:
     return Command(_about(kind), run, (kind,), **more)
 
 
-# Training
-
-
-def _lone(name: str, kind: Any, spec: Any) -> Any:
+def _lone(name: str, kind: Any, help: str, default: Any, metavar: str = "") -> Any:
     """A dataclass of one option that no request has."""
-    return make_dataclass("Lone", [(name, kind, spec)], frozen=True)
-
-
-RESUME_RUN = _lone("resume", bool, option("continue the run in the folder", False))
+    return make_dataclass("Lone", [(name, kind, option(help, default, metavar=metavar))])
 
 
 def _train(options: Namespace, head: OpenHead | None) -> None:
@@ -269,15 +260,6 @@ def write_blend(
 # Continuing a finished run
 
 
-CONTINUE = _lone("resume", bool, option("RUN was stopped: continue it", False))
-SELECT_ONLY = option(
-    "only write which triangles it would train: timestep of the take -> triangles", None,
-    metavar="NPZ",
-)  # fmt: skip
-SELECT_OUT = option("also write timestep -> triangles", None, metavar="NPZ")
-INFO_JSON = option("print the effects alone, as JSON", False)
-
-
 def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
     """A command that continues a finished run in one of its own, or resumes such a run."""
 
@@ -307,10 +289,8 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
                 given["seconds"] = seconds
             carry_out(kind(**given))
 
-    return Command(_about(kind), run, (kind, CONTINUE, *more), may_lack=("run", "captures"))
-
-
-# Captures
+    resume = _lone("resume", bool, "RUN was stopped: continue it", False)
+    return Command(_about(kind), run, (kind, resume, *more), may_lack=("run", "captures"))
 
 
 def _write_selection(request: Select | SelectForTake, path: Path | None) -> None:
@@ -350,9 +330,6 @@ def _info(options: Namespace, head: OpenHead | None) -> None:
         print("", *format_table(describe_effects(found.plan)), sep="\n")
 
 
-# Avatars
-
-
 @dataclass(frozen=True)
 class RenderOutput:
     out: Path | None = option("folder for PNGs", None, metavar="DIR", group="output")
@@ -381,9 +358,6 @@ def _export(options: Namespace, head: OpenHead | None) -> None:
     carry_out(Export(**given))
 
 
-# Requests in folders
-
-
 @dataclass(frozen=True)
 class PerformOptions:
     folder: Path = option("folder that holds request.json", flag="FOLDER")
@@ -400,11 +374,10 @@ def _perform(options: Namespace, head: OpenHead | None) -> None:
             import_module("..raster.cpu.threads", __package__).set_threads(options.threads)
     from ..jobs.perform import perform_in_folder
 
-    if not sys.stderr.isatty():  # started by Blender, which reads the status in the folder
-        perform_in_folder(options.folder, also=ignore, resume=bool(options.resume))
-        return
+    # without a terminal started by Blender, which reads the status in the folder
     with ProgressBar() as bar:
-        perform_in_folder(options.folder, bar.say, bar.report, bool(options.resume))
+        report = bar.report if sys.stderr.isatty() else ignore
+        perform_in_folder(options.folder, bar.say, report, bool(options.resume))
 
 
 TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("out", "avatar")]
@@ -420,10 +393,14 @@ COMMANDS = {
     "track": _asking(Track, may_lack=("model",)),
     "train": Command(
         _about(Train), _train,
-        (Train, TrainingSettings, (SelectionOptions, "threshold"), RESUME_RUN), uses_head=True
+        (Train, TrainingSettings, (SelectionOptions, "threshold"),
+         _lone("resume", bool, "continue the run in the folder", False)), uses_head=True
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
-    "extend": _continuing(Extend, EXTEND_SECONDS, _lone("select_only", Path | None, SELECT_ONLY)),
+    "extend": _continuing(Extend, EXTEND_SECONDS, _lone(
+        "select_only", Path | None,
+        "only write which triangles it would train: timestep of the take -> triangles", None, "NPZ"
+    )),
     "relight": _asking(Relight),
     "perform": Command(
         "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
@@ -439,12 +416,14 @@ COMMANDS = {
     "select": Command(
         _about(Select),
         lambda options, _: _write_selection(Select(**given_options(options, Select)), options.out),
-        (Select, _lone("out", Path | None, SELECT_OUT)), uses_head=True
+        (Select, _lone("out", Path | None, "also write timestep -> triangles", None, "NPZ")),
+        uses_head=True
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),
     "info": Command(
-        _about(Analyze), _info, (Analyze, _lone("json", bool, INFO_JSON)), uses_head=True
+        _about(Analyze), _info,
+        (Analyze, _lone("json", bool, "print the effects alone, as JSON", False)), uses_head=True
     ),
     "presets": _asking(TimePresets, with_bar=False, uses_head=True),
 }  # fmt: skip

@@ -73,14 +73,14 @@ def analyze(request: Analyze, report: Report, say: Say) -> Analyzed:
     device, _ = choose_device(request.device)
     settings = make_settings(iterations=1, effects=dict(request.effects or {}))
     _, plan = plan_effects(capture, settings, device)
-    if not request.timed:
-        return Analyzed(plan, {})
-    # imports Numba, which deciding effects does without
-    from ..training.preset_timing import time_presets
+    seconds: dict[str, float] = {}
+    if request.timed:
+        # imports Numba, which deciding effects does without
+        from ..training.preset_timing import time_presets
 
-    report(Progress(0.5, "Timing the presets"))
-    timings = time_presets(capture, device=device)
-    return Analyzed(plan, {timing.preset: timing.seconds for timing in timings})
+        report(Progress(0.5, "Timing the presets"))
+        seconds = {timing.preset: timing.seconds for timing in time_presets(capture, device=device)}
+    return Analyzed(plan, seconds)
 
 
 def time_each_preset(request: TimePresets, report: Report, say: Say) -> Analyzed:

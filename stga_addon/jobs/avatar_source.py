@@ -167,13 +167,11 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     return motion
 
 
-def motion_capture(request: Posed, motion: Motion, own: Capture | None) -> Capture:
+def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, say: Say) -> Capture:
     """The motion as a capture, seen by the cameras of the run's own one."""
-    assert request.motion is not None
-    views = {} if own is None else own.views
-    return replace(
-        sequence_capture(request.motion, motion.sequence, request.flame, views), fps=motion.fps
-    )
+    motion, views = open_avatar_motion(request, avatar, say), {} if own is None else own.views
+    capture = sequence_capture(request.motion, motion.sequence, request.flame, views)
+    return replace(capture, fps=motion.fps)
 
 
 def findings(motion: Motion) -> list[str]:

@@ -105,17 +105,17 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
     """
     if not request.blend.is_file():
         raise StgaError(f"{request.blend}: is not a file; expected a .blend file")
-    pictures = request.pictures
-    missing = [frame for frame, path in pictures.items() if not path.exists()]
-    done = len(pictures) - len(missing)
-    report(Progress(done / len(pictures), "Rendering"))
+    total = len(request.pictures)
+    missing = [frame for frame, path in request.pictures.items() if not path.exists()]
+    done = total - len(missing)
+    report(Progress(done / total, "Rendering"))
     # runs that follow each other
     for _, numbered in groupby(enumerate(missing), lambda item: item[1] - item[0]):
         frames = [frame for _, frame in numbered]
         for _ in _rendered(request, frames[0], frames[-1], say):
             done += 1
-            detail = f"Frame {done} of {len(pictures)}"
-            if report(Progress(done / len(pictures), "Rendering", detail)) and done < len(pictures):
+            progress = Progress(done / total, "Rendering", f"Frame {done} of {total}")
+            if report(progress) and done < total:
                 raise Cancelled
     return Written(request.output)
 

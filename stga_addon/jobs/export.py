@@ -22,16 +22,7 @@ from ..options import flag_of, like, option
 from ..progress import Report, Say, Written, counted
 from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
-from .avatar_source import (
-    Played,
-    motion_capture,
-    motion_field,
-    motion_options_field,
-    open_avatar,
-    open_avatar_motion,
-    required_capture,
-    timesteps_between,
-)  # fmt: skip
+from . import avatar_source
 from .train import Train
 
 
@@ -49,7 +40,7 @@ class Export:
     flame: Path | None = like(
         Train, "flame", help="FLAME model file of that capture, or of the motion"
     )
-    played: Played | None = None
+    played: avatar_source.Played | None = None
     timestep: int | None = option(
         "of a format that holds one frame (default: the neutral mesh)", None, 0
     )
@@ -64,8 +55,8 @@ class Export:
         "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
         "stay in the page, and FLAME's licence decides who may receive it either way", False,
     )  # fmt: skip
-    motion: Path | None = motion_field()
-    motion_options: MotionOptions = motion_options_field("motion")
+    motion: Path | None = avatar_source.motion_field()
+    motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     albedo: bool = option(
         "leave out the capture's light: colors are the albedo (docs/light.md)", False
     )
@@ -89,47 +80,36 @@ class Export:
         check_suffix(self.output, self.file_format)
 
 
-# Work
-
-
 def export(request: Export, report: Report, say: Say) -> Written:
     """Write the file or the folder. Says how much room several frames take; raises StgaError."""
-    avatar, capture = open_avatar(request)
+    avatar, capture = avatar_source.open_avatar(request)
     if request.albedo:
         avatar = albedo_avatar(avatar)
     if request.motion is not None:
-        capture = motion_capture(request, open_avatar_motion(request, avatar, say), capture)
+        capture = avatar_source.motion_capture(request, avatar, capture, say)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
-    format, playback = FORMATS[request.file_format], None
+    format, playback, timestep = FORMATS[request.file_format], None, request.timestep
     flame = None if capture is None else capture.flame
-    meshes: Meshes = ()
+    meshes: Meshes = [(0, avatar.neutral)]
     if format.is_page and capture is None and request.frames is None:
         _say_size(request, avatar, 1, say)
-        _say_licence(flame_notice(avatar, None, motion_only=True), say)
         playback = Playback(title=_title(request), fps=fps, motion_only=True)
-        meshes = [(0, avatar.neutral)]
+        _say_licence(flame_notice(avatar, None, motion_only=True), say)
     elif format.source == "range":
-        capture = required_capture(capture)
-        timesteps = timesteps_between(capture, request.frames, say)
+        capture = avatar_source.required_capture(capture)
+        timesteps = avatar_source.timesteps_between(capture, request.frames, say)
         _say_size(request, avatar, len(timesteps), say)
         if format.is_page:
             playback, flame = capture_playback(request, avatar, capture, timesteps, fps, say)
         posed = ((timestep, capture.mesh(timestep)) for timestep in timesteps)
         meshes = counted(posed, len(timesteps), report, "Exporting", "Frame")
-    elif format.source == "frame":
-        meshes = [_frame(avatar, capture, request.timestep)]
+    elif format.source == "frame" and timestep is not None:
+        capture = avatar_source.required_capture(capture)
+        if timestep not in capture.timesteps:
+            raise StgaError(f"{capture.root}: has no timestep {timestep}")
+        meshes = [(timestep, capture.mesh(timestep))]
     export_avatar(request.output, avatar, request.file_format, meshes, flame, fps, playback)
     return Written(request.output)
-
-
-def _frame(avatar: Avatar, capture: Capture | None, timestep: int | None) -> tuple[int, np.ndarray]:
-    """The mesh of one timestep, or the neutral mesh."""
-    if timestep is None:
-        return 0, avatar.neutral
-    capture = required_capture(capture)
-    if timestep not in capture.timesteps:
-        raise StgaError(f"{capture.root}: has no timestep {timestep}")
-    return timestep, capture.mesh(timestep)
 
 
 def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
@@ -162,12 +142,12 @@ def capture_playback(
     if not chosen and request.played is None:
         chosen = select_capture(capture, SelectionOptions())
     everything, motion_only = np.ones(len(capture.faces), bool), request.motion_only
+    sequence = capture.flame
     playback = Playback(
         title=_title(request), fps=fps, views=capture_views(capture), up=_up(capture),
         selection=[chosen.get(t, everything) for t in timesteps] if chosen else None,
-        motion_only=motion_only, controls=None if motion_only else page_controls(capture.flame),
+        motion_only=motion_only, controls=None if motion_only else page_controls(sequence),
     )  # fmt: skip
-    sequence = capture.flame
     if sequence is not None:  # an open head numbers the capture's timesteps by the scene's frames
         numbered = dict(zip(capture.timesteps, sequence.timesteps, strict=True))
         sequence = replace(sequence, timesteps=tuple(numbered[t] for t in timesteps))

@@ -16,14 +16,8 @@ from ..files import write_json
 from ..light.environment import harmonics_of, read_hdr
 from ..options import like, option
 from ..progress import Progress, Report, Say, Written, ignore
-from ..training.run.folder import (
-    AVATAR,
-    WORLD_FILE,
-    locked,
-    open_refined,
-    open_run,
-    with_refined_tracking,
-)
+from ..training.run import folder as run_folder
+from ..training.run.folder import AVATAR, WORLD_FILE
 
 if TYPE_CHECKING:
     from ..light.estimate import Known
@@ -56,7 +50,7 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
     from ..light.estimate import Known
 
     folder = request.run
-    capture = open_refined(folder, request.capture, request.flame)
+    capture = run_folder.open_refined(folder, request.capture, request.flame)
     known = Known()
     if request.light is not None:
         known = Known(radiance=harmonics_of(read_hdr(request.light)))
@@ -81,7 +75,7 @@ def add_light(
     from ..light.estimate import Known, estimate_light
     from ..training.evaluate.metrics import known_exposure
 
-    with locked(avatar_file.parent):
+    with run_folder.locked(avatar_file.parent):
         avatar = read_avatar(avatar_file)
         exposure = known_exposure(avatar.settings.get("exposure") or (), ())
         light = estimate_light(capture, replace(known or Known(), exposure=exposure), report)
@@ -91,16 +85,13 @@ def add_light(
 
 def describe_light(light: AvatarLight) -> tuple[str, ...]:
     """Lines about where a light is from and how well it explains the capture."""
-    source = {"estimated": "estimated", "file": "from a file"}
-    source["gray_card"] = "estimated, level by a gray card"
-    line = f"light: {source[light.source]}; recorded colors differ from it by {light.residual:.1%}"
+    source = {"file": "from a file", "gray_card": "estimated, level by a gray card"}
+    found = f"recorded colors differ from it by {light.residual:.1%}"
+    line = f"light: {source.get(light.source, light.source)}; {found}"
     if not light.damping:
         return (line,)
     damped = f"albedo is pulled to its mean by {light.damping:.0%} (docs/light.md)"
     return line, f"warning: the capture's light is too hard to be taken away; {damped}"
-
-
-# Quality
 
 
 @dataclass(frozen=True)
@@ -120,8 +111,8 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
 
     folder, split = request.run, request.split
     report(Progress(stage="Evaluating"))
-    tracked = open_run(folder, request.capture, request.flame).capture
-    capture = with_refined_tracking(tracked, folder)
+    tracked = run_folder.open_run(folder, request.capture, request.flame).capture
+    capture = run_folder.with_refined_tracking(tracked, folder)
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")

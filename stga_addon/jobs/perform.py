@@ -127,9 +127,6 @@ def _read(path: Path, kinds: Any) -> Any:
         raise StgaError(f"{path}: {error}") from error
 
 
-# Carrying out
-
-
 def perform(request: Request, report: Report = ignore, say: Say = print) -> Result:
     """Carry out a request; returns what it found.
 

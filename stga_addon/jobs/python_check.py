@@ -64,10 +64,8 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
     missing = [package_name(text) for module, text in REQUIREMENTS.items() if module in failures]
     if missing:
-        why = next(
-            (text for text in failures.values() if not text.startswith("ModuleNotFoundError")), ""
-        )
-        failed = f" ({why})" if why else ""
+        whys = [text for text in failures.values() if not text.startswith("ModuleNotFoundError")]
+        failed = f" ({whys[0]})" if whys else ""
         problem = f"Python {version} lacks {', '.join(missing)}{failed}; install that there"
         raise StgaError(f"{python}: {problem}")
     known = f"torch {versions['torch']}, numba {versions['numba']}"
@@ -81,26 +79,19 @@ def main() -> None:
             versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that fails to load raises what it likes
             failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
-    names, device = _adapters()
+    # the device to report, which `choose_device` tries later, and GPUs for `--device gpu:NAME`
+    device, names = f"CPU with {os.cpu_count()} threads", list[str]()
+    with suppress(Exception):  # a package is missing, or a driver fails: the CPU trains
+        from ..raster.gpu.adapters import adapters, is_software
+
+        found = adapters()
+        names = list(found)
+        device = next((name for name in names if not is_software(found[name])), device)
     report = {
         "python": platform.python_version(), "versions": versions, "failures": failures,
         "device": device, "adapters": names,
     }  # fmt: skip
     print(json.dumps(report))
-
-
-def _adapters() -> tuple[list[str], str]:
-    """GPUs for `--device gpu:NAME`, and the device to report; `choose_device` tries it later."""
-    cpu = f"CPU with {os.cpu_count()} threads"
-    try:
-        from ..raster.gpu.adapters import adapters, is_software
-
-        found = adapters()
-    except Exception:  # a package is missing, or a driver fails: the CPU trains
-        return [], cpu
-    return list(found), next(
-        (name for name, adapter in found.items() if not is_software(adapter)), cpu
-    )
 
 
 if __name__ == "__main__":

@@ -25,14 +25,7 @@ from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
 from ..training.run.folder import WORLD_FILE
-from .avatar_source import (
-    Played,
-    avatar_path,
-    motion_field,
-    motion_options_field,
-    open_avatar,
-    open_avatar_motion,
-)  # fmt: skip
+from . import avatar_source
 from .train import Train
 
 MAX_TURNTABLE_IMAGES = 100_000
@@ -75,8 +68,8 @@ class Render:
     flame: Path | None = like(
         Train, "flame", help="FLAME model file of that capture, or of the motion"
     )
-    motion: Path | None = motion_field()
-    played: Played | None = None
+    motion: Path | None = avatar_source.motion_field()
+    played: avatar_source.Played | None = None
     background: tuple[float, float, float] = option(
         "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
     )
@@ -85,7 +78,7 @@ class Render:
         help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
     )  # fmt: skip
     device: str = like(Train, "device")
-    motion_options: MotionOptions = motion_options_field("motion")
+    motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     light: Path | None = option(
         "environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE"
     )
@@ -113,9 +106,6 @@ class Render:
             raise StgaError(f"--frames: {problem}")
 
 
-# Work
-
-
 def render(request: Render, report: Report, say: Say) -> Written:
     """Render the pictures or the video; cancelled, no video is written, and pictures that are
     finished stay. Raises StgaError."""
@@ -125,7 +115,7 @@ def render(request: Render, report: Report, say: Say) -> Written:
     if request.cameras is not None:
         principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # a PLY has none
         if request.principal_point is None and not is_ply(request.source):
-            principal_point = read_avatar(avatar_path(request.source)).principal_point
+            principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
     composer.choose()
@@ -252,15 +242,15 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
             lambda: np.median(splats.xyz, axis=0), playback_fps(None, request.fps),
         )  # fmt: skip
     if request.motion is not None:
-        avatar = read_avatar(avatar_path(source))
-        motion = open_avatar_motion(request, avatar, say)
+        avatar = read_avatar(avatar_source.avatar_path(source))
+        motion = avatar_source.open_avatar_motion(request, avatar, say)
         sequence, fps = motion.sequence, request.fps or motion.fps or DEFAULT_FPS
         return _Subject(
             _pictured(request, avatar, lambda v: sequence_mesh(sequence, v.timestep), composer),
             tuple(sequence.timesteps),
             lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])), fps,
         )  # fmt: skip
-    avatar, capture = open_avatar(request)
+    avatar, capture = avatar_source.open_avatar(request)
     if capture is None:
         problem = "an avatar needs the meshes of a capture to follow; give --capture"
         raise StgaError(f"{source}: {problem}")
@@ -286,7 +276,7 @@ def _pictured(
 
     background, behind = request.background, None
     if request.world:
-        path = avatar_path(request.source).with_name(WORLD_FILE)
+        path = avatar_source.avatar_path(request.source).with_name(WORLD_FILE)
         if not path.is_file():
             shown = "--world shows what a training with --effect world=on has written"
             raise StgaError(f"{path}: is missing; {shown}")

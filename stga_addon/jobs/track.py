@@ -143,9 +143,6 @@ class MakeAvatar:
             raise StgaError(f"{self.out}: {problem}")
 
 
-# Work
-
-
 STAGES = {
     "Opening the footage": (0.0, 0.0), "Head model": (0.0, 0.01), "Landmarks": (0.01, 0.06),
     "Focal length": (0.06, 0.07), "Fit": (0.07, 0.12), "Dense tracking": (0.12, 0.3),

@@ -8,14 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..avatar.file import read_avatar
+from ..capture import model as capture_model
 from ..capture.meshes import SELECTED_WEIGHT, find_region, is_region_file
-from ..capture.model import (
-    Capture,
-    first_timesteps,
-    join_takes,
-    require_same_head,
-    require_same_scale,
-)
+from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError
@@ -27,20 +22,8 @@ from ..render.device import EXPECTED_DEVICE, choose_device, is_device
 from ..report import CurveUpdater, report_run
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
-from ..training.run.folder import (
-    AVATAR,
-    TRACKING,
-    WORLD_FILE,
-    Continuation,
-    OpenedRun,
-    Run,
-    Take,
-    device_of,
-    has_run,
-    open_run,
-    read_run,
-    with_refined_tracking,
-)
+from ..training.run import folder as run_folder
+from ..training.run.folder import AVATAR, OpenedRun, Run
 from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
@@ -179,9 +162,6 @@ class SelectForTake:
     flame: Path | None = None
 
 
-# Work
-
-
 Training = Train | Resume | Refine | Extend
 
 
@@ -235,7 +215,8 @@ def train(request: Training, report: Report, say: Say) -> Written:
             lines.append(_world_of(prepared, report_afterwards))
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
-        lines.append(f"refined meshes: {folder / TRACKING} (in Blender: Apply Motion, Own Offsets)")
+        refined = f"refined meshes: {folder / run_folder.TRACKING}"
+        lines.append(f"{refined} (in Blender: Apply Motion, Own Offsets)")
     return Written(avatar, tuple(lines))
 
 
@@ -246,7 +227,7 @@ def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ..
         return (f"light: not estimated ({why}); `stga relight RUN` estimates it",)
     from .finished_run import add_light
 
-    capture = with_refined_tracking(prepared.capture, prepared.request.run)
+    capture = run_folder.with_refined_tracking(prepared.capture, prepared.request.run)
     try:
         return add_light(avatar, capture, report=report)
     except StgaError as error:  # an avatar without it is whole
@@ -257,7 +238,7 @@ def _world_of(prepared: Prepared, report: Report) -> str:
     """Write what stands still behind the person; what there is to say."""
     from ..training.world import world_of
 
-    path = prepared.request.run / WORLD_FILE
+    path = prepared.request.run / run_folder.WORLD_FILE
     try:
         splats = world_of(prepared.capture, prepared.run.settings, report)
     except Cancelled:
@@ -268,7 +249,7 @@ def _world_of(prepared: Prepared, report: Report) -> str:
 
 def refuse_run(folder: Path) -> None:
     """Raise StgaError where the folder holds a run."""
-    if has_run(folder):
+    if run_folder.has_run(folder):
         raise StgaError(f"{folder}: already holds a run; resume it, or choose another folder")
 
 
@@ -276,15 +257,15 @@ def prepare(request: Training, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if isinstance(request, Resume):
         flame, principal_point = request.flame, request.principal_point
-        opened = open_run(request.run, request.capture, flame, principal_point)
-        device, why = device_of(opened.run, request.device)
+        opened = run_folder.open_run(request.run, request.capture, flame, principal_point)
+        device, why = run_folder.device_of(opened.run, request.device)
         say(why)
         run = replace(opened.run, device=device)
         return Prepared(request, run, opened.capture, request.selection)
     refuse_run(request.run)
     if isinstance(request, Train):
         return _new_run(request, report, say)
-    device, why = device_of(read_run(request.parent), request.device)
+    device, why = run_folder.device_of(run_folder.read_run(request.parent), request.device)
     say(f"{why}\nrun: {request.run}")
     begin: Any = _refinement if isinstance(request, Refine) else _extension
     prepared: Prepared = begin(request, report, say)
@@ -330,8 +311,8 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
 
     parent, weights = request.parent, request.weights
     report(Progress(stage="Opening the run"))
-    opened = open_run(parent, flame=request.flame)
-    capture = with_refined_tracking(opened.capture, parent)
+    opened = run_folder.open_run(parent, flame=request.flame)
+    capture = run_folder.with_refined_tracking(opened.capture, parent)
     count = len(capture.faces)
     if weights is None:
         region, name = find_region(capture, request.region), request.region
@@ -389,25 +370,25 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     """
     from ..training.run.continuation import select_for_takes
 
-    opened = open_run(request.parent, flame=request.flame)
+    opened = run_folder.open_run(request.parent, flame=request.flame)
     run, new = opened.run, list[Capture]()
     for path in request.captures:
         take = open_capture(path, run.flame, run.principal_point)
-        require_same_head(opened.capture, take)
+        capture_model.require_same_head(opened.capture, take)
         if not take.views.get("train"):
             problem = "has no training views, so there is nothing to extend the avatar with"
             raise StgaError(f"{take.root}: {problem}")
-        require_same_scale(opened.takes[0], take)
+        capture_model.require_same_scale(opened.takes[0], take)
         if any(take.root == old.root for old in opened.takes):
             raise StgaError(f"{take.root}: is a take of this run already")
         if any(take.root == other.root for other in new):
             raise StgaError(f"{take.root}: is given twice; expected each take once")
         new.append(take)
     everything = [*opened.takes, *new]
-    capture = with_refined_tracking(join_takes(everything), request.parent)
-    starts = first_timesteps(everything)[len(opened.takes) :]
+    capture = run_folder.with_refined_tracking(capture_model.join_takes(everything), request.parent)
+    starts = capture_model.first_timesteps(everything)[len(opened.takes) :]
     added = [
-        Take(take.root, start, identity_of(take, run.principal_point, run.settings))
+        run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
         for take, start in zip(new, starts, strict=True)
     ]
     continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))
@@ -419,5 +400,5 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     return opened, capture, selection, run
 
 
-def _continuation(parent: Path, frames: tuple[int, int]) -> Continuation:
-    return Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)
+def _continuation(parent: Path, frames: tuple[int, int]) -> run_folder.Continuation:
+    return run_folder.Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from ..errors import StgaError
@@ -98,12 +97,12 @@ def start_in_background(
 
 
 def start_python(
-    python: str, arguments: Sequence[str], variables: Mapping[str, str] = MappingProxyType({}),
+    python: str, arguments: Sequence[str], variables: Mapping[str, str] | None = None,
     **options: Any,
 ) -> subprocess.Popen[Any]:  # fmt: skip
     """Start `python -m ARGUMENTS…` in `worker_environment` and `variables`; options are those of
     Popen. Raises StgaError where the interpreter cannot be started."""
-    environment = {**worker_environment(os.environ, python), **variables}
+    environment = {**worker_environment(os.environ, python), **(variables or {})}
     try:
         return subprocess.Popen([python, "-m", *arguments], env=environment, **options)
     except (OSError, ValueError) as error:  # ValueError: a null character in the path

@@ -161,9 +161,6 @@ def failure_report(folder: Path, snapshot: WorkerSnapshot) -> str:
     return "\n".join(part for part in parts if part) + "\n"
 
 
-# Control
-
-
 def request_cancel(folder: Path) -> None:
     """Ask the worker to stop and to keep what it has. Raises StgaError."""
     path = folder / CANCEL_FILE

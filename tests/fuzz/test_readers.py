@@ -83,15 +83,38 @@ def behaves(read: Callable[[], Any], folder: Path) -> str:
     return message
 
 
+JUNK = {
+    "empty": b"", "zeros": bytes(10_000), "not utf-8": b'{"format": "\xff\xfe"}',
+    "utf-16": '{"a": 1}'.encode("utf-16"), "byte order mark": b"\xef\xbb\xbf{}",
+    "brackets": b"[" * 100_000, "objects": b'{"a":' * 100_000, "digits": b"9" * 100_000,
+    "nan": b"NaN", "string": b'"text"', "zip": b"PK\x05\x06" + bytes(18),
+    "pickle": pickle.dumps({"a": 1}),
+    "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
+}  # fmt: skip
+IN_PLACE: dict[str, Callable[[Path], object]] = {
+    "link to itself": lambda path: path.symlink_to(path.name), "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"), "folder": Path.mkdir,
+}  # fmt: skip
+"""What is no file, in the place of one."""
+NAMES = ("nul\0byte", "\ud800", "x" * 5000)
+"""That no file can have, and a capture's JSON may hold."""
+OF_A_FOLDER = ("run", "checkpoint", "selection", "metrics", "colmap")
+"""Beginnings of targets whose readers take the folder of their file."""
+
+
 @pytest.mark.parametrize("name", TARGETS)
 def test_reader(tmp_path: Path, name: str) -> None:
-    """Catches a reader that neither loads a damaged file nor raises StgaError."""
+    """Catches a reader that neither loads a damaged file nor raises StgaError, or that trusts a
+    file because of its name."""
     target = TARGETS[name]
     path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
     path.parent.mkdir()
     broken.parent.mkdir()
     target.write(path)
     target.read(path)
+    for content in JUNK.values():
+        broken.write_bytes(content)
+        behaves(lambda: target.read(broken), broken.parent)
     whole, end = path.read_bytes(), time.monotonic() + SECONDS / len(TARGETS)
     for example in itertools.count():
         if example >= EXAMPLES and time.monotonic() > end:
@@ -106,62 +129,23 @@ def test_reader(tmp_path: Path, name: str) -> None:
             raise
 
 
-# What is no file of a reader's kind
-
-
-def link_to_itself(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
 @pytest.mark.skipif(
     sys.platform == "win32", reason="needs links, pipes and devices of a POSIX system"
 )
-@pytest.mark.parametrize("make", [link_to_itself, os.mkfifo, device, Path.mkdir])
 @pytest.mark.parametrize("reader", [name for name in TARGETS if not name.startswith("colmap")])
-def test_what_is_no_file(tmp_path: Path, reader: str, make: Callable[[Path], None]) -> None:
+def test_what_is_no_file(tmp_path: Path, reader: str) -> None:
     """Catches readers that wait for ever on a pipe, fill the memory from a device, or trip over a
-    link to itself."""
+    link to itself or a name that no file can have."""
     target = TARGETS[reader]
-    make(tmp_path / target.name)
-    message = behaves(lambda: target.read(tmp_path / target.name), tmp_path)
-    assert message or (reader == "metrics" and make is link_to_itself)
-
-
-OF_A_FOLDER = ("run", "checkpoint", "selection", "metrics")
-"""Targets whose readers take the folder of their file."""
-
-
-@pytest.mark.parametrize(
-    "reader", [name for name in TARGETS if not name.startswith(("colmap", *OF_A_FOLDER))]
-)
-@pytest.mark.parametrize("stem", ["nul\0byte", "\ud800", "x" * 5000])
-def test_names_no_file_can_have(tmp_path: Path, reader: str, stem: str) -> None:
-    """Catches ValueError and UnicodeEncodeError from names that a capture's JSON may hold."""
-    target = TARGETS[reader]
-    assert behaves(lambda: target.read(tmp_path / (stem + target.name)), tmp_path)
-
-
-JUNK = {
-    "empty": b"", "zeros": bytes(10_000), "not utf-8": b'{"format": "\xff\xfe"}',
-    "utf-16": '{"a": 1}'.encode("utf-16"), "byte order mark": b"\xef\xbb\xbf{}",
-    "brackets": b"[" * 100_000, "objects": b'{"a":' * 100_000, "digits": b"9" * 100_000,
-    "nan": b"NaN", "string": b'"text"', "zip": b"PK\x05\x06" + bytes(18),
-    "pickle": pickle.dumps({"a": 1}),
-    "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("reader", TARGETS)
-def test_junk(tmp_path: Path, reader: str) -> None:
-    """Catches a reader that trusts a file because of its name."""
-    target = TARGETS[reader]
-    for content in JUNK.values():
-        (tmp_path / target.name).write_bytes(content)
-        behaves(lambda: target.read(tmp_path / target.name), tmp_path)
+    for kind, make in IN_PLACE.items():
+        (tmp_path / kind).mkdir()
+        path = tmp_path / kind / target.name
+        make(path)
+        message = behaves(lambda path=path: target.read(path), path.parent)
+        assert message or (reader, kind) == ("metrics", "link to itself"), kind
+    for stem in NAMES if not reader.startswith(OF_A_FOLDER) else ():
+        path = tmp_path / (stem + target.name)
+        assert behaves(lambda path=path: target.read(path), tmp_path), stem
 
 
 # Arrays and archives that lie
@@ -700,23 +684,20 @@ def test_checkpoints_of_wrong_kinds(tmp_path: Path) -> None:
         assert "checkpoint.npz: " in message, text
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("part", ["parameters", "first", "second"])
-def test_checkpoints_that_are_not_finite(tmp_path: Path, part: str, value: float) -> None:
-    """Catches a broken number that a resumed run would keep for ever."""
-    checkpoint = make_checkpoint()
-    getattr(checkpoint.state, part).opacity[3] = value
-    checkpoints.write_checkpoint(tmp_path, checkpoint)
-    message = behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
-    assert f"{part}/opacity holds a value that is not finite" in message
-
-
-def test_a_checkpoint_of_an_odd_number_of_coefficients(tmp_path: Path) -> None:
-    """Catches spherical harmonics of no degree, which the kernels would read past their end."""
+def test_checkpoints_whose_values_train_nothing(tmp_path: Path, part: str) -> None:
+    """Catches a broken number that a resumed run would keep for ever, and spherical harmonics of no
+    degree, which the kernels would read past their end."""
+    for value in (float("nan"), float("inf")):
+        checkpoint = make_checkpoint()
+        getattr(checkpoint.state, part).opacity[3] = value
+        checkpoints.write_checkpoint(tmp_path, checkpoint)
+        message = behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
+        assert f"{part}/opacity holds a value that is not finite" in message
     checkpoint = make_checkpoint()
     sh = np.zeros((len(checkpoint.state), 7, 3), np.float32)
-    for part in ("parameters", "gradients", "first", "second"):
-        setattr(checkpoint.state, part, getattr(checkpoint.state, part)._replace(sh=sh))
+    for each in ("parameters", "gradients", "first", "second"):
+        setattr(checkpoint.state, each, getattr(checkpoint.state, each)._replace(sh=sh))
     checkpoints.write_checkpoint(tmp_path, checkpoint)
     assert "7 coefficients" in behaves(lambda: checkpoints.read_checkpoint(tmp_path), tmp_path)
 

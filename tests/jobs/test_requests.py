@@ -21,22 +21,9 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.format import describe_figures
+from stga_addon.jobs import perform as jobs
 from stga_addon.jobs.export import Export
-from stga_addon.jobs.perform import (
-    FILES,
-    PREVIEW,
-    REQUEST,
-    check_request,
-    perform,
-    perform_in_folder,
-    read_request,
-    read_result,
-    remove_request,
-    request_folder,
-    worker_arguments,
-    write_request,
-    write_result,
-)
+from stga_addon.jobs.perform import perform, perform_in_folder, write_request
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
@@ -90,7 +77,7 @@ def painted() -> dict[int, np.ndarray]:
 
 def asked(request: Train | Resume | Refine) -> Path:
     """The folder of a request that is written into it."""
-    folder = request_folder(request.run)
+    folder = jobs.request_folder(request.run)
     write_request(folder, request)
     return folder
 
@@ -107,20 +94,20 @@ def test_round_trip(tmp_path: Path, value: Any) -> None:
     """Catches a field that is lost, or changes its type, between the panel and the worker."""
     if type(value) in JOBS:
         write_request(tmp_path, value)
-        assert same(read_request(tmp_path), value)
+        assert same(jobs.read_request(tmp_path), value)
     else:
-        write_result(tmp_path, value)
-        assert same(read_result(tmp_path), value)
+        jobs.write_result(tmp_path, value)
+        assert same(jobs.read_result(tmp_path), value)
 
 
 def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> None:
     """Catches yesterday's selection, preview, result or wish to cancel in today's work."""
     folder = asked(training(tmp_path / "run", capture))
-    for name in (PREVIEW, CANCEL_FILE, STATUS_FILE):
+    for name in (jobs.PREVIEW, CANCEL_FILE, STATUS_FILE):
         (folder / name).write_text("{}")
-    write_result(folder, RESULTS[1])
+    jobs.write_result(folder, RESULTS[1])
     write_request(folder, REQUESTS[-1])
-    assert sorted(path.name for path in folder.iterdir()) == [REQUEST, LOG_FILE]
+    assert sorted(path.name for path in folder.iterdir()) == [jobs.REQUEST, LOG_FILE]
 
 
 def test_refusals(tmp_path: Path, capture: Path) -> None:
@@ -128,19 +115,19 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
     started."""
     run = tmp_path / "run"
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
-        check_request(Resume(run))
+        jobs.check_request(Resume(run))
     assert not run.exists()
     write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
     with pytest.raises(StgaError, match="already holds a run; resume it, or choose another folder"):
-        check_request(training(run, capture))
-    check_request(Resume(run))
+        jobs.check_request(training(run, capture))
+    jobs.check_request(Resume(run))
     folder = asked(Resume(run))
     with status_writer(folder), pytest.raises(StgaError, match="another worker is running"):
         write_request(folder, Resume(run))
     with pytest.raises(StgaError, match="holds no tracked capture to solve again"):
-        check_request(SolveAgain(tmp_path / "nothing", Path("m"), {}))
+        jobs.check_request(SolveAgain(tmp_path / "nothing", Path("m"), {}))
     with pytest.raises(StgaError, match="already holds a capture"):
-        check_request(Track(Path("f"), Path("m"), capture))
+        jobs.check_request(Track(Path("f"), Path("m"), capture))
 
 
 def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
@@ -173,11 +160,11 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
     is JSON of another form."""
     write_request(tmp_path, REQUESTS[0])
     if name in DAMAGES:
-        edit(tmp_path / REQUEST, lambda values: values.update({name: DAMAGES[name]}))
+        edit(tmp_path / jobs.REQUEST, lambda values: values.update({name: DAMAGES[name]}))
     else:
-        (tmp_path / REQUEST).write_text(name)
+        (tmp_path / jobs.REQUEST).write_text(name)
     with pytest.raises(StgaError, match=r"request\.json: ") as caught:
-        read_request(tmp_path)
+        jobs.read_request(tmp_path)
     expected = rf"{name}|not a request that this version reads"
     assert name in TEXTS or re.search(expected, str(caught.value))
 
@@ -255,9 +242,9 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
     for name, (words, request) in asked_for.items():
         folder = tmp_path / f"{name}_job"
         write_request(folder, request)
-        process = start_worker(folder, sys.executable, worker_arguments(folder))
+        process = start_worker(folder, sys.executable, jobs.worker_arguments(folder))
         assert process.wait(300) == 0, log_lines(folder, 50)
-        assert read_result(folder) == Written(tmp_path / name)
+        assert jobs.read_result(folder) == Written(tmp_path / name)
         here, there = tmp_path / "here" / name, tmp_path / name
         assert main([*words, str(here)]) == 0
         assert contents(there)
@@ -335,7 +322,7 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     )
     assert min(n for n in iterations if n) >= 5
     assert max(iterations) == 40
-    seen, found = inspect_worker(folder), read_result(folder)
+    seen, found = inspect_worker(folder), jobs.read_result(folder)
     assert seen.state == WorkerState.FINISHED
     assert {"splats", "psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
     assert found.lines[-1] == f"avatar: {request.run / 'avatar.npz'}"
@@ -360,12 +347,12 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     folder = asked(training(run, capture))
 
     def look(progress: Progress) -> bool:
-        if (folder / PREVIEW).exists():
-            previews.append(len(read_avatar(folder / PREVIEW).splats))
+        if (folder / jobs.PREVIEW).exists():
+            previews.append(len(read_avatar(folder / jobs.PREVIEW).splats))
         return False
 
     def full(path: Path, avatar: Avatar) -> None:
-        if path.name == PREVIEW:
+        if path.name == jobs.PREVIEW:
             raise StgaError(f"{path}: cannot be written (No space left on device)")
         write_avatar(path, avatar)
 
@@ -373,7 +360,7 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     assert len(previews) > 5
     monkeypatch.setattr("stga_addon.training.run.session.write_avatar", full)
     perform_in_folder(asked(training(quiet, capture)))
-    assert not (request_folder(quiet) / PREVIEW).exists()
+    assert not (jobs.request_folder(quiet) / jobs.PREVIEW).exists()
     np.testing.assert_array_equal(
         read_npz(run / "avatar.npz")["xyz"], read_npz(quiet / "avatar.npz")["xyz"]
     )
@@ -403,7 +390,7 @@ def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path)
         [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True
     )
     python = tmp_path / "venv/bin/python"
-    process = start_worker(folder, str(python), worker_arguments(folder))
+    process = start_worker(folder, str(python), jobs.worker_arguments(folder))
     assert process.wait(60) == 2
     seen = inspect_worker(folder, process)
     assert (
@@ -414,16 +401,16 @@ def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path)
 
 def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> None:
     """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
-    folder = request_folder(tmp_path / "run")
+    folder = jobs.request_folder(tmp_path / "run")
     folder.mkdir(parents=True)
     for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
         (folder / name).write_text("mine")
-    remove_request(folder)
+    jobs.remove_request(folder)
     assert len(list(folder.iterdir())) == 3  # no request
     asked(training(tmp_path / "run", capture))
-    for name in FILES:
+    for name in jobs.FILES:
         (folder / name).touch()
-    remove_request(folder)
+    jobs.remove_request(folder)
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 

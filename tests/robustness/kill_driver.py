@@ -21,7 +21,6 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import numpy as np
 from capture import factory
 from training.toys import quick_settings
 
@@ -43,17 +42,14 @@ LONGEST_S = 0.3  # until a kill
 
 class Driver:
     def __init__(self, root: Path) -> None:
-        self.root = root
-        self.capture = open_capture(
-            factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4))
-        )
+        folder = factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4))
+        self.capture = open_capture(folder)
         busy = {
             "density_interval": 5, "density_span": (0.0, 1.0), "stray_reset_interval": 4,
             "stray_limit": 0.3, "lattice": 1,
         }  # fmt: skip
-        self.run = Run(
-            self.capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, **busy)
-        )
+        settings = quick_settings(iterations=ITERATIONS, **busy)
+        self.run = Run(self.capture.root, None, "vhap", settings)
         self.reached = mmap.mmap(-1, 8)  # the child's last iteration, readable after its death
 
     def train(self, out: Path, resume: bool) -> None:
@@ -114,12 +110,9 @@ def opened(out: Path, faces: int) -> dict[str, Any]:
 
 
 def same_bits(out: Path, expected: Path) -> bool:
-    ours, theirs = (
-        arrays_of(checkpoints.read_checkpoint(folder).state) for folder in (out, expected)
-    )
-    return all(
-        np.array_equal(ours[name].view(np.uint8), theirs[name].view(np.uint8)) for name in theirs
-    )
+    states = (checkpoints.read_checkpoint(folder).state for folder in (out, expected))
+    ours, theirs = map(arrays_of, states)
+    return all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
 
 
 def main(root: Path, kills: int) -> dict[str, Any]:
@@ -144,9 +137,7 @@ def main(root: Path, kills: int) -> dict[str, Any]:
     if out.exists() and not records[-1]["error"]:
         os.waitpid(driver.spawn(out, (out / "run.json").exists()), 0)
         finished.append(same_bits(out, whole))
-    litter = [path.name for path in root.glob("run*/.*")] + [
-        path.name for path in root.glob("run*/run.lock")
-    ]
+    litter = [path.name for name in (".*", "run.lock") for path in root.glob(f"run*/{name}")]
     return {"records": records, "finished": finished, "litter": litter}
 
 

@@ -59,7 +59,7 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the finished run, whose density control comes often when it is refined."""
     monkeypatch.setattr(module, "DENSITY_INTERVAL", 4)
-    monkeypatch.setattr("stga_addon.jobs.train.open_run", opening(toy))
+    monkeypatch.setattr("stga_addon.training.run.folder.open_run", opening(toy))
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 

@@ -26,22 +26,7 @@ from stga_addon.worker.launch import (
     start_worker,
     worker_environment,
 )
-from stga_addon.worker.status import (
-    CANCEL_FILE,
-    LOG_FILE,
-    STATUS_FILE,
-    StatusWriter,
-    WorkerSnapshot,
-    WorkerState,
-    WorkerStatus,
-    failure_report,
-    inspect_worker,
-    log_lines,
-    read_status,
-    remove_status_folder,
-    request_cancel,
-    status_writer,
-)
+from stga_addon.worker.status import WorkerState, WorkerStatus, inspect_worker
 from stga_addon.worker.training_python import own_python
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,11 +35,11 @@ WORKER = """
 import os, sys, time
 from pathlib import Path
 from stga_addon.progress import Progress
-from stga_addon.worker.status import status_writer
+from stga_addon.worker.status import status.status_writer
 from stga_addon.errors import StgaError
 
 def main():
-    with status_writer(Path(sys.argv[1])) as writer:
+    with status.status_writer(Path(sys.argv[1])) as writer:
         print("a line of the log", flush=True)
         for n in range(2000):
             if writer.report(Progress(n / 2000, "counting", "on time",
@@ -121,17 +106,17 @@ def test_worker_is_cancelled(start):
     ):
         prepare_status_folder(folder)
     with pytest.raises(StgaError, match="another worker"):
-        remove_status_folder(folder)
-    request_cancel(folder)
-    request_cancel(folder)
+        status.remove_status_folder(folder)
+    status.request_cancel(folder)
+    status.request_cancel(folder)
     assert inspect_worker(folder, process).state in (WorkerState.CANCELLING, WorkerState.CANCELLED)
     assert process.wait(20) == 0
     final = inspect_worker(folder, process)
     assert final.state == WorkerState.CANCELLED
     assert 0 < final.status.progress < 1
-    remove_status_folder(folder)
+    status.remove_status_folder(folder)
     assert not folder.exists()
-    assert inspect_worker(folder) == WorkerSnapshot()
+    assert inspect_worker(folder) == status.WorkerSnapshot()
 
 
 @pytest.mark.parametrize(
@@ -151,7 +136,7 @@ def test_failures_are_reported(start, action, code, error):
     assert snapshot.state == (WorkerState.LOST if action == "exit" else WorkerState.FAILED)
     assert snapshot.status.error == error
     assert snapshot.log_tail
-    report = failure_report(folder, snapshot)
+    report = status.failure_report(folder, snapshot)
     assert report.startswith(f"{error}\nTraceback") == (action == "bug")
     assert "a line of the log" in report
 
@@ -185,7 +170,7 @@ def test_final_status_without_output_streams(tmp_path, streams, action):
         shell=True, check=False, env=same_interpreter_environment(os.environ), timeout=60,
     )  # fmt: skip
     expected = WorkerState.FINISHED if action == "done" else WorkerState.FAILED
-    wait(lambda: (read_status(folder) or WorkerStatus()).state == expected)
+    wait(lambda: (status.read_status(folder) or WorkerStatus()).state == expected)
 
 
 def test_interpreter_that_does_not_exist(tmp_path):
@@ -210,14 +195,14 @@ def test_interpreter_that_does_not_exist(tmp_path):
 def test_only_own_files_are_removed(tmp_path):
     """Catches a folder removed with a person's files, and one that is not a folder taken for an
     error."""
-    with status_writer(tmp_path / "job") as writer:
+    with status.status_writer(tmp_path / "job") as writer:
         writer.report(Progress(0.5, "working"))
     (tmp_path / "job" / "notes.txt").write_text("mine")
     (tmp_path / "job" / "job.json").write_text("")
-    remove_status_folder(tmp_path / "job", ["job.json"])
+    status.remove_status_folder(tmp_path / "job", ["job.json"])
     assert [path.name for path in (tmp_path / "job").iterdir()] == ["notes.txt"]
     (tmp_path / "file").write_text("")
-    remove_status_folder(tmp_path / "file")
+    status.remove_status_folder(tmp_path / "file")
     assert (tmp_path / "file").exists()
 
 
@@ -227,18 +212,18 @@ def test_symbolic_links_are_not_followed(tmp_path):
     target, folder = tmp_path / "target", tmp_path / "job"
     target.write_text("mine")
     folder.mkdir()
-    for name in (STATUS_FILE, LOG_FILE, CANCEL_FILE):
+    for name in (status.STATUS_FILE, status.LOG_FILE, status.CANCEL_FILE):
         (folder / name).symlink_to(target)
     prepare_status_folder(folder)
-    (folder / CANCEL_FILE).symlink_to(tmp_path / "created")
-    request_cancel(folder)
+    (folder / status.CANCEL_FILE).symlink_to(tmp_path / "created")
+    status.request_cancel(folder)
     assert not (tmp_path / "created").exists()
-    (folder / CANCEL_FILE).unlink()
-    (folder / LOG_FILE).unlink()
-    (folder / LOG_FILE).symlink_to(target)
-    with pytest.raises(StgaError, match=rf"{LOG_FILE}: cannot be written"):
+    (folder / status.CANCEL_FILE).unlink()
+    (folder / status.LOG_FILE).unlink()
+    (folder / status.LOG_FILE).symlink_to(target)
+    with pytest.raises(StgaError, match=rf"{status.LOG_FILE}: cannot be written"):
         start_worker(folder, sys.executable, ["this"])
-    with status_writer(folder) as writer:
+    with status.status_writer(folder) as writer:
         writer.report(Progress(0.5, "working"))
     assert target.read_text() == "mine"
 
@@ -253,8 +238,8 @@ def test_symbolic_links_are_not_followed(tmp_path):
 )  # fmt: skip
 def test_damaged_status_is_ignored(tmp_path, text):
     """Catches an exception in Blender's timer for a truncated or foreign status.json."""
-    (tmp_path / STATUS_FILE).write_text(text)
-    assert read_status(tmp_path) is None
+    (tmp_path / status.STATUS_FILE).write_text(text)
+    assert status.read_status(tmp_path) is None
     assert inspect_worker(tmp_path).state == WorkerState.NONE
 
 
@@ -264,14 +249,16 @@ def test_status_round_trip(tmp_path, monkeypatch):
     figures, machine, now = {"psnr": 30.5}, platform.node(), 100.0
     expected = WorkerStatus("working", 0.25, "training", "enough", "", "", figures, machine, 0.25)
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
-    with status_writer(tmp_path) as writer:
+    with status.status_writer(tmp_path) as writer:
         now += 0.25
         writer.report(Progress(0.25, "training", "enough", lambda: figures))
-        with pytest.raises(StgaError, match="another worker"), status_writer(tmp_path):
+        with pytest.raises(StgaError, match="another worker"), status.status_writer(tmp_path):
             pass
-        assert read_status(tmp_path) == expected
+        assert status.read_status(tmp_path) == expected
         now += 1
-    assert read_status(tmp_path) == replace(expected, state=WorkerState.FINISHED, seconds=1.25)
+    assert status.read_status(tmp_path) == replace(
+        expected, state=WorkerState.FINISHED, seconds=1.25
+    )
 
 
 def test_status_is_written_rarely(tmp_path, monkeypatch):
@@ -279,7 +266,7 @@ def test_status_is_written_rarely(tmp_path, monkeypatch):
     status.json, which other programs cannot read."""
     written = []
     monkeypatch.setattr(status, "write_json", lambda path, value, **_: written.append(value))
-    writer = StatusWriter(tmp_path)
+    writer = status.StatusWriter(tmp_path)
     for message in ("a", "a", "b", "b"):
         figures = partial(dict, psnr=math.nan, loss=math.inf, n=1.0)
         writer.report(Progress(0, message, figures=figures))
@@ -294,11 +281,11 @@ def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
     def full(path: Path, value: object, **options: object) -> None:
         raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
 
-    with status_writer(tmp_path) as writer:
+    with status.status_writer(tmp_path) as writer:
         monkeypatch.setattr(status, "write_json", full)
         assert not writer.report(Progress(0.5, "training"))
     monkeypatch.undo()
-    (tmp_path / LOG_FILE).touch()
+    (tmp_path / status.LOG_FILE).touch()
     assert inspect_worker(tmp_path).state == WorkerState.LOST
     monkeypatch.setattr(status.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 100}))
     assert f"the disk that holds {tmp_path} is full" in inspect_worker(tmp_path).status.error
@@ -307,10 +294,10 @@ def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
 def test_folder_that_cannot_be_written(tmp_path):
     """Catches a traceback where the folder's place is taken by a file."""
     (tmp_path / "file").write_text("")
-    for use in (prepare_status_folder, request_cancel):
+    for use in (prepare_status_folder, status.request_cancel):
         with pytest.raises(StgaError, match=r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
-    writing = status_writer(tmp_path / "file" / "status")
+    writing = status.status_writer(tmp_path / "file" / "status")
     with pytest.raises(StgaError, match="cannot be written"), writing:
         pass
 
@@ -380,6 +367,6 @@ def test_own_python(monkeypatch, tmp_path):
 def test_log_lines(tmp_path):
     """Catches progress bars, which use carriage returns, and a character that is cut in half."""
     text = "ä".encode()[1:] + b"x" * 5000 + b"\nfirst\rsecond\n\nthird\n"
-    (tmp_path / LOG_FILE).write_bytes(text)
-    assert log_lines(tmp_path, 2) == ["second", "third"]
-    assert log_lines(tmp_path / "none", 2) == []
+    (tmp_path / status.LOG_FILE).write_bytes(text)
+    assert status.log_lines(tmp_path, 2) == ["second", "third"]
+    assert status.log_lines(tmp_path / "none", 2) == []

@@ -1,23 +1,5 @@
-"""Plan of a batch, a TOML file of jobs or some captures with a job each; and what an engine is,
-which carries them out.
-
-    out = "runs"                       # folder of the batch
-
-    [resources]                        # of every job, unless its own table says otherwise
-    threads = 1
-
-    [job.anna]
-    request = "train"                  # a request (`request_kinds`); the other keys are its fields
-    capture = "captures/anna"
-    settings = { preset = "standard", seed = 1 }
-
-    [job.anna-test]
-    request = "evaluate"
-    run = "runs/anna"                  # the folder of another job, which is waited for
-    after = ["…"]                      # further jobs to wait for
-
-Paths are relative to the plan's folder; where a request writes, to the job's own folder.
-"""
+"""Plan of a batch, a TOML file of jobs (docs/batch.md) or some captures with a job each; and what
+an engine is, which carries them out."""
 
 import os
 import re
@@ -42,8 +24,6 @@ from ..perform import request_folder, worker_arguments
 from ..table import JOBS, Request
 from ..track import MakeAvatar
 from ..train import Extend, Refine, Resume, Train
-
-# Jobs
 
 TRAININGS = (Train, Refine, Extend)
 OUTPUT_FIELDS = ("out", "output")
@@ -305,9 +285,6 @@ def _resources(where: str, values: Any, shared: Resources) -> Resources:
     return found
 
 
-# Requests
-
-
 def _request(
     where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path
 ) -> Request:
@@ -367,9 +344,6 @@ def _training_settings(where: str, changes: Any) -> Any:
 
 def _tuples(value: Any) -> Any:
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
-
-
-# Inputs
 
 
 def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:

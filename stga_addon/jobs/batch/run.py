@@ -2,10 +2,8 @@
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from graphlib import TopologicalSorter
 from importlib.util import find_spec
 from statistics import median
 
@@ -114,15 +112,6 @@ class BatchRun:
         self._show, self._say = show, say
         self._entries = batch.entries
         self._shown_s = 0.0
-        waiting = {n: e for n, e in self._entries.items() if e.state == JobState.WAITING}
-        self._left = len(waiting)
-        self._order = TopologicalSorter(
-            {name: [o for o in e.job.after if o in waiting] for name, e in waiting.items()}
-        )
-        self._order.prepare()
-        # dictionaries as ordered sets: jobs leave them from anywhere
-        free = dict.fromkeys(self._order.get_ready())
-        self._ready = dict.fromkeys(waiting) if engine.takes_all else free
 
     def run(self) -> None:
         """Raises KeyboardInterrupt after Ctrl-C when the running jobs have saved what they have,
@@ -138,13 +127,12 @@ class BatchRun:
             self._engine.close()
 
     def _work(self) -> None:
-        for name in list(self._ready):  # workers that an earlier start left running
-            entry = self._entries[name]
-            if is_running(entry.job, entry.digest):
-                self._mark_running(entry)
+        for name, entry in self._entries.items():  # workers that an earlier start left running
+            if self._is_free(entry) and is_running(entry.job, entry.digest):
+                entry.state = JobState.RUNNING
                 self._engine.adopt(entry.job)
                 self._say(f"{name}: goes on in the worker of an earlier start")
-        while self._left:
+        while self._batch.unfinished:
             if self._lease.compromise is not None:
                 problem = "another batch has taken this folder; this one has ended"
                 raise StgaError(f"{self._batch.plan.out}: {problem}")
@@ -170,16 +158,30 @@ class BatchRun:
         for entry in running:
             if entry.state == JobState.RUNNING:  # Ctrl-C came between its end and the note of it
                 self._over(entry, JobState.CANCELLED)
+        for entry in self._entries.values():
+            self._is_free(entry)
+
+    def _is_free(self, entry: Entry) -> bool:
+        """Whether a job can start; takes note of one that cannot any more."""
+        if entry.state != JobState.WAITING:
+            return False
+        others = [self._entries[name] for name in entry.job.after]
+        missing = next((o for o in others if o.state.is_over and not o.state.is_done), None)
+        if missing is not None:
+            was_stopped = missing.state == JobState.CANCELLED
+            state = JobState.CANCELLED if was_stopped else JobState.BLOCKED
+            self._over(entry, state, f"it comes after {missing.job.name}, which is not finished")
+            return False
+        return self._engine.takes_all or all(other.state.is_done for other in others)
 
     def _begin(self) -> bool:
         """Submit what can start; whether there was something."""
         fitting: list[Entry] = []
-        misses = 0
-        for name in list(self._ready):
-            entry = self._entries[name]
-            if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not self._engine.takes_all):
+        misses, takes_all = 0, self._engine.takes_all
+        for name, entry in self._entries.items():  # each after those that it comes after
+            if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not takes_all):
                 break
-            if name not in self._ready:  # what it comes after could not be prepared
+            if not self._is_free(entry):
                 continue
             if not self._engine.has_room(entry.job):
                 misses += 1
@@ -191,10 +193,10 @@ class BatchRun:
                 continue
             if moved is not None:
                 self._say(f"{name}: has changed; what it wrote before is in {moved}")
-            if not self._engine.takes_all:
+            if not takes_all:
                 self._submit([entry])
             fitting.append(entry)
-        if self._engine.takes_all and fitting:
+        if takes_all and fitting:
             self._submit(fitting)
         return bool(fitting)
 
@@ -206,11 +208,7 @@ class BatchRun:
                 self._over(entry, JobState.FAILED, str(error))
             return
         for entry in entries:
-            self._mark_running(entry)
-
-    def _mark_running(self, entry: Entry) -> None:
-        self._ready.pop(entry.job.name, None)
-        entry.state, entry.status = JobState.RUNNING, WorkerStatus()
+            entry.state, entry.status = JobState.RUNNING, WorkerStatus()
 
     def _collect(self, retry: bool = True) -> bool:
         """Take note of what has ended; whether something has."""
@@ -238,7 +236,6 @@ class BatchRun:
             elif retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
                 entry.retries += 1
                 entry.state = JobState.WAITING
-                self._ready[name] = None
                 self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
             else:
                 outcome = _OUTCOMES.get(state, JobState.FAILED)
@@ -246,27 +243,8 @@ class BatchRun:
         return bool(ended)
 
     def _over(self, entry: Entry, state: JobState, error: str = "") -> None:
-        """Take note of a job's end; those that come after it can start, or cannot any more."""
-        self._end(entry, state, error)
-        if state == JobState.FINISHED:
-            with suppress(ValueError):  # an engine that takes all finished it before another
-                self._order.done(entry.job.name)
-            for name in self._order.get_ready():
-                if self._entries[name].state == JobState.WAITING:
-                    self._ready[name] = None
-            return
-        after = JobState.CANCELLED if state == JobState.CANCELLED else JobState.BLOCKED
-        missing = {entry.job.name}
-        for child in self._entries.values():  # each after those that it comes after
-            cause = next((other for other in child.job.after if other in missing), None)
-            if cause is not None and child.state == JobState.WAITING:
-                self._end(child, after, f"it comes after {cause}, which is not finished")
-                missing.add(child.job.name)
-
-    def _end(self, entry: Entry, state: JobState, error: str) -> None:
-        self._ready.pop(entry.job.name, None)
+        """Take note of a job's end."""
         entry.state, entry.error = state, error
-        self._left -= 1
         self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
