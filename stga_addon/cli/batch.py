@@ -106,9 +106,11 @@ def batch_plan(options: Namespace) -> Plan:
 
 def with_threads(plan: Plan, threads: int) -> Plan:
     """The plan with so many threads for the jobs that name none."""
-    resources = (replace(j.resources, threads=j.resources.threads or threads) for j in plan.jobs)
-    jobs = zip(plan.jobs, resources, strict=True)
-    return replace(plan, jobs=tuple(replace(job, resources=needs) for job, needs in jobs))
+    jobs = []
+    for job in plan.jobs:
+        resources = replace(job.resources, threads=job.resources.threads or threads)
+        jobs.append(replace(job, resources=resources))
+    return replace(plan, jobs=tuple(jobs))
 
 
 def print_plan(plan: Plan) -> None:

@@ -160,8 +160,8 @@ def _pictures(request: Render, subject: _Subject, views: Sequence[View], report:
     from ..render.render import to_uint8
 
     folder, names = request.output, unique_names([view.name for view in views])
-    captured = {view.image for view in views}
-    overwritten = next((name for name in names if folder.resolve() / name in captured), None)
+    captured, target = {view.image for view in views}, folder.resolve()
+    overwritten = next((name for name in names if target / name in captured), None)
     if overwritten is not None:
         raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
     for view, name in counted(

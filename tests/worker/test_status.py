@@ -35,11 +35,11 @@ WORKER = """
 import os, sys, time
 from pathlib import Path
 from stga_addon.progress import Progress
-from stga_addon.worker.status import status.status_writer
+from stga_addon.worker.status import status_writer
 from stga_addon.errors import StgaError
 
 def main():
-    with status.status_writer(Path(sys.argv[1])) as writer:
+    with status_writer(Path(sys.argv[1])) as writer:
         print("a line of the log", flush=True)
         for n in range(2000):
             if writer.report(Progress(n / 2000, "counting", "on time",

@@ -5,6 +5,7 @@ import math
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from ...errors import StgaError
 from ...worker.helpers import processors
 from ...worker.launch import start_worker
 from ...worker.status import inspect_worker
+from ...worker.training_python import find_training_python
 from ..perform import worker_arguments
-from .plan import Ended, Engine, Job, training_python
+from .plan import Ended, Engine, Job
 
 MEMORY_SHARE = 0.9  # Share of the memory that is free at the start that workers may use
 GPUS = 1  # Jobs at once that need a GPU to themselves
@@ -33,7 +35,7 @@ class LocalEngine(Engine):
     ) -> None:
         self._cores = cores or processors()
         self._memory_gb = MEMORY_SHARE * free_memory_gb() if memory_gb is None else memory_gb
-        self._python = python or training_python()
+        self._python = python or find_training_python(sys.executable)
         self._jobs: dict[str, tuple[Job, subprocess.Popen[bytes] | None]] = {}
 
     def has_room(self, job: Job) -> bool:

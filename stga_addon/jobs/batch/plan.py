@@ -18,7 +18,7 @@ from ...schema import IS_PATH, complaint, from_json, setting, to_json, type_hint
 from ...training.run.folder import AVATAR
 from ...training.settings import TrainingSettings, make_settings
 from ...worker.status import WorkerSnapshot
-from ...worker.training_python import PYTHON_VARIABLE
+from ...worker.training_python import find_training_python
 from ..blender import RenderBlend
 from ..perform import request_folder, worker_arguments
 from ..table import JOBS, Request
@@ -167,12 +167,7 @@ class Engine(ABC):
 def job_command(job: Job) -> list[str]:
     """What a machine that sees the job's folder runs."""
     arguments = worker_arguments(job.request_folder, job.resources.threads or None, resume=True)
-    return [training_python(), "-m", *arguments]
-
-
-def training_python() -> str:
-    """The interpreter that carries out jobs: that of STGA_PYTHON, else this one."""
-    return os.environ.get(PYTHON_VARIABLE) or sys.executable
+    return [find_training_python(sys.executable), "-m", *arguments]
 
 
 # Plans

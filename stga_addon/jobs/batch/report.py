@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from ...training.run.folder import has_run, read_run
 from ...training.run.metrics_log import read_metrics
 from ...worker.status import log_lines
 from .run import Batch, Entry, JobState
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 MAX_LIVE_ROWS = 20  # Jobs that the live table shows: the running ones, then those that failed
 BAR_WIDTH = 20
@@ -241,29 +244,30 @@ def _pictures(runs: Sequence[Run]) -> str:
     shown = []
     for run in evenly_spread(runs, MAX_PICTURES):
         with suppress(StgaError, ModuleNotFoundError):
-            pair = held_out_pair(run.entry.job.folder)
-            if pair is not None:
-                from PIL import Image
-
-                psnr = f", {run.figures['psnr']:.2f} dB" if "psnr" in run.figures else ""
-                picture, out = Image.fromarray(pair), io.BytesIO()
-                height = min(2 * PICTURE_HEIGHT_PX, picture.height)
-                picture = picture.resize((round(picture.width * height / picture.height), height))
-                picture.save(out, "JPEG", quality=JPEG_QUALITY)
-                source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
-                name = html.escape(run.entry.job.name)
-                image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
-                shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
+            picture = _held_out_pair(run.entry.job.folder)
+            if picture is None:
+                continue
+            height = min(2 * PICTURE_HEIGHT_PX, picture.height)
+            picture = picture.resize((round(picture.width * height / picture.height), height))
+            out = io.BytesIO()
+            picture.save(out, "JPEG", quality=JPEG_QUALITY)
+            source = f"data:image/jpeg;base64,{base64.b64encode(out.getvalue()).decode()}"
+            name = html.escape(run.entry.job.name)
+            psnr = f", {run.figures['psnr']:.2f} dB" if "psnr" in run.figures else ""
+            image = f'<img alt="{name}" height="{PICTURE_HEIGHT_PX}" src="{source}">'
+            shown.append(f"<figure>{image}<figcaption>{name}{psnr}</figcaption></figure>")
     title = "<h2>Held-out views: image and avatar, from the lowest PSNR</h2>"
     return title + "".join(shown) if shown else ""
 
 
-def held_out_pair(run: Path) -> np.ndarray | None:
-    """(H, 2W, 3) uint8: a run's first evaluation view, image and avatar; None without one. Raises
-    StgaError where the run or its capture cannot be opened."""
+def _held_out_pair(run: Path) -> "Image.Image | None":
+    """A run's first evaluation view, image and avatar; None without one. Raises StgaError where the
+    run or its capture cannot be opened."""
+    from PIL import Image
+
     from ...avatar.file import read_avatar
     from ...capture.images import read_image
-    from ...render.render import render_avatar
+    from ...render.render import render_avatar, to_uint8
     from ...training.evaluate.metrics import choose_evaluation_views
     from ...training.run.folder import AVATAR, open_refined
 
@@ -273,10 +277,9 @@ def held_out_pair(run: Path) -> np.ndarray | None:
         return None
     avatar, view = read_avatar(run / AVATAR), views[0]
     red, green, blue = (round(255 * level) for level in avatar.background)
-    image = read_image(view, (red, green, blue))
-    rendered = render_avatar(avatar, capture.mesh(view.timestep), view.camera, avatar.background)
-    pixels = np.round(255 * np.clip(rendered, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
-    return np.hstack([image, pixels])
+    mesh = capture.mesh(view.timestep)
+    rendered = to_uint8(render_avatar(avatar, mesh, view.camera, avatar.background))
+    return Image.fromarray(np.hstack([read_image(view, (red, green, blue)), rendered]))
 
 
 def _table(batch: Batch, runs: Iterable[Run]) -> str:
