@@ -63,13 +63,9 @@ def _hold_file_lock(path: Path) -> Iterator[None]:
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:
-        with suppress(OSError):  # only messages need it
-            descriptor = os.open(path, os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0))
-            try:
-                os.lseek(descriptor, OWNER_OFFSET, os.SEEK_SET)
-                os.write(descriptor, b"%-20d" % os.getpid())
-            finally:
-                os.close(descriptor)
+        with suppress(OSError), path.open("r+b", buffering=0) as file:  # only messages need it
+            file.seek(OWNER_OFFSET)
+            file.write(b"%-20d" % os.getpid())
         yield
     finally:
         with suppress(OSError):  # Windows removes no open file, which leaves an empty lock behind

@@ -79,15 +79,3 @@ def test_what_is_left_of_flame_is_said(tmp_path, capsys):
     assert stga(*words, "--out", tmp_path / "a.stga") == 0
     said = "--motion-only leaves them out, but not the meshes of the take."
     assert said in capsys.readouterr().out
-
-
-def test_mistakes_are_one_sentence(avatar_file, tmp_path, capsys):
-    """Catches a traceback, a page under a name that no browser opens, and a range of frames that is
-    ignored."""
-    assert stga("export", avatar_file, "--format web --out", tmp_path / "a.txt") == 2
-    assert ".html" in capsys.readouterr().err
-    assert not (tmp_path / "a.txt").exists()
-    words = ["--frames", "1:2", "--out", str(tmp_path / "a.html")]
-    assert main(["export", str(avatar_file), "--format", "web", *words]) == 2
-    assert "give --capture" in capsys.readouterr().err
-    assert not (tmp_path / "a.html").exists()

@@ -1,7 +1,9 @@
 """The Python that tracks and trains: how it is chosen and checked."""
 
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,13 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.jobs.python_check import describe_check, finish_check, start_check
 from stga_addon.worker import training_python
-from stga_addon.worker.training_python import PYTHON_VARIABLE, REQUIREMENTS, find_training_python
+from stga_addon.worker.training_python import (
+    GPU_REQUIREMENT,
+    PYTHON_VARIABLE,
+    REQUIREMENTS,
+    find_training_python,
+    package_name,
+)
 
 FOUND = {
     "python": "3.11.7", "versions": dict.fromkeys(REQUIREMENTS, "1.0"), "failures": {},
@@ -83,3 +91,22 @@ def test_order_of_choices(monkeypatch):
     assert Path(find_training_python()).samefile(sys.executable)
     monkeypatch.setenv(PYTHON_VARIABLE, "/farm/python")
     assert find_training_python("/preferred/python") == "/farm/python"
+
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())[
+    "project"
+]
+
+
+def test_environment_and_project_require_the_same():
+    """Catches a training Python with other versions than an installation by pip."""
+    extras = PROJECT["optional-dependencies"]
+    assert sorted(REQUIREMENTS.values()) == sorted([*PROJECT["dependencies"], *extras["train"]])
+    assert GPU_REQUIREMENT in extras["gpu"]
+
+
+def test_requirements_are_bounded():
+    """Catches a release of a package, with other behavior, that reaches users untested."""
+    for requirement in [*REQUIREMENTS.values(), GPU_REQUIREMENT]:
+        assert re.fullmatch(r"[a-z-]+>=[\d.]+,<\d+", requirement)
+        assert re.fullmatch(r"[a-z-]+", package_name(requirement))

@@ -186,3 +186,27 @@ def _state(pid):
         return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[0]
     except OSError:
         return "Z"
+
+
+CLAIM = """
+import os, sys
+if {closed}: os.close(2)
+from stga_addon.worker.helpers import claim_stdout
+messages = claim_stdout()
+os.write(1, b"from C")
+if not {closed}: print("from Python")
+messages.write(b"message")
+messages.flush()
+"""
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_only_messages_reach_standard_output(closed: bool) -> None:
+    """Catches output of libraries between the messages, and a closed standard error that ends the
+    process."""
+    done = subprocess.run([sys.executable, "-c", CLAIM.format(closed=closed)], capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == b"message"
+    if not closed:
+        assert b"from C" in done.stderr
+        assert b"from Python" in done.stderr
