@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 from .. import __version__
 from ..errors import StgaError, one_line
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
-from .commands import COMMANDS, Command
+from .commands import COMMANDS
 
 
 class _Parser(argparse.ArgumentParser):
@@ -52,7 +52,7 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
             head = read_head(Path(folder))
         options = make_parser(head).parse_args(arguments)
         command = options.command
-        all_commands()[command].carry_out(options, head)
+        COMMANDS[command].carry_out(options, head)
     except StgaError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:
@@ -81,24 +81,18 @@ def _fail(message: str) -> int:
 
 def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     """The parser of all commands; what the head of the open file provides may be left out."""
+    if find_spec("..development", __package__) is not None:  # not in the extension's zip
+        import_module("..development.commands", __package__)  # adds its commands and requests
     top = _Parser(prog="stga", description="Selective-training Gaussian head avatars.")
     top.add_argument("--version", action="version", version=__version__)
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, command in all_commands().items():
+    for name, command in COMMANDS.items():
         about = " ".join(command.about.split()).replace("%", "%%")
         first = about.partition(". ")[0].rstrip(".")
         command.add_arguments(
             commands.add_parser(name, help=first[0].lower() + first[1:], description=about), head
         )
     return top
-
-
-def all_commands() -> dict[str, Command]:
-    """The commands of this installation; `development`, which the extension's zip leaves out, adds
-    its own, and its requests, when it is loaded."""
-    if find_spec("..development", __package__) is not None:
-        import_module("..development.commands", __package__)
-    return COMMANDS
 
 
 # Standard streams

@@ -126,7 +126,13 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
     for left in request.output.glob(PARTIAL + "*"):  # of a process that was killed
         shutil.rmtree(left, ignore_errors=True)
     with TemporaryDirectory(prefix=PARTIAL, dir=request.output) as partial:
-        process = _start(request, first, last, Path(partial))
+        names = str(Path(partial).absolute() / ("#" * FRAME_DIGITS))
+        process = _start([
+            *blender_command(), "--background", str(request.blend.absolute()),
+            "--engine", request.engine, "--render-output", names, "--render-format", "PNG",
+            "--use-extension", "1", "--frame-start", str(first), "--frame-end", str(last),
+            "--frame-jump", "1", "--render-anim",
+        ])  # fmt: skip
         printed: deque[str] = deque(maxlen=LAST_LINES)
         pictures, expected = request.pictures, first
         assert process.stdout is not None
@@ -164,13 +170,7 @@ def blender_command() -> list[str]:
     return shlex.split(text, posix=os.name != "nt") or ["blender"]
 
 
-def _start(request: RenderBlend, first: int, last: int, folder: Path) -> subprocess.Popen[str]:
-    blend, names = str(request.blend.absolute()), str(folder.absolute() / ("#" * FRAME_DIGITS))
-    command = [
-        *blender_command(), "--background", blend, "--engine", request.engine,
-        "--render-output", names, "--render-format", "PNG", "--use-extension", "1",
-        "--frame-start", str(first), "--frame-end", str(last), "--frame-jump", "1", "--render-anim",
-    ]  # fmt: skip
+def _start(command: list[str]) -> subprocess.Popen[str]:
     # Without the variables of this Python, whose place the add-on is told.
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     try:

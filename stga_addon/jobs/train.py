@@ -23,7 +23,7 @@ from ..report import CurveUpdater, report_run
 from ..schema import setting
 from ..training.effect_catalog import RELIGHT, WORLD
 from ..training.run import folder as run_folder
-from ..training.run.folder import AVATAR, OpenedRun, Run
+from ..training.run.folder import AVATAR, Continuation, OpenedRun, Run
 from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
@@ -335,7 +335,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
         raise StgaError(f"{parent}: its capture has no training views {between}")
     if not is_faced(capture, views, region):
         raise StgaError(f"region '{name}': faces no training camera {between}")
-    continuation = _continuation(parent, (first, last))
+    continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), first, last)
     run = replace(opened.run, settings=settings, identity=None, continuation=continuation)
     return Prepared(request, run, capture, {capture.timesteps[0]: region})
 
@@ -391,14 +391,11 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
         run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
         for take, start in zip(new, starts, strict=True)
     ]
-    continuation = _continuation(request.parent, (starts[0], max(capture.timesteps)))
+    parent, last = request.parent, max(capture.timesteps)
+    continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), starts[0], last)
     selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
     if unlike:
         names = ", ".join(view.name for view in unlike[:MAX_NAMED_VIEWS])
         say(f"warning: {names}: does not look like the head from this camera; are images swapped?")
     run = replace(run, identity=None, takes=(*run.takes, *added), continuation=continuation)
     return opened, capture, selection, run
-
-
-def _continuation(parent: Path, frames: tuple[int, int]) -> run_folder.Continuation:
-    return run_folder.Continuation(parent.resolve(), file_digest(parent / AVATAR), *frames)

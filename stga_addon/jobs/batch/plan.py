@@ -225,7 +225,7 @@ def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
         raise StgaError(f"{source}: out: expected the batch's folder as a text, got {shorten(out)}")
     if not isinstance(tables, dict) or not tables:
         raise StgaError(f"{source}: holds no job; expected a table [job.NAME]")
-    folder = _absolute(base, out)
+    folder = Path(_resolved(base, out))
     shared = _resources(f"{source}: [resources]", values.get("resources", {}), Resources())
     jobs = [_job(source, name, table, base, folder, shared) for name, table in tables.items()]
     by_name = {job.name: job for job in _with_inputs(source, jobs)}
@@ -308,13 +308,11 @@ def _request(
 
 
 def _resolved(base: Path, value: Any) -> Any:
+    """An absolute path, or a list of them; other values as they are."""
     if isinstance(value, list):
         return [_resolved(base, item) for item in value]
-    return str(_absolute(base, value)) if isinstance(value, str) and value else value
-
-
-def _absolute(base: Path, text: str) -> Path:
-    return Path(os.path.abspath(base / os.path.expanduser(text)))
+    is_path = isinstance(value, str) and value
+    return os.path.abspath(base / os.path.expanduser(value)) if is_path else value
 
 
 def _training_settings(where: str, changes: Any) -> Any:

@@ -61,12 +61,13 @@ class LiveTable:
 
 def table_lines(batch: Batch) -> list[str]:
     """A line on the whole batch, and one for each job that runs or has failed."""
-    shown = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
-    shown += batch.failures
-    width = max((len(entry.job.name) for entry in shown[:MAX_LIVE_ROWS]), default=0)
-    lines = [summary_line(batch), *(_row(entry, width) for entry in shown[:MAX_LIVE_ROWS])]
-    more = [f"… and {len(shown) - MAX_LIVE_ROWS} more"] if len(shown) > MAX_LIVE_ROWS else []
-    return lines + more
+    entries = [entry for entry in batch.entries.values() if entry.state == JobState.RUNNING]
+    entries += batch.failures
+    shown = entries[:MAX_LIVE_ROWS]
+    width = max((len(entry.job.name) for entry in shown), default=0)
+    lines = [summary_line(batch), *(_row(entry, width) for entry in shown)]
+    more = len(entries) - len(shown)
+    return [*lines, f"… and {more} more"] if more else lines
 
 
 def summary_line(batch: Batch) -> str:
