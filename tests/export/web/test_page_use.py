@@ -35,6 +35,8 @@ BATCH = 200
 MAX_HEAP_GROWTH = 300_000
 """Bytes that may be left over from a run of pictures: compiled code and the browser's own
 bookkeeping."""
+INPUT = """[...document.querySelectorAll('.slider')]
+  .find((row) => row.firstChild.textContent === name).querySelector('input')"""
 CAMERA = "[...document.querySelector('stga-avatar').camera.matrix]"
 MIDDLE_IN_CAMERA = """(() => {
   const { player, camera } = document.querySelector('stga-avatar');
@@ -164,8 +166,8 @@ def test_sliders_are_flames(browser, head, tmp_path):
     found = browser.evaluate(f"""(() => {{
       const avatar = document.querySelector('stga-avatar');
       for (const [k, value] of Object.entries({expressions.tolist()})) {{
-        const name = `expr_${{k.padStart(3, '0')}}`;
-        const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
+        const name = `Expression ${{k}}`;
+        const input = {INPUT};
         input.value = value;
         input.dispatchEvent(new Event('input'));
       }}
@@ -322,7 +324,7 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
     weights[[COLUMN["jawOpen"], COLUMN["mouthClose"]]] = 0.4, 0.9
     chosen = dict(zip(ARKIT_SHAPES, weights.tolist(), strict=True))
     script = f"""for (const [name, value] of Object.entries({chosen})) {{
-        const input = document.querySelector(`.slider[data-name="${{name}}"] input`);
+        const input = {INPUT};
         input.value = value;
         input.dispatchEvent(new Event('input'));
       }}"""

@@ -4,8 +4,7 @@
 
 /**
  * @import { Player } from './stga-avatar.js'
- * @import { Camera, Vector, View } from './types.js'
- * @typedef {[number, number]} Point pixels of the page
+ * @import { Camera, Pair, Vector, View } from './types.js'
  */
 
 import { box, crossed, difference, dotProduct, scaled, unit, vector } from './vector.js';
@@ -13,12 +12,11 @@ import { box, crossed, difference, dotProduct, scaled, unit, vector } from './ve
 const MAX_ELEVATION = 1.54; // radians; short of the pole, where "up" has no direction
 const MIN_DISTANCE_M = 0.02;
 
-// A view of the data file as a camera: { size, focal, center } in pixels, matrix (16): world to
-// camera, row-major.
+// A view of the data file as a camera.
 /** @type {(view: View) => Camera} */
 export function cameraOfView(view) {
-  const { size, focal, center } = structuredClone(view);
-  return { size, focal, center, matrix: Float64Array.from(view.world_to_camera) };
+  const { size, focal, center, world_to_camera } = structuredClone(view);
+  return { size, focal, center, matrix: Float64Array.from(world_to_camera) };
 }
 
 // The same camera for a canvas of another size, with the whole of its picture in the middle.
@@ -28,8 +26,8 @@ export function fitted(camera, width, height) {
   const scale = Math.min(width / size[0], height / size[1]);
   const x = width / 2 + (center[0] - size[0] / 2) * scale;
   const y = height / 2 + (center[1] - size[1] / 2) * scale;
-  const scaledFocal = /** @type {Point} */ (focal.map(length => length * scale));
-  return { size: [width, height], focal: scaledFocal, center: [x, y], matrix };
+  const [fx, fy] = focal;
+  return { size: [width, height], focal: [fx * scale, fy * scale], center: [x, y], matrix };
 }
 
 // A camera in front (+z, y up) of the points (3·V) for data without views.
@@ -55,8 +53,7 @@ export function bounds(points) {
   return [difference(high, scaled(diagonal, 0.5)), Math.hypot(...diagonal) / 2];
 }
 
-// Turn a camera around the point `pivot`: by `yaw` about `up` and by `pitch` about its own x axis
-// (radians).
+// Turn a camera around a point: by `yaw` about `up` and by `pitch` about its own x axis (radians).
 /** @type {(camera: Camera, pivot: Vector, up: Vector, yaw: number, pitch: number) => Camera} */
 export function orbited(camera, pivot, up, yaw, pitch) {
   const axis = unit(up);
@@ -66,8 +63,8 @@ export function orbited(camera, pivot, up, yaw, pitch) {
   return turned(aside, pivot, row(aside.matrix, 0), tilt);
 }
 
-// Shift a camera's picture by pixels; returns the camera and the point to orbit about, shifted with
-// the view.
+// Shift a camera's picture by pixels; returns the camera and the point to orbit about, which shifts
+// with the view.
 /** @type {(camera: Camera, pivot: Vector, dx: number, dy: number) => [Camera, Vector]} */
 export function panned(camera, pivot, dx, dy) {
   const depth = inCamera(camera.matrix, pivot)[2];
@@ -87,14 +84,6 @@ export function dollied(camera, pivot, factor) {
   const matrix = camera.matrix.slice();
   for (let k = 0; k < 3; k++) matrix[4 * k + 3] += (kept - 1) * q[k];
   return { ...camera, matrix };
-}
-
-// A direction turned with what faces the camera: `yaw` moves that to the right, `pitch` down
-// (radians).
-/** @type {(camera: Camera, direction: Vector, yaw: number, pitch: number) => Vector} */
-export function turnedAsSeen(camera, direction, yaw, pitch) {
-  const aside = rotatedAbout(direction, row(camera.matrix, 1), -yaw);
-  return rotatedAbout(aside, row(camera.matrix, 0), pitch);
 }
 
 // Rotate about a world axis through `pivot`, which stays where it is in the picture.
@@ -135,8 +124,8 @@ const MAX_WHEEL_PX = 120; // of one event, so that no mouse jumps
 // distance zooms.
 /** @type {(element: HTMLElement, player: () => ?Player, changed: (name: string) => void) => void} */
 export function addControls(element, player, changed) {
-  /** @type {Map<number, Point>} */
-  const pointers = new Map();
+  /** @type {Map<number, Pair>} */
+  const pointers = new Map(); // pixels of the page
   element.addEventListener('contextmenu', event => event.preventDefault());
   element.addEventListener('pointerdown', event => {
     element.setPointerCapture(event.pointerId);
@@ -155,7 +144,9 @@ export function addControls(element, player, changed) {
     const [dx, dy] = middle(after).map((place, axis) => place - middle(before)[axis]);
     const [yaw, pitch] = [dx * ORBIT_PER_PIXEL, dy * ORBIT_PER_PIXEL];
     if (event.altKey && after.length === 1 && lighting?.sun) {
-      const toward = turnedAsSeen(camera, lighting.sun.toward, yaw, pitch);
+      // With what faces the camera.
+      const aside = rotatedAbout(lighting.sun.toward, row(camera.matrix, 1), -yaw);
+      const toward = rotatedAbout(aside, row(camera.matrix, 0), pitch);
       shown.lighting = { ...lighting, sun: { ...lighting.sun, toward } };
       changed('lightchange');
       return;
@@ -183,11 +174,8 @@ export function addControls(element, player, changed) {
   }, { passive: false });
 }
 
-/** @param {Point[]} points one or two */
-function middle(points) {
-  const [a, b] = [points[0], points[1] ?? points[0]];
-  return [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
-}
+/** @param {Pair[]} points one or two */
+const middle = ([a, b = a]) => [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2];
 
-/** @param {Point[]} points two, or more */
+/** @param {Pair[]} points two, or more */
 const distance = ([a, b]) => Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1]));

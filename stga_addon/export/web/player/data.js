@@ -8,9 +8,7 @@ import { SIGNALS } from './face_frames.js';
 export class DataError extends Error {}
 
 const VERSION = 2;
-const MAX_BYTES = 1 << 30;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
-const CHANNELS = 3;
 
 // Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
 /** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Data>} */
@@ -18,52 +16,32 @@ export async function readData(bytes) {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b)
     throw new DataError('This is not an avatar data file.');
   const raw = await inflate(bytes);
-  const view = new DataView(raw.buffer, raw.byteOffset, raw.byteLength);
+  const view = new DataView(raw.buffer);
   if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
     throw new DataError('This is not an avatar data file.');
   const version = view.getUint32(4, true);
   if (version !== VERSION)
     throw new DataError(`The avatar has format version ${version}; this player reads ${VERSION}.`);
-  const length = view.getUint32(8, true);
-  if (12 + length > raw.length) throw new DataError('The avatar data is cut off.');
-  const header = parseHeader(raw.subarray(12, 12 + length));
-  const arrays = readArrays(header, raw.subarray(12 + length));
-  checkData(header, arrays);
-  return /** @type {any} */ ({ header, arrays });
-}
-
-/** @type {(bytes: Uint8Array<ArrayBuffer>) => Promise<Uint8Array>} */
-async function inflate(bytes) {
-  const inflated = new DecompressionStream('gzip');
-  /** @type {Uint8Array<ArrayBuffer>[]} */
-  const chunks = [];
-  let size = 0;
+  const end = 12 + view.getUint32(8, true);
+  if (end > raw.length) throw new DataError('The avatar data is cut off.');
+  let header;
   try {
-    const reader = new Blob([bytes]).stream().pipeThrough(inflated).getReader();
-    for (let part = await reader.read(); !part.done; part = await reader.read()) {
-      chunks.push(part.value);
-      size += part.value.length;
-      if (size > MAX_BYTES) throw new DataError('The avatar data is too large.');
-    }
-  } catch (error) {
-    throw error instanceof DataError ? error : new DataError('The avatar data is damaged.');
-  }
-  const raw = new Uint8Array(size);
-  let at = 0;
-  for (const chunk of chunks) {
-    raw.set(chunk, at);
-    at += chunk.length;
-  }
-  return raw;
-}
-
-/** @type {(bytes: Uint8Array) => any} */
-function parseHeader(bytes) {
-  try {
-    const header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(bytes));
-    if (header.format === 'stga-web' && header.version === VERSION) return header;
+    header = JSON.parse(new TextDecoder('utf-8', { fatal: true }).decode(raw.subarray(12, end)));
   } catch {} // reported below
-  throw new DataError('The header of the avatar data is damaged.');
+  require(header instanceof Object, 'header');
+  const arrays = readArrays(header, raw.subarray(end));
+  checkData(header, arrays);
+  return { header, arrays };
+}
+
+/** @param {Uint8Array<ArrayBuffer>} bytes */
+async function inflate(bytes) {
+  try {
+    const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
+    return new Uint8Array(await new Response(inflated).arrayBuffer());
+  } catch {
+    throw new DataError('The avatar data is damaged.');
+  }
 }
 
 /** @type {(header: any, payload: Uint8Array) => Record<string, DataArray>} */
@@ -90,9 +68,7 @@ function readArrays(header, payload) {
 function decoded(name, entry, block, count) {
   if (entry.type === 'float32') return new Float32Array(block.slice().buffer);
   const step = entry.type === 'fixed' ? entry.step : 1;
-  require((entry.type === 'fixed' || entry.type === 'integer') &&
-    step > 0 &&
-    Number.isFinite(step), `${name}.type`);
+  require(['fixed', 'integer'].includes(entry.type) && step > 0 && step < Infinity, `${name}.type`);
   require(Number.isSafeInteger(entry.low), `${name}.low`);
   const values = entry.type === 'fixed' ? new Float32Array(count) : new Int32Array(count);
   const columns = count ? (entry.shape.at(-1) ?? 1) : 0;
@@ -116,67 +92,59 @@ function checkData(header, arrays) {
   const joints = list(header.parents, 'parents').length;
   const isEmpty = !vertices || !faces || !joints || !frames;
   require(!isEmpty, 'number of vertices, triangles, joints or frames');
-  /** @type {Record<string, number[]>} */
-  const shapesOf = {
-    xyz: [splats, 3],
-    rotation: [splats, 3],
-    rotation_largest: [splats],
-    log_scale: [splats, 3],
-    opacity: [splats],
-    color: [splats, CHANNELS],
-    faces: [faces, 3],
-    neutral: [vertices, 3],
-    splats_per_face: [faces],
-    base: [vertices, 3],
-    basis: [shapes, vertices, 3],
-    correctives: [9 * (joints - 1), vertices, 3],
-    weights: [vertices, joints],
-    joint_rest: [joints, 3],
-    joint_basis: [shapes, joints, 3],
-    coefficients: [frames, shapes],
-    pose: [frames, joints, 3],
-    translation: [frames, 3],
-  };
-  /** @type {Record<string, number[]>} */
-  const optional = {
-    selection: [frames, Math.ceil(faces / 8)],
-    strain_color: [splats, 3 * CHANNELS],
-    strain_range: [faces, 6],
-    sh: [splats, arrays.sh?.shape[1]],
-  };
+  /** @type {[string, ...number[]][]} */
+  const shapesOf = [
+    ['xyz rotation log_scale color', splats, 3],
+    ['opacity rotation_largest', splats],
+    ['base neutral', vertices, 3],
+    ['faces', faces, 3],
+    ['splats_per_face', faces],
+    ['basis', shapes, vertices, 3],
+    ['correctives', 9 * (joints - 1), vertices, 3],
+    ['weights', vertices, joints],
+    ['joint_rest', joints, 3],
+    ['joint_basis', shapes, joints, 3],
+    ['coefficients', frames, shapes],
+    ['pose', frames, joints, 3],
+    ['translation', frames, 3],
+  ];
+  /** @type {[string, ...number[]][]} */
+  const optional = [
+    ['selection', frames, Math.ceil(faces / 8)],
+    ['strain_color', splats, 9],
+    ['strain_range', faces, 6],
+    ['sh', splats, [9, 24, 45].find(count => count === arrays.sh?.shape[1]) ?? 0],
+  ];
   for (const [name, { components }] of Object.entries(SIGNALS))
-    optional[name] = [faces, 3 * components];
-  for (const name in optional) if (arrays[name]) shapesOf[name] = optional[name];
+    optional.push([name, faces, 3 * components]);
+  shapesOf.push(...optional.filter(([name]) => arrays[name]));
   if (header.shapes) {
-    const controls = list(header.shapes.names, 'shapes').length;
+    const controls = strings(header.shapes.names, 'shapes');
     const moved = size(arrays, 'shape_products', 1);
     require(moved <= shapes, 'shape_products');
-    shapesOf.shape_linear = [controls, moved + 9];
-    shapesOf.shape_products = [controls, moved];
+    shapesOf.push(['shape_linear', controls.length, moved + 9]);
+    shapesOf.push(['shape_products', controls.length, moved]);
+    const { opens, limited } = header.shapes;
+    require(controls.includes(opens) && controls.includes(limited), 'shapes');
   }
+  const limits = { faces: vertices, rotation_largest: 4, splats_per_face: splats + 1 };
   if (header.light) {
     const { damping, recorded, typical } = header.light;
     require(damping >= 0 && damping <= 1 && numbers(recorded, 27) && numbers(typical, 3), 'light');
     const lashes = arrays.light_lash_face?.shape[0] ?? 0;
-    Object.assign(shapesOf, {
-      light_transfer: [vertices, 9],
-      light_occlusion: [vertices],
-      light_irradiance: [vertices, 3],
-      light_roughness: [vertices],
-      light_face: [splats],
-      light_lash_face: [lashes],
-      light_lash_corners: [lashes, 12],
-    });
+    shapesOf.push(['light_transfer', vertices, 9], ['light_irradiance', vertices, 3]);
+    shapesOf.push(['light_occlusion light_roughness', vertices], ['light_face', splats]);
+    shapesOf.push(['light_lash_face', lashes], ['light_lash_corners', lashes, 12]);
+    Object.assign(limits, { light_face: faces, light_lash_face: faces });
   }
 
-  for (const [name, expected] of Object.entries(shapesOf)) {
-    const { shape, values } = arrays[name] ?? { shape: [], values: [] };
-    require(shape.join() === expected.join(), name);
-    require(!(values instanceof Float32Array) || values.every(Number.isFinite), name);
+  for (const [names, ...expected] of shapesOf) {
+    for (const name of names.split(' ')) {
+      const { shape, values } = arrays[name] ?? { shape: [], values: [] };
+      require(shape.join() === expected.join(), name);
+      require(!(values instanceof Float32Array) || values.every(Number.isFinite), name);
+    }
   }
-  require(!arrays.sh || [9, 24, 45].includes(arrays.sh.shape[1]), 'sh');
-  const limits = { faces: vertices, rotation_largest: 4, splats_per_face: splats + 1 };
-  if (header.light) Object.assign(limits, { light_face: faces, light_lash_face: faces });
   for (const [name, past] of Object.entries(limits)) {
     require(arrays[name].values.every(value => isIndex(value, past)), name);
   }
@@ -186,24 +154,18 @@ function checkData(header, arrays) {
     require(parent === -1 || isIndex(parent, joint), 'parents');
   require(header.convention === 'stga' || header.convention === 'gaussian_avatars', 'convention');
   require(typeof header.antialiased === 'boolean', 'antialiased');
-  require(typeof header.title === 'string', 'title');
+  require(isText(header.title), 'title');
   require(numbers([header.fps], 1) && header.fps > 0 && header.fps <= 1000, 'fps');
   require(numbers(header.background, 3), 'background');
   require(Math.min(...header.background, 1 - Math.max(...header.background)) >= 0, 'background');
   require(numbers(header.up, 3) && Math.hypot(...header.up) > 0.1, 'up');
   require(strings(header.joints, 'joints').length === joints, 'joints');
   for (const slider of list(header.sliders, 'sliders')) {
-    require(typeof slider?.name === 'string' && isIndex(slider.component, shapes), 'sliders');
+    require(isText(slider?.name) && isIndex(slider.component, shapes), 'sliders');
     require(slider.reach > 0 && Number.isFinite(slider.reach), 'sliders');
   }
-  if (header.shapes) {
-    const controls = strings(header.shapes.names, 'shapes');
-    require([header.shapes.opens, header.shapes.limited].every(n =>
-      controls.includes(n),
-    ), 'shapes');
-  }
   for (const view of list(header.views, 'views')) {
-    require(typeof view?.name === 'string' && numbers(view.size, 2), 'views');
+    require(isText(view?.name) && numbers(view.size, 2), 'views');
     for (const side of view.size) require(side && isIndex(side, MAX_VIEW_SIZE), 'views');
     require(numbers(view.focal, 2) && Math.min(...view.focal) > 0, 'views');
     require(numbers(view.center, 2) && numbers(view.world_to_camera, 16), 'views');
@@ -231,9 +193,11 @@ function list(value, name) {
 
 /** @type {(value: any, name: string) => string[]} */
 function strings(value, name) {
-  require(list(value, name).every(text => typeof text === 'string'), name);
+  require(list(value, name).every(isText), name);
   return value;
 }
+
+const isText = (/** @type {unknown} */ value) => typeof value === 'string';
 
 /** @type {(holds: unknown, field: string) => void} */
 function require(holds, field) {

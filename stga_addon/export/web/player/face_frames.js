@@ -11,27 +11,9 @@ const MAX_STRAIN = 2;
 const AVERAGING_ROUNDS = 3; // of smoothed strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
-// Sides u and v of triangles from corner 0, and their product, twice the area long (9·F).
-/** @type {(faces: Values, vertices: ArrayLike<number>, out?: Float64Array) => Float64Array} */
-export function sidesOf(faces, vertices, out = new Float64Array(3 * faces.length)) {
-  for (let at = 0; at < out.length; at += 9) {
-    const i = 3 * faces[at / 3];
-    const j = 3 * faces[at / 3 + 1];
-    const k = 3 * faces[at / 3 + 2];
-    for (let c = 0; c < 3; c++) {
-      out[at + c] = vertices[j + c] - vertices[i + c];
-      out[at + 3 + c] = vertices[k + c] - vertices[i + c];
-    }
-    out[at + 6] = out[at + 1] * out[at + 5] - out[at + 2] * out[at + 4];
-    out[at + 7] = out[at + 2] * out[at + 3] - out[at] * out[at + 5];
-    out[at + 8] = out[at] * out[at + 4] - out[at + 1] * out[at + 3];
-  }
-  return out;
-}
-
 class Strain {
-  // By the sides of the neutral triangles. Without a range (6·F: lowest three, highest three of a
-  // triangle) in the file, strain is within ±MAX_STRAIN.
+  // By `FaceFrames.sides` of the neutral mesh. Without a range (6·F: lowest three, highest three of
+  // a triangle) in the file, strain is within ±MAX_STRAIN.
   /** @param {Arrays} arrays @param {Float64Array} sides */
   constructor(arrays, sides) {
     const faces = arrays.faces.values;
@@ -48,28 +30,25 @@ class Strain {
     this.share = new Float64Array(vertices); // of a triangle in the means of vertex and triangle
     this.atVertex = new Float64Array(6 * vertices);
     for (const vertex of faces) this.share[vertex]++;
-    for (let v = 0; v < vertices; v++) this.share[v] = 1 / (3 * Math.max(1, this.share[v]));
-    for (let f = 0; f < count; f++) this.prepare(f, sides);
-  }
-
-  /** @type {(f: number, sides: Float64Array) => void} */
-  prepare(f, sides) {
-    const [u, v, normal] = [0, 3, 6].map(k => sides.subarray(9 * f + k, 9 * f + k + 3));
-    this.gram.set([dotProduct(u, u), dotProduct(u, v), dotProduct(v, v)], 3 * f);
-    const square = dotProduct(normal, normal);
-    if (square < MIN_SQUARED_NORMAL) return;
-    const a1 = scaled(crossed(v, normal), 1 / square);
-    const a2 = scaled(crossed(normal, u), 1 / square);
-    const along = unit(u);
-    const across = scaled(crossed(normal, along), 1 / Math.sqrt(square));
-    symmetricProduct(a1, a1, 0.5, this.toTensor, 18 * f);
-    symmetricProduct(a1, a2, 1, this.toTensor, 18 * f + 6);
-    symmetricProduct(a2, a2, 0.5, this.toTensor, 18 * f + 12);
-    symmetricProduct(along, along, 1, this.toPlane, 18 * f);
-    symmetricProduct(across, across, 1, this.toPlane, 18 * f + 6);
-    symmetricProduct(along, across, 1, this.toPlane, 18 * f + 12);
-    // A tensor has each of the mixed components twice.
-    for (let k = 0; k < 18; k++) if (k % 6 > 2) this.toPlane[18 * f + k] *= 2;
+    this.share = this.share.map(faces => 1 / (3 * Math.max(1, faces)));
+    for (let f = 0; f < count; f++) {
+      const [u, v, normal] = [0, 3, 6].map(k => sides.subarray(9 * f + k, 9 * f + k + 3));
+      this.gram.set([dotProduct(u, u), dotProduct(u, v), dotProduct(v, v)], 3 * f);
+      const square = dotProduct(normal, normal);
+      if (square < MIN_SQUARED_NORMAL) continue;
+      const a1 = scaled(crossed(v, normal), 1 / square);
+      const a2 = scaled(crossed(normal, u), 1 / square);
+      const along = unit(u);
+      const across = scaled(crossed(normal, along), 1 / Math.sqrt(square));
+      symmetricProduct(a1, a1, 0.5, this.toTensor, 18 * f);
+      symmetricProduct(a1, a2, 1, this.toTensor, 18 * f + 6);
+      symmetricProduct(a2, a2, 0.5, this.toTensor, 18 * f + 12);
+      symmetricProduct(along, along, 1, this.toPlane, 18 * f);
+      symmetricProduct(across, across, 1, this.toPlane, 18 * f + 6);
+      symmetricProduct(along, across, 1, this.toPlane, 18 * f + 12);
+      // A tensor has each of the mixed components twice.
+      for (let k = 0; k < 18; k++) if (k % 6 > 2) this.toPlane[18 * f + k] *= 2;
+    }
   }
 
   // Follow the sides of the posed triangles: add every triangle's tensor to its three vertices,
@@ -209,7 +188,6 @@ function symmetricProduct(a, b, factor, out, at) {
 // updated first.
 export const SIGNALS = { strain_position: SmoothedStrain };
 
-const MIN_DIVISOR = 1e-30;
 const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
 const UPRIGHT_COSINE = 0.8;
 // Of a triangle in the texture: three rows of matrix | origin, then strain | selected.
@@ -220,27 +198,27 @@ export class FaceFrames {
   // follow it.
   /** @param {Arrays} arrays @param {string} convention */
   constructor(arrays, convention) {
-    const faces = arrays.faces.values;
-    const neutral = arrays.neutral.values;
-    this.faces = faces;
-    this.count = faces.length / 3;
+    this.faces = arrays.faces.values;
+    this.count = this.faces.length / 3;
     this.isStga = convention === 'stga';
     // Rotation · scale and origin, rows of a 3×4 matrix.
     this.world = new Float64Array(12 * this.count);
-    this.sides = sidesOf(faces, neutral); // of the triangles as last placed
-    this.neutralArea = neutralAreas(this.sides);
+    // Of the triangles as last placed: sides u and v from corner 0 and their product, twice the
+    // area long (9·F); area, 0 of those that count as lines.
+    this.sides = new Float64Array(9 * this.count);
+    this.area = new Float64Array(this.count);
+    this.neutralArea = this.area; // while it is the neutral mesh that is placed
+    this.placeFrames(Float64Array.from(arrays.neutral.values));
+    this.neutralArea = this.area.slice();
     const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
     const followsStrain = arrays.strain_color || offsets.length;
     const strain = followsStrain ? new Strain(arrays, this.sides) : null;
     this.strain = strain;
     /** Signals and their coefficients (3·S·F): for each of S components a vector in the frame. */
-    this.offsets = strain
-      ? offsets.map(([name, Signal]) => ({
-          signal: new Signal(strain),
-          components: Signal.components,
-          coefficients: arrays[name].values,
-        }))
-      : [];
+    this.offsets = offsets.flatMap(([name, Signal]) => {
+      const { values } = arrays[name];
+      return strain ? { signal: new Signal(strain), coefficients: values } : [];
+    });
   }
 
   // Follow the posed vertices (3·V).
@@ -248,9 +226,9 @@ export class FaceFrames {
   update(vertices) {
     this.placeFrames(vertices);
     this.strain?.update(this.sides);
-    for (const { signal, components, coefficients } of this.offsets) {
+    for (const { signal, coefficients } of this.offsets) {
       signal.update();
-      this.moveOrigins(signal.values, components, coefficients);
+      this.moveOrigins(signal.values, coefficients);
     }
   }
 
@@ -259,16 +237,23 @@ export class FaceFrames {
   // along the first edge; scale the mean of edge and height.
   /** @param {Float64Array} vertices */
   placeFrames(vertices) {
-    const { faces, isStga, neutralArea, world } = this;
-    const sides = sidesOf(faces, vertices, this.sides);
+    const { area, faces, isStga, neutralArea, sides, world } = this;
     const [first, normal] = [new Float64Array(3), new Float64Array(3)];
     for (let f = 0, at = 0; f < this.count; f++, at += 9) {
+      const corner = 3 * faces[3 * f];
+      const second = 3 * faces[3 * f + 1];
+      const third = 3 * faces[3 * f + 2];
+      for (let k = 0; k < 3; k++) {
+        sides[at + k] = vertices[second + k] - vertices[corner + k];
+        sides[at + 3 + k] = vertices[third + k] - vertices[corner + k];
+      }
       let [uu, vv, ww, twice, length] = [0, 0, 0, 0, 0];
       for (let k = 0; k < 3; k++) {
+        const [a, b] = [at + ((k + 1) % 3), at + ((k + 2) % 3)];
         const u = sides[at + k];
         const v = sides[at + 3 + k];
         first[k] = isStga ? -(u + v) / 3 : u;
-        normal[k] = sides[at + 6 + k];
+        normal[k] = sides[at + 6 + k] = sides[a] * sides[b + 3] - sides[b] * sides[a + 3];
         uu += u * u;
         vv += v * v;
         ww += (v - u) * (v - u);
@@ -280,6 +265,7 @@ export class FaceFrames {
       const longest = Math.max(uu, vv, ww);
       const isShort = length <= MIN_AREA_RATIO * Math.sqrt(longest);
       const isLine = twice <= 2 * MIN_AREA_RATIO * longest;
+      area[f] = isLine ? 0 : twice / 2;
       let scale = 1;
       if (!isStga) scale = (length + (isShort ? Math.sqrt(vv) : twice / length)) / 2;
       else if (neutralArea[f] > 0) scale = Math.sqrt(twice / 2 / neutralArea[f]);
@@ -288,7 +274,6 @@ export class FaceFrames {
         first[k] *= isShort || isLine ? scale : scale / length;
         normal[k] *= isShort || isLine ? 1 : 1 / twice;
       }
-      const corner = 3 * faces[3 * f];
       for (let k = 0, to = 12 * f; k < 3; k++, to += 4) {
         const a = k < 2 ? k + 1 : 0;
         const b = k > 0 ? k - 1 : 2;
@@ -303,9 +288,10 @@ export class FaceFrames {
 
   // Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and
   // unit.
-  /** @type {(values: Float64Array, components: number, coefficients: Values) => void} */
-  moveOrigins(values, components, coefficients) {
+  /** @type {(values: Float64Array, coefficients: Values) => void} */
+  moveOrigins(values, coefficients) {
     const { count, world } = this;
+    const components = values.length / count;
     for (let f = 0; f < count; f++) {
       let [x, y, z] = [0, 0, 0];
       for (let k = components * f; k < components * (f + 1); k++) {
@@ -348,18 +334,6 @@ export class FaceFrames {
       out[to + 3] = selection ? (selection[f >> 3] >> (7 - (f & 7))) & 1 : 1;
     }
   }
-}
-
-// Areas of triangles by their sides; 0 for those that count as lines.
-/** @param {Float64Array} sides */
-function neutralAreas(sides) {
-  return Float64Array.from({ length: sides.length / 9 }, (_, f) => {
-    const [u, v, normal] = [0, 3, 6].map(k => sides.subarray(9 * f + k, 9 * f + k + 3));
-    const area = Math.hypot(...normal) / 2;
-    const w = difference(v, u);
-    const longest = Math.max(dotProduct(u, u), dotProduct(v, v), dotProduct(w, w));
-    return area > Math.max(MIN_AREA_RATIO * longest, MIN_DIVISOR) ? area : 0;
-  });
 }
 
 // Make first and normal of a triangle that is a line, or whose `first` has no length, perpendicular

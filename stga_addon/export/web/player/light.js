@@ -3,15 +3,13 @@
 // reflects it. Axes are those of the data file's meshes; the rules are those of STGA for Blender's
 // light/.
 
-/**
- * @import { Arrays, Data, GL, LightOfCapture, Lighting, LitBy } from './types.js'
- * @import { Program, Sun, Values, Vector } from './types.js'
- */
+/** @import { Arrays, Data, DataArray, GL, LightOfCapture, Lighting, LitBy } from './types.js' */
+/** @import { Sun, Uniforms, Values, Vector } from './types.js' */
 
 import { bounds, rotatedAbout } from './camera.js';
 import { FaceFrames } from './face_frames.js';
-import { bindTexture, deleteTarget, floatTexture, makeTarget } from './renderer.js';
-import { paddedLength, program, updateTexture } from './renderer.js';
+import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength } from './renderer.js';
+import { program, updateTexture } from './renderer.js';
 import { LIFT_M, MAP_SIZE, SURFACE_TEXELS, TEXTURE_WIDTH, VERTEX_TEXELS } from './shaders.js';
 import { OVER_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER, SHADOW_VERTEX_SHADER } from './shaders.js';
 import { lightFragmentShader } from './shaders.js';
@@ -55,13 +53,13 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
   let sun = lighting.sun ?? null;
   check([...even, turn, exposure], 5, 'even, turn and exposure');
   const world = new Float64Array(3 * HARMONICS);
-  addEven(world, even);
+  let everywhere = even;
   if (environment !== undefined) {
     if (!Object.hasOwn(ENVIRONMENTS, environment))
       throw new RangeError(`There is no environment "${environment}".`);
-    const { even, lobes, sun: own } = ENVIRONMENTS[environment];
+    const { lobes, sun: own, ...found } = ENVIRONMENTS[environment];
     const turned = fromUpright(up, turn);
-    addEven(world, even);
+    everywhere = vector(k => even[k] + found.even[k]);
     for (const { toward, color } of lobes)
       addPoint(world, turned(unit(toward)), color, COSINE_LOBE);
     if (own) sun ??= { toward: turned(own.toward), color: own.color };
@@ -70,6 +68,7 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
     check(harmonics, 3 * HARMONICS, 'harmonics');
     for (let k = 0; k < world.length; k++) world[k] += harmonics[k];
   }
+  for (let c = 0; c < 3; c++) world[c] += everywhere[c] / DEGREE_0;
   if (sun) check([...sun.toward, ...sun.color], 6, 'sun');
   sun = sun && { toward: unit(sun.toward), color: sun.color };
   return { world, sun, factor: 2 ** exposure };
@@ -85,12 +84,11 @@ function fromUpright(up, turn) {
   return v => rotatedAbout(rotatedAbout(v, about, angle), unit(up), turn);
 }
 
-/** @type {(values: ArrayLike<number>, count: number, name: string) => void} */
+/** @type {(values: number[], count: number, name: string) => void} */
 function check(values, count, name) {
-  if (values.length !== count || !Array.from(values).every(Number.isFinite)) {
-    const problem = 'holds something else than finite numbers, or too few or too many';
+  const problem = 'holds something else than finite numbers, or too few or too many';
+  if (values.length !== count || !values.every(Number.isFinite))
     throw new RangeError(`Lighting: ${name} ${problem}.`);
-  }
 }
 
 // Spherical harmonics of degree 2, in which distant light is kept: nine coefficients of red, green
@@ -107,18 +105,11 @@ const COSINE_LOBE = [1, 2 / 3, 2 / 3, 2 / 3, 0.25, 0.25, 0.25, 0.25, 0.25].map(k
 
 // Basis functions of a unit vector, orthonormal on the sphere: 1, y, z, x, xy, yz, 3z² − 1, xz, x²
 // − y².
-/** @param {ArrayLike<number>} direction */
-function harmonicsOf(direction) {
-  const [x, y, z] = [direction[0], direction[1], direction[2]];
+/** @param {Vector} direction */
+function harmonicsOf([x, y, z]) {
   const linear = [DEGREE_0, DEGREE_1 * y, DEGREE_1 * z, DEGREE_1 * x];
   const [xy, yz, xz, sides] = [x * y, y * z, x * z, (x * x - y * y) / 2].map(v => DEGREE_2 * v);
   return [...linear, xy, yz, UPRIGHT * (3 * z * z - 1), xz, sides];
-}
-
-// Add light of a color from everywhere.
-/** @type {(light: Float64Array, color: ArrayLike<number>) => void} */
-function addEven(light, color) {
-  for (let c = 0; c < 3; c++) light[c] += color[c] / DEGREE_0;
 }
 
 // Add light of an irradiance from one direction; COSINE_LOBE as `lobe`: radiance that falls with
@@ -155,11 +146,18 @@ function rotatedLight(light, rotation) {
 
 // What arrives at a head, and how much of its recorded colors that keeps
 
-// The rotation (3×3, row by row) that best takes vertices to others (both 3·V), by weights (V): the
-// orthogonal factor of their weighted covariance (Higham's iteration).
-/** @type {(from: Values, to: Values, weights: Values) => number[]} */
-function rigidRotation(from, to, weights) {
-  let m = covariance(from, to, weights);
+// The rotation (3×3, row by row) that best takes vertices to those of the neutral mesh (both 3·V),
+// by `arms`, the latter's weighted places about their mean: the orthogonal factor of the covariance
+// (Higham's iteration).
+/** @type {(arms: Values, vertices: ArrayLike<number>) => number[]} */
+function rigidRotation(arms, vertices) {
+  const covariance = Array(9).fill(0);
+  for (let at = 0; at < arms.length; at += 3) {
+    for (let k = 0; k < 9; k++)
+      covariance[k] += arms[at + Math.floor(k / 3)] * vertices[at + (k % 3)];
+  }
+  const norm = Math.hypot(...covariance) || 1;
+  let m = covariance.map(value => value / norm);
   for (let k = 0; k < 30; k++) {
     const [r0, r1, r2] = [m.slice(0, 3), m.slice(3, 6), m.slice(6, 9)];
     const cofactors = [crossed(r1, r2), crossed(r2, r0), crossed(r0, r1)].flat();
@@ -174,22 +172,17 @@ function rigidRotation(from, to, weights) {
   return m;
 }
 
-// Σ weight · to · fromᵀ about the weighted means, over its norm.
-/** @type {(from: Values, to: Values, weights: Values) => number[]} */
-function covariance(from, to, weights) {
-  const sums = { from: [0, 0, 0], to: [0, 0, 0], weight: 0 };
-  const m = Array(9).fill(0);
+// Neutral vertices (3·V) about their mean, times weights (V), for `rigidRotation`.
+/** @type {(neutral: Values, weights: ArrayLike<number>) => Float64Array} */
+function weightedArms(neutral, weights) {
+  const sums = [0, 0, 0, 0];
   for (let v = 0; v < weights.length; v++) {
-    sums.weight += weights[v];
-    for (let i = 0; i < 3; i++) {
-      sums.from[i] += weights[v] * from[3 * v + i];
-      sums.to[i] += weights[v] * to[3 * v + i];
-      for (let j = 0; j < 3; j++) m[3 * i + j] += weights[v] * to[3 * v + i] * from[3 * v + j];
-    }
+    for (let c = 0; c < 3; c++) sums[c] += weights[v] * neutral[3 * v + c];
+    sums[3] += weights[v];
   }
-  for (let k = 0; k < 9; k++) m[k] -= (sums.to[Math.floor(k / 3)] * sums.from[k % 3]) / sums.weight;
-  const norm = Math.hypot(...m) || 1;
-  return m.map(value => value / norm);
+  const arm = (/** @type {number} */ place, /** @type {number} */ k) =>
+    weights[Math.floor(k / 3)] * (place - sums[k % 3] / sums[3]);
+  return Float64Array.from(neutral, arm);
 }
 
 // Irradiance (3·V) of light (harmonics in the head's axes) past the head itself.
@@ -224,13 +217,12 @@ class Bounce {
     const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
       Math.floor((value - low[axis]) / CELL_M) + 1;
     const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
-    this.cell = Int32Array.from(occlusion, (_, v) => {
-      const [x, y, z] = vector(axis => place(neutral[3 * v + axis], axis));
-      return (x * ny + y) * nz + z;
-    });
     this.cells = nx * ny * nz;
-    /** Cells between neighbors along x, y and z; the outermost cells are empty. */
-    this.strides = [ny * nz, nz, 1];
+    this.strides = [ny * nz, nz, 1]; // to the next cell along x, y, z; the outermost are empty
+    this.cell = Int32Array.from(occlusion, (_, v) => {
+      const places = vector(axis => place(neutral[3 * v + axis], axis));
+      return dotProduct(places, this.strides);
+    });
     this.sumOfWeights = this.around(this.weight);
   }
 
@@ -304,28 +296,26 @@ const MIN_IRRADIANCE = 0.15; // of the capture, as a share of its mean
 export class LightPass {
   // For data of an avatar whose light is known.
   /** @param {GL} gl @param {Data} data */
-  constructor(gl, data) {
+  constructor(gl, { arrays, header }) {
     this.gl = gl;
-    const { arrays, header } = data;
-    const { convention } = header;
     const light = (/** @type {string} */ name) => arrays[`light_${name}`].values;
     this.faces = arrays.faces.values;
-    this.neutral = arrays.neutral.values;
     this.transfer = light('transfer');
-    this.rigid = Float64Array.from(light('occlusion'), share => share + MIN_RIGID);
+    const neutral = arrays.neutral.values;
+    const weights = Float64Array.from(light('occlusion'), share => share + MIN_RIGID);
+    this.arms = weightedArms(neutral, weights);
     this.count = arrays.xyz.shape[0];
-    const frames = new FaceFrames({ faces: arrays.faces, neutral: arrays.neutral }, convention);
-    frames.placeFrames(Float64Array.from(this.neutral));
-    const areas = frames.neutralArea;
-    this.bounce = new Bounce([this.neutral, this.faces, areas, light('occlusion')]);
+    const framesOf = (/** @type {DataArray} */ faces) =>
+      new FaceFrames({ faces, neutral: arrays.neutral }, header.convention);
+    const frames = framesOf(arrays.faces);
+    this.bounce = new Bounce([neutral, this.faces, frames.area, light('occlusion')]);
     this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
     this.lashCorners = light('lash_corners');
     this.lashes = light('lash_face').length;
     const corners = (/** @type {number} */ face) => this.faces.subarray(3 * face, 3 * face + 3);
     const lashFaces = Array.from(light('lash_face')).flatMap(face => [...corners(face)]);
-    const lashes = { shape: [this.lashes, 3], values: Int32Array.from(lashFaces) };
-    this.lashFrames = new FaceFrames({ faces: lashes, neutral: arrays.neutral }, convention);
-    const vertices = this.neutral.length / 3;
+    this.lashFrames = framesOf({ shape: [this.lashes, 3], values: Int32Array.from(lashFaces) });
+    const vertices = neutral.length / 3;
     const texels = (vertices + 4 * this.lashes) * VERTEX_TEXELS;
     this.vertexValues = new Float32Array(paddedLength(texels));
     this.vertexTexture = floatTexture(gl, gl.RGBA32F, this.vertexValues);
@@ -341,19 +331,17 @@ export class LightPass {
     gl.bindVertexArray(null);
     const rows = Math.ceil(this.count / TEXTURE_WIDTH) || 1;
     this.colors = makeTarget(gl, gl.RGBA32F, TEXTURE_WIDTH, rows);
-    const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
-    const colorShader = lightFragmentShader(harmonics, arrays.strain_color ? 3 : 0);
-    this.program = program(gl, OVER_VERTEX_SHADER, colorShader);
+    this.program = program(gl, OVER_VERTEX_SHADER, lightFragmentShader(arrays));
     this.shadowProgram = program(gl, SHADOW_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER);
     const { damping, recorded, typical } = /** @type {LightOfCapture} */ (header.light);
     this.recorded = recorded;
     this.typical = [...typical, damping];
     this.light = litBy({}, header.up);
     this.kept = [0, 0, 0, 0]; // gain of red, green and blue, share
-    this.view = sunView(this.neutral, [0, 1, 0]);
+    this.view = sunView(neutral, [0, 1, 0]);
   }
 
-  // Follow the posed vertices (3·V) and the light.
+  // Follow the posed vertices (3·V), the sides of their triangles (`FaceFrames`) and the light.
   /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
   update(vertices, sides, light) {
     const { gl } = this;
@@ -362,13 +350,23 @@ export class LightPass {
     updateTexture(gl, this.vertexTexture, this.vertexValues);
     if (!light.sun) return;
     this.view = sunView(vertices, light.sun.toward);
-    this.drawShadows();
+    const { program, uniforms } = this.shadowProgram;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadows.framebuffer);
+    gl.viewport(0, 0, MAP_SIZE, MAP_SIZE);
+    gl.enable(gl.DEPTH_TEST);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.useProgram(program);
+    bindTexture(gl, 0, this.vertexTexture, uniforms.uVertices);
+    this.setSun(uniforms);
+    gl.bindVertexArray(this.vertexArray);
+    gl.drawElements(gl.TRIANGLES, this.casters.length, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.DEPTH_TEST);
   }
 
   /** @type {(vertices: Float64Array, sides: Float64Array, light: LitBy) => void} */
   packVertices(vertices, sides, { world, sun }) {
     const normals = vertexNormals(this.faces, sides, vertices.length);
-    const rotation = rigidRotation(vertices, this.neutral, this.rigid);
+    const rotation = rigidRotation(this.arms, vertices);
     const around = Float64Array.from(world);
     if (sun) addPoint(around, sun.toward, sun.color);
     const arriving = received(this.transfer, rotatedLight(world, rotation));
@@ -390,22 +388,7 @@ export class LightPass {
     }
   }
 
-  drawShadows() {
-    const { gl, view } = this;
-    const { program, uniforms } = this.shadowProgram;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.shadows.framebuffer);
-    gl.viewport(0, 0, MAP_SIZE, MAP_SIZE);
-    gl.enable(gl.DEPTH_TEST);
-    gl.clear(gl.DEPTH_BUFFER_BIT);
-    gl.useProgram(program);
-    bindTexture(gl, 0, this.vertexTexture, uniforms.uVertices);
-    this.setSun(uniforms);
-    gl.bindVertexArray(this.vertexArray);
-    gl.drawElements(gl.TRIANGLES, this.casters.length, gl.UNSIGNED_INT, 0);
-    gl.disable(gl.DEPTH_TEST);
-  }
-
-  /** @param {Program['uniforms']} uniforms */
+  /** @param {Uniforms} uniforms */
   setSun(uniforms) {
     this.gl.uniformMatrix3fv(uniforms.uToSun, true, this.view.axes);
     this.gl.uniform3f(uniforms.uMiddle, ...this.view.middle);
@@ -413,7 +396,7 @@ export class LightPass {
   }
 
   // Compute the colors seen from a camera (world to camera, row-major); returns their texture.
-  // Textures: the renderer's splats, tail and frames. Framebuffer and viewport are others afterwards.
+  // Textures: the renderer's splats, tail and frames. Another framebuffer and viewport stay bound.
   /** @type {(camera: Float64Array, textures: WebGLTexture[]) => WebGLTexture} */
   draw(camera, textures) {
     const { gl, colors, view, light } = this;
@@ -441,12 +424,12 @@ export class LightPass {
   }
 
   dispose() {
-    const { gl } = this;
-    for (const item of [this.surfaceTexture, this.vertexTexture]) gl.deleteTexture(item);
+    const { gl, surfaceTexture, vertexTexture, colors, shadows } = this;
+    for (const texture of [surfaceTexture, vertexTexture]) gl.deleteTexture(texture);
     gl.deleteBuffer(this.indexBuffer);
     gl.deleteVertexArray(this.vertexArray);
-    for (const item of [this.program, this.shadowProgram]) gl.deleteProgram(item.program);
-    for (const target of [this.colors, this.shadows]) deleteTarget(gl, target);
+    for (const { program } of [this.program, this.shadowProgram]) gl.deleteProgram(program);
+    for (const target of [colors, shadows]) deleteTarget(gl, target);
   }
 }
 
@@ -486,8 +469,8 @@ function surfaceTexels(arrays, frames) {
     for (const end = splat + splats_per_face.values[own]; splat < end; splat++) {
       const from = 3 * ((own + face[splat]) % faces.shape[0]);
       const corners = Array.from(faces.values.subarray(from, from + 3));
-      const [a, b, c] = corners.map(vertex => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
-      const weights = nearestWeights(a, b, c, placed(frames.world, own, xyz.values, splat));
+      const places = corners.map(vertex => neutral.values.subarray(3 * vertex, 3 * vertex + 3));
+      const weights = nearestWeights(places, placed(frames.world, own, xyz.values, splat));
       const to = 4 * SURFACE_TEXELS * splat;
       for (let k = 0; k < 3; k++) {
         const [vertex, weight] = [corners[k], weights[k]];
@@ -506,10 +489,10 @@ function surfaceTexels(arrays, frames) {
   return values;
 }
 
-// The point of a splat (xyz in its triangle's frame) in space.
-/** @type {(world: Float64Array, face: number, xyz: Values, splat: number) => Vector} */
-function placed(world, face, xyz, splat) {
-  const [x, y, z] = xyz.subarray(3 * splat, 3 * splat + 3);
+// A point (its number among xyz, in a triangle's frame) in space.
+/** @type {(world: Float64Array, face: number, xyz: Values, point: number) => Vector} */
+function placed(world, face, xyz, point) {
+  const [x, y, z] = xyz.subarray(3 * point, 3 * point + 3);
   return vector(row => {
     const at = 12 * face + 4 * row;
     return world[at] * x + world[at + 1] * y + world[at + 2] * z + world[at + 3];
@@ -517,16 +500,15 @@ function placed(world, face, xyz, splat) {
 }
 
 // Barycentric coordinates of a point in the plane of a triangle, clamped to it.
-/** @type {(a: Values, b: Values, c: Values, point: Vector) => number[]} */
-function nearestWeights(a, b, c, point) {
+/** @type {(corners: Values[], point: Vector) => number[]} */
+function nearestWeights([a, b, c], point) {
   const [first, second, offset] = [difference(b, a), difference(c, a), difference(point, a)];
   const [uu, uv, pu] = [first, second, offset].map(each => dotProduct(each, first));
   const [vv, pv] = [dotProduct(second, second), dotProduct(offset, second)];
   const area = Math.max(uu * vv - uv * uv, 1e-30);
   const [u, v] = [(vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area];
   const clamped = [1 - u - v, u, v].map(weight => Math.max(0, Math.min(1, weight)));
-  const sum = clamped[0] + clamped[1] + clamped[2];
-  return clamped.map(weight => weight / sum);
+  return clamped.map(weight => weight / (clamped[0] + clamped[1] + clamped[2]));
 }
 
 // Unit normals (3·V) weighted by the area of triangles, by their sides; 0 where there are none.

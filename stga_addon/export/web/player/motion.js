@@ -5,51 +5,48 @@
 /** @import { Data, Performance } from './types.js' */
 
 import { DataError } from './data.js';
-import { axisAngleOf, matrixFromAxisAngle, multiplied } from './vector.js';
-import { quaternionOf, slerpAxisAngle } from './vector.js';
+import { axisAngleOf, matrixOf, multiplied, quaternionOf, slerpAxisAngle } from './vector.js';
 
-// Coefficients, pose and translation of any moment. A pinned value (not NaN) replaces the recorded
-// one.
+// Coefficients, pose and translation of any moment. Pinned values (not NaN) replace recorded ones.
 export class Motion {
   /** @param {Data} data */
   constructor(data) {
-    const { arrays } = data;
-    this.recordedFrames = arrays.coefficients.shape[0];
-    this.recordedFps = data.header.fps;
+    this.data = data;
     this.shapes = new Shapes(data);
-    this.recorded = arrays;
-    const [shapes, joints] = [arrays.coefficients.shape[1], arrays.pose.shape[1]];
-    this.coefficients = new Float64Array(shapes);
-    this.pose = new Float64Array(3 * joints);
+    const { coefficients, pose } = data.arrays;
+    this.coefficients = new Float64Array(coefficients.shape[1]);
+    this.pose = new Float64Array(3 * pose.shape[1]);
     this.translation = new Float64Array(3);
-    this.pinnedCoefficients = new Float64Array(shapes).fill(NaN);
-    this.pinnedPose = new Float64Array(3 * joints).fill(NaN);
+    this.pinnedCoefficients = this.coefficients.slice().fill(NaN);
+    this.pinnedPose = this.pose.slice().fill(NaN);
   }
 
   /** Of the performance, where one plays instead of the recording. */
   get frames() {
-    return this.shapes.performance?.rows.length ?? this.recordedFrames;
+    return this.shapes.performance?.rows.length ?? this.data.arrays.pose.shape[0];
   }
 
   get fps() {
-    return this.shapes.performance?.fps ?? this.recordedFps;
+    return this.shapes.performance?.fps ?? this.data.header.fps;
   }
 
   // Fill coefficients, pose and translation with those of `frame`, between frames on the shortest
   // way. Of a performance, the head as a whole stays where it is in the first recorded frame.
   /** @param {number} frame */
   sample(frame) {
+    const { arrays } = this.data;
     const time = this.shapes.performance ? 0 : frame;
-    const [first, second, share] = neighbors(time, this.recordedFrames);
+    const [first, second, share] = neighbors(time, arrays.pose.shape[0]);
     for (const name of /** @type {const} */ (['coefficients', 'translation'])) {
-      const [{ values }, out] = [this.recorded[name], this[name]];
+      const [{ values }, out] = [arrays[name], this[name]];
       for (let k = 0, at = first * out.length, to = second * out.length; k < out.length; k++)
         out[k] = values[at + k] + share * (values[to + k] - values[at + k]);
     }
-    const [pose, size] = [this.recorded.pose.values, this.pose.length];
-    for (let at = 0; at < size; at += 3) {
-      const before = pose.subarray(first * size + at, first * size + at + 3);
-      const after = pose.subarray(second * size + at, second * size + at + 3);
+    for (let at = 0; at < this.pose.length; at += 3) {
+      const [before, after] = [first, second].map(row => {
+        const from = row * this.pose.length + at;
+        return arrays.pose.values.subarray(from, from + 3);
+      });
       this.pose.set(share > 0 ? slerpAxisAngle(before, after, share) : before, at);
     }
     if (this.shapes.active) this.shapes.apply(frame, this.coefficients, this.pose);
@@ -58,9 +55,8 @@ export class Motion {
   }
 
   release() {
-    this.pinnedCoefficients.fill(NaN);
-    this.pinnedPose.fill(NaN);
-    this.shapes.pinned.fill(NaN);
+    const { pinnedCoefficients, pinnedPose, shapes } = this;
+    for (const pinned of [pinnedCoefficients, pinnedPose, shapes.pinned]) pinned.fill(NaN);
   }
 }
 
@@ -90,26 +86,24 @@ export class Rig {
     this.shaped = new Float64Array(this.base.length);
     this.vertices = new Float64Array(this.base.length);
     this.local = new Float64Array(9 * joints);
-    // After the joints, one that rests at the origin: the parent of the root.
-    this.joints = new Float64Array(3 * joints + 3);
-    this.placed = new Float64Array(3 * joints + 3);
-    // Per joint: rotation and offset, rows of a 3×4 matrix.
+    this.joints = new Float64Array(3 * joints);
+    // Per joint: rotation and offset, rows of a 3×4 matrix. The last, the root's parent, rests.
     this.skin = new Float64Array(12 * joints + 12);
     for (let row = 0; row < 3; row++) this.skin[12 * joints + 5 * row] = 1;
   }
 
   // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
-  /** @param {Pick<Motion, 'coefficients' | 'pose' | 'translation'>} motion */
+  /** @param {Motion} motion */
   pose({ coefficients, pose, translation }) {
     this.shaped.set(this.base);
     this.joints.set(this.jointRest);
     addShapes(this.shaped, this.basis, coefficients);
-    addShapes(this.joints.subarray(0, -3), this.jointBasis, coefficients);
-    for (let j = 0; j < this.parents.length; j++)
-      matrixFromAxisAngle(pose, 3 * j, this.local, 9 * j);
+    addShapes(this.joints, this.jointBasis, coefficients);
+    for (let at = 0; at < pose.length; at += 3)
+      this.local.set(matrixOf(pose.subarray(at, at + 3)), 3 * at);
     // Correctives follow the entries of the rotations of joints 1… minus identity.
     const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
-    if (this.correctives.length) addShapes(this.shaped, this.correctives, features);
+    addShapes(this.shaped, this.correctives, features);
     this.chain();
     const { shaped, weights, skin, vertices } = this;
     const joints = this.parents.length;
@@ -137,24 +131,16 @@ export class Rig {
 
   /** Rotation and offset of each joint in the world, from the root outwards. */
   chain() {
-    const { parents, joints, local, skin, placed } = this;
+    const { parents, joints, local, skin } = this;
     for (let j = 0; j < parents.length; j++) {
-      const parent = parents[j];
-      for (let row = 0; row < 3; row++) {
-        const [to, from] = [12 * j + 4 * row, 12 * parent + 4 * row];
-        let place = placed[3 * parent + row];
+      for (let to = 12 * j, from = 12 * parents[j]; to < 12 * j + 12; to += 4, from += 4) {
+        let offset = skin[from + 3];
         for (let c = 0; c < 3; c++) {
-          const at = 9 * j + c;
-          const [x, y, z] = [local[at], local[at + 3], local[at + 6]];
+          const [x, y, z] = [local[9 * j + c], local[9 * j + c + 3], local[9 * j + c + 6]];
           skin[to + c] = skin[from] * x + skin[from + 1] * y + skin[from + 2] * z;
-          place += skin[from + c] * (joints[3 * j + c] - joints[3 * parent + c]);
+          offset += (skin[from + c] - skin[to + c]) * joints[3 * j + c]; // which the parent carries
         }
-        placed[3 * j + row] = place;
-        const turned =
-          skin[to] * joints[3 * j] +
-          skin[to + 1] * joints[3 * j + 1] +
-          skin[to + 2] * joints[3 * j + 2];
-        skin[to + 3] = place - turned;
+        skin[to + 3] = offset;
       }
     }
   }
@@ -197,9 +183,6 @@ function addShapes(target, shapes, factors) {
   }
 }
 
-const JOINTS = ['jaw', 'left_eye', 'right_eye'];
-const NECK = 'neck';
-
 /** Weights of the shapes: pinned ones, else those of a performance, else 0; and what they pose. */
 export class Shapes {
   /** @param {Data} data */
@@ -208,15 +191,14 @@ export class Shapes {
     this.names = shapes?.names ?? [];
     this.linear = arrays.shape_linear?.values;
     this.products = arrays.shape_products?.values;
-    this.columns = arrays.shape_linear?.shape[1] ?? 0;
     this.expressions = arrays.shape_products?.shape[1] ?? 0;
     this.opens = this.names.indexOf(shapes?.opens ?? '');
     this.limited = this.names.indexOf(shapes?.limited ?? '');
-    this.joints = JOINTS.map(joint => 3 * joints.indexOf(joint));
-    this.neck = 3 * joints.indexOf(NECK);
+    this.joints = ['jaw', 'left_eye', 'right_eye'].map(joint => 3 * joints.indexOf(joint));
+    this.neck = 3 * joints.indexOf('neck');
     this.weights = new Float64Array(this.names.length);
-    this.pinned = new Float64Array(this.names.length).fill(NaN);
-    this.values = new Float64Array(this.columns);
+    this.pinned = this.weights.slice().fill(NaN);
+    this.values = new Float64Array(this.expressions + 9);
     /** @type {Performance | null} */
     this.performance = null;
   }
@@ -230,25 +212,30 @@ export class Shapes {
   /** @type {(frame: number, coefficients: Float64Array, pose: Float64Array) => void} */
   apply(frame, coefficients, pose) {
     const head = this.sample(frame);
-    const { columns, expressions, linear, opens, products, values, weights } = this;
+    const { expressions, linear, opens, products, values, weights } = this;
     if (!linear || !products) return;
     values.fill(0);
     for (let shape = 0; shape < weights.length; shape++) {
       let weight = weights[shape];
       if (shape === this.limited) weight = Math.min(weight, Math.max(weights[opens], 0));
       if (weight === 0) continue;
-      for (let k = 0; k < columns; k++) values[k] += weight * linear[shape * columns + k];
       const product = weight * weights[opens];
+      const from = shape * values.length;
+      for (let k = 0; k < values.length; k++) values[k] += weight * linear[from + k];
       for (let k = 0; k < expressions; k++)
         values[k] += product * products[shape * expressions + k];
     }
     coefficients.fill(0);
     coefficients.set(values.subarray(0, expressions));
     for (const [number, at] of this.joints.entries()) {
-      if (at >= 0)
-        pose.set(values.subarray(expressions + 3 * number, expressions + 3 * number + 3), at);
+      const from = expressions + 3 * number;
+      if (at >= 0) pose.set(values.subarray(from, from + 3), at);
     }
-    if (head && this.neck >= 0) pose.set(headTurn(head), this.neck);
+    if (!head || this.neck < 0) return;
+    // About y, then the turned x, then the turned z.
+    const [yaw, pitch, roll] = head;
+    const turned = multiplied(quaternionOf([0, yaw, 0]), quaternionOf([pitch, 0, 0]));
+    pose.set(axisAngleOf(multiplied(turned, quaternionOf([0, 0, roll]))), this.neck);
   }
 
   // Fill the weights with those of the frame; returns yaw, pitch and roll of the head, where the
@@ -269,13 +256,6 @@ export class Shapes {
     replacePinned(weights, pinned);
     return head;
   }
-}
-
-// Axis-angle of yaw, pitch and roll: about y, then the turned x, then the turned z.
-/** @param {number[]} angles */
-function headTurn([yaw, pitch, roll]) {
-  const turned = multiplied(quaternionOf([0, yaw, 0]), quaternionOf([pitch, 0, 0]));
-  return axisAngleOf(multiplied(turned, quaternionOf([0, 0, roll])));
 }
 
 // Performances in CSV: Live Link Face, Audio2Face, and any table with a column per shape. The
@@ -299,7 +279,8 @@ export function readPerformance(text, names) {
   const header = (lines[0] ?? '').split(',').map(cell => cell.trim());
   const plain = header.map(plainName);
   const columns = names.map(name => plain.indexOf(name.toLowerCase()));
-  if (columns.filter(column => column >= 0).length < MIN_SHAPES)
+  const used = columns.filter(column => column >= 0);
+  if (used.length < MIN_SHAPES)
     throw new DataError('This file is no table of face shapes (Live Link Face or Audio2Face CSV).');
   const counts = header.findIndex(name => name.toLowerCase() === 'blendshapecount');
   const rowsOfCells = lines.slice(1, MAX_ROWS + 1).map(line => line.split(','));
@@ -307,7 +288,6 @@ export function readPerformance(text, names) {
   const cells = rowsOfCells.filter(row => row.length === header.length && hasFace(row));
   if (!cells.length) throw new DataError('The performance has no row with a face.');
   const rows = cells.map(row => Float64Array.from(row, Number));
-  const used = columns.filter(column => column >= 0);
   if (!rows.every(row => used.every(column => Math.abs(row[column]) <= MAX_WEIGHT)))
     throw new DataError('The performance holds weights that are no numbers from 0 to 1.');
   const head = HEAD.map(name => plain.indexOf(name));

@@ -2,6 +2,7 @@
 // The page's controls. Everything that they do is in the public interface of <stga-avatar>.
 
 /** @import { Camera, Lighting, Vector } from './types.js' */
+/** @typedef {[row: HTMLElement, value: HTMLElement, slider: HTMLInputElement]} Row */
 
 import { row } from './camera.js';
 import { DataError } from './data.js';
@@ -19,7 +20,7 @@ const SLIDERS_SHOWN = 8;
 const SHAPES_FIRST = `browInnerUp mouthPucker mouthSmileRight mouthSmileLeft eyeBlinkRight
   eyeBlinkLeft mouthClose jawOpen`.split(/\s+/);
 const FACTS_INTERVAL_MS = 500;
-const BACKGROUNDS = { White: '#ffffff', Gray: '#808080', Black: '#000000' };
+const BACKGROUNDS = { 'As the page': '', White: '#ffffff', Gray: '#808080', Black: '#000000' };
 const DARK_BACKGROUND = '#15171b'; // in light, what the avatar was trained against
 // Joint, axis, smallest and largest angle in radians.
 /** @type {[string, string[], number, number, number][]} */
@@ -65,12 +66,11 @@ function fillTrack(input) {
 // Playback
 
 function updateTransport() {
-  const last = avatar.frameCount - 1;
-  const frame = Math.min(Math.round(avatar.frame), last);
-  setPressed(byId('play'), avatar.playing);
-  byId('play').title = avatar.playing ? 'Pause (Space)' : 'Play (Space)';
-  inputOf('scrub').value = String(Math.min(avatar.frame, last));
-  byId('number').textContent = `${frame + 1} / ${last + 1}`;
+  const { frame, frameCount, playing } = avatar;
+  setPressed(byId('play'), playing);
+  byId('play').title = playing ? 'Pause (Space)' : 'Play (Space)';
+  inputOf('scrub').value = String(frame); // up to the last
+  byId('number').textContent = `${Math.min(Math.round(frame) + 1, frameCount)} / ${frameCount}`;
   fillTrack(inputOf('scrub'));
 }
 
@@ -81,10 +81,10 @@ function toggleLoop() {
   setPressed(byId('loop'), avatar.loop);
 }
 
-/** @param {number} by */
-function step(by) {
+/** @param {number} frame */
+function stopAt(frame) {
   avatar.pause();
-  avatar.frame = Math.round(avatar.frame) + by;
+  avatar.frame = frame;
 }
 
 function showLength() {
@@ -99,10 +99,7 @@ function addTransport() {
   const speed = element('#speed', HTMLSelectElement);
   speed.addEventListener('change', () => (avatar.speed = Number(speed.value)));
   const scrub = inputOf('scrub');
-  scrub.addEventListener('input', () => {
-    avatar.pause();
-    avatar.frame = Number(scrub.value);
-  });
+  scrub.addEventListener('input', () => stopAt(Number(scrub.value)));
   for (const name of ['frame', 'play', 'pause']) avatar.addEventListener(name, updateTransport);
   updateTransport();
 }
@@ -125,33 +122,28 @@ function showView(index) {
   if (view || !index) element('#view', HTMLSelectElement).selectedIndex = index;
 }
 
-function resetView() {
-  avatar.resetCamera();
-  element('#view', HTMLSelectElement).selectedIndex = 0;
-}
+const resetView = () => showView(0);
 
-/** @type {string | null} */
-let background = null; // chosen by the viewer; null: the theme's
+let background = ''; // chosen by the viewer; '': the theme's
 
-/** @type {Map<HTMLElement, string | null>} */
-const swatches = new Map(); // button → color; null: the theme's
+/** @type {Map<HTMLElement, string>} */
+const swatches = new Map(); // button → color
 
-/** @param {string | null} [chosen] null: the theme's; by default the one before */
 function applyBackground(chosen = background) {
   background = chosen;
   const dark = document.documentElement.dataset.theme === 'dark';
-  avatar.background = background ?? (dark ? DARK_BACKGROUND : hexOf(info().background));
+  avatar.background = background || (dark ? DARK_BACKGROUND : hexOf(info().background));
   for (const [swatch, color] of swatches) setPressed(swatch, color === background);
 }
 
 function addBackgrounds() {
   const row = byId('backgrounds');
-  for (const [name, color] of Object.entries({ 'As the page': '', ...BACKGROUNDS })) {
+  for (const [name, color] of Object.entries(BACKGROUNDS)) {
     const swatch = document.createElement('button');
     Object.assign(swatch, { className: 'swatch', title: name });
-    swatches.set(swatch, color || null);
+    swatches.set(swatch, color);
     swatch.style.setProperty('--color', color || 'linear-gradient(135deg, #fff 50%, #15171b 50%)');
-    swatch.addEventListener('click', () => applyBackground(color || null));
+    swatch.addEventListener('click', () => applyBackground(color));
     row.append(swatch);
   }
   const custom = document.createElement('input');
@@ -162,8 +154,7 @@ function addBackgrounds() {
 }
 
 function toggleSelection() {
-  if (!avatar.hasSelection) return;
-  avatar.showSelection = !avatar.showSelection;
+  avatar.showSelection = !avatar.showSelection; // stays false where there is none
   inputOf('show-selection').checked = avatar.showSelection;
 }
 
@@ -176,10 +167,7 @@ function toggleTheme() {
 // Sliders: each shows what plays until it is moved, and again when its value is clicked.
 
 // A row with a name, an `output` or (kind "slider") a button that shows the value, and the slider.
-/**
- * @type {(parent: HTMLElement, kind: string, label: string, low: number, high: number) =>
- *   [HTMLLabelElement, HTMLElement, HTMLInputElement]}
- */
+/** @type {(parent: HTMLElement, kind: string, label: string, low: number, high: number) => Row} */
 function sliderRow(parent, kind, label, low, high) {
   const row = Object.assign(document.createElement('label'), { className: kind });
   const button = '<button class="value" title="Release"></button>';
@@ -193,13 +181,11 @@ function sliderRow(parent, kind, label, low, high) {
 
 // A slider that shows what `read` says plays, and writes; null: as recorded.
 /**
- * @type {(parent: HTMLElement, id: string, label: string, low: number, high: number,
- *   read: () => number, write: (value: number | null) => void,
- *   format?: (value: number) => string) => HTMLLabelElement}
+ * @type {(parent: HTMLElement, label: string, low: number, high: number, read: () => number,
+ *   write: (value: number | null) => void, format?: (value: number) => string) => HTMLElement}
  */
-function addSlider(parent, id, label, low, high, read, write, format = fixed) {
+function addSlider(parent, label, low, high, read, write, format = fixed) {
   const [row, value, input] = sliderRow(parent, 'slider', label, low, high);
-  row.dataset.name = id;
   let pinned = false;
   const pin = (/** @type {boolean} */ whether) => {
     pinned = whether;
@@ -233,8 +219,7 @@ function addExpressions() {
   const rows = info().sliders.map(({ name, reach }) => {
     const label = name.replace(/^expr_0*(\d+)$/, 'Expression $1');
     const read = () => avatar.getExpression(name);
-    const write = (/** @type {number | null} */ value) => avatar.setExpression(name, value);
-    return addSlider(list, name, label, -reach, reach, read, write);
+    return addSlider(list, label, -reach, reach, read, value => avatar.setExpression(name, value));
   });
   section.hidden = !rows.length;
   showFirst(rows, byId('more'));
@@ -261,7 +246,7 @@ function addFaceShapes() {
   const list = element('.sliders', HTMLElement, byId('shapes'));
   const rows = names.map(name => {
     const read = () => avatar.getShape(name);
-    return addSlider(list, name, name, 0, 1, read, value => avatar.setShape(name, value));
+    return addSlider(list, name, 0, 1, read, value => avatar.setShape(name, value));
   });
   showFirst(rows, byId('more-shapes'));
   const file = inputOf('performance');
@@ -288,8 +273,8 @@ async function playFile(file) {
     avatar.setPerformance(await file.text());
     avatar.play();
   } catch (error) {
-    problem.textContent =
-      error instanceof DataError ? error.message : `The file cannot be read: ${error}`;
+    const isKnown = error instanceof DataError;
+    problem.textContent = isKnown ? error.message : `The file cannot be read: ${error}`;
     problem.hidden = false;
   }
 }
@@ -307,7 +292,7 @@ function addPose() {
       }
     };
     const format = (/** @type {number} */ value) => degrees((180 / Math.PI) * value);
-    addSlider(list, label, label, low, high, read, write, format);
+    addSlider(list, label, low, high, read, write, format);
   }
   byId('pose').hidden = !known.length;
 }
@@ -355,20 +340,15 @@ function addLight() {
     const sun = { toward, color: scaled(linearColor(color.value), strength) };
     return { even: [even, even, even], sun, exposure };
   };
-  const apply = () => (avatar.lighting = lighting());
   const showDirection = () => {
     const [x, y] = onPad(toward);
     pad.style.setProperty('--x', `${50 + 50 * x}%`);
     pad.style.setProperty('--y', `${50 + 50 * y}%`);
   };
   const showKind = () => {
-    const isDragged = select.value === DRAGGED;
-    const isEnvironment = Object.hasOwn(ENVIRONMENTS, select.value);
-    byId('light-dragged').hidden = !isDragged;
-    for (const { shown, kinds } of rows)
-      shown.hidden = !(isEnvironment
-        ? kinds.endsWith('*')
-        : isDragged && kinds.startsWith(DRAGGED));
+    byId('light-dragged').hidden = select.value !== DRAGGED;
+    const kind = Object.hasOwn(ENVIRONMENTS, select.value) ? '*' : select.value;
+    for (const { shown, kinds } of rows) shown.hidden = !kinds.includes(kind);
   };
   const rows = Object.entries(RANGES).map(([name, { label, kinds, low, high, value, format }]) => {
     const [shown, output, input] = sliderRow(section, 'range', label, low, high);
@@ -378,13 +358,13 @@ function addLight() {
       fillTrack(input);
     };
     input.addEventListener('input', show);
-    input.addEventListener('input', apply);
     show();
     return { name, shown, input, kinds };
   });
   select.addEventListener('change', showKind);
+  const apply = () => (avatar.lighting = lighting());
   select.addEventListener('change', apply);
-  color.addEventListener('input', apply);
+  for (const { input } of [{ input: color }, ...rows]) input.addEventListener('input', apply);
   /** @param {PointerEvent} event */
   const drag = event => {
     if (event.type === 'pointerdown') pad.setPointerCapture(event.pointerId);
@@ -443,11 +423,11 @@ function linearColor(hex) {
 const KEYS = {
   ' ': toggle,
   k: toggle,
-  ArrowLeft: () => step(-1),
-  ArrowRight: () => step(1),
+  ArrowLeft: () => stopAt(Math.round(avatar.frame) - 1),
+  ArrowRight: () => stopAt(Math.round(avatar.frame) + 1),
   Home: () => (avatar.frame = 0),
   End: () => (avatar.frame = avatar.frameCount - 1),
-  c: togglePanel,
+  c: () => togglePanel(),
   f: toggleFullscreen,
   h: () => document.body.classList.toggle('bare'),
   l: toggleLoop,
@@ -469,10 +449,9 @@ function press(event) {
   action();
 }
 
-function togglePanel() {
-  const { hidden } = byId('panel');
-  byId('panel').hidden = !hidden;
-  byId('open').setAttribute('aria-expanded', String(hidden));
+function togglePanel(open = byId('panel').hidden) {
+  byId('panel').hidden = !open;
+  byId('open').setAttribute('aria-expanded', String(open));
 }
 
 function toggleFullscreen() {
@@ -502,27 +481,23 @@ function start() {
   byId('selection').hidden = !avatar.hasSelection;
   byId('show-selection').addEventListener('change', toggleSelection);
   byId('release').addEventListener('click', releaseAll);
-  byId('open').addEventListener('click', togglePanel);
-  byId('panel').hidden = innerWidth <= 640;
-  byId('open').setAttribute('aria-expanded', String(!byId('panel').hidden));
+  byId('open').addEventListener('click', () => togglePanel());
+  togglePanel(innerWidth > 640);
   setInterval(showFacts, FACTS_INTERVAL_MS);
   showFacts();
   avatar.loop = true;
   if (!matchMedia('(prefers-reduced-motion: reduce)').matches) avatar.play();
 }
 
-function fail() {
-  for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
-}
-
-document.documentElement.dataset.theme = matchMedia('(prefers-color-scheme: dark)').matches
-  ? 'dark'
-  : 'light';
+const isDark = matchMedia('(prefers-color-scheme: dark)').matches;
+document.documentElement.dataset.theme = isDark ? 'dark' : 'light';
 byId('theme').addEventListener('click', toggleTheme);
 byId('fullscreen').addEventListener('click', toggleFullscreen);
 addEventListener('keydown', press);
 avatar.addEventListener('load', start, { once: true });
-avatar.addEventListener('error', fail);
+avatar.addEventListener('error', () => {
+  for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
+});
 
 // The data file that the page holds as base64. Throws DataError where it was cut off or altered.
 async function embeddedData() {

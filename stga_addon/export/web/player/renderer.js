@@ -4,14 +4,14 @@
 
 /**
  * @import { LightPass } from './light.js'
- * @import { Arrays, Camera, Data, GL, Look, Program, Target, Values } from './types.js'
+ * @import { Arrays, Camera, Data, GL, Look, Program, Uniforms } from './types.js'
+ * @typedef {ReturnType<typeof makeTarget>} Target texture that splats are blended into
  */
 
 import { FACE_FLOATS } from './face_frames.js';
-import { FACE_TEXELS, SPLAT_TEXELS, TEXTURE_WIDTH, tailTexels } from './shaders.js';
-import { OVER_FRAGMENT_SHADER, OVER_VERTEX_SHADER } from './shaders.js';
-import { SPLAT_FRAGMENT_SHADER, splatVertexShader } from './shaders.js';
-import { wholeQuaternion } from './vector.js';
+import { FACE_TEXELS, OVER_FRAGMENT_SHADER, OVER_VERTEX_SHADER, SPLAT_TEXELS } from './shaders.js';
+import { SPLAT_FRAGMENT_SHADER, TEXTURE_WIDTH, splatVertexShader, tailSizes } from './shaders.js';
+import { dotProduct } from './vector.js';
 
 const SH_C0 = 0.28209479177387814;
 
@@ -39,7 +39,7 @@ export function program(gl, vertex, fragment) {
     const log = `${logs.join(' ')} ${gl.getProgramInfoLog(made)}`;
     throw new RendererError(`The graphics driver rejects a shader: ${log}`);
   }
-  /** @type {Program['uniforms']} */
+  /** @type {Uniforms} */
   const uniforms = {};
   const count = gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS) ?? 0;
   for (let k = 0; k < count; k++) {
@@ -52,9 +52,8 @@ export function program(gl, vertex, fragment) {
 /** @type {(gl: GL, format: number, values: Float32Array) => WebGLTexture} */
 export function floatTexture(gl, format, values) {
   const height = values.length / (4 * TEXTURE_WIDTH);
-  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+  if (height > gl.getParameter(gl.MAX_TEXTURE_SIZE))
     throw new RendererError('The avatar has more splats than this graphics card can hold.');
-  }
   const made = gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D, made);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
@@ -79,7 +78,10 @@ export function bindTexture(gl, unit, bound, uniform) {
   gl.uniform1i(uniform, unit);
 }
 
-/** @type {(gl: GL, format: number, width: number, height: number, kind?: number) => Target} */
+/**
+ * @param {GL} gl @param {number} format @param {number} width @param {number} height
+ * @param {number} [kind] of attachment
+ */
 export function makeTarget(gl, format, width, height, kind = gl.COLOR_ATTACHMENT0) {
   const made = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0);
@@ -107,28 +109,23 @@ export class Renderer {
     if (!gl.getExtension('EXT_color_buffer_float'))
       throw new RendererError('This browser cannot draw to float textures, as the avatar needs.');
     this.gl = gl;
-    const { arrays, header } = data;
-    this.antialiased = header.antialiased;
-    this.count = arrays.xyz.shape[0];
-    this.faces = arrays.faces.shape[0];
-    const harmonics = arrays.sh ? arrays.sh.shape[1] / 3 : 0;
-    const strains = arrays.strain_color ? 3 : 0;
-    this.splatProgram = program(gl, splatVertexShader(harmonics, strains), SPLAT_FRAGMENT_SHADER);
+    const { arrays } = data;
+    this.data = data;
+    this.splatProgram = program(gl, splatVertexShader(arrays, false), SPLAT_FRAGMENT_SHADER);
     /** @type {Program | null} */
     this.litProgram = null;
     /** @type {LightPass | null} where the splats get their colors, if they are not as recorded */
     this.lightPass = null;
     this.overProgram = program(gl, OVER_VERTEX_SHADER, OVER_FRAGMENT_SHADER);
     this.splatTexture = floatTexture(gl, gl.RGBA32F, splatTexels(arrays));
-    const tail = tailValues(arrays, tailTexels(harmonics, strains));
-    this.tailTexture = floatTexture(gl, gl.RGBA16F, tail);
-    this.frameValues = new Float32Array(paddedLength(this.faces * FACE_TEXELS));
+    this.tailTexture = floatTexture(gl, gl.RGBA16F, tailValues(arrays));
+    this.frameValues = new Float32Array(paddedLength(arrays.faces.shape[0] * FACE_TEXELS));
     this.frameTexture = floatTexture(gl, gl.RGBA32F, this.frameValues);
     this.vertexArray = gl.createVertexArray();
     this.indexBuffer = gl.createBuffer();
     gl.bindVertexArray(this.vertexArray);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
-    gl.bufferData(gl.ARRAY_BUFFER, 4 * this.count, gl.DYNAMIC_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, 4 * arrays.xyz.shape[0], gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(0);
     gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
     gl.vertexAttribDivisor(0, 1);
@@ -137,7 +134,7 @@ export class Renderer {
     this.finest = gl.getExtension('EXT_float_blend') ? gl.RGBA32F : gl.RGBA16F;
   }
 
-  // Draw `order` (back to front) of the splats on the frames in `frameValues` into a framebuffer, or
+  // Draw splats in `order` (back to front) on the frames in `frameValues` into a framebuffer, or
   // the canvas, where they are blended in half precision.
   /** @type {(order: Uint32Array, camera: Camera, look: Look, into?: ?WebGLFramebuffer) => void} */
   draw(order, camera, { background, showSelection }, into = null) {
@@ -154,14 +151,14 @@ export class Renderer {
     gl.bindBuffer(gl.ARRAY_BUFFER, this.indexBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
     const { splatTexture, tailTexture, frameTexture } = this;
-    const textures = [splatTexture, tailTexture, frameTexture];
-    const colors = this.lightPass?.draw(camera.matrix, textures);
+    const colors = this.lightPass?.draw(camera.matrix, [splatTexture, tailTexture, frameTexture]);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
+    const { arrays, header } = this.data;
     if (colors)
-      this.litProgram ??= program(gl, splatVertexShader(0, 0, true), SPLAT_FRAGMENT_SHADER);
+      this.litProgram ??= program(gl, splatVertexShader(arrays, true), SPLAT_FRAGMENT_SHADER);
     const { program: used, uniforms } = (colors && this.litProgram) || this.splatProgram;
     gl.useProgram(used);
     bindTexture(gl, 0, frameTexture, uniforms.uFaces);
@@ -173,11 +170,11 @@ export class Renderer {
     gl.uniform2f(uniforms.uFocal, ...camera.focal);
     gl.uniform2f(uniforms.uCenter, ...camera.center);
     gl.uniform2f(uniforms.uSize, ...camera.size);
-    gl.uniform1i(uniforms.uAntialiased, Number(this.antialiased));
+    gl.uniform1i(uniforms.uAntialiased, Number(header.antialiased));
     gl.uniform1i(uniforms.uShowSelection, Number(showSelection));
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);
     gl.disable(gl.BLEND);
     gl.bindFramebuffer(gl.FRAMEBUFFER, into);
     gl.useProgram(this.overProgram.program);
@@ -209,14 +206,12 @@ export class Renderer {
   }
 
   dispose() {
-    const gl = this.gl;
-    const { splatTexture, tailTexture, frameTexture } = this;
-    for (const item of [splatTexture, tailTexture, frameTexture]) gl.deleteTexture(item);
+    const { gl, splatTexture, tailTexture, frameTexture } = this;
+    for (const texture of [splatTexture, tailTexture, frameTexture]) gl.deleteTexture(texture);
     gl.deleteBuffer(this.indexBuffer);
     gl.deleteVertexArray(this.vertexArray);
-    const { splatProgram, overProgram, litProgram } = this;
-    for (const item of [splatProgram, overProgram, litProgram])
-      gl.deleteProgram(item?.program ?? null);
+    for (const used of [this.splatProgram, this.overProgram, this.litProgram])
+      gl.deleteProgram(used?.program ?? null);
     if (this.target) deleteTarget(gl, this.target);
   }
 }
@@ -235,16 +230,20 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, ...arra
         values[to + 12 + k] = 0.5 + SH_C0 * color.values[from + k];
       }
       values[to + 3] = face; // a float holds whole numbers up to 2^24
-      const smaller = rotation.values.subarray(from, from + 3);
-      values.set(wholeQuaternion(smaller, rotation_largest.values[splat]), to + 4);
+      const turn = Array.from(rotation.values.subarray(from, from + 3));
+      const rest = Math.sqrt(Math.max(0, 1 - dotProduct(turn, turn)));
+      turn.splice(rotation_largest.values[splat], 0, rest); // the largest part, which is positive
+      values.set(turn, to + 4);
       values[to + 11] = opacity.values[splat];
     }
   }
   return values;
 }
 
-/** @type {(arrays: Arrays, texels: number) => Float32Array<ArrayBuffer>} */
-function tailValues({ xyz, sh, strain_color }, texels) {
+/** @param {Arrays} arrays */
+function tailValues(arrays) {
+  const { xyz, sh, strain_color } = arrays;
+  const texels = tailSizes(arrays)[2];
   const values = new Float32Array(paddedLength(Math.max(1, xyz.shape[0] * texels)));
   let offset = 0;
   for (const array of [sh, strain_color]) {
@@ -283,8 +282,23 @@ export class DepthSort {
   // Indices of the splats, farthest first; `frames` as FaceFrames.compose writes them.
   /** @param {ArrayLike<number>} frames */
   sort(frames) {
-    const { byLow, depth, high, key, low, order } = this;
-    const [near, far] = this.measureDepth(frames);
+    const { byLow, depth, high, key, low, order, splatsPerFace, xyz } = this;
+    let near = Infinity; // of those in front of the camera
+    let far = 0;
+    for (let f = 0, i = 0; f < splatsPerFace.length; f++) {
+      const at = FACE_FLOATS * f + 8;
+      const a = frames[at];
+      const b = frames[at + 1];
+      const c = frames[at + 2];
+      const d = frames[at + 3];
+      for (const end = i + splatsPerFace[f]; i < end; i++) {
+        const z = a * xyz[3 * i] + b * xyz[3 * i + 1] + c * xyz[3 * i + 2] + d;
+        depth[i] = z;
+        if (z < near && z > 0) near = z;
+        if (z > far) far = z;
+      }
+    }
+    near = Math.min(near, far);
     const scale = MAX_KEY / (far - near || 1);
     low.fill(0);
     high.fill(0);
@@ -306,27 +320,5 @@ export class DepthSort {
     for (let i = 0; i < key.length; i++) byLow[low[key[i] & (DIGITS - 1)]++] = i;
     for (let n = 0; n < key.length; n++) order[high[key[byLow[n]] >> DIGIT_BITS]++] = byLow[n];
     return order;
-  }
-
-  // Fill `depth`; returns the nearest in front of the camera, and the farthest.
-  /** @param {ArrayLike<number>} frames */
-  measureDepth(frames) {
-    const { depth, splatsPerFace, xyz } = this;
-    let near = Infinity;
-    let far = 0;
-    for (let f = 0, i = 0; f < splatsPerFace.length; f++) {
-      const at = FACE_FLOATS * f + 8;
-      const a = frames[at];
-      const b = frames[at + 1];
-      const c = frames[at + 2];
-      const d = frames[at + 3];
-      for (const end = i + splatsPerFace[f]; i < end; i++) {
-        const z = a * xyz[3 * i] + b * xyz[3 * i + 1] + c * xyz[3 * i + 2] + d;
-        depth[i] = z;
-        if (z < near && z > 0) near = z;
-        if (z > far) far = z;
-      }
-    }
-    return [Math.min(near, far), far];
   }
 }

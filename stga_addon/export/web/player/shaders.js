@@ -2,6 +2,8 @@
 // GLSL: splats as quads, then the picture over its background; and a pass that computes the color
 // of each splat under a light once, with the shadow map of the sun.
 
+/** @import { Arrays } from './types.js' */
+
 export const TEXTURE_WIDTH = 2048;
 export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | color
 export const FACE_TEXELS = 4; // rows of the frame in camera space | strain, selected
@@ -26,9 +28,13 @@ ivec2 texel(int index) {
 /** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
 const SH = '{{harmonics}}'.split('; ');
 
-// Texels a splat needs for its view-dependent and strain-dependent colors.
-/** @type {(harmonics: number, strains: number) => number} */
-export const tailTexels = (harmonics, strains) => Math.ceil((3 * (harmonics + strains)) / 4);
+// Of the coefficients of splats' colors by view and by strain, how many there are of each, and the
+// texels that a splat needs for them.
+/** @type {(arrays: Arrays) => [number, number, number]} */
+export function tailSizes({ sh, strain_color }) {
+  const [view, strain] = [sh?.shape[1] ?? 0, strain_color?.shape[1] ?? 0];
+  return [view / 3, strain / 3, Math.ceil((view + strain) / 4)];
+}
 
 /** @param {number} k */
 const tailTriple = k =>
@@ -37,8 +43,8 @@ const tailTriple = k =>
 // Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
 // are slow on many GPUs.
 /** @type {(count: number, direction: string, sum: string, factors?: number[]) => string} */
-function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
-  const terms = SH.slice(0, harmonics).map((term, k) => {
+function harmonicsSum(count, direction, sum, factors = [1, 1, 1]) {
+  const terms = SH.slice(0, count).map((term, k) => {
     const factor = factors[Math.floor(Math.sqrt(k + 1)) - 1];
     return `${sum} += ${factor.toFixed(8)} * (${term}) * ${tailTriple(k)};`;
   });
@@ -51,14 +57,13 @@ function harmonicsSum(harmonics, direction, sum, factors = [1, 1, 1]) {
 
 // Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
 // to `byStrain`.
-/** @param {number} harmonics @param {number} strains @param {string} direction */
-function tailColor(harmonics, strains, direction, byView = 'color', byStrain = 'color') {
-  const texels = tailTexels(harmonics, strains);
+/** @type {(arrays: Arrays, direction: string, byView: string, byStrain: string) => string} */
+function tailColor(arrays, direction, byView, byStrain) {
+  const [harmonics, strains, texels] = tailSizes(arrays);
   const lines = [];
   for (let t = 0; t < texels; t++)
     lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  if (harmonics)
-    lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
+  lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
   for (let k = 0; k < strains; k++)
     lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
   return lines.join('\n  ');
@@ -66,8 +71,8 @@ function tailColor(harmonics, strains, direction, byView = 'color', byStrain = '
 
 // The limits and constants are those of the kernels that trained the splats (raster/cpu). isLit:
 // whether colors come from the light pass.
-/** @type {(harmonics: number, strains: number, isLit?: boolean) => string} */
-export function splatVertexShader(harmonics, strains, isLit = false) {
+/** @type {(arrays: Arrays, isLit: boolean) => string} */
+export function splatVertexShader(arrays, isLit) {
   return `${PREAMBLE}
 uniform sampler2D uFaces;
 uniform sampler2D uSplats;
@@ -139,7 +144,7 @@ void main() {
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${isLit ? LIT_COLOR : tailColor(harmonics, strains, 'uToWorld * center')}
+  ${isLit ? LIT_COLOR : tailColor(arrays, 'uToWorld * center', 'color', 'color')}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);
@@ -193,9 +198,9 @@ void main() {
 export const SHADOW_FRAGMENT_SHADER = `#version 300 es
 void main() {}`;
 
-// A texel a splat: its color in sRGB, not clipped. strains: 3 where colors depend on strain.
-/** @type {(harmonics: number, strains: number) => string} */
-export function lightFragmentShader(harmonics, strains) {
+// A texel a splat: its color in sRGB, not clipped.
+/** @param {Arrays} arrays */
+export function lightFragmentShader(arrays) {
   return `${PREAMBLE}
 uniform sampler2D uSplats, uTail, uFaces, uSurface, uVertices, uShadows;
 uniform mat3 uToSun;
@@ -238,11 +243,11 @@ void main() {
   vec3 byView = vec3(0.0), byStrain = vec3(0.0);
   int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
   vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
-  ${tailColor(harmonics, strains, 'point - uEye', 'byView', 'byStrain')}
+  ${tailColor(arrays, 'point - uEye', 'byView', 'byStrain')}
   vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain;
   vec3 recorded = color + byView;
   vec3 inward = -surface.xyz / max(length(surface.xyz), 1e-12);
-  ${harmonics ? harmonicsSum(harmonics, 'inward', 'color', VIEW_MEANS) : ''}
+  ${harmonicsSum(tailSizes(arrays)[0], 'inward', 'color', VIEW_MEANS)}
   vec4 albedo = vec4(color, surface.a);
   vec3 lit = lit_color(albedo, old.rgb, arriving, highlight, recorded, uTypical, uKept);
   result = vec4(linear_to_srgb(uFactor * lit), 1.0);

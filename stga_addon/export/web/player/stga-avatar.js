@@ -21,7 +21,7 @@ export class Player {
   // `data` of readData. Throws RendererError where the browser cannot draw it.
   /** @param {HTMLCanvasElement} canvas @param {Data} data */
   constructor(canvas, data) {
-    const options = { alpha: true, antialias: false, depth: false, premultipliedAlpha: true };
+    const options = { antialias: false, depth: false };
     const gl = canvas.getContext('webgl2', { ...options, powerPreference: 'high-performance' });
     const problem = 'needs WebGL 2, which this browser or graphics driver does not offer.';
     if (!gl) throw new RendererError(`This page ${problem}`);
@@ -43,9 +43,9 @@ export class Player {
     this.lightPass = null;
     /** @type {Lighting | null} that the light pass holds, for the pose that it holds */
     this.lit = null;
-    /** @type {number | null} */
-    this.posed = null; // frame that faceFrames hold
-    this.frame = 0;
+    /** @type {number | null} that faceFrames hold; null: the pose has to be computed anew */
+    this.posed = null;
+    this.frame = 0; // whole or fractional
     this.milliseconds = 0;
     this.pose();
     this.middle = bounds(this.rig.vertices)[0];
@@ -76,47 +76,33 @@ export class Player {
     return this.renderer.read(this.prepare(camera), camera, this);
   }
 
-  /** Forget the pose, because pinned values have changed. */
-  invalidate() {
-    this.posed = null;
-  }
-
   /** @param {Camera} camera */
   prepare(camera) {
     this.pose();
-    const values = this.renderer.frameValues;
-    this.faceFrames.compose(camera.matrix, values);
-    this.renderer.lightPass = this.lighting && this.litPass(this.lighting);
-    return this.depthSort.sort(values);
+    const { faceFrames, lighting, renderer, rig } = this;
+    faceFrames.compose(camera.matrix, renderer.frameValues);
+    if (lighting && this.lit !== lighting) {
+      this.lightPass ??= new LightPass(this.gl, this.data);
+      this.lightPass.update(rig.vertices, faceFrames.sides, litBy(lighting, this.data.header.up));
+      this.lit = lighting;
+    }
+    renderer.lightPass = lighting && this.lightPass;
+    return this.depthSort.sort(renderer.frameValues);
   }
 
   pose() {
     if (this.posed === this.frame) return;
-    this.motion.sample(this.frame);
-    this.faceFrames.update(this.rig.pose(this.motion));
-    this.faceFrames.annotate(this.selectionBits(), this.renderer.frameValues);
-    this.posed = this.frame;
-    this.lit = null;
-  }
-
-  // The light pass for the current pose.
-  /** @param {Lighting} lighting */
-  litPass(lighting) {
-    this.lightPass ??= new LightPass(this.gl, this.data);
-    if (this.lit !== lighting) {
-      const light = litBy(lighting, this.data.header.up);
-      this.lightPass.update(this.rig.vertices, this.faceFrames.sides, light);
-    }
-    this.lit = lighting;
-    return this.lightPass;
-  }
-
-  selectionBits() {
+    const { faceFrames, frame, motion, renderer, rig } = this;
+    motion.sample(frame);
+    faceFrames.update(rig.pose(motion));
     const { selection } = this.data.arrays;
-    if (!selection || this.motion.shapes.performance) return null;
-    const [, bytes] = selection.shape;
-    const first = bytes * Math.min(Math.round(this.frame), this.motion.frames - 1);
-    return selection.values.subarray(first, first + bytes);
+    const bytes = selection?.shape[1] ?? 0;
+    const first = bytes * Math.min(Math.round(frame), motion.frames - 1);
+    const isKnown = selection && !motion.shapes.performance;
+    const selected = isKnown ? selection.values.subarray(first, first + bytes) : null;
+    faceFrames.annotate(selected, renderer.frameValues);
+    this.posed = frame;
+    this.lit = null;
   }
 
   dispose() {
@@ -141,7 +127,6 @@ export class StgaAvatar extends HTMLElement {
   /** @type {Player | null} */
   #player = null;
   #playing = false;
-  #time = 0; // in frames
   #last = 0;
   #request = 0;
   #loading = 0;
@@ -199,11 +184,12 @@ export class StgaAvatar extends HTMLElement {
 
   /** Whole or fractional frame that is shown, from 0. */
   get frame() {
-    return this.#time;
+    return this.#player?.frame ?? 0;
   }
 
   set frame(value) {
-    this.#time = Math.min(Math.max(Number(value) || 0, 0), Math.max(0, this.frameCount - 1));
+    const frame = Math.min(Math.max(Number(value) || 0, 0), this.frameCount - 1);
+    if (this.#player) this.#player.frame = frame;
     this.#changed('frame');
   }
 
@@ -213,7 +199,7 @@ export class StgaAvatar extends HTMLElement {
 
   play() {
     if (!this.#player || this.#playing || this.frameCount < 2) return;
-    if (!this.loop && this.#time >= this.frameCount - 1) this.#time = 0;
+    if (!this.loop && this.frame >= this.frameCount - 1) this.#player.frame = 0;
     this.#playing = true;
     this.#last = 0;
     this.#changed('play');
@@ -223,15 +209,14 @@ export class StgaAvatar extends HTMLElement {
   pause() {
     if (!this.#playing) return;
     this.#playing = false;
-    this.#time = Math.min(Math.round(this.#time), this.frameCount - 1);
+    this.#loaded.frame = Math.min(Math.round(this.frame), this.frameCount - 1);
     this.#changed('pause');
   }
 
   // Replace an expression (its name or component) by a value; null: as recorded.
   /** @type {(name: string | number, value: number | null) => void} */
   setExpression(name, value) {
-    const component = this.#component(name);
-    this.#loaded.motion.pinnedCoefficients[component] = value ?? NaN;
+    this.#loaded.motion.pinnedCoefficients[this.#component(name)] = value ?? NaN;
     this.#posed();
   }
 
@@ -244,7 +229,7 @@ export class StgaAvatar extends HTMLElement {
   // null: all parts.
   /** @type {(joint: string, rotation: ArrayLike<number | null> | null) => void} */
   setPose(joint, rotation) {
-    const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
+    const at = this.#joint(joint);
     const { pinnedPose } = this.#loaded.motion;
     for (let k = 0; k < 3; k++) pinnedPose[at + k] = rotation?.[k] ?? NaN;
     this.#posed();
@@ -252,7 +237,7 @@ export class StgaAvatar extends HTMLElement {
 
   /** @param {string} joint */
   getPose(joint) {
-    const at = 3 * this.#index(this.#loaded.data.header.joints, joint, 'joint');
+    const at = this.#joint(joint);
     return Array.from(this.#loaded.motion.pose.subarray(at, at + 3));
   }
 
@@ -280,7 +265,7 @@ export class StgaAvatar extends HTMLElement {
       throw new DataError('This avatar has no shapes for a performance.');
     shapes.performance = text === null ? null : readPerformance(text, shapes.names);
     if (text === null) shapes.weights.fill(0);
-    this.#time = 0;
+    this.#loaded.frame = 0;
     this.#last = 0;
     this.dispatchEvent(new CustomEvent('motionchange'));
     this.#posed();
@@ -297,8 +282,7 @@ export class StgaAvatar extends HTMLElement {
     this.#posed();
   }
 
-  // { size, focal, center, matrix }: pixels, and world to camera (16, row-major, OpenCV axes,
-  // meters).
+  // { size, focal, center, matrix } (types.d.ts).
   /** @returns {Camera | null} */
   get camera() {
     return this.#player?.camera ?? null;
@@ -395,7 +379,7 @@ export class StgaAvatar extends HTMLElement {
     return this.#player;
   }
 
-  /** The player. Throws where no avatar is loaded. */
+  /** Throws where no avatar is loaded. */
   get #loaded() {
     if (!this.#player) throw new Error('No avatar is loaded.');
     return this.#player;
@@ -407,6 +391,11 @@ export class StgaAvatar extends HTMLElement {
     const index = names.indexOf(name);
     if (index < 0) throw new RangeError(`There is no ${kind} "${name}".`);
     return index;
+  }
+
+  /** @param {string} name */
+  #joint(name) {
+    return 3 * this.#index(this.#loaded.data.header.joints, name, 'joint');
   }
 
   /** @param {string | number} name of an expression, or its component */
@@ -426,7 +415,6 @@ export class StgaAvatar extends HTMLElement {
     this.#resize(); // before there is anything to draw
     this.#player = player;
     this.#playing = false;
-    this.#time = 0;
     const background = this.getAttribute('background');
     if (background) this.background = background;
     this.dispatchEvent(new CustomEvent('load'));
@@ -438,44 +426,47 @@ export class StgaAvatar extends HTMLElement {
   /** @param {Event} event */
   #lose(event) {
     event.preventDefault(); // so that it will be given back
-    this.#message.textContent = 'The graphics driver was restarted. Waiting for it …';
-    this.#message.hidden = false;
+    this.#say('The graphics driver was restarted. Waiting for it …');
   }
 
   /** Upload everything again, and go on where it was. */
   #restore() {
     if (!this.#player) return;
-    const { camera, pivot, background, showSelection, lighting, data, motion } = this.#player;
+    const { camera, pivot, background, showSelection, lighting, motion, frame } = this.#player;
     try {
-      const kept = { camera, pivot, background, showSelection, lighting, motion };
-      this.#player = Object.assign(new Player(this.#canvas, data), kept);
+      const kept = { camera, pivot, background, showSelection, lighting, motion, frame };
+      this.#player = Object.assign(new Player(this.#canvas, this.#player.data), kept);
     } catch (error) {
       return this.#fail(error);
     }
-    this.#player.invalidate();
     this.#message.hidden = true;
-    this.#changed('frame');
+    this.#posed();
   }
 
   /** @param {unknown} error */
   #fail(error) {
     const known = error instanceof DataError || error instanceof RendererError;
     const text = error instanceof Error ? error.message : String(error);
-    this.#message.textContent = known ? text : `The avatar cannot be shown: ${text}`;
-    this.#message.hidden = false;
+    this.#say(known ? text : `The avatar cannot be shown: ${text}`);
     this.#canvas.hidden = true;
     this.dispatchEvent(new CustomEvent('error', { detail: error }));
   }
 
+  /** @param {string} text */
+  #say(text) {
+    Object.assign(this.#message, { textContent: text, hidden: false });
+  }
+
+  /** After a change of what replaces the recorded motion. */
   #posed() {
-    this.#player?.invalidate();
+    if (this.#player) this.#player.posed = null;
     this.#changed('frame');
   }
 
   /** @param {string} event */
   #changed(event) {
     if (this.#player) this.#request ||= requestAnimationFrame(now => this.#tick(now));
-    this.#player?.motion.sample(this.#time); // what listeners ask for is that of the new frame
+    this.#player?.motion.sample(this.frame); // what listeners ask for is that of the new frame
     this.dispatchEvent(new CustomEvent(event));
   }
 
@@ -487,19 +478,18 @@ export class StgaAvatar extends HTMLElement {
     if (this.#playing) {
       const step = this.#last ? Math.min(Math.max((now - this.#last) / 1000, 0), MAX_STEP_S) : 0;
       this.#last = now;
-      this.#time += step * this.fps * this.speed;
-      if (this.loop) this.#time %= this.frameCount;
-      else if (this.#time >= this.frameCount - 1) this.pause();
+      player.frame += step * this.fps * this.speed;
+      if (this.loop) player.frame %= this.frameCount;
+      else if (player.frame >= this.frameCount - 1) this.pause();
     }
-    player.frame = this.#time;
     player.draw();
     if (this.#playing) this.#changed('frame');
   }
 
   #resize() {
     const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const width = Math.max(1, Math.round(this.clientWidth * ratio));
-    const height = Math.max(1, Math.round(this.clientHeight * ratio));
+    const sides = [this.clientWidth, this.clientHeight];
+    const [width, height] = sides.map(side => Math.max(1, Math.round(side * ratio)));
     if (this.#canvas.width === width && this.#canvas.height === height) return;
     Object.assign(this.#canvas, { width, height });
     if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas

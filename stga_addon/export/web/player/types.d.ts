@@ -1,5 +1,6 @@
 // Types of the player, for `make lint-web`; the page holds none of them.
 
+export type Pair = [number, number];
 export type Vector = [number, number, number];
 
 /** What the player uses of a Float32Array or Int32Array. */
@@ -9,29 +10,16 @@ export interface Values extends ArrayLike<number>, Iterable<number> {
   reduce(add: (sum: number, value: number) => number, start: number): number;
 }
 
-export interface DataArray {
-  shape: number[];
-  values: Values;
-}
-
-export interface View {
-  name: string;
-  size: [number, number];
-  focal: [number, number];
-  center: [number, number];
-  world_to_camera: number[];
-}
-
-export interface Slider {
-  name: string;
-  component: number;
-  reach: number;
-}
+/** A view of a data file: as a camera, but for the matrix's name. */
+export type View = Omit<Camera, 'matrix'> & { name: string; world_to_camera: number[] };
 
 /** Light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
 export type LightOfCapture = { damping: number; recorded: number[]; typical: number[] };
 
-/** Header of a data file, checked. */
+/**
+ * Header of a data file, checked. Of `shapes`, which move expressions, jaw and eyes together, one
+ * counts up to the weight of another only.
+ */
 export interface Header {
   title: string;
   convention: 'stga' | 'gaussian_avatars';
@@ -41,11 +29,7 @@ export interface Header {
   up: Vector;
   joints: string[];
   parents: number[];
-  sliders: Slider[];
-  /**
-   * Controls that move expressions, jaw and eyes together: one counts up to the weight of another
-   * only.
-   */
+  sliders: { name: string; component: number; reach: number }[];
   shapes?: { names: string[]; opens: string; limited: string };
   light?: LightOfCapture;
   views: View[];
@@ -53,28 +37,17 @@ export interface Header {
 
 /** Arrays of a data file, checked: those of `checkData` (data.js). */
 export type Arrays = { [name: string]: DataArray };
-
-export interface Data {
-  header: Header;
-  arrays: Arrays;
-}
+export type DataArray = { shape: number[]; values: Values };
+export type Data = { header: Header; arrays: Arrays };
 
 /** Pixels, and world to camera (16, row-major, OpenCV axes, meters). */
-export interface Camera {
-  size: [number, number];
-  focal: [number, number];
-  center: [number, number];
-  matrix: Float64Array;
-}
+export type Camera = { size: Pair; focal: Pair; center: Pair; matrix: Float64Array };
 
 /**
  * Unit vector towards a distant light, and what a surface that faces it gets: W/m², linear red,
  * green, blue.
  */
-export interface Sun {
-  toward: Vector;
-  color: Vector;
-}
+export type Sun = { toward: Vector; color: Vector };
 
 /**
  * What lights the avatar, in the axes of its meshes. Radiance 1 from everywhere shows albedo as it
@@ -95,11 +68,7 @@ export interface Lighting {
 }
 
 /** Lighting as the player computes with it. */
-export interface LitBy {
-  world: Float64Array;
-  sun: Sun | null;
-  factor: number;
-}
+export type LitBy = { world: Float64Array; sun: Sun | null; factor: number };
 
 /** Red, green, blue and alpha, 0 to 1. */
 export type Color = [number, number, number, number];
@@ -108,28 +77,11 @@ export type Color = [number, number, number, number];
 export type Look = { background: Color; showSelection: boolean };
 
 export type GL = WebGL2RenderingContext;
-
-export interface Program {
-  program: WebGLProgram;
-  uniforms: Record<string, WebGLUniformLocation | null>;
-}
-
-/** Texture that splats are blended into. */
-export interface Target {
-  texture: WebGLTexture;
-  framebuffer: WebGLFramebuffer;
-  format: number;
-  width: number;
-  height: number;
-}
+export type Uniforms = Record<string, WebGLUniformLocation | null>;
+export type Program = { program: WebGLProgram; uniforms: Uniforms };
 
 /**
  * Rows at even times; the column of each shape, and of yaw, pitch and roll of the head (radians);
  * -1: none.
  */
-export interface Performance {
-  columns: number[];
-  head: number[];
-  rows: Float64Array[];
-  fps: number;
-}
+export type Performance = { columns: number[]; head: number[]; rows: Float64Array[]; fps: number };

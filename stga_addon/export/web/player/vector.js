@@ -2,7 +2,7 @@
 // Vectors of three numbers, and rotations as axis-angle vectors, unit quaternions (w, x, y, z) and
 // 3×3 matrices, row by row.
 
-/** @import { Values, Vector } from './types.js' */
+/** @import { Vector } from './types.js' */
 
 const SMALL_ANGLE = 1e-8;
 
@@ -42,40 +42,21 @@ export function box(points) {
   return [low, high];
 }
 
-// Write the matrix of the axis-angle vector at `from` of `vectors` to `out` (9 numbers from `to`).
-/** @type {(vectors: ArrayLike<number>, from: number, out: Float64Array, to: number) => void} */
-export function matrixFromAxisAngle(vectors, from, out, to) {
-  const [x, y, z] = [vectors[from], vectors[from + 1], vectors[from + 2]];
-  const angle = Math.hypot(x, y, z);
-  const first = angle < SMALL_ANGLE ? 1 : Math.sin(angle) / angle;
-  const half = angle < SMALL_ANGLE ? 1 : Math.sin(angle / 2) / (angle / 2);
-  const second = (half * half) / 2; // (1 − cos) / angle², without cancellation
-  out[to] = 1 - second * (y * y + z * z);
-  out[to + 1] = second * x * y - first * z;
-  out[to + 2] = second * x * z + first * y;
-  out[to + 3] = second * x * y + first * z;
-  out[to + 4] = 1 - second * (x * x + z * z);
-  out[to + 5] = second * y * z - first * x;
-  out[to + 6] = second * x * z - first * y;
-  out[to + 7] = second * y * z + first * x;
-  out[to + 8] = 1 - second * (x * x + y * y);
+// The matrix of an axis-angle vector.
+/** @param {ArrayLike<number>} vector */
+export function matrixOf(vector) {
+  const [w, x, y, z] = quaternionOf(vector);
+  const first = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)];
+  const second = [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)];
+  return [...first, ...second, 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
 }
 
 // Axis-angle vector on the shortest arc from axis-angle vector `a` to `b`, at `share` of the way.
 /** @type {(a: ArrayLike<number>, b: ArrayLike<number>, share: number) => Vector} */
 export function slerpAxisAngle(a, b, share) {
-  const p = quaternionOf(a);
-  let q = quaternionOf(b);
-  let cosine = p[0] * q[0] + p[1] * q[1] + p[2] * q[2] + p[3] * q[3];
-  if (cosine < 0) {
-    q = q.map(part => -part);
-    cosine = -cosine;
-  }
-  const angle = Math.acos(Math.min(1, cosine));
-  const sine = Math.sin(angle);
-  const before = sine < SMALL_ANGLE ? 1 - share : Math.sin((1 - share) * angle) / sine;
-  const after = sine < SMALL_ANGLE ? share : Math.sin(share * angle) / sine;
-  return axisAngleOf(p.map((part, k) => before * part + after * q[k]));
+  const [w, x, y, z] = quaternionOf(a);
+  const way = axisAngleOf(multiplied([w, -x, -y, -z], quaternionOf(b)));
+  return axisAngleOf(multiplied([w, x, y, z], quaternionOf(scaled(way, share))));
 }
 
 /** @type {(vector: ArrayLike<number>) => number[]} */
@@ -86,12 +67,11 @@ export function quaternionOf(vector) {
   return [Math.cos(angle / 2), factor * x, factor * y, factor * z];
 }
 
+// By half a turn at most.
 /** @type {(quaternion: number[]) => Vector} */
 export function axisAngleOf([w, x, y, z]) {
   const length = Math.hypot(x, y, z);
-  const angle = 2 * Math.atan2(length, w);
-  const factor = length < SMALL_ANGLE ? 2 : angle / length;
-  return [factor * x, factor * y, factor * z];
+  return scaled([x, y, z], length < SMALL_ANGLE ? 2 : (2 * Math.atan(length / w)) / length);
 }
 
 // The quaternion that turns by `b`, then by `a`.
@@ -103,13 +83,4 @@ export function multiplied([aw, ax, ay, az], [bw, bx, by, bz]) {
     aw * by - ax * bz + ay * bw + az * bx,
     aw * bz + ax * by - ay * bx + az * bw,
   ];
-}
-
-// The unit quaternion whose parts but the largest, which is positive, are `smaller`.
-/** @type {(smaller: Values, largest: number) => number[]} */
-export function wholeQuaternion(smaller, largest) {
-  const rest = Math.sqrt(Math.max(0, 1 - smaller[0] ** 2 - smaller[1] ** 2 - smaller[2] ** 2));
-  const whole = Array.from(smaller);
-  whole.splice(largest, 0, rest);
-  return whole;
 }
