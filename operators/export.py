@@ -145,7 +145,7 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
         check_suffix(path, self.format)
         avatar = read_avatar(self._source(context))
         check_head(avatar, head)
-        motion = playback = None
+        motion, playback = None, Playback(fps=frames_per_second(context.scene))
         if self.format == "web":
             motion = None if self.motion_only else exact_motion(head, frames, self.warn)
             playback = scene_playback(context, head, frames, self.motion_only)
@@ -154,10 +154,9 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
             check_free_space(path, format.size(avatar, len(frames)))
         elif format.source == "motion":
             motion = sample_motion(head, own_motion(head), frames, self.warn)
-        fps = frames_per_second(context.scene)
 
         def write(meshes: Meshes) -> None:
-            export_avatar(path, avatar, self.format, meshes, motion, fps, playback)
+            export_avatar(path, avatar, self.format, meshes, motion, playback)
 
         return path, write
 

@@ -64,7 +64,7 @@ def face_frames(
     rotation and a finite scale.
     """
     triangles = _triangles(vertices, faces)
-    to_p1, to_p2, _ = triangles.edges
+    to_p1, to_p2 = triangles.edges
     if convention == "stga":
         # p0 - origin without computing the origin, whose rounding would not vanish where the
         # corners coincide.
@@ -85,7 +85,7 @@ def face_frames(
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
     deformed = np.zeros((len(faces), 0), np.float32)
     if strain is not None:
-        first_squared, second_squared, _ = triangles.squared
+        first_squared, second_squared = triangles.squared
         deformed = gram_strain(strain, first_squared, _dot(to_p1, to_p2), second_squared)
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
@@ -103,10 +103,7 @@ def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
 
 
 def frame_backward(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    frames: FaceFrames,
-    by_frame: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray, frames: FaceFrames, by_frame: np.ndarray
 ) -> np.ndarray:
     """Gradient (V, 3) of a scalar with respect to the vertices, from its gradient with respect to
     "stga" frames.
@@ -120,7 +117,8 @@ def frame_backward(
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
     x, y = corners[..., 0], corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
-    longest_squared = _largest(_squared(_edges(corners.transpose(1, 2, 0))))
+    edges = corners - corners[:, [1, 2, 0]]
+    longest_squared = np.einsum("fkc,fkc->fk", edges, edges).max(1)
     flat = twice <= np.maximum(2 * MIN_AREA_RATIO * longest_squared, MIN_DIVISOR)
     per_area = np.where(flat, 0.0, 1 / np.where(flat, 1.0, twice))[:, None]
     # Slopes (F, 3) of the corners' barycentric coordinates: the edge across, turned to the left,
@@ -205,13 +203,12 @@ def to_local(world: Splats, frames: FaceFrames, face: np.ndarray) -> Splats:
 
 
 class _Triangles(NamedTuple):
-    """corners (3 corners, 3, F); edges p1 − p0, p2 − p0 and p2 − p1, each (3, F), their squared
-    lengths (F,) and the largest of these; normal (3, F), as long as twice the area; twice_area
-    (F,)."""
+    """corners (3 corners, 3, F); edges p1 − p0 and p2 − p0, each (3, F), their squared lengths (F,)
+    and that of the longest of three; normal (3, F), as long as twice the area; twice_area (F,)."""
 
     corners: np.ndarray
-    edges: tuple[np.ndarray, np.ndarray, np.ndarray]
-    squared: tuple[np.ndarray, np.ndarray, np.ndarray]
+    edges: tuple[np.ndarray, np.ndarray]
+    squared: tuple[np.ndarray, np.ndarray]
     longest_squared: np.ndarray
     normal: np.ndarray
     twice_area: np.ndarray
@@ -220,22 +217,12 @@ class _Triangles(NamedTuple):
 def _triangles(vertices: np.ndarray, faces: np.ndarray) -> _Triangles:
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     corners = np.take(rows, np.ascontiguousarray(faces.T), axis=1).transpose(1, 0, 2)
-    edges = _edges(corners)
-    squared, normal = _squared(edges), _cross(edges[0], edges[1])
-    return _Triangles(corners, edges, squared, _largest(squared), normal, _length(normal))
-
-
-def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return corners[1] - corners[0], corners[2] - corners[0], corners[2] - corners[1]
-
-
-def _squared(edges: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    first, second, third = (_dot(edge, edge) for edge in edges)
-    return first, second, third
-
-
-def _largest(values: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    return np.asarray(np.maximum(np.maximum(values[0], values[1]), values[2]))
+    edges = corners[1] - corners[0], corners[2] - corners[0]
+    third = corners[2] - corners[1]
+    first, second = _dot(edges[0], edges[0]), _dot(edges[1], edges[1])
+    longest = np.maximum(np.maximum(first, second), _dot(third, third))
+    normal = _cross(*edges)
+    return _Triangles(corners, edges, (first, second), longest, normal, _length(normal))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -20,7 +20,11 @@ from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
 
 FORMAT = "stga-avatar"
 VERSION = 2
-
+_HEADER = {
+    "convention": str, "background": list, "antialiased": bool, "principal_point": str,
+    "regions": list, "settings": dict,
+}  # fmt: skip
+"""Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
 _LIGHT_ARRAYS = {
@@ -80,8 +84,7 @@ class Avatar:
     strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and
                   positions follow (`avatar.strain`); None: the same for all, ±MAX_STRAIN
     driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of
-                    that name in
-                `offsets.OFFSETS`, for each of its S components a vector in the triangle's frame
+                    that name in `offsets.OFFSETS`: a vector in its frame for each of S components
     light       what relighting needs, None where it was not estimated
     """
 
@@ -118,9 +121,8 @@ class Avatar:
 
     @cached_property
     def _strain(self) -> StrainBasis | None:
-        if not self.follows_strain:
-            return None
-        return strain_basis(self.neutral, self.faces, self.strain_range)
+        known = self.neutral, self.faces, self.strain_range
+        return strain_basis(*known) if self.follows_strain else None
 
 
 def write_avatar(path: Path, avatar: Avatar) -> None:
@@ -130,26 +132,20 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     triangles.
     """
     _check(path, avatar)
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "convention": avatar.convention,
-        "background": list(avatar.background),
-        "antialiased": avatar.antialiased,
-        "principal_point": avatar.principal_point,
-        "regions": list(avatar.regions),
-        "settings": dict(avatar.settings),
-    }
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+    header |= {name: kind(getattr(avatar, name)) for name, kind in _HEADER.items()}
     arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
-    arrays["neutral"], arrays["faces"] = avatar.neutral, avatar.faces
-    masks = np.array(list(avatar.regions.values()), bool)
-    arrays["region_faces"] = masks.reshape(-1, len(avatar.faces))
+    masks = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
+    arrays |= {"neutral": avatar.neutral, "faces": avatar.faces, "region_faces": masks}
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
     arrays.update(avatar.driven_offsets)
     if avatar.light is not None:
-        found, header["light"] = light_arrays(avatar.light)
-        arrays.update(found)
+        # by vertex in half precision: 30 bytes a vertex
+        rest = dict(vars(avatar.light))
+        for name in _LIGHT_ARRAYS:
+            arrays[_PREFIX + name] = np.asarray(rest.pop(name), np.float16)
+        header["light"] = rest
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_npz(path, arrays)
 
@@ -167,21 +163,17 @@ def read_avatar(path: Path) -> Avatar:
     if masks.ndim != 2 or len(masks) != len(names):
         expected = f"expected ({len(names)}, faces)"
         raise StgaError(f"{path}: region_faces has shape {masks.shape}, {expected}")
-    light, vertices = header.get("light"), len(arrays["neutral"])
-    light = light_from(path, arrays, light, vertices) if "light" in header else None
+    values = {name: header[name] for name in _HEADER}
+    values["regions"] = dict(zip(names, masks, strict=True))
+    values["background"] = tuple(header["background"])
     avatar = Avatar(
         splats=Splats(**{name: arrays[name] for name in ARRAYS if name in arrays}),
-        convention=header["convention"],
         neutral=arrays["neutral"],
         faces=arrays["faces"],
-        settings=header["settings"],
-        regions=dict(zip(names, masks, strict=True)),
-        background=tuple(header["background"]),
-        antialiased=header["antialiased"],
-        principal_point=header["principal_point"],
+        **values,
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
-        light=light,
+        light=_light(path, arrays, header["light"]) if "light" in header else None,
     )
     _check(path, avatar)
     return avatar
@@ -199,11 +191,7 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if header.get("version") != VERSION:
         version = shorten(header.get("version"))
         raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
-    kinds = {
-        "convention": str, "background": list, "antialiased": bool, "principal_point": str,
-        "regions": list, "settings": dict,
-    }  # fmt: skip
-    for name, kind in kinds.items():
+    for name, kind in _HEADER.items():
         if not isinstance(header.get(name), kind):
             raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
     if not all(isinstance(name, str) for name in header["regions"]):
@@ -213,12 +201,10 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
 
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
-    if avatar.convention not in CONVENTIONS:
-        expected = f"expected one of {', '.join(CONVENTIONS)}"
-        raise StgaError(f"{path}: convention is {shorten(avatar.convention)}, {expected}")
-    if avatar.principal_point not in PRINCIPAL_POINTS:
-        expected = f"expected one of {', '.join(PRINCIPAL_POINTS)}"
-        raise StgaError(f"{path}: principal_point is {shorten(avatar.principal_point)}, {expected}")
+    for name, known in (("convention", CONVENTIONS), ("principal_point", PRINCIPAL_POINTS)):
+        if getattr(avatar, name) not in known:
+            found = shorten(getattr(avatar, name))
+            raise StgaError(f"{path}: {name} is {found}, expected one of {', '.join(known)}")
     check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
     check_array(path, "faces", avatar.faces, "int32", (-1, 3))
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
@@ -233,8 +219,7 @@ def _check(path: Path, avatar: Avatar) -> None:
     if limits is not None:
         check_array(path, "strain_range", limits, "float32", (faces, 2, STRAIN_COMPONENTS))
     for name, coefficients in avatar.driven_offsets.items():
-        shape = faces, OFFSETS[name].signals, 3
-        check_array(path, name, coefficients, "float32", shape)
+        check_array(path, name, coefficients, "float32", (faces, OFFSETS[name].signals, 3))
     _check_index(path, "face", avatar.splats.face, faces, "faces")
     for name, mask in avatar.regions.items():
         check_array(path, f"region {name!r}", mask, "bool", (faces,))
@@ -248,9 +233,8 @@ def check_array(
 ) -> None:
     """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is
     finite."""
-    fits = array.ndim == len(shape) and all(
-        want in (-1, have) for want, have in zip(shape, array.shape, strict=True)
-    )
+    sizes = zip(shape, array.shape, strict=False)
+    fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in sizes)
     if not fits or array.dtype != dtype:
         expected = ", ".join("any" if size < 0 else str(size) for size in shape)
         found = f"{array.dtype} {array.shape}"
@@ -265,31 +249,20 @@ def _check_index(path: Path, name: str, index: np.ndarray, count: int, of: str) 
         raise StgaError(f"{path}: {refers}, but there are {count} {of}")
 
 
-def light_arrays(light: AvatarLight) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays for an avatar file, by vertex in half precision (30 bytes a vertex), and the rest for
-    its header."""
-    values, arrays = dict(vars(light)), {}
-    for name in _LIGHT_ARRAYS:
-        arrays[f"{_PREFIX}{name}"] = np.asarray(values.pop(name), np.float16)
-    return arrays, values
-
-
-def light_from(
-    path: Path, arrays: Mapping[str, np.ndarray], rest: object, vertices: int
-) -> AvatarLight:
-    """The reverse of `light_arrays`. Raises StgaError naming the file and what is wrong."""
+def _light(path: Path, arrays: Mapping[str, np.ndarray], rest: object) -> AvatarLight:
+    """By what the header says. Raises StgaError naming the file and what is wrong."""
     values: dict[str, Any] = {}
     for name, shape in _LIGHT_ARRAYS.items():
         array = arrays.get(_PREFIX + name, np.zeros(0))
-        sizes = tuple(vertices if size < 0 else size for size in shape)
+        sizes = tuple(len(arrays["neutral"]) if size < 0 else size for size in shape)
         check_array(path, _PREFIX + name, array, "float16", sizes)
         values[name] = array.astype(np.float32)
-    if not isinstance(rest, dict) or rest.get("source") not in SOURCES:
-        expected_fields = "expected residual, damping and source"
-        raise StgaError(f"{path}: header field 'light' is {shorten(rest)}, {expected_fields}")
-    for name in ("residual", "damping"):
-        value = rest.get(name)
-        if not isinstance(value, (int, float)) or not 0 <= value <= 1e6:
-            found = f"header field 'light.{name}' is {shorten(value)}"
-            raise StgaError(f"{path}: {found}, expected a number from 0 on")
-    return AvatarLight(**values, **{name: rest[name] for name in ("residual", "damping", "source")})
+    match rest:
+        case {
+            "residual": int() | float() as residual,
+            "damping": int() | float() as damping,
+            "source": str() as source,
+        } if source in SOURCES and min(residual, damping) >= 0:
+            return AvatarLight(**values, residual=residual, damping=damping, source=source)
+    expected = "expected residual and damping, numbers from 0 on, and source"
+    raise StgaError(f"{path}: header field 'light' is {shorten(rest)}, {expected}")

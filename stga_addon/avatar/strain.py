@@ -3,7 +3,8 @@ bulges."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ MIN_SQUARED_NORMAL = 1e-24
 having no area."""
 
 
-class IndexLists(NamedTuple):
+@dataclass(frozen=True)
+class IndexLists:
     """Lists of indices, compressed: the i-th is indices[indptr[i] : indptr[i + 1]]."""
 
     indptr: np.ndarray
@@ -44,16 +46,14 @@ class IndexLists(NamedTuple):
         """Length of each list."""
         return np.diff(self.indptr)
 
-
-class RankedLists(NamedTuple):
-    """The same lists by rank, so that numpy adds along them without a loop over lists.
-
-    order  lists by falling length; ranks: for each rank, the index at that place of every list that
-           is long enough
-    """
-
-    order: np.ndarray
-    ranks: tuple[np.ndarray, ...]
+    @cached_property
+    def by_rank(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Lists by falling length; for each rank, the index at that place of every list that is
+        long enough. So numpy adds along them without a loop over lists."""
+        order = np.argsort(-self.counts, kind="stable")
+        starts, counts = self.indptr[:-1][order], self.counts[order]
+        lengths = ((counts > rank).sum() for rank in range(int(counts.max(initial=0))))
+        return order, [self.indices[starts[:n] + rank] for rank, n in enumerate(lengths)]
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,6 @@ class StrainBasis:
     vertex_weight (V,): a third of one over how many these are.
     range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
     neighbors: `edge_neighbors`.
-    ranked_vertex_faces, ranked_neighbors: both by rank.
     neighbor_weight (F,): one over how many neighbors a triangle has and itself.
     """
 
@@ -83,8 +82,6 @@ class StrainBasis:
     range: np.ndarray
     neighbors: IndexLists
     neighbor_weight: np.ndarray
-    ranked_vertex_faces: RankedLists
-    ranked_neighbors: RankedLists
 
 
 def strain_basis(
@@ -95,7 +92,8 @@ def strain_basis(
 
     strain_range: (F, 2, 3) `StrainBasis.range`; None: ±MAX_STRAIN.
     """
-    d1, d2 = _edges(neutral, faces)
+    p0, p1, p2 = np.asarray(neutral, np.float64)[faces.T]
+    d1, d2 = p1 - p0, p2 - p0
     normal = np.cross(d1, d2)
     square = _dot(normal, normal)
     flat = square < MIN_SQUARED_NORMAL
@@ -124,8 +122,6 @@ def strain_basis(
         range=_by_component(strain_range),
         neighbors=neighbors,
         neighbor_weight=(1 / (1 + neighbors.counts)).astype(np.float32),
-        ranked_vertex_faces=_ranked(vertex_faces),
-        ranked_neighbors=_ranked(neighbors),
     )
 
 
@@ -136,25 +132,18 @@ def _index_lists(owners: np.ndarray, indices: np.ndarray, count: int) -> IndexLi
     return IndexLists(indptr, indices[np.argsort(owners, kind="stable")])
 
 
-def _ranked(lists: IndexLists) -> RankedLists:
-    order = np.argsort(-lists.counts, kind="stable")
-    starts, counts = lists.indptr[:-1][order], lists.counts[order]
-    lengths = (int((counts > rank).sum()) for rank in range(int(counts.max(initial=0))))
-    ranks = tuple(lists.indices[starts[:n] + rank] for rank, n in enumerate(lengths))
-    return RankedLists(order, ranks)
-
-
-def _add_listed(lists: RankedLists, rows: np.ndarray, total: np.ndarray) -> None:
+def _add_listed(lists: IndexLists, rows: np.ndarray, total: np.ndarray) -> None:
     """Add to the columns of total (·, L) the columns of rows (·, N) that each of L lists names, in
     the list's order.
 
     Not by `np.add.at`, which numpy before 1.25, as in Blender 4.2, carries out element by element.
     """
+    order, ranks = lists.by_rank
     for row, sums in zip(rows, total, strict=True):
-        ordered = np.take(sums, lists.order)
-        for indices in lists.ranks:
+        ordered = np.take(sums, order)
+        for indices in ranks:
             ordered[: len(indices)] += np.take(row, indices)
-        sums[lists.order] = ordered
+        sums[order] = ordered
 
 
 def edge_neighbors(faces: np.ndarray) -> IndexLists:
@@ -186,7 +175,7 @@ def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
     smoothed = np.ascontiguousarray((strain - rest_strain(basis.range)).T, np.float32)
     for _ in range(AVERAGING_ROUNDS):
         total = smoothed.copy()
-        _add_listed(basis.ranked_neighbors, smoothed, total)
+        _add_listed(basis.neighbors, smoothed, total)
         smoothed = total * basis.neighbor_weight
     return np.ascontiguousarray(smoothed.T)
 
@@ -235,7 +224,7 @@ def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
     e1, e2 = p1 - p0, p2 - p0
-    return gram_strain(basis, _row_dot(e1, e1), _row_dot(e1, e2), _row_dot(e2, e2))
+    return gram_strain(basis, _dot(e1.T, e1.T), _dot(e1.T, e2.T), _dot(e2.T, e2.T))
 
 
 def gram_strain(
@@ -248,7 +237,7 @@ def gram_strain(
     change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
     tensor = np.einsum("kf,kdf->df", change, basis.to_tensor.transpose(1, 2, 0))
     at_vertex = np.zeros((len(tensor), len(basis.vertex_weight)), np.float32)
-    _add_listed(basis.ranked_vertex_faces, tensor, at_vertex)
+    _add_listed(basis.vertex_faces, tensor, at_vertex)
     p0, p1, p2 = np.take(at_vertex * basis.vertex_weight, basis.corners, axis=1).transpose(1, 0, 2)
     strain = np.einsum("df,kdf->kf", p0 + p1 + p2, basis.to_plane.transpose(1, 2, 0))
     lowest, highest = basis.range.transpose(1, 2, 0)
@@ -256,18 +245,9 @@ def gram_strain(
     return np.ascontiguousarray(within.T)
 
 
-def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    corners = np.asarray(vertices, np.float64)[faces]
-    return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-
-
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(np.einsum("fi,fi->f", a, b))
-
-
-def _row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products (F,) of vectors (3, F)."""
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+    """Scalar products (F,) of vectors (F, 3)."""
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
 
 
 def _by_component(per_face: np.ndarray, dtype: Any = None) -> np.ndarray:

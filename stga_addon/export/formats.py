@@ -14,7 +14,7 @@ from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes
 from .gltf import write_gltf
-from .playback import DEFAULT_FPS, Playback, check_rate
+from .playback import Playback, check_rate
 from .ply import ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
@@ -34,10 +34,8 @@ class Content:
     playback: Playback = field(default_factory=Playback)
 
     def frames(self, path: Path) -> Iterator[tuple[int, Splats]]:
-        """The splats in world space on each mesh, with its number.
-
-        Raises StgaError naming `path` where there is no mesh or no splat.
-        """
+        """The splats in world space on each mesh, with its number. Raises StgaError naming `path`
+        where there is no mesh or no splat."""
         if not len(self.avatar.splats):
             raise StgaError(f"{path}: the avatar has no splats to export")
         number = None
@@ -138,8 +136,7 @@ FORMATS = {
 
 def export_avatar(
     path: Path, avatar: Avatar, format: str, meshes: Meshes = (),
-    sequence: FlameSequence | None = None, fps: float = DEFAULT_FPS,
-    playback: Playback | None = None,
+    sequence: FlameSequence | None = None, playback: Playback | None = None,
 ) -> list[Path]:  # fmt: skip
     """Write an avatar in one of FORMATS, all of its files or none; returns the files written.
 
@@ -148,13 +145,12 @@ def export_avatar(
              (point_cloud.ply and flame_param.npz)
     meshes   taken one at a time; a "frame" takes the first
     sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
-    fps      meshes per second
-    playback what else a "web" page shows, and its meshes per second
+    playback meshes per second, and what else a "web" page shows
     Raises StgaError where the suffix is another, the format needs what is not given or has no such
     frame rate, or a file cannot be written.
     """
     check_suffix(path, format)
-    playback = playback or Playback(fps=fps)
+    playback = playback or Playback()
     if FORMATS[format].has_rate:
         check_rate(path, playback.fps)
     return FORMATS[format].write(path, Content(avatar, meshes, sequence, playback)) or [path]

@@ -15,7 +15,10 @@ from ..files import replacing
 EXTENSION = "KHR_gaussian_splatting"
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
 _POINTS, _VERTICES = 0, 34962  # primitive mode; buffer target ARRAY_BUFFER
-_COMPONENTS = {"float32": 5126, "uint8": 5121}
+_COMPONENTS = {
+    "float32": {"componentType": 5126},
+    "uint8": {"componentType": 5121, "normalized": True},
+}
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -42,18 +45,15 @@ def write_gltf(path: Path, world: Splats) -> None:
         name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
         attributes[name] = world.sh[:, k]
     views, accessors, offset = [], list[dict[str, Any]](), 0
-    for name, array in attributes.items():
+    for array in attributes.values():
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
+        accessor = {"bufferView": len(views), "count": len(array)}
+        accessor |= _COMPONENTS[array.dtype.name]
+        accessors.append(accessor | {"type": _TYPES[array.shape[1] if array.ndim > 1 else 1]})
         views.append(view | {"target": _VERTICES})
-        accessor: dict[str, Any] = {"bufferView": len(views) - 1, "count": len(array)}
-        accessor["componentType"] = _COMPONENTS[array.dtype.name]
-        accessor["type"] = _TYPES[array.shape[1] if array.ndim > 1 else 1]
-        if array.dtype == np.uint8:
-            accessor |= {"normalized": True}
-        if name == "POSITION":
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        accessors.append(accessor)
         offset += array.nbytes
+    # The first is the position.
+    accessors[0] |= {"min": world.xyz.min(axis=0).tolist(), "max": world.xyz.max(axis=0).tolist()}
     splatting = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",

@@ -102,17 +102,11 @@ def read_ply(path: Path) -> Splats:
 
 def splat_columns(splats: Splats) -> np.ndarray:
     """(N, 62) float32 in the order of PROPERTIES."""
-    count = len(splats)
-    columns = np.zeros((count, len(PROPERTIES)), "<f4")
-    columns[:, 0:3] = splats.xyz
-    columns[:, 6:9] = splats.sh[:, 0]
-    rest = columns[:, 9 : 9 + REST_COEFFICIENTS].reshape(count, 3, REST_COEFFICIENTS // 3)
-    rest[:, :, : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
-    columns[:, 9 : 9 + REST_COEFFICIENTS] = rest.reshape(count, REST_COEFFICIENTS)
-    columns[:, 54] = splats.opacity
-    columns[:, 55:58] = splats.log_scale
-    columns[:, 58:62] = splats.rotation
-    return columns
+    count, normals = len(splats), np.zeros_like(splats.xyz)
+    rest = np.zeros((count, 3, REST_COEFFICIENTS // 3), np.float32)
+    rest[..., : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+    parts = splats.xyz, normals, splats.sh[:, 0], rest.reshape(count, REST_COEFFICIENTS)
+    return np.column_stack([*parts, splats.opacity, splats.log_scale, splats.rotation])
 
 
 def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -210,19 +204,16 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
     raise StgaError(f"{path}: PLY header describes no vertices")
 
 
-PLY_NAME, MOTION_NAME, BINDING = "point_cloud.ply", "flame_param.npz", "binding_0"
-
-
 def write_gaussian_avatars(
     folder: Path, avatar: Avatar, sequence: FlameSequence | None
 ) -> list[Path]:
     """Write point_cloud.ply and flame_param.npz of GaussianAvatars' layout into `folder`, both or
-    neither.
+    neither; returns them.
 
     Splats go out in the "gaussian_avatars" convention, all float32 and before activation, with the
     triangle as the float property binding_0. The motion holds every timestep of `sequence`, its
-    static offset, and the dynamic offset that the viewer requires. Returns the two files. Raises
-    StgaError without a sequence, or where its mesh is not the avatar's.
+    static offset, and the dynamic offset that the viewer requires. Raises StgaError without a
+    sequence, or where its mesh is not the avatar's.
     """
     if sequence is None:
         raise StgaError(f"{folder}: GaussianAvatars needs the FLAME parameters of a FLAME capture")
@@ -232,12 +223,13 @@ def write_gaussian_avatars(
         raise StgaError(f"{folder}: {problem}, expected an avatar trained on this model's meshes")
     splats = in_convention(avatar, "gaussian_avatars")
     columns = np.column_stack([splat_columns(splats), splats.face.astype(np.float32)])
+    files = [folder / "point_cloud.ply", folder / "flame_param.npz"]
     with replacing_together() as new_file:
-        with new_file(folder / PLY_NAME) as partial:
-            save_columns(partial, [*PROPERTIES, BINDING], columns)
-        with new_file(folder / MOTION_NAME) as partial:
+        with new_file(files[0]) as partial:
+            save_columns(partial, [*PROPERTIES, "binding_0"], columns)
+        with new_file(files[1]) as partial:
             save_npz(partial, motion_arrays(sequence, np.float32), compressed=True)
-    return [folder / PLY_NAME, folder / MOTION_NAME]
+    return files
 
 
 def in_convention(avatar: Avatar, convention: str) -> Splats:

@@ -81,12 +81,26 @@ def _write_layer(
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
-    prim = None
+    types, vt, prim = usd.Sdf.ValueTypeNames, usd.Vt, None
     for number, world in frames:
         if prim is None:
             prim = _define(usd, stage, world, moving_color)
             stage.SetStartTimeCode(number)
-        _write_sample(usd, prim, number, world, moving_color)
+        scales = world.scales()
+        reach = EXTENT_DEVIATIONS * scales.max(axis=1, keepdims=True)
+        extent = np.stack([(world.xyz - reach).min(axis=0), (world.xyz + reach).max(axis=0)])
+        xyzw = _rows(world.unit_rotations()[:, [1, 2, 3, 0]])  # as FromNumpy takes them
+        values = [
+            ("extent", types.Float3Array, vt.Vec3fArray.FromNumpy(extent)),
+            ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
+            ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
+            ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(xyzw)),
+        ]
+        if moving_color:
+            half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))
+            values.append((f"{COEFFICIENTS}h", types.Half3Array, half))
+        for name, kind, value in values:
+            prim.CreateAttribute(name, kind, False).Set(value, number)
         stage.SetEndTimeCode(number)
         layer.Save()
 
@@ -110,25 +124,6 @@ def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
         coefficients = usd.Vt.Vec3fArray.FromNumpy(_rows(first.sh))
         prim.CreateAttribute(COEFFICIENTS, types.Float3Array, False).Set(coefficients)
     return prim
-
-
-def _write_sample(usd: Any, prim: Any, time: int, world: Splats, moving_color: bool) -> None:
-    types, vt = usd.Sdf.ValueTypeNames, usd.Vt
-    scales = world.scales()
-    reach = EXTENT_DEVIATIONS * scales.max(axis=1, keepdims=True)
-    extent = np.stack([(world.xyz - reach).min(axis=0), (world.xyz + reach).max(axis=0)])
-    xyzw = _rows(world.unit_rotations()[:, [1, 2, 3, 0]])  # as FromNumpy takes them
-    values = [
-        ("extent", types.Float3Array, vt.Vec3fArray.FromNumpy(extent)),
-        ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
-        ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
-        ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(xyzw)),
-    ]
-    if moving_color:
-        half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))
-        values.append((f"{COEFFICIENTS}h", types.Half3Array, half))
-    for name, kind, value in values:
-        prim.CreateAttribute(name, kind, False).Set(value, time)
 
 
 def _rows(array: np.ndarray) -> np.ndarray:

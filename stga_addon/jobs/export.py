@@ -88,7 +88,8 @@ def export(request: Export, report: Report, say: Say) -> Written:
     if request.motion is not None:
         capture = avatar_source.motion_capture(request, avatar, capture, say)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
-    format, playback, timestep = FORMATS[request.file_format], None, request.timestep
+    format, timestep = FORMATS[request.file_format], request.timestep
+    playback = Playback(fps=fps)
     flame = None if capture is None else capture.flame
     meshes: Meshes = [(0, avatar.neutral)]
     if format.is_page and capture is None and request.frames is None:
@@ -108,7 +109,7 @@ def export(request: Export, report: Report, say: Say) -> Written:
         if timestep not in capture.timesteps:
             raise StgaError(f"{capture.root}: has no timestep {timestep}")
         meshes = [(timestep, capture.mesh(timestep))]
-    export_avatar(request.output, avatar, request.file_format, meshes, flame, fps, playback)
+    export_avatar(request.output, avatar, request.file_format, meshes, flame, playback)
     return Written(request.output)
 
 

@@ -213,8 +213,8 @@ def test_neighbors_share_an_edge() -> None:
     """Catches triangles that touch at a corner only, an edge of three triangles, and one that is
     its own neighbor."""
     fan = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [4, 1, 5], [5, 6, 7], [8, 8, 9]])
-    indptr, indices = edge_neighbors(fan)
-    found = [sorted(indices[indptr[f] : indptr[f + 1]].tolist()) for f in range(len(fan))]
+    lists = edge_neighbors(fan)
+    found = [sorted(part.tolist()) for part in np.split(lists.indices, lists.indptr[1:-1])]
     assert found == [[1, 2], [0, 2], [0, 1, 3], [2], [], []]
 
 

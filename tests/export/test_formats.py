@@ -18,7 +18,7 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
-from stga_addon.export.playback import DEFAULT_FPS, playback_fps
+from stga_addon.export.playback import DEFAULT_FPS, Playback, playback_fps
 from stga_addon.export.ply import read_ply
 
 
@@ -80,7 +80,7 @@ def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):
     """Catches a file its viewers refuse, such as a page with damaged data."""
     path = tmp_path / f"a{FORMATS[format].suffixes[0]}"
     with pytest.raises(StgaError, match=r"frame rate \(--fps\) must be from 0\.01 to 1000"):
-        export_avatar(path, avatar, format, [(0, avatar.neutral)], fps=fps)
+        export_avatar(path, avatar, format, [(0, avatar.neutral)], playback=Playback(fps=fps))
     assert list(tmp_path.iterdir()) == []
 
 

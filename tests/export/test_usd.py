@@ -15,8 +15,9 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
+from stga_addon.export.playback import Playback
 
-FPS, MISSING = 30.0, "the package usd-core is not installed"
+PLAYBACK, MISSING = Playback(fps=30.0), "the package usd-core is not installed"
 
 
 def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple[int, np.ndarray]]:
@@ -63,10 +64,10 @@ def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
     """Catches wrong quaternion or coefficient order, activations, frames, no strain."""
     path = tmp_path / f"a{suffix}"
     stage_of = avatar if color == "constant" else strained(avatar)
-    assert export_avatar(path, stage_of, "usd", moved(avatar), fps=FPS) == [path]
+    assert export_avatar(path, stage_of, "usd", moved(avatar), playback=PLAYBACK) == [path]
     stage = opened(path)
     times = stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()
-    assert times == (3, 7, FPS)
+    assert times == (3, 7, 30.0)
     pictures = []
     for frame, mesh in moved(avatar):
         expected = to_world(stage_of.splats, stage_of.frames(mesh))
@@ -85,7 +86,7 @@ def test_valid(avatar, tmp_path):
     from pxr import UsdGeom
 
     path = tmp_path / "a.usdz"
-    export_avatar(path, avatar, "usd", moved(avatar), fps=FPS)
+    export_avatar(path, avatar, "usd", moved(avatar), playback=PLAYBACK)
     stage = opened(path)
     validators = validation.ValidationRegistry().GetOrLoadAllValidators()
     assert validators

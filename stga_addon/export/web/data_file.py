@@ -16,7 +16,7 @@ from ...capture.mesh_geometry import weighted_procrustes
 from ...flame.forward import joint_positions
 from ...flame.model import JOINTS
 from ...flame.quaternions import from_matrices, to_axis_angle
-from ...flame.sequence import FlameSequence, with_identity
+from ...flame.sequence import FlameSequence, motion_arrays, with_identity
 from ...light.relight import Relighter
 from ..playback import Playback
 from ..spz import smallest_three
@@ -30,21 +30,16 @@ GZIP_LEVEL = 7
 """Level 9 takes six times as long and makes the demo's page half a percent smaller."""
 
 
-@dataclass(frozen=True)
-class FixedPoint:
-    """Real numbers to be stored as multiples of `step`, with an error of at most half of it."""
+def pack(
+    header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], steps: Mapping[str, float]
+) -> bytes:
+    """A data file: `header` and `arrays`, by their names in fixed point as multiples of a step,
+    with an error of at most half of it.
 
-    values: np.ndarray
-    step: float
-
-
-def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint]) -> bytes:
-    """A data file: `header` and `arrays`, which are integers, float32 or `FixedPoint`.
-
-    Integers are stored exactly. Equal contents give equal bytes. Raises ValueError where a value is
-    not finite, or too many steps from zero.
+    Other integers are stored exactly, others in float32. Equal contents give equal bytes. Raises
+    ValueError where a value is not finite, or too many steps from zero.
     """
-    packed = {name: _entry(name, array) for name, array in arrays.items()}
+    packed = {name: _entry(name, array, steps.get(name)) for name, array in arrays.items()}
     entries = {name: entry for name, (entry, _) in packed.items()}
     complete = {"format": FORMAT, "version": VERSION, **header, "arrays": entries}
     text = json.dumps(complete, ensure_ascii=False, allow_nan=False).encode("utf-8")
@@ -53,20 +48,20 @@ def pack(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray | FixedPoint
     return gzip.compress(raw, GZIP_LEVEL, mtime=0)
 
 
-def _entry(name: str, array: np.ndarray | FixedPoint) -> tuple[dict[str, Any], bytes]:
+def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, Any], bytes]:
     """Header entry and stored bytes of an array."""
-    if isinstance(array, FixedPoint):
-        steps = np.rint(np.asarray(array.values, np.float64) / array.step)
+    if step is not None:
+        steps = np.rint(np.asarray(array, np.float64) / step)
         if not (np.abs(steps) < MAX_STEPS).all():
-            limit = MAX_STEPS * array.step
+            limit = MAX_STEPS * step
             raise ValueError(f"{name} holds a value that is not finite, or beyond {limit:g}")
-        integers, entry = steps.astype(np.int64), {"type": "fixed", "step": array.step}
+        integers, entry = steps.astype(np.int64), {"type": "fixed", "step": step}
     elif array.dtype.kind in "iub":
         integers, entry = array.astype(np.int64), {"type": "integer"}
     else:
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} holds a value that is not finite")
         floats = np.ascontiguousarray(array, "<f4")
+        if not np.isfinite(floats).all():
+            raise ValueError(f"{name} holds a value that is not finite")
         return {"type": "float32", "shape": list(array.shape)}, floats.tobytes()
     # Byte planes of what is above the lowest, least significant first. Within a plane the last
     # axis varies slowest, so that equal quantities lie side by side: gzip gains a fifth.
@@ -95,7 +90,7 @@ class WebRig:
                  `expression_names` or, without any, numbers
     correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus
                  identity
-    joints       (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
+    joint_rest   (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
     parents      of the joints, -1 for the root
     weights      (V, J) of linear blend skinning
     coefficients (T, R); pose (T, J, 3) axis-angle; translation (T, 3), added last
@@ -104,7 +99,7 @@ class WebRig:
     base: np.ndarray
     basis: np.ndarray
     correctives: np.ndarray
-    joints: np.ndarray
+    joint_rest: np.ndarray
     joint_basis: np.ndarray
     joint_names: tuple[str, ...]
     parents: tuple[int, ...]
@@ -120,28 +115,25 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
     """The FLAME model with the person's identity baked in; dynamic offsets become blend shapes."""
     person = with_identity(sequence)
     model = person.model
-    frames = [person.frame(timestep) for timestep in person.timesteps]
-    expressions = np.moveaxis(model.shapedirs, 2, 0)
-    coefficients = np.stack([frame.expr for frame in frames])
-    offsets = [frame.dynamic_offset for frame in frames]
-    if any(offset is not None for offset in offsets):
-        zero = np.zeros_like(model.v_template)
-        moved = np.stack([zero if offset is None else offset for offset in offsets])
-        shapes, factors = principal_shapes(moved)
+    motion = motion_arrays(person)
+    expressions, coefficients = np.moveaxis(model.shapedirs, 2, 0), motion["expr"]
+    if motion["dynamic_offset"].any():
+        shapes, factors = principal_shapes(motion["dynamic_offset"])
         expressions = np.concatenate([expressions, shapes])
         coefficients = np.concatenate([coefficients, factors], axis=1)
+    turns = [motion[name] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")]
     return WebRig(
         base=model.v_template,
         basis=expressions,
         correctives=np.moveaxis(model.posedirs, 2, 0),
-        joints=joint_positions(model, model.v_template),
+        joint_rest=joint_positions(model, model.v_template),
         joint_basis=np.einsum("jv,rvc->rjc", model.j_regressor, expressions),
         joint_names=JOINTS,
         parents=tuple(model.parents.tolist()),
         weights=model.weights,
         coefficients=coefficients,
-        pose=np.stack([frame.pose for frame in frames]),
-        translation=np.stack([frame.translation for frame in frames]),
+        pose=np.concatenate(turns, axis=1).reshape(len(coefficients), -1, 3),
+        translation=motion["translation"],
         expressions=model.n_expression,
         expression_names=model.expression_names,
     )
@@ -166,7 +158,7 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
         base=base,
         basis=basis,
         correctives=np.zeros((0, vertices, 3)),
-        joints=np.zeros((1, 3)),
+        joint_rest=np.zeros((1, 3)),
         joint_basis=np.zeros((len(basis), 1, 3)),
         joint_names=("root",),
         parents=(-1,),
@@ -195,37 +187,39 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return basis, coefficients / largest
 
 
-Arrays = dict[str, np.ndarray | FixedPoint]
-
-# Steps of fixed-point values: half of one is the largest error. Together they leave a picture of
-# large random splats 55 dB PSNR at least (tests/export/web/test_page.py).
 POSITION_STEP_M = 4e-6
-ROTATION_STEP = 1 / 724
-"""The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each."""
-LOG_SCALE_STEP = 0.015
-OPACITY_STEP = 1 / 255
-COLOR_STEP = 0.004
-"""Of the constant SH coefficient, which a color has 0.28 times."""
-SH_STEP = 0.005
-STRAIN_COLOR_STEP = 0.008
-STRAIN_RANGE_STEP = 0.002
-"""Of the ends of a triangle's range of strain: positions that follow it by 2 mm err by 2 µm."""
+STEPS = {
+    # The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each.
+    "rotation": 1 / 724,
+    "log_scale": 0.015,
+    "opacity": 1 / 255,
+    # Of the constant SH coefficient, which a color has 0.28 times.
+    "color": 0.004,
+    "sh": 0.005,
+    "strain_color": 0.008,
+    # Of the ends of a triangle's range: positions that follow strain by 2 mm err by 2 µm.
+    "strain_range": 0.002,
+    # Meters, so fine that no thin triangle becomes a line, or the reverse.
+    "base": 2.0**-24,
+    "neutral": 2.0**-24,
+    "basis": 2e-6,
+    "correctives": 2e-6,
+    "weights": 1 / 65535,
+    # Of irradiance over radiance, which is at most π.
+    "light_transfer": 2.0**-12,
+    "light_occlusion": 1 / 255,
+    "light_roughness": 1 / 255,
+}
+"""Array -> step of its fixed-point values: half of one is the largest error. With POSITION_STEP_M
+they leave a picture of large random splats 55 dB PSNR at least (tests/export/web/test_page.py)."""
 OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
 """Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its
 coefficients.
 
 Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a
 splat by 0.75 µm along an axis at most, where half of POSITION_STEP_M is 2 µm."""
-TRANSFER_STEP = 2.0**-12
-"""Of irradiance over radiance, which is at most π."""
-SHARE_STEP = 1 / 255
-"""Of ambient occlusion and roughness."""
 IRRADIANCE_STEPS = 65535
 """Steps to the largest irradiance of the capture, whose level is any."""
-VERTEX_STEP_M = 2.0**-24
-"""Of base and neutral mesh: so fine that no thin triangle becomes a line, or the reverse."""
-BASIS_STEP_M = 2e-6
-WEIGHT_STEP = 1 / 65535
 
 MIN_SLIDER_RANGE, SLIDER_HEADROOM = 1.0, 1.5
 """Sliders reach beyond the motion by this factor, and to ±1 at least."""
@@ -240,32 +234,74 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     surface = avatar.splats.face if relighter is None else relighter.face
     # equal triangles side by side, which gzip likes
     order = np.lexsort((surface, avatar.splats.face))
-    splats = avatar.splats.rows(order)
-    frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
-    # meters of a unit of the splats' local frames, where it is largest
-    unit = float(frames.scale.max(initial=1e-6))
-    arrays = _splat_arrays(splats, unit) | {
+    splats, faces = avatar.splats.rows(order), len(avatar.faces)
+    arrays = _splat_arrays(splats) | {
         "faces": avatar.faces,
-        "neutral": FixedPoint(avatar.neutral, VERTEX_STEP_M),
-        "splats_per_face": np.bincount(splats.face, minlength=len(avatar.faces)),
-        "base": FixedPoint(rig.base, VERTEX_STEP_M),
-        "basis": FixedPoint(rig.basis, BASIS_STEP_M),
-        "correctives": FixedPoint(rig.correctives, BASIS_STEP_M),
-        "weights": FixedPoint(rig.weights, WEIGHT_STEP),
-        "joint_rest": rig.joints.astype(np.float32),
-        "joint_basis": rig.joint_basis.astype(np.float32),
-        "coefficients": rig.coefficients.astype(np.float32),
-        "pose": rig.pose.astype(np.float32),
-        "translation": rig.translation.astype(np.float32),
+        "neutral": avatar.neutral,
+        "splats_per_face": np.bincount(splats.face, minlength=faces),
     }
-    rows = (len(avatar.faces), -1)
+    moving = "base basis correctives weights joint_rest joint_basis coefficients pose translation"
+    arrays |= {name: getattr(rig, name) for name in moving.split()}
+    # meters of a unit of the splats' local frames, where it is largest
+    frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
+    unit = float(frames.scale.max(initial=1e-6))
+    steps = STEPS | {"xyz": POSITION_STEP_M / unit, "light_lash_corners": POSITION_STEP_M / unit}
     if avatar.follows_strain and avatar.strain_range is not None:
-        arrays["strain_range"] = FixedPoint(avatar.strain_range.reshape(rows), STRAIN_RANGE_STEP)
+        arrays["strain_range"] = avatar.strain_range.reshape(faces, -1)
     for name, coefficients in avatar.driven_offsets.items():
         if name not in OFFSET_STEPS_M:
             raise ValueError(f"the web player has no driven offset {name}")
-        arrays[name] = FixedPoint(coefficients.reshape(rows), OFFSET_STEPS_M[name] / unit)
-    header: dict[str, Any] = {
+        arrays[name] = coefficients.reshape(faces, -1)
+        steps[name] = OFFSET_STEPS_M[name] / unit
+    header = _header(avatar, rig, playback)
+    if playback.controls is not None and rig.expressions:
+        controls = playback.controls
+        arrays |= {"shape_linear": controls.linear, "shape_products": controls.products}
+        header["shapes"] = {"names": list(controls.names)}
+        header["shapes"] |= {"opens": controls.opens, "limited": controls.limited}
+        if rig.expression_names:  # they are ARKit's shapes, whose sliders these are
+            header["sliders"] = []
+    if relighter is not None:
+        light, lashes = relighter.light, relighter.lashes
+        by_vertex = "transfer", "occlusion", "irradiance", "roughness"
+        arrays |= {f"light_{name}": getattr(light, name) for name in by_vertex}
+        steps["light_irradiance"] = float(light.irradiance.max(initial=1e-6)) / IRRADIANCE_STEPS
+        # of most splats 0: their own
+        arrays["light_face"] = ((relighter.face - avatar.splats.face) % faces)[order]
+        arrays["light_lash_face"] = lashes.face
+        arrays["light_lash_corners"] = lashes.corners.reshape(-1, 12)
+        header["light"] = {
+            "damping": light.damping,
+            "typical": relighter.typical_albedo.tolist(),
+            "recorded": relighter.recorded_light.ravel().tolist(),
+        }
+    if playback.selection is not None:
+        arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
+    return pack(header, arrays, {} if exact else steps)
+
+
+def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
+    largest, smaller = smallest_three(splats.rotation)
+    optional = {"sh": splats.sh[:, 1:], "strain_color": splats.strain_color}
+    return {
+        "xyz": splats.xyz,
+        "rotation": smaller,
+        "rotation_largest": largest,
+        "log_scale": splats.log_scale,
+        "opacity": splats.opacities(),
+        "color": splats.sh[:, 0],
+        **{name: part.reshape(len(part), -1) for name, part in optional.items() if part.shape[1]},
+    }
+
+
+def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
+    """All but what tells of shapes, light and arrays."""
+    # Sliders: every expression with its range, those that the motion uses most first.
+    names = rig.expression_names or [f"expr_{k:03d}" for k in range(rig.expressions)]
+    used = rig.coefficients[:, : rig.expressions]
+    reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
+    order = np.argsort(-used.std(0), kind="stable").tolist()
+    return {
         "title": playback.title,
         "convention": avatar.convention,
         "antialiased": avatar.antialiased,
@@ -274,7 +310,9 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         "up": [float(value) for value in playback.up],
         "joints": list(rig.joint_names),
         "parents": list(rig.parents),
-        "sliders": _sliders(rig),
+        "sliders": [
+            {"name": names[k], "component": k, "reach": round(float(reach[k]), 2)} for k in order
+        ],
         "views": [
             {
                 "name": name,
@@ -285,72 +323,4 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
             }
             for name, camera in playback.views.items()
         ],
-    }
-    if playback.controls is not None and rig.expressions:
-        controls = playback.controls
-        arrays["shape_linear"] = controls.linear.astype(np.float32)
-        arrays["shape_products"] = controls.products.astype(np.float32)
-        header["shapes"] = {"names": list(controls.names)}
-        header["shapes"] |= {"opens": controls.opens, "limited": controls.limited}
-        if rig.expression_names:  # they are ARKit's shapes, whose sliders these are
-            header["sliders"] = []
-    if relighter is not None:
-        arrays |= _light_arrays(relighter, order, unit)
-        header["light"] = {
-            "damping": relighter.light.damping,
-            "typical": relighter.typical_albedo.tolist(),
-            "recorded": relighter.recorded_light.ravel().tolist(),
-        }
-    if playback.selection is not None:
-        arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
-    if exact:
-        for name, array in arrays.items():
-            if isinstance(array, FixedPoint):
-                arrays[name] = array.values.astype(np.float32)
-    return pack(header, arrays)
-
-
-def _sliders(rig: WebRig) -> list[dict[str, Any]]:
-    """Name, component and range of every expression, those that the motion uses most first."""
-    names = rig.expression_names or [f"expr_{k:03d}" for k in range(rig.expressions)]
-    used = rig.coefficients[:, : rig.expressions]
-    reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
-    order = np.argsort(-used.std(0), kind="stable") if len(used) else np.arange(rig.expressions)
-    return [
-        {"name": names[k], "component": k, "reach": round(float(reach[k]), 2)}
-        for k in order.tolist()
-    ]
-
-
-def _splat_arrays(splats: Splats, local_unit: float) -> Arrays:
-    largest, smaller = smallest_three(splats.rotation)
-    arrays: Arrays = {
-        "xyz": FixedPoint(splats.xyz, POSITION_STEP_M / local_unit),
-        "rotation": FixedPoint(smaller, ROTATION_STEP),
-        "rotation_largest": largest,
-        "log_scale": FixedPoint(splats.log_scale, LOG_SCALE_STEP),
-        "opacity": FixedPoint(splats.opacities(), OPACITY_STEP),
-        "color": FixedPoint(splats.sh[:, 0], COLOR_STEP),
-    }
-    if splats.sh.shape[1] > 1:
-        arrays["sh"] = FixedPoint(splats.sh[:, 1:].reshape(len(splats), -1), SH_STEP)
-    if splats.strain_color.shape[1]:
-        strained = splats.strain_color.reshape(len(splats), -1)
-        arrays["strain_color"] = FixedPoint(strained, STRAIN_COLOR_STEP)
-    return arrays
-
-
-def _light_arrays(relighter: Relighter, order: np.ndarray, local_unit: float) -> Arrays:
-    """How vertices receive light, and did in the capture; triangles of splats; lashes."""
-    light, lashes, faces = relighter.light, relighter.lashes, len(relighter.avatar.faces)
-    largest, corner_step = float(light.irradiance.max(initial=1e-6)), POSITION_STEP_M / local_unit
-    return {
-        "light_transfer": FixedPoint(light.transfer, TRANSFER_STEP),
-        "light_occlusion": FixedPoint(light.occlusion, SHARE_STEP),
-        "light_irradiance": FixedPoint(light.irradiance, largest / IRRADIANCE_STEPS),
-        "light_roughness": FixedPoint(light.roughness, SHARE_STEP),
-        # of most splats 0: their own
-        "light_face": ((relighter.face - relighter.avatar.splats.face) % faces)[order],
-        "light_lash_face": lashes.face,
-        "light_lash_corners": FixedPoint(lashes.corners.reshape(-1, 12), corner_step),
     }

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import Playback
 from stga_addon.export.web import data_file
-from stga_addon.export.web.data_file import BAKE_TOLERANCE_M, FixedPoint, baked_rig, pack
+from stga_addon.export.web.data_file import BAKE_TOLERANCE_M, baked_rig, pack
 from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules, write_web
 
 from .conftest import make_head
@@ -22,7 +22,7 @@ def test_fixed_point_errs_by_half_a_step():
     others."""
     values = np.random.default_rng(0).normal(size=(50, 3)) * [1, 1e3, 1e-3]
     whole = np.array([[-70000, 3], [4, 5]])
-    _, arrays = read_web_data(pack({}, {"a": FixedPoint(values, 1e-3), "b": whole}))
+    _, arrays = read_web_data(pack({}, {"a": values, "b": whole}, {"a": 1e-3}))
     assert np.abs(arrays["a"] - values).max() <= 0.5e-3 + 1e-4  # float32 of values near 3,000
     assert np.array_equal(arrays["b"], whole)
 
@@ -48,13 +48,9 @@ def test_splats_come_back_within_their_steps(head):
     assert np.array_equal(found.face, original.face)
     assert np.abs(found.xyz - original.xyz).max() <= data_file.POSITION_STEP_M
     assert np.abs(np.abs((found.rotation * unit).sum(1)) - 1).max() < 1e-5
-    for field, step in (
-        ("log_scale", data_file.LOG_SCALE_STEP),
-        ("sh", data_file.SH_STEP),
-        ("strain_color", data_file.STRAIN_COLOR_STEP),
-    ):
+    for field in ("log_scale", "sh", "strain_color"):
         error = np.abs(getattr(found, field) - getattr(original, field)).max()
-        assert error <= step / 2 + 1e-6, field
+        assert error <= data_file.STEPS[field] / 2 + 1e-6, field
     selected = np.unpackbits(arrays["selection"].astype(np.uint8), axis=1)
     assert np.array_equal(selected[:, : len(head.avatar.faces)], head.selection)
     assert head.data() == head.data()  # no time, or order of a set, in the file
