@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from avatar.conftest import random_splats
 
 from stga_addon.avatar.splats import Splats
@@ -73,9 +74,11 @@ def test_real_file_is_rewritten_byte_for_byte(shared_data, tmp_path):
 
 
 def test_file_is_the_standard_layout(tmp_path):
-    """Catches column order and channel-major f_rest, read back by plain arithmetic on the bytes."""
+    """Catches column order and channel-major f_rest, read back by plain arithmetic on the bytes,
+    and a header that only our own reader understands."""
     splats = world_splats(3)
     write_ply(tmp_path / "a.ply", splats)
+    np.testing.assert_array_equal(np.float32(trimesh.load(tmp_path / "a.ply").vertices), splats.xyz)
     head, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     lines = head.decode().splitlines()
     names = [line.split()[-1] for line in lines if line.startswith("property float")]
@@ -90,14 +93,6 @@ def test_file_is_the_standard_layout(tmp_path):
     np.testing.assert_array_equal(column["rot_0"], splats.rotation[:, 0])
     np.testing.assert_array_equal(column["scale_2"], splats.log_scale[:, 2])
     assert not any(column[name].any() for name in ("nx", "ny", "nz"))
-
-
-def test_trimesh_reads_the_positions(tmp_path):
-    """Catches a header that only our own reader understands."""
-    trimesh = pytest.importorskip("trimesh")
-    splats = world_splats()
-    write_ply(tmp_path / "a.ply", splats)
-    np.testing.assert_array_equal(np.float32(trimesh.load(tmp_path / "a.ply").vertices), splats.xyz)
 
 
 @pytest.mark.parametrize("rest", [0, 9, 24, 45])

@@ -81,13 +81,15 @@ OTHER = {"convention": "gaussian_avatars", "strain": False}
         ({"strain_position": True}, True),
         ({"strain_position": True}, False),
         ({**OTHER, "strain_position": True}, False),
+        ({"baked": True}, False),
     ],
 )
 def test_picture_is_the_renderers(options, exact, browser, tmp_path):
-    """Catches a difference of projection, position, color, blending or quantization, and any
-    request of the page."""
+    """Catches a difference of projection, position, color, blending or quantization, a baked motion
+    that is not that of the meshes, and any request of the page."""
+    baked = options.pop("baked", False)
     head = make_head(**options)
-    show(browser, tmp_path, head.data(exact=exact))
+    show(browser, tmp_path, head.data(baked_rig(list(head.meshes)) if baked else None, exact))
     found = sorted(psnr(browser, head, frame) for frame in range(3))
     if exact:
         assert found[0] >= MIN_EXACT_PSNR
@@ -96,13 +98,6 @@ def test_picture_is_the_renderers(options, exact, browser, tmp_path):
         assert found[1] >= MIN_PSNR
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
-
-
-def test_baked_meshes_play_as_rendered(browser, head, tmp_path):
-    """Catches a baked motion that is not that of the meshes, or strain that is lost with it."""
-    show(browser, tmp_path, head.data(rig=baked_rig(list(head.meshes))))
-    for frame in range(len(head.meshes)):
-        assert psnr(browser, head, frame) >= MIN_PSNR
 
 
 @pytest.mark.slow
@@ -131,46 +126,6 @@ def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
         assert difference(quantized[number], expected) >= MIN_PSNR
     show(browser, tmp_path, data_file(avatar, rig, playback, exact=True))
     assert difference(quantized[0], picture(browser, 0, "a")) >= MIN_QUANTIZED_PSNR
-
-
-def test_controls(browser, head, tmp_path):
-    """Catches a slider, key or property of the page that does nothing, or something else than it
-    says."""
-    show(browser, tmp_path, head.data())
-    found = browser.evaluate("""(() => {
-      const avatar = document.querySelector('stga-avatar');
-      const rows = [...document.querySelectorAll('.slider')];
-      const name = rows[0].firstChild.textContent;
-      const input = rows[0].querySelector('input');
-      input.value = 0.5;
-      input.dispatchEvent(new Event('input'));
-      avatar.frame = 1;
-      const press = new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true });
-      document.body.dispatchEvent(press);
-      document.body.dispatchEvent(new KeyboardEvent('keydown', { key: 's', bubbles: true }));
-      const before = [...avatar.camera.matrix];
-      document.getElementById('panel').hidden = false;
-      avatar.frame = 0;
-      avatar.frame = 2;
-      const shown = Number(rows[1].querySelector('.value').textContent);
-      const played = avatar.info.sliders[1].component;
-      avatar.setPose('jaw', [0.3, null, null]);
-      avatar.player.draw();
-      return { shown_value: shown, played, sliders: rows.length,
-        pinned: document.querySelectorAll('.pinned').length, frame: avatar.frame,
-        value: avatar.player.motion.pinnedCoefficients[avatar.info.sliders[0].component],
-        shown: avatar.showSelection, notice: document.getElementById('number').textContent, name,
-        jaw: avatar.player.motion.pinnedPose[6],
-        views: document.getElementById('view').options.length, before };
-    })()""")
-    assert found["sliders"] == head.sequence.model.n_expression + 6
-    assert (found["pinned"], found["value"], found["frame"], found["shown"]) == (1, 0.5, 2, True)
-    played = head.rig.coefficients[2, found["played"]]
-    assert found["shown_value"] == pytest.approx(played, abs=0.006)
-    assert found["jaw"] == pytest.approx(0.3)
-    assert found["notice"] == "3 / 3"
-    assert np.allclose(found["before"], head.camera.world_to_camera.ravel())
-    assert browser.errors == []
 
 
 def cut(text: str, start: str, characters: int = 0) -> str:

@@ -158,8 +158,20 @@ def test_keyboard(browser, head, tmp_path):
 
 
 def test_sliders_are_flames(browser, head, tmp_path):
-    """Catches a slider that moves another blend shape, joint or axis than FLAME's of its name."""
+    """Catches a slider that moves another blend shape, joint or axis than FLAME's of its name, one
+    that does not follow the motion until it is moved, and another first camera than the file's."""
     show(browser, tmp_path, head.data(exact=True))
+    assert np.allclose(browser.evaluate(CAMERA), head.camera.world_to_camera.ravel())
+    shown, component = browser.evaluate("""(() => {
+      const avatar = document.querySelector('stga-avatar');
+      document.getElementById('panel').hidden = false;
+      avatar.frame = 2;
+      const value = document.querySelector('.slider .value').textContent;
+      return [Number(value), avatar.info.sliders[0].component];
+    })()""")
+    assert shown == pytest.approx(head.rig.coefficients[2, component], abs=0.006)
+    assert browser.evaluate("document.getElementById('number').textContent") == "3 / 3"
+    of_avatar(browser, "frame = 0")
     rng = np.random.default_rng(1)
     expressions = rng.uniform(-0.9, 0.9, head.sequence.model.n_expression)
     jaw = [0.25, 0.05, -0.03]
@@ -175,6 +187,8 @@ def test_sliders_are_flames(browser, head, tmp_path):
       avatar.player.draw();
       return Array.from(avatar.player.rig.vertices);
     }})()""")
+    count = "document.querySelectorAll('.pinned').length"
+    assert browser.evaluate(count) == len(expressions)
     recorded = head.sequence.frame(0)
     wanted = replace(recorded, expr=expressions, jaw_pose=np.array(jaw))
     assert np.abs(np.reshape(found, (-1, 3)) - forward(head, wanted)).max() < 1e-5

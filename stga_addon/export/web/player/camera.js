@@ -154,8 +154,8 @@ export function addControls(element, player, changed) {
     if (after.length === 1 && !event.shiftKey && event.buttons <= 1) {
       shown.camera = orbited(camera, pivot, data.header.up, -yaw, pitch);
     } else {
-      const { clientWidth, clientHeight } = element;
-      const scale = Math.max(camera.size[0] / clientWidth, camera.size[1] / clientHeight);
+      const [width, height] = camera.size;
+      const scale = Math.max(width / element.clientWidth, height / element.clientHeight);
       [shown.camera, shown.pivot] = panned(camera, pivot, dx * scale, dy * scale);
     }
     if (after.length > 1)

@@ -76,15 +76,10 @@ export class Rig {
   /** @param {Data} data */
   constructor({ header, arrays }) {
     const joints = header.parents.length;
+    this.arrays = arrays;
     this.parents = header.parents.map(parent => (parent < 0 ? joints : parent));
-    this.base = arrays.base.values;
-    this.basis = arrays.basis.values;
-    this.correctives = arrays.correctives.values;
-    this.weights = arrays.weights.values;
-    this.jointRest = arrays.joint_rest.values;
-    this.jointBasis = arrays.joint_basis.values;
-    this.shaped = new Float64Array(this.base.length);
-    this.vertices = new Float64Array(this.base.length);
+    this.shaped = new Float64Array(3 * arrays.base.shape[0]);
+    this.vertices = this.shaped.slice();
     this.local = new Float64Array(9 * joints);
     this.joints = new Float64Array(3 * joints);
     // Per joint: rotation and offset, rows of a 3×4 matrix. The last, the root's parent, rests.
@@ -95,18 +90,20 @@ export class Rig {
   // Vertices (3·V, meters) of coefficients (R), pose (3·J, axis-angle) and translation (3).
   /** @param {Motion} motion */
   pose({ coefficients, pose, translation }) {
-    this.shaped.set(this.base);
-    this.joints.set(this.jointRest);
-    addShapes(this.shaped, this.basis, coefficients);
-    addShapes(this.joints, this.jointBasis, coefficients);
+    const { base, basis, correctives, joint_rest, joint_basis } = this.arrays;
+    const weights = this.arrays.weights.values;
+    const { joints, shaped, skin, vertices } = this;
+    shaped.set(base.values);
+    joints.set(joint_rest.values);
+    addShapes(shaped, basis.values, coefficients);
+    addShapes(joints, joint_basis.values, coefficients);
     for (let at = 0; at < pose.length; at += 3)
       this.local.set(matrixOf(pose.subarray(at, at + 3)), 3 * at);
     // Correctives follow the entries of the rotations of joints 1… minus identity.
     const features = this.local.slice(9).map((entry, k) => entry - ((k % 9) % 4 === 0 ? 1 : 0));
-    addShapes(this.shaped, this.correctives, features);
+    addShapes(shaped, correctives.values, features);
     this.chain();
-    const { shaped, weights, skin, vertices } = this;
-    const joints = this.parents.length;
+    const count = this.parents.length;
     for (let v = 0, at = 0; at < shaped.length; v++, at += 3) {
       const x = shaped[at];
       const y = shaped[at + 1];
@@ -114,8 +111,8 @@ export class Rig {
       let px = translation[0];
       let py = translation[1];
       let pz = translation[2];
-      for (let j = 0; j < joints; j++) {
-        const w = weights[v * joints + j];
+      for (let j = 0; j < count; j++) {
+        const w = weights[v * count + j];
         if (w === 0) continue;
         const s = 12 * j;
         px += w * (skin[s] * x + skin[s + 1] * y + skin[s + 2] * z + skin[s + 3]);

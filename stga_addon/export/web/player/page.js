@@ -186,16 +186,14 @@ function sliderRow(parent, kind, label, low, high) {
  */
 function addSlider(parent, label, low, high, read, write, format = fixed) {
   const [row, value, input] = sliderRow(parent, 'slider', label, low, high);
-  let pinned = false;
   const pin = (/** @type {boolean} */ whether) => {
-    pinned = whether;
     row.classList.toggle('pinned', whether);
     byId('released').hidden = !document.querySelector('.pinned');
   };
   const update = () => {
-    const current = read();
-    if (!pinned) input.value = String(current);
-    value.textContent = format(pinned ? Number(input.value) : current);
+    const current = row.classList.contains('pinned') ? Number(input.value) : read();
+    input.value = String(current); // within its range
+    value.textContent = format(current);
     fillTrack(input);
   };
   input.addEventListener('input', () => {

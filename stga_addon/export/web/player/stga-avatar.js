@@ -113,12 +113,10 @@ export class Player {
 
 const STYLE = `
 :host { display: block; position: relative; overflow: hidden; contain: content; }
-canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab;
-  outline: none; }
+canvas { display: block; width: 100%; height: 100%; touch-action: none; cursor: grab; }
 canvas:active { cursor: grabbing; }
 p { position: absolute; inset: 0; margin: auto; height: fit-content; max-width: 30em; padding: 1em;
-  text-align: center;
-  font: 16px/1.5 system-ui, sans-serif; }
+  text-align: center; font: 16px/1.5 system-ui, sans-serif; }
 [hidden] { display: none; }`;
 
 export class StgaAvatar extends HTMLElement {
@@ -142,7 +140,10 @@ export class StgaAvatar extends HTMLElement {
     this.attachShadow({ mode: 'open' }).append(style, this.#canvas, this.#message);
     const get = () => this.#player;
     addControls(this.#canvas, get, event => this.#changed(event));
-    this.#canvas.addEventListener('webglcontextlost', event => this.#lose(event));
+    this.#canvas.addEventListener('webglcontextlost', event => {
+      event.preventDefault(); // so that it will be given back
+      this.#say('The graphics driver was restarted. Waiting for it …');
+    });
     this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
   }
@@ -172,8 +173,7 @@ export class StgaAvatar extends HTMLElement {
     }
   }
 
-  // What the data file says of itself: title, fps, views, sliders, joints, …; null before it is
-  // loaded.
+  // What the data file says of itself (types.d.ts); null before it is loaded.
   get info() {
     return this.#player?.data.header ?? null;
   }
@@ -420,13 +420,6 @@ export class StgaAvatar extends HTMLElement {
     this.dispatchEvent(new CustomEvent('load'));
     if (this.hasAttribute('autoplay')) this.play();
     this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
-  }
-
-  // The graphics driver was restarted.
-  /** @param {Event} event */
-  #lose(event) {
-    event.preventDefault(); // so that it will be given back
-    this.#say('The graphics driver was restarted. Waiting for it …');
   }
 
   /** Upload everything again, and go on where it was. */

@@ -16,10 +16,7 @@ export type View = Omit<Camera, 'matrix'> & { name: string; world_to_camera: num
 /** Light of the capture (27 harmonics); how much albedo is drawn to its mean, 0 to 1, and that. */
 export type LightOfCapture = { damping: number; recorded: number[]; typical: number[] };
 
-/**
- * Header of a data file, checked. Of `shapes`, which move expressions, jaw and eyes together, one
- * counts up to the weight of another only.
- */
+/** Header of a data file, checked. Of `shapes`, `limited` counts up to the weight of `opens`. */
 export interface Header {
   title: string;
   convention: 'stga' | 'gaussian_avatars';
@@ -43,16 +40,10 @@ export type Data = { header: Header; arrays: Arrays };
 /** Pixels, and world to camera (16, row-major, OpenCV axes, meters). */
 export type Camera = { size: Pair; focal: Pair; center: Pair; matrix: Float64Array };
 
-/**
- * Unit vector towards a distant light, and what a surface that faces it gets: W/m², linear red,
- * green, blue.
- */
+/** Unit vector to a distant light; what a surface that faces it gets: W/m², linear RGB. */
 export type Sun = { toward: Vector; color: Vector };
 
-/**
- * What lights the avatar, in the axes of its meshes. Radiance 1 from everywhere shows albedo as it
- * is.
- */
+/** What lights the avatar, in the axes of its meshes; even radiance 1 shows albedo as it is. */
 export interface Lighting {
   /** Radiance from everywhere, linear red, green, blue. */
   even?: Vector;
@@ -80,8 +71,5 @@ export type GL = WebGL2RenderingContext;
 export type Uniforms = Record<string, WebGLUniformLocation | null>;
 export type Program = { program: WebGLProgram; uniforms: Uniforms };
 
-/**
- * Rows at even times; the column of each shape, and of yaw, pitch and roll of the head (radians);
- * -1: none.
- */
+/** Rows at even times; columns of shapes, and of the head's yaw, pitch, roll in radians, or -1. */
 export type Performance = { columns: number[]; head: number[]; rows: Float64Array[]; fps: number };
