@@ -46,13 +46,9 @@ WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.ones(1), NO_STRAIN)
 
 
 def face_frames(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    neutral: np.ndarray,
-    convention: str = "stga",
-    strain: StrainBasis | None = None,
-    neutral_areas: np.ndarray | None = None,
-) -> FaceFrames:
+    vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, convention: str = "stga",
+    strain: StrainBasis | None = None, neutral_areas: np.ndarray | None = None,
+) -> FaceFrames:  # fmt: skip
     """Local frame of every triangle of a posed mesh.
 
     vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the
@@ -93,13 +89,6 @@ def face_frames(
         for row in range(3):
             rotation[:, row, column] = axis[row]
     return FaceFrames(origin, rotation, scale, deformed)
-
-
-def shifted_frames(frames: FaceFrames, shift: np.ndarray) -> FaceFrames:
-    """The frames with their origins moved by shift (F, 3), in each triangle's own axes and unit."""
-    # In one type: einsum takes several times as long where it has to convert.
-    turned = np.einsum("fij,fj->fi", frames.rotation, shift.astype(np.float64))
-    return replace(frames, origin=frames.origin + frames.scale[:, None] * turned)
 
 
 def frame_backward(

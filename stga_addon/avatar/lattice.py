@@ -20,13 +20,9 @@ def splats_per_triangle(order: int) -> int:
 
 
 def lattice_splats(
-    neutral: np.ndarray,
-    faces: np.ndarray,
-    order: int = 2,
-    sh_degree: int = 3,
-    opacity_logit: float = 0.0,
-    convention: str = "stga",
-) -> Splats:
+    neutral: np.ndarray, faces: np.ndarray, order: int = 2, sh_degree: int = 3,
+    opacity_logit: float = 0.0, convention: str = "stga",
+) -> Splats:  # fmt: skip
     """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local
     frame.
 

@@ -44,7 +44,7 @@ def write_gltf(path: Path, world: Splats) -> None:
         degree = math.isqrt(k)
         name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
         attributes[name] = world.sh[:, k]
-    views, accessors, offset = [], list[dict[str, Any]](), 0
+    views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
     for array in attributes.values():
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
         accessor = {"bufferView": len(views), "count": len(array)}

@@ -225,7 +225,7 @@ def shifted(offset: str, convention: str) -> NodeGroup:
         mesh = nodes.group(SIGNALS[offset].group, mesh)
         signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute))
         names = [stored.DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
-        # In the frames' own axes and unit (`avatar.embedding.shifted_frames`).
+        # In the frames' own axes and unit (`avatar.offsets.moved_frames`).
         scale = _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention)
         turn = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
         local = {"Vector": nodes.scale(_weighted(nodes, names, signal), scale), "Rotation": turn}

@@ -11,17 +11,10 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--hide-scrollbars",
-    "--disable-dev-shm-usage",
-    "--disable-background-networking",
-    "--no-first-run",
-    "--force-prefers-reduced-motion",
-    "--remote-debugging-pipe",
-)
+    "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--hide-scrollbars", "--disable-dev-shm-usage", "--disable-background-networking",
+    "--no-first-run", "--force-prefers-reduced-motion", "--remote-debugging-pipe",
+)  # fmt: skip
 TIMEOUT_S = 120.0
 
 

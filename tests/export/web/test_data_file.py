@@ -96,40 +96,32 @@ def test_baked_meshes_come_back(head):
 
 
 def test_motion_only_leaves_the_rig_out(head, tmp_path):
-    """Catches FLAME's blend shapes in a file that was asked for without them, and a page that does
-    not name them."""
-    path, meshes = tmp_path / "a.stga", enumerate(head.meshes)
+    """Catches FLAME's blend shapes in a file that was asked for without them, a page that keeps
+    quiet about them, or about FLAME's triangles and meshes in it, one of any other head that names
+    FLAME's licence, and a data file left behind by an export that fails at the player beside it."""
+    path, meshes = tmp_path / "a.stga", list(enumerate(head.meshes))
+    (tmp_path / ELEMENT).mkdir()
+    with pytest.raises(StgaError, match=ELEMENT):
+        write_web(path, head.avatar, Playback(), meshes)
+    assert not path.exists()
+    (tmp_path / ELEMENT).rmdir()
     write_web(path, head.avatar, Playback(motion_only=True), meshes, head.sequence)
     header, arrays = read_web_data(path.read_bytes())
     assert header["sliders"] == []
     assert arrays["weights"].shape[1] == 1
     assert (tmp_path / ELEMENT).read_text(encoding="utf-8") == element_script()
-    write_web(tmp_path / "b.html", head.avatar, Playback(), sequence=head.sequence)
-    assert "derived from a FLAME model" in (tmp_path / "b.html").read_text(encoding="utf-8")
 
-
-def test_pages_of_flame_meshes_name_flames_licence(head, tmp_path):
-    """Catches a page without FLAME's rig that keeps quiet about FLAME's triangles and meshes in it,
-    and one of any other head that names FLAME's licence."""
-    path = tmp_path / "a.html"
-
-    def notice(avatar, sequence):
-        write_web(path, avatar, Playback(motion_only=True), [(0, avatar.neutral)], sequence)
+    def notice(avatar, sequence, motion_only=True):
+        path = tmp_path / "b.html"
+        write_web(path, avatar, Playback(motion_only=motion_only), meshes, sequence)
         return re.search(r'<p id="notice">(.*?)</p>', path.read_text(encoding="utf-8"))[1]
 
+    assert "derived from a FLAME model" in notice(head.avatar, head.sequence, False)
     assert "posed meshes of a FLAME head" in notice(head.avatar, head.sequence)
     assert notice(head.avatar, None) == ""
     padding = np.zeros((5143 - len(head.avatar.neutral), 3))
     flame_sized = replace(head.avatar, neutral=np.concatenate([head.avatar.neutral, padding]))
     assert "FLAME&#x27;s licence (flame.is.tue.mpg.de) decides" in notice(flame_sized, None)
-
-
-def test_no_data_without_its_player(head, tmp_path):
-    """Catches a data file left behind by an export that fails at the player beside it."""
-    (tmp_path / ELEMENT).mkdir()
-    with pytest.raises(StgaError, match=ELEMENT):
-        write_web(tmp_path / "a.stga", head.avatar, Playback(), enumerate(head.meshes))
-    assert not (tmp_path / "a.stga").exists()
 
 
 def test_every_module_is_in_the_page():

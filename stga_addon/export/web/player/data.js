@@ -15,8 +15,11 @@ const MAX_VIEW_SIZE = 1 << 16; // pixels
 export async function readData(bytes) {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b)
     throw new DataError('This is not an avatar data file.');
-  const raw = await inflate(bytes);
-  const view = new DataView(raw.buffer);
+  const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
+  const buffer = await new Response(inflated).arrayBuffer().catch(() => {
+    throw new DataError('The avatar data is damaged.');
+  });
+  const [raw, view] = [new Uint8Array(buffer), new DataView(buffer)];
   if (raw.length < 12 || view.getUint32(0, false) !== 0x53544741)
     throw new DataError('This is not an avatar data file.');
   const version = view.getUint32(4, true);
@@ -32,16 +35,6 @@ export async function readData(bytes) {
   const arrays = readArrays(header, raw.subarray(end));
   checkData(header, arrays);
   return { header, arrays };
-}
-
-/** @param {Uint8Array<ArrayBuffer>} bytes */
-async function inflate(bytes) {
-  try {
-    const inflated = new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip'));
-    return new Uint8Array(await new Response(inflated).arrayBuffer());
-  } catch {
-    throw new DataError('The avatar data is damaged.');
-  }
 }
 
 /** @type {(header: any, payload: Uint8Array) => Record<string, DataArray>} */

@@ -2,7 +2,7 @@
 // Local frames of the triangles, in which splats are stored, and what these follow: strain against
 // the neutral mesh. The rules are those of STGA for Blender's embedding.py and strain.py.
 
-/** @import { Arrays, Values, Vector } from './types.js' */
+/** @import { Arrays, Vector } from './types.js' */
 
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
@@ -105,70 +105,50 @@ class SmoothedStrain {
   /** @param {Strain} strain */
   constructor(strain) {
     const { faces, range } = strain;
-    const count = faces.length / 3;
     this.strain = strain;
-    this.values = new Float64Array(3 * count);
-    this.rest = new Float64Array(3 * count);
-    for (let k = 0; k < 3 * count; k++) {
+    this.values = new Float64Array(faces.length);
+    this.before = new Float64Array(faces.length); // of the last round
+    this.rest = Float64Array.from(this.values, (_, k) => {
       const lowest = k + 3 * Math.floor(k / 3);
-      this.rest[k] = Math.min(range[lowest + 3], Math.max(range[lowest], 0));
-    }
-    const vertices = strain.share.length;
-    /** @type {Map<number, number>} */
-    const index = new Map(); // of an edge by its ends, times three
-    const edges = Int32Array.from(faces, (vertex, c) => {
-      const next = faces[c % 3 < 2 ? c + 1 : c - 2];
-      const ends = Math.min(vertex, next) * vertices + Math.max(vertex, next);
-      if (!index.has(ends)) index.set(ends, 3 * index.size);
-      return /** @type {number} */ (index.get(ends));
+      return Math.min(range[lowest + 3], Math.max(range[lowest], 0));
     });
-    this.edges = edges; // (3·F) from each corner to the next
-    this.edgeSum = new Float64Array(3 * index.size); // over all triangles at an edge
-    this.ownFactor = new Float64Array(count);
-    this.share = new Float64Array(count); // one over how many neighbors a triangle has and itself
-    // The sums of a triangle's three edges hold its neighbors, and itself three times: `ownFactor`
-    // leaves it once.
-    const touching = new Int32Array(index.size);
-    for (const edge of edges) touching[edge / 3]++;
-    for (let f = 0; f < count; f++) {
-      const own = edges.subarray(3 * f, 3 * f + 3);
-      let held = 0;
-      let itself = 0; // 3, or more where a degenerate triangle has one edge twice
-      for (const edge of own) {
-        held += touching[edge / 3];
-        for (const other of own) if (edge === other) itself++;
-      }
-      this.ownFactor[f] = 1 - itself;
-      this.share[f] = 1 / (1 + held - itself);
+    /** @type {Map<number, number[]>} */
+    const touching = new Map(); // the triangles at an edge, by its ends
+    const edges = Array.from(faces, (vertex, c) => {
+      const next = faces[c % 3 < 2 ? c + 1 : c - 2];
+      const ends = Math.min(vertex, next) * strain.share.length + Math.max(vertex, next);
+      const triangles = touching.get(ends) ?? [];
+      triangles.push(Math.floor(c / 3));
+      touching.set(ends, triangles);
+      return triangles;
+    });
+    /** @type {number[]} */
+    const neighbors = [];
+    const ends = new Int32Array(faces.length / 3); // of each triangle's in the list of neighbors
+    for (let c = 0; c < edges.length; c++) {
+      const own = Math.floor(c / 3);
+      for (const other of edges[c]) if (other !== own) neighbors.push(3 * other);
+      ends[own] = neighbors.length;
     }
+    this.neighbors = Int32Array.from(neighbors);
+    this.ends = ends;
   }
 
-  /** Follow the strain. */
+  /** Follow the strain: AVERAGING_ROUNDS times the mean with those that share an edge. */
   update() {
-    for (let k = 0; k < this.values.length; k++)
-      this.values[k] = this.strain.values[k] - this.rest[k];
-    for (let round = 0; round < AVERAGING_ROUNDS; round++) this.average();
-  }
-
-  /** Replace every value by the mean of the triangle and those that share an edge with it. */
-  average() {
-    const { edges, edgeSum, ownFactor, share, values } = this;
-    edgeSum.fill(0);
-    for (let at = 0; at < edges.length; at += 3) {
-      for (let c = at; c < at + 3; c++) {
-        const e = edges[c];
-        edgeSum[e] += values[at];
-        edgeSum[e + 1] += values[at + 1];
-        edgeSum[e + 2] += values[at + 2];
-      }
-    }
-    for (let f = 0, at = 0; f < share.length; f++, at += 3) {
-      const i = edges[at];
-      const j = edges[at + 1];
-      const k = edges[at + 2];
-      for (let n = 0; n < 3; n++) {
-        const around = edgeSum[i + n] + edgeSum[j + n] + edgeSum[k + n];
-        values[at + n] = share[f] * (ownFactor[f] * values[at + n] + around);
+    const { before, ends, neighbors, values } = this;
+    for (let k = 0; k < values.length; k++) values[k] = this.strain.values[k] - this.rest[k];
+    for (let round = 0; round < AVERAGING_ROUNDS; round++) {
+      before.set(values);
+      for (let f = 0, n = 0; f < ends.length; f++) {
+        const at = 3 * f;
+        const share = 1 / (1 + ends[f] - n);
+        for (; n < ends[f]; n++) {
+          values[at] += before[neighbors[n]];
+          values[at + 1] += before[neighbors[n] + 1];
+          values[at + 2] += before[neighbors[n] + 2];
+        }
+        for (let k = at; k < at + 3; k++) values[k] *= share;
       }
     }
   }
@@ -214,7 +194,7 @@ export class FaceFrames {
     const followsStrain = arrays.strain_color || offsets.length;
     const strain = followsStrain ? new Strain(arrays, this.sides) : null;
     this.strain = strain;
-    /** Signals and their coefficients (3·S·F): for each of S components a vector in the frame. */
+    // Signals (S·F) and their coefficients (3·S·F): for each component a vector in the frame.
     this.offsets = offsets.flatMap(([name, Signal]) => {
       const { values } = arrays[name];
       return strain ? { signal: new Signal(strain), coefficients: values } : [];
@@ -224,11 +204,25 @@ export class FaceFrames {
   // Follow the posed vertices (3·V).
   /** @param {Float64Array} vertices */
   update(vertices) {
+    const { count, world } = this;
     this.placeFrames(vertices);
     this.strain?.update(this.sides);
     for (const { signal, coefficients } of this.offsets) {
       signal.update();
-      this.moveOrigins(signal.values, coefficients);
+      const { values } = signal;
+      const components = values.length / count;
+      for (let f = 0; f < count; f++) {
+        let [x, y, z] = [0, 0, 0];
+        for (let k = components * f; k < components * (f + 1); k++) {
+          x += values[k] * coefficients[3 * k];
+          y += values[k] * coefficients[3 * k + 1];
+          z += values[k] * coefficients[3 * k + 2];
+        }
+        // In the triangle's own axes and unit.
+        for (let to = 12 * f; to < 12 * f + 12; to += 4) {
+          world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
+        }
+      }
     }
   }
 
@@ -282,25 +276,6 @@ export class FaceFrames {
         world[to + 1] = isStga ? side : scale * normal[k];
         world[to + 2] = isStga ? scale * normal[k] : -side;
         world[to + 3] = vertices[corner + k] + (sides[at + k] + sides[at + 3 + k]) / 3;
-      }
-    }
-  }
-
-  // Move the origins by a signal (S·F) times coefficients (3·S·F), in each triangle's own axes and
-  // unit.
-  /** @type {(values: Float64Array, coefficients: Values) => void} */
-  moveOrigins(values, coefficients) {
-    const { count, world } = this;
-    const components = values.length / count;
-    for (let f = 0; f < count; f++) {
-      let [x, y, z] = [0, 0, 0];
-      for (let k = components * f; k < components * (f + 1); k++) {
-        x += values[k] * coefficients[3 * k];
-        y += values[k] * coefficients[3 * k + 1];
-        z += values[k] * coefficients[3 * k + 2];
-      }
-      for (let to = 12 * f; to < 12 * f + 12; to += 4) {
-        world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
       }
     }
   }

@@ -58,7 +58,13 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
     if (!Object.hasOwn(ENVIRONMENTS, environment))
       throw new RangeError(`There is no environment "${environment}".`);
     const { lobes, sun: own, ...found } = ENVIRONMENTS[environment];
-    const turned = fromUpright(up, turn);
+    // From axes in which y is up to those in which `up` is, and about it.
+    const top = unit(up);
+    const axis = crossed([0, 1, 0], top);
+    const sine = Math.hypot(...axis);
+    const about = sine > 1e-9 ? scaled(axis, 1 / sine) : vector(k => Number(k === 0));
+    const turned = (/** @type {Vector} */ v) =>
+      rotatedAbout(rotatedAbout(v, about, Math.atan2(sine, top[1])), top, turn);
     everywhere = vector(k => even[k] + found.even[k]);
     for (const { toward, color } of lobes)
       addPoint(world, turned(unit(toward)), color, COSINE_LOBE);
@@ -72,16 +78,6 @@ export function litBy({ even = [0, 0, 0], environment, ...lighting }, up) {
   if (sun) check([...sun.toward, ...sun.color], 6, 'sun');
   sun = sun && { toward: unit(sun.toward), color: sun.color };
   return { world, sun, factor: 2 ** exposure };
-}
-
-// How directions turn from axes in which y is up, by an angle about it, to those in which `up` is.
-/** @type {(up: Vector, turn: number) => (direction: Vector) => Vector} */
-function fromUpright(up, turn) {
-  const axis = crossed([0, 1, 0], unit(up));
-  const sine = Math.hypot(...axis);
-  const angle = Math.atan2(sine, unit(up)[1]);
-  const about = sine > 1e-9 ? scaled(axis, 1 / sine) : vector(k => Number(k === 0));
-  return v => rotatedAbout(rotatedAbout(v, about, angle), unit(up), turn);
 }
 
 /** @type {(values: number[], count: number, name: string) => void} */
@@ -203,61 +199,51 @@ const CELL_M = 0.02;
 const SKIN = [0.5, 0.33, 0.25];
 const MIN_OPEN = 0.3; // share of the sky that a vertex must see to count as lit skin
 
-class Bounce {
-  // Neutral vertices (3·V), triangles (3·F) with their areas, and the share of the sky that
-  // vertices see (V).
-  /** @param {Values[]} arrays */
-  constructor([neutral, faces, areas, occlusion]) {
-    this.occlusion = occlusion;
-    this.weight = new Float64Array(occlusion.length);
-    for (let c = 0; c < faces.length; c++) {
-      if (occlusion[faces[c]] > MIN_OPEN) this.weight[faces[c]] += areas[Math.floor(c / 3)];
-    }
-    const [low, high] = box(neutral);
-    const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
-      Math.floor((value - low[axis]) / CELL_M) + 1;
-    const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
-    this.cells = nx * ny * nz;
-    this.strides = [ny * nz, nz, 1]; // to the next cell along x, y, z; the outermost are empty
-    this.cell = Int32Array.from(occlusion, (_, v) => {
-      const places = vector(axis => place(neutral[3 * v + axis], axis));
-      return dotProduct(places, this.strides);
-    });
-    this.sumOfWeights = this.around(this.weight);
+// What adds the irradiance that vertices get from skin around them to `out`, by what arrives at
+// them (both three numbers a vertex). Neutral vertices (3·V); triangles (3·F) with their areas;
+// share of the sky that vertices see (V).
+/** @type {(...arrays: Values[]) => (arriving: Float64Array, out: Float64Array) => void} */
+function bounceOf(neutral, faces, areas, occlusion) {
+  const vertices = occlusion.length;
+  const weight = new Float64Array(vertices);
+  for (let c = 0; c < faces.length; c++) {
+    if (occlusion[faces[c]] > MIN_OPEN) weight[faces[c]] += areas[Math.floor(c / 3)];
   }
-
+  const [low, high] = box(neutral);
+  const place = (/** @type {number} */ value, /** @type {number} */ axis) =>
+    Math.floor((value - low[axis]) / CELL_M) + 1;
+  const [nx, ny, nz] = high.map((value, axis) => place(value, axis) + 2);
+  const strides = [ny * nz, nz, 1]; // to the next cell along x, y, z; the outermost are empty
+  const cell = Int32Array.from(occlusion, (_, v) => {
+    const places = vector(axis => place(neutral[3 * v + axis], axis));
+    return dotProduct(places, strides);
+  });
   // Sum of values (V) in each vertex's cell and the 26 around it.
-  /** @param {ArrayLike<number>} values */
-  around(values) {
-    const { cell } = this;
-    let total = new Float64Array(this.cells);
-    for (let v = 0; v < cell.length; v++) total[cell[v]] += values[v];
-    for (const stride of this.strides) {
+  const around = (/** @type {Float64Array} */ values) => {
+    let total = new Float64Array(nx * ny * nz);
+    for (let v = 0; v < vertices; v++) total[cell[v]] += values[v];
+    for (const stride of strides) {
       const sum = new Float64Array(total.length);
       for (let k = stride; k < total.length - stride; k++)
         sum[k] = total[k - stride] + total[k] + total[k + stride];
       total = sum;
     }
-    const found = new Float64Array(cell.length);
-    for (let v = 0; v < cell.length; v++) found[v] = total[cell[v]];
+    const found = new Float64Array(vertices);
+    for (let v = 0; v < vertices; v++) found[v] = total[cell[v]];
     return found;
-  }
-
-  // Add the irradiance that vertices get from skin around them to `out`: of `arriving`, both three
-  // numbers a vertex.
-  /** @type {(arriving: Float64Array, out: Float64Array) => void} */
-  add(arriving, out) {
-    const { occlusion, weight, sumOfWeights } = this;
-    const channel = new Float64Array(weight.length);
+  };
+  const sumOfWeights = around(weight);
+  const channel = new Float64Array(vertices);
+  return (arriving, out) => {
     for (let c = 0; c < 3; c++) {
-      for (let v = 0; v < weight.length; v++) channel[v] = weight[v] * arriving[3 * v + c];
-      const near = this.around(channel);
-      for (let v = 0; v < weight.length; v++) {
+      for (let v = 0; v < vertices; v++) channel[v] = weight[v] * arriving[3 * v + c];
+      const near = around(channel);
+      for (let v = 0; v < vertices; v++) {
         const mean = near[v] / Math.max(sumOfWeights[v], 1e-12);
         out[3 * v + c] += (1 - occlusion[v]) * SKIN[c] * mean;
       }
     }
-  }
+  };
 }
 
 // Difference between two lights from which on nothing is kept, as a share of the capture's light.
@@ -308,7 +294,7 @@ export class LightPass {
     const framesOf = (/** @type {DataArray} */ faces) =>
       new FaceFrames({ faces, neutral: arrays.neutral }, header.convention);
     const frames = framesOf(arrays.faces);
-    this.bounce = new Bounce([neutral, this.faces, frames.area, light('occlusion')]);
+    this.addBounce = bounceOf(neutral, this.faces, frames.area, light('occlusion'));
     this.surfaceTexture = floatTexture(gl, gl.RGBA32F, surfaceTexels(arrays, frames));
     this.lashCorners = light('lash_corners');
     this.lashes = light('lash_face').length;
@@ -372,7 +358,7 @@ export class LightPass {
     const arriving = received(this.transfer, rotatedLight(world, rotation));
     const distant = rotatedLight(around, rotation);
     this.kept = keptColors(this.recorded, distant);
-    this.bounce.add(received(this.transfer, distant), arriving);
+    this.addBounce(received(this.transfer, distant), arriving);
     for (let from = 0, to = 0; from < vertices.length; from += 3, to += 4 * VERTEX_TEXELS) {
       for (let k = 0; k < 3; k++) {
         this.vertexValues[to + k] = vertices[from + k];

@@ -273,13 +273,13 @@ const MIN_SHAPES = 10; // of a table that holds a performance
 export function readPerformance(text, names) {
   const all = text.replace(/^\uFEFF/, '').split(/\r?\n/);
   const lines = all.filter(line => line.trim());
-  const header = (lines[0] ?? '').split(',').map(cell => cell.trim());
+  const header = (lines[0] ?? '').toLowerCase().split(',').map(cell => cell.trim());
   const plain = header.map(plainName);
   const columns = names.map(name => plain.indexOf(name.toLowerCase()));
   const used = columns.filter(column => column >= 0);
   if (used.length < MIN_SHAPES)
     throw new DataError('This file is no table of face shapes (Live Link Face or Audio2Face CSV).');
-  const counts = header.findIndex(name => name.toLowerCase() === 'blendshapecount');
+  const counts = header.indexOf('blendshapecount');
   const rowsOfCells = lines.slice(1, MAX_ROWS + 1).map(line => line.split(','));
   const hasFace = (/** @type {string[]} */ row) => counts < 0 || Number(row[counts]) > 0;
   const cells = rowsOfCells.filter(row => row.length === header.length && hasFace(row));
@@ -291,10 +291,10 @@ export function readPerformance(text, names) {
   return evenly({ columns, head, rows, fps: DEFAULT_FPS }, times(header, cells));
 }
 
-// mouthsmileleft of blendShapes.MouthSmile_L, mouth_smile_left, …
-/** @param {string} name */
+// mouthsmileleft of blendshapes.mouthsmile_l, mouth_smile_left, …
+/** @param {string} name in small letters */
 function plainName(name) {
-  const last = name.slice(name.lastIndexOf('.') + 1).toLowerCase();
+  const last = name.slice(name.lastIndexOf('.') + 1);
   const side = /^(.*)[_\- ]([lr])$/.exec(last);
   return (side ? side[1] + (side[2] === 'l' ? 'left' : 'right') : last).replace(/[_\- ]/g, '');
 }
@@ -302,8 +302,7 @@ function plainName(name) {
 // Seconds of each row from the first, or null where the table has none.
 /** @type {(header: string[], cells: string[][]) => number[] | null} */
 function times(header, cells) {
-  const names = header.map(name => name.toLowerCase());
-  const at = names.findIndex(name => ['timecode', 'time', 'timestamp', 'seconds'].includes(name));
+  const at = header.findIndex(name => ['timecode', 'time', 'timestamp', 'seconds'].includes(name));
   if (at < 0) return null;
   const texts = cells.map(row => row[at].trim());
   const found = texts.map(text => /^(\d+):(\d+):(\d+)[:;.](\d+)(\.\d+)?$/.exec(text));

@@ -7,7 +7,7 @@
 import { row } from './camera.js';
 import { DataError } from './data.js';
 import { ENVIRONMENTS } from './light.js';
-import { StgaAvatar, hexOf } from './stga-avatar.js';
+import { StgaAvatar, hexOf, levelsOf } from './stga-avatar.js';
 import { dotProduct, scaled, vector } from './vector.js';
 
 const fixed = (/** @type {number} */ value) => value.toFixed(2);
@@ -335,7 +335,7 @@ function addLight() {
     const { strength, even, exposure } = values;
     if (select.value !== DRAGGED)
       return { environment: select.value, turn: (Math.PI / 180) * values.turn, exposure };
-    const sun = { toward, color: scaled(linearColor(color.value), strength) };
+    const sun = { toward, color: scaled(levelsOf(color.value).map(linear), strength) };
     return { even: [even, even, even], sun, exposure };
   };
   const showDirection = () => {
@@ -406,14 +406,9 @@ function onPad(toward) {
   return side > 1e-9 ? [(x / side) * reach, (y / side) * reach] : [0, 0];
 }
 
-// "#rrggbb" in linear light.
-/** @type {(hex: string) => Vector} */
-function linearColor(hex) {
-  return vector(k => {
-    const value = parseInt(hex.slice(2 * k + 1, 2 * k + 3), 16) / 255;
-    return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
-  });
-}
+// From sRGB.
+/** @param {number} level */
+const linear = level => (level <= 0.04045 ? level / 12.92 : ((level + 0.055) / 1.055) ** 2.4);
 
 // Keyboard, panel and facts
 

@@ -13,7 +13,6 @@ export const MAP_SIZE = 512;
 export const LIFT_M = 0.001;
 const SKIN_ROUGHNESS = 0.45;
 const MIN_ALPHA = 1 / 255;
-const LIT_COLOR = 'color = texelFetch(uColors, texel(splat), 0).rgb;';
 /** Of the recorded color without what depends on the view, by degree from 1 (light/relight.py). */
 const VIEW_MEANS = [0.65, 0.195, -0.089375];
 
@@ -73,6 +72,7 @@ function tailColor(arrays, direction, byView, byStrain) {
 // whether colors come from the light pass.
 /** @type {(arrays: Arrays, isLit: boolean) => string} */
 export function splatVertexShader(arrays, isLit) {
+  const lit = 'color = texelFetch(uColors, texel(splat), 0).rgb;';
   return `${PREAMBLE}
 uniform sampler2D uFaces;
 uniform sampler2D uSplats;
@@ -144,7 +144,7 @@ void main() {
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${isLit ? LIT_COLOR : tailColor(arrays, 'uToWorld * center', 'color', 'color')}
+  ${isLit ? lit : tailColor(arrays, 'uToWorld * center', 'color', 'color')}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);

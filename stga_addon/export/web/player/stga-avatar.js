@@ -55,11 +55,6 @@ export class Player {
     this.pivot = this.middle;
   }
 
-  resetCamera() {
-    this.camera = this.home;
-    this.pivot = this.middle;
-  }
-
   /** Draw the current frame on the canvas. */
   draw() {
     const begin = performance.now();
@@ -303,8 +298,7 @@ export class StgaAvatar extends HTMLElement {
   }
 
   resetCamera() {
-    this.#player?.resetCamera();
-    this.#changed('camerachange');
+    if (this.#player) this.camera = this.#player.home;
   }
 
   /** "#rrggbb" or "transparent". */
@@ -314,11 +308,10 @@ export class StgaAvatar extends HTMLElement {
   }
 
   set background(value) {
-    const digits = /^#([0-9a-f]{6})$/i.exec(value)?.[1];
-    if (!digits && value !== 'transparent')
+    const isColor = /^#[0-9a-f]{6}$/i.test(value);
+    if (!isColor && value !== 'transparent')
       throw new RangeError(`"${value}" is not #rrggbb or transparent.`);
-    const part = (/** @type {number} */ k) => parseInt(value.slice(2 * k + 1, 2 * k + 3), 16) / 255;
-    if (this.#player) this.#player.background = digits ? [...vector(part), 1] : [0, 0, 0, 0];
+    if (this.#player) this.#player.background = isColor ? [...levelsOf(value), 1] : [0, 0, 0, 0];
     this.#request ||= requestAnimationFrame(now => this.#tick(now));
   }
 
@@ -494,6 +487,10 @@ export function hexOf(color) {
   const levels = color.map(part => (256 + Math.round(255 * part)).toString(16).slice(1));
   return `#${levels.join('')}`;
 }
+
+// The reverse.
+/** @param {string} hex */
+export const levelsOf = hex => vector(k => parseInt(hex.slice(2 * k + 1, 2 * k + 3), 16) / 255);
 
 /** @param {string} address */
 async function fetchBytes(address) {
