@@ -28,10 +28,8 @@ def read(path: Path) -> tuple[Splats, int]:
         parts.append(np.frombuffer(data, np.uint8, count * width, offset).reshape(count, width))
         offset += count * width
     position, alpha, color, scale, rotation, sh = parts
-    xyz = [
-        [int.from_bytes(p[i : i + 3].tobytes(), "little", signed=True) / 2**bits for i in (0, 3, 6)]
-        for p in position
-    ]
+    places = np.frombuffer(np.pad(position.reshape(-1, 3), ((0, 0), (1, 0))).tobytes(), "<i4")
+    xyz = (places >> 8) / 2**bits
     opacity = np.clip(alpha[:, 0] / 255, 1e-6, 1 - 1e-6)
     base = (color / 255 - 0.5) / 0.15
     higher = (sh.reshape(count, rest, 3) - 128.0) / 128
