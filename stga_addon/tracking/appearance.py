@@ -9,10 +9,8 @@ import numpy as np
 from ..capture.camera import Camera
 
 LEVELS_M = (0.0012, 0.0024, 0.0048, 0.0096)  # Pixel sizes of the pyramid at the head
-BLUR_PX = 0.8
-"""Standard deviation of the blur, so that differences of neighboring pixels are derivatives."""
-DETAIL_PX = 2.5
-"""Of the neighborhood whose mean is taken off the luma: the rest hardly depends on lighting."""
+BLUR_PX = 0.8  # Standard deviation of the blur, by which differences of neighbors are derivatives
+DETAIL_PX = 2.5  # Of the neighborhood whose mean is taken off the luma, against lighting
 COLORS = np.array([[0.299, 0.587, 0.114], [0.8, -0.8, 0.0]], np.float32)
 """Luma, and redness, in which lips differ from skin."""
 CHANNEL_WEIGHTS = np.array([0.5, 1.5, 0.7])  # Of luma, detail and redness
@@ -39,8 +37,7 @@ steps."""
 FLOW_SHARE, FLOW_SCALE_PX = 0.3, 2.0
 """Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
 MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
-MIN_OBSERVATIONS = 1.0
-"""Sum of the weights of the views of a point, below which its texture is not known."""
+MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
 
 
 @dataclass(frozen=True)
@@ -201,6 +198,25 @@ def fitted_light(
 def robust(residual: np.ndarray, scale: float) -> np.ndarray:
     """Geman-McClure weights."""
     return np.asarray(1 / (1 + (residual / scale) ** 2) ** 2)
+
+
+def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
+    """(M,) of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
+    share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
+    return np.asarray(POINT_SHARE / (1 + share) ** 2)
+
+
+def unexplained(
+    residual: np.ndarray, level: int, weights: np.ndarray = CHANNEL_WEIGHTS
+) -> np.ndarray:
+    """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
+    squared = residual**2 @ weights
+    return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
+
+
+def flow_weights(miss: np.ndarray) -> np.ndarray:
+    """(M,) of points that lie (M, 2) pixels from where optical flow moves them."""
+    return FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
 
 
 def average_texture(samples: Sequence[Sample]) -> Texture:

@@ -15,7 +15,7 @@ from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
-from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE
+from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, rounded
 from .footage.model import Footage
 from .footage.open import open_footage
 from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
@@ -48,7 +48,14 @@ def correct_capture(
     if capture.flame is None:
         raise StgaError(f"{out}: was not tracked with FLAME; only FLAME's pose can be corrected")
     timesteps, solved = _solved(out, capture.flame)
-    rows = _rows(out, timesteps, keys, solved.shape[1])
+    unknown = sorted(set(keys) - set(timesteps))
+    if unknown:
+        raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
+    size = solved.shape[1]
+    for timestep, values in keys.items():
+        if not _are_parameters(values, (size,)):
+            raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
+    rows = {timesteps.index(t): values.astype(np.float64) for t, values in keys.items()}
     trust = _trust(out / REPORT_FILE, read_json(out / REPORT_FILE), timesteps)
     places, used, _, _ = _landmarks(out, capture)
     report("Solve", 0, 1)
@@ -139,19 +146,6 @@ def _are_parameters(values: np.ndarray | None, shape: tuple[int, ...]) -> bool:
     return bool((np.abs(values.astype(np.float64)) <= MAX_PARAMETER).all())  # not where one is NaN
 
 
-def _rows(
-    out: Path, timesteps: list[int], keys: Mapping[int, np.ndarray], size: int
-) -> dict[int, np.ndarray]:
-    """The keys by row. Raises StgaError for one of no timestep, or that poses no head."""
-    unknown = sorted(set(keys) - set(timesteps))
-    if unknown:
-        raise StgaError(f"{out}: has no timestep {unknown[0]}, which a key is of")
-    for timestep, values in keys.items():
-        if not _are_parameters(values, (size,)):
-            raise StgaError(f"key at timestep {timestep}: expected {(size,)} finite numbers")
-    return {timesteps.index(t): values.astype(np.float64) for t, values in keys.items()}
-
-
 def _misfit(report: Mapping[str, Any]) -> dict[str, dict[int, float]]:
     """Region -> timestep -> share of the images not explained, of a report that has one."""
     return {
@@ -194,9 +188,7 @@ def report_errors(out: Path, model: Path | None) -> float:
     median = float(np.median([px for own in errors.values() for px in own.values()]))
     report = read_json(out / REPORT_FILE)
     report["median_reprojection_px"] = round(median, 3)
-    report["reprojection_px"] = {
-        name: {str(t): round(px, 3) for t, px in own.items()} for name, own in errors.items()
-    }
+    report["reprojection_px"] = rounded(errors)
     write_json(out / REPORT_FILE, report)
     misfit = _misfit(report)
     sheet = out / SHEET_FILE

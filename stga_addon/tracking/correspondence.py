@@ -11,7 +11,7 @@ from ..capture.mesh_geometry import nearest_in_triangles, rasterize, vertex_norm
 from ..errors import StgaError
 from ..flame.forward import flame_forward, neutral_frame
 from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, Detector
+from .face_networks import FIRST_IRIS_POINT, IRIS_CENTERS, MESH_POINTS, FaceNetworks
 from .fit import MIN_LANDMARKS, Triangulation, triangulate
 from .posed_points import SurfacePoints
 from .seen_surface import large_parts
@@ -39,8 +39,7 @@ MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
 MAX_RESIDUAL = 0.013
 """Share of the head's extent: a landmark whose rays miss each other by more (4 mm) is not used."""
-CANDIDATES = 48
-"""Triangles whose centers are nearest to a point, among which the nearest is looked for."""
+CANDIDATES = 48  # Triangles of the nearest centers, among which the nearest one is looked for
 
 
 def shaded_image(
@@ -62,7 +61,9 @@ def shaded_image(
     return np.asarray(255 * np.clip(image, 0, 1) ** (1 / 1.8) + 0.5, np.uint8)
 
 
-def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[SurfacePoints, np.ndarray]:
+def calibrate(
+    model: FlameModel, detector: FaceNetworks, name: str
+) -> tuple[SurfacePoints, np.ndarray]:
     """The detector's landmarks on the neutral head: their places, and (N,) bool which of them are
     reliable.
 
@@ -80,7 +81,14 @@ def calibrate(model: FlameModel, detector: Detector, name: str) -> tuple[Surface
             f"expected at least {MIN_PICTURES}; it must look along +z with y up"
         )
     seen = [(neutral, located.position)]
-    for mesh in _moved_heads(model):
+    # with the mouth open, and with the eyes closed, as far as shapes or a joint are known for that
+    frame, names = neutral_frame(model), np.array(model.expression_names)
+    weights = [OPEN_JAW_WEIGHT * (names == "jawOpen"), np.isin(names, BLINKS)]
+    frames = [replace(frame, expr=1.0 * own) for own in weights if len(names) and own.any()]
+    if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
+        frames = [replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))]
+    for own in frames:
+        mesh = flame_forward(model, np.zeros(model.n_identity), own)
         found, _ = _located(mesh, faces, colors, detector)
         seen += [] if found is None else [(mesh, found.position)]
     # Of lids, the nearest points would lie on the eyeball, which does not blink.
@@ -117,7 +125,7 @@ def _colors(model: FlameModel) -> np.ndarray:
 
 
 def _located(
-    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, detector: Detector
+    vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray, detector: FaceNetworks
 ) -> tuple[Triangulation | None, int]:
     """The landmarks in pictures of a mesh, and how many of these show a face; None where too few
     do."""
@@ -128,17 +136,6 @@ def _located(
         return None, len(seen)
     points = np.stack([face for _, face in seen])
     return triangulate([camera for camera, _ in seen], points, np.ones(points.shape[:2])), len(seen)
-
-
-def _moved_heads(model: FlameModel) -> list[np.ndarray]:
-    """The neutral head's vertices (V, 3) with the mouth open, and with the eyes closed, as far as
-    shapes or a joint are known that do it."""
-    frame, names = neutral_frame(model), np.array(model.expression_names)
-    weights = [OPEN_JAW_WEIGHT * (names == "jawOpen"), np.isin(names, BLINKS)]
-    frames = [replace(frame, expr=1.0 * own) for own in weights if len(names) and own.any()]
-    if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
-        frames = [replace(frame, jaw_pose=np.array([OPEN_JAW_RAD, 0, 0]))]
-    return [flame_forward(model, np.zeros(model.n_identity), own) for own in frames]
 
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:

@@ -23,15 +23,13 @@ from .fit import (
     RecordedTake,
     TimestepLandmarks,
     excerpt,
-    observed_landmarks,
-    triangulated,
+    landmarks_in_capture,
 )
 from .landmarks import Report
 from .posed_points import split
-from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smooth_take
+from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smoothed
 
-MIN_TIMESTEPS = 6
-"""Below it, a texture averaged over the take is no evidence of how its timesteps differ."""
+MIN_TIMESTEPS = 6  # Below it, an averaged texture is no evidence of how timesteps differ
 SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
 TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
 """Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are
@@ -61,14 +59,12 @@ USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
 DAMPING = 1e-3
-CONVERGED_STEP_M = 1e-4
-"""Root mean square of the points' motion in a step, after which a level is done."""
+CONVERGED_STEP_M = 1e-4  # Root mean square motion of points in a step, after which a level is done
 MAX_TURN = 0.3  # Of a joint in one step, in radians
 SETTLED_GAIN = 0.01
 """By which a region's misfit has to fall for a settled timestep to be changed: below it, the
 surface that several cameras see is the better evidence."""
-KEPT_STIFFNESS = 100.0
-"""Of a timestep that keeps what it had, in the stiffness of the smoothness over time."""
+KEPT_STIFFNESS = 100.0  # Of a timestep that keeps what it had; in the stiffness over time
 MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
 """Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it:
 beyond, landmarks are the better evidence there. A forehead in wrinkles looks a little more like
@@ -100,13 +96,15 @@ class _Shot:
 
 @dataclass(frozen=True)
 class _Solved:
-    """Parameters of a timestep, visibility (C, N), Gauss–Newton terms, misfit, distances of the
-    landmarks (L,), and whether it is better than the start."""
+    """Parameters of a timestep, visibility (C, N), Gauss–Newton matrix and right-hand side, misfit
+    of the regions (R,), distances of the landmarks (L,), and whether it is better than the
+    start."""
 
     values: np.ndarray
     visible: np.ndarray
-    terms: tuple[np.ndarray, np.ndarray]
-    misfit: Misfit
+    matrix: np.ndarray
+    right: np.ndarray
+    misfit: np.ndarray
     missed: np.ndarray
     better: bool
 
@@ -141,7 +139,7 @@ def fit_dense(
         stage = "Refinement" if settled else "Dense tracking"
         return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
 
-    weights = head.rest([head.reduced(fit.parameters[t]) for t in chosen])
+    weights = head.rest([fit.parameters[t] for t in chosen])
     weights = np.maximum(weights, SETTLED_WEIGHT if settled else 0)
     some = parts_of(chosen, TEXTURE_PART_TIMESTEPS)
     rows = np.split(weights, np.cumsum([len(part) for part in some])[:-1])
@@ -152,10 +150,10 @@ def fit_dense(
     parts = [(part, texture, usual, settled) for part in parts_of(timesteps, PART_TIMESTEPS)]
     found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
     solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
-    terms = list(zip(solved["matrix"], solved["right"], strict=True))
-    smooth = smooth_take(head.head, solved["values"], terms, fit.ordered)
-    parameters = {t: head.complete(own) for t, own in zip(timesteps, smooth, strict=True)}
-    moved = replace(fit, parameters=parameters)
+    stiffness = acceleration_precision(fit.head.model) if fit.ordered else None
+    solved_for = solved["values"], solved["matrix"], stiffness, solved["right"]
+    smooth = smoothed(*solved_for, fit.head)
+    moved = replace(fit, parameters=dict(zip(timesteps, smooth, strict=True)))
     landmarks = _agreeing(head, moved, take, solved["missed"], solved["better"])
     return DenseFit(moved, landmarks, dict(zip(timesteps, solved["misfit"], strict=True)))
 
@@ -167,7 +165,7 @@ def _sampled_part(
     solver, found = _Solver(fit, take), []
     for timestep, weight in zip(sorted(take.landmarks), weights, strict=True):
         shot = solver.shot(timestep)
-        visible = solver.visible(shot, shot.start)
+        visible = solver.head.visibility(shot.start, shot.views)
         found += solver.head.samples(shot.views, shot.start, weight * visible)
         step()
     return found
@@ -179,7 +177,7 @@ def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step
     solver, found = _Solver(fit, take, texture), []
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
-        visible = solver.visible(shot, shot.start)
+        visible = solver.head.visibility(shot.start, shot.views)
         found.append(solver.started(shot, shot.start, visible)[1].regions)
         step()
     return np.stack(found)
@@ -192,16 +190,14 @@ def _solved_part(
     each."""
     solver = _Solver(fit, take, texture, SETTLED_GAIN if settled else 0.0)
     before: tuple[_Shot, _Solved] | None = None
-    solved: list[dict[str, Any]] = []
+    solved: list[_Solved] = []
     for timestep in sorted(take.landmarks, reverse=settled):
         shot = solver.shot(timestep)
-        own = solver.solve(shot, before, usual)
-        before, (matrix, right) = (shot, own), own.terms
-        every = vars(own) | {"matrix": matrix, "right": right, "misfit": own.misfit.regions}
-        solved.append(every)
+        solved.append(solver.solve(shot, before, usual))
+        before = shot, solved[-1]
         step()
     names, order = ("values", "matrix", "right", "misfit", "missed", "better"), -1 if settled else 1
-    return {name: np.stack([own[name] for own in solved[::order]]) for name in names}
+    return {name: np.stack([getattr(own, name) for own in solved[::order]]) for name in names}
 
 
 class _Solver:
@@ -221,27 +217,20 @@ class _Solver:
     def shot(self, timestep: int) -> _Shot:
         """Read a timestep."""
         parameters, world = self._fit.parameters[timestep], self._fit.to_capture
-        start = self.head.reduced(parameters)
-        center, views = self.head.positions(start).mean(0), []
+        center, views = self.head.positions(parameters).mean(0), []
         for recording, image in self._take.images(timestep, MAX_CAMERAS):
             camera, key = world.camera(recording), recording.world_to_camera.tobytes()
             views.append(PyramidView(key, camera, pyramid(camera, image, center)))
-        model, places, reliable = self._fit.head.model, self._take.places, self._take.reliable
         seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
-        found = triangulated(seen, reliable, places.on(model.v_template, model.faces), world.scale)
-        landmarks = observed_landmarks(found, world, reliable)
-        return _Shot(views, landmarks, start, np.zeros(len(REGIONS), bool))
-
-    def visible(self, shot: _Shot, values: np.ndarray) -> np.ndarray:
-        """Visibility (C, N) from the cameras of a timestep, of a head with these parameters."""
-        return self.head.visibility(values, [view.camera for view in shot.views])
+        landmarks = landmarks_in_capture(seen, self._take, self._fit)
+        return _Shot(views, landmarks, parameters, np.zeros(len(REGIONS), bool))
 
     def solve(
         self, shot: _Shot, before: tuple[_Shot, _Solved] | None, usual: np.ndarray
     ) -> _Solved:
         """The parameters that explain a timestep best, or the start where none are better; before:
         another timestep and its result."""
-        visible = self.visible(shot, shot.start)
+        visible = self.head.visibility(shot.start, shot.views)
         best, error = self.started(shot, shot.start, visible)
         if (error.regions > USUAL_FACTOR * usual).any():
             others = [self.head.opened(shot.start, distance) for distance in OPENINGS_M]
@@ -262,13 +251,13 @@ class _Solver:
         old, new = (self._evidence(shot, own, by_images) for own in (shot.start, best))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
-            terms = self._terms(shot, best, visible, 0)[:2]
+            matrix, right, _ = self._terms(shot, best, visible, 0)
         else:
             best = shot.start
-            stiff = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
-            terms = stiff, -prior_terms(self.head.head, best)[1]  # which the prior does not move
-        missed = self._missed(shot.landmarks, best)
-        return _Solved(best, visible, terms, self._evidence(shot, best, visible), missed, better)
+            matrix = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
+            right = -prior_terms(self.head.head, best)[1]  # which the prior does not move
+        missed, misfit = self._missed(shot.landmarks, best), self._evidence(shot, best, visible)
+        return _Solved(best, visible, matrix, right, misfit.regions, missed, better)
 
     def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""
@@ -293,12 +282,11 @@ class _Solver:
         return astray
 
     def _refined(self, shot: _Shot, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters after the steps in fine images, and the visibility (C, N) of which they
-        are."""
-        visible = self.visible(shot, values)
+        """Parameters after the steps in fine images, and their visibility (C, N)."""
+        visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, FINE_STEPS)
         for _ in range(LAST_ROUNDS):
-            assumed, visible = visible, self.visible(shot, values)
+            assumed, visible = visible, self.head.visibility(values, shot.views)
             if np.array_equal(assumed, visible):
                 break
             values = self._descended(shot, values, visible, LAST_STEPS)
@@ -373,8 +361,10 @@ def _agreeing(
     beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}
     for timestep, far in zip(sorted(take.landmarks), beyond, strict=True):
-        own, values = take.landmarks[timestep], head.reduced(fit.parameters[timestep])
-        at = head.landmarks.positions(*split(values))
+        own, at = (
+            take.landmarks[timestep],
+            head.landmarks.positions(*split(fit.parameters[timestep])),
+        )
         weight = robust(far, DISAGREEMENT_M)[head.landmark_region][:, None]
         seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
         moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)

@@ -2,38 +2,16 @@
 optical flow."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..capture.camera import Camera
 from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
-from ..flame.model import EYEBALL_WEIGHT, JOINTS, FlameModel
-from .appearance import (
-    CHANNEL_WEIGHTS,
-    FLOW_ITERATIONS,
-    FLOW_POINTS,
-    FLOW_SCALE_PX,
-    FLOW_SHARE,
-    LEVELS_M,
-    NOISE_LEVELS,
-    OUTLIER_SQUARED,
-    POINT_SHARE,
-    PyramidView,
-    Sample,
-    Texture,
-    Views,
-    fitted_light,
-    flow_targets,
-    inside,
-    light_basis,
-    projection_derivative,
-    robust,
-    sampled,
-    shading,
-)
+from ..flame.model import EYEBALL_WEIGHT, JOINTS
+from . import appearance
+from .appearance import PyramidView, Sample, Texture, Views
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
 from .seen_surface import (
@@ -50,8 +28,7 @@ HEAD_POINTS = 5000
 """Points over the whole head, of which those near landmarks are used; the landmarks' places come on
 top, because they are dense at eyes and lips."""
 FACE_RADIUS_M = 0.035  # Distance from the landmarks beyond which there is hair and clothes
-LID_DISTANCE_M = 0.005
-"""From an eyeball's vertices, up to which a landmark is one of the lids' edges."""
+LID_DISTANCE_M = 0.005  # From an eyeball, up to which a landmark is one of the lids' edges
 HELD_OUT = 8  # One point of so many is not fitted, and tells whether the fit is better
 STEPS = (1, 2, 2, 3)  # By level: one point of so many is fitted
 REGIONS = ("lower face", "middle face", "eyes", "brows")
@@ -68,9 +45,9 @@ of itself."""
 REST_QUANTILE, REST_SCALE_M = 0.2, 0.002
 """A region is at rest when it moves as little as at this share of the timesteps, within that
 distance."""
-HELD_OUT_LEVEL = len(LEVELS_M)
-"""Stands for the points that are not fitted, where a level is asked for."""
-
+HELD_OUT_LEVEL = len(appearance.LEVELS_M)
+ALL_POINTS = HELD_OUT_LEVEL + 1
+"""Stand for the points that are not fitted, and for all, where a level is asked for."""
 
 NO_TEXTURE = Texture({}, {}, np.zeros(0))
 
@@ -85,8 +62,7 @@ class Misfit:
 
 
 class DenseHead:
-    """N points on a person's face. Parameters (K + 18,) are those of `HeadFit` without components
-    that move nothing."""
+    """N points on a person's face; parameters (E + 18,) are those of `HeadFit`."""
 
     def __init__(
         self,
@@ -96,53 +72,39 @@ class DenseHead:
         texture: Texture = NO_TEXTURE,
     ) -> None:
         """texture: of the points, which `photo_term` and `misfit` compare with images."""
-        self._texture = texture
-        model = person.model
-        self.active = np.flatnonzero(np.abs(model.shapedirs).max(axis=(0, 1)) > 0)
-        dirs = np.ascontiguousarray(model.shapedirs[:, :, self.active])
-        names = (
-            tuple(model.expression_names[k] for k in self.active) if model.expression_names else ()
-        )
-        self.head = replace(person, model=replace(model, shapedirs=dirs, expression_names=names))
-        self.count = model.n_expression
-        self.landmarks = PosedPoints(self.head.model, places)
+        from scipy.spatial import cKDTree
+
+        self.head, self._texture, model = person, texture, person.model
+        template, faces = model.v_template, model.faces
+        self.landmarks, at = PosedPoints(model, places), places.on(template, faces)
         skin = large_parts(model)[places.face]
-        self.inner = ~skin | _on_lids(model, places)
+        eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
+        balls = template[(eyeballs > EYEBALL_WEIGHT).any(1)]
+        on_lids = cKDTree(balls).query(at)[0] < LID_DISTANCE_M if len(balls) else False
+        self.inner = ~skin | on_lids
         """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
         used = reliable & skin
-        self.points = _face_points(person, places, used if used.any() else reliable)
+        used = used if used.any() else reliable
+        points = surface_points(person, HEAD_POINTS)
+        distance, _ = cKDTree(at[used]).query(points.on(template, faces))
+        self.points = points[distance < FACE_RADIUS_M] + places[used]
         held = np.arange(len(self.points)) % HELD_OUT == 0
-        self.rows = [np.flatnonzero(~held)[::step] for step in STEPS] + [np.flatnonzero(held)]
-        self._posed = [PosedPoints(self.head.model, self.points[rows]) for rows in self.rows]
-        self._all = PosedPoints(self.head.model, self.points)
-        template, faces = self.head.model.v_template, self.head.model.faces
-        height = places.on(template, faces)[:, 1]
+        fitted, others = np.flatnonzero(~held), np.flatnonzero(held)
+        self.rows = [*(fitted[::step] for step in STEPS), others, np.arange(len(self.points))]
+        self._posed = [PosedPoints(model, self.points[rows]) for rows in self.rows]
+        height = at[:, 1]
         low, high = height[reliable].min(), height[reliable].max()
         edges = low + (high - low) * np.array(REGION_EDGES)
         self.landmark_region = np.digitize(height, edges)
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
         self._chin = reliable & (height < low + CHIN_SHARE * (high - low))
         self._fixed = reliable & (self.landmark_region >= UPPER_FACE)
-        rest = np.zeros(len(self.active) + RIGID_SIZE)
-        smooth = unit(self.points.on(vertex_normals(model.v_template, model.faces), model.faces))
-        self._bend = smooth - self._all.triangle_normals(*split(rest))
+        rest = np.zeros(model.n_expression), np.zeros(RIGID_SIZE)
+        smooth = unit(self.points.on(vertex_normals(template, faces), faces))
+        self._bend = smooth - self._posed[ALL_POINTS].triangle_normals(*rest)
         self._visible: VisiblePoints = {}
 
-    def reduced(self, parameters: np.ndarray) -> np.ndarray:
-        """The active ones of parameters (E + 18,) of a `HeadFit`."""
-        return np.concatenate([parameters[:-RIGID_SIZE][self.active], parameters[-RIGID_SIZE:]])
-
-    def complete(self, values: np.ndarray) -> np.ndarray:
-        """Parameters of a `HeadFit` (E + 18,) from active ones."""
-        parameters = np.zeros(self.count + RIGID_SIZE)
-        parameters[self.active], parameters[-RIGID_SIZE:] = split(values)
-        return parameters
-
-    def positions(self, values: np.ndarray) -> np.ndarray:
-        """(N, 3) of all points."""
-        return self._all.positions(*split(values))
-
-    def level_positions(self, values: np.ndarray, level: int) -> np.ndarray:
+    def positions(self, values: np.ndarray, level: int = ALL_POINTS) -> np.ndarray:
         """(M, 3) of the points of a level, which are `rows[level]`."""
         return self._posed[level].positions(*split(values))
 
@@ -150,20 +112,19 @@ class DenseHead:
         """Positions (M, 3) of a level's points, and derivatives (M, 3, K + 18)."""
         return self._posed[level].linearized(*split(values))
 
-    def light_basis(self, values: np.ndarray, level: int | None = None) -> np.ndarray:
-        """(M, 9) of the smooth normals of a level's points, or of all (N, 9)."""
-        rows = slice(None) if level is None else self.rows[level]
-        posed = self._all if level is None else self._posed[level]
-        bend = self._bend[rows] @ head_rotation(values).T
-        return light_basis(unit(posed.triangle_normals(*split(values)) + bend))
+    def light_basis(self, values: np.ndarray, level: int = ALL_POINTS) -> np.ndarray:
+        """(M, 9) of the smooth normals of a level's points."""
+        bend = self._bend[self.rows[level]] @ head_rotation(values).T
+        flat = self._posed[level].triangle_normals(*split(values))
+        return appearance.light_basis(unit(flat + bend))
 
-    def visibility(self, values: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    def visibility(self, values: np.ndarray, views: Views) -> np.ndarray:
         """(C, N) squared cosine at which each camera sees each point, 0 where the head hides it;
         kept by direction and by how far the mouth is open."""
         at, turn = self.positions(values), head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
         seen, faces = [], self.head.model.faces
-        for camera in cameras:
+        for camera in (view.camera for view in views):
             key = opening, *rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
             if key not in self._visible:
                 vertices = flame_forward(self.head.model, np.zeros(0), frame_of(values))
@@ -205,7 +166,7 @@ class DenseHead:
             by_region = (distance[self.region == region] for region in regions)
             moved.append([np.sqrt(own.mean()) for own in by_region])
         beyond = np.maximum(moved - np.quantile(moved, REST_QUANTILE, axis=0), 0)
-        return robust(beyond, REST_SCALE_M)[:, of_region]
+        return appearance.robust(beyond, REST_SCALE_M)[:, of_region]
 
     def samples(self, views: Views, values: np.ndarray, weight: np.ndarray) -> list[Sample]:
         """What the views show of the points; weight (C, N)."""
@@ -213,10 +174,10 @@ class DenseHead:
         for view, own in zip(views, weight, strict=True):
             projected = [level.camera.project(at) for level in view.levels]
             levels = [
-                sampled([level.channels], pixels)[0].astype(np.float64)
+                appearance.sampled([level.channels], pixels)[0].astype(np.float64)
                 for level, (pixels, _) in zip(view.levels, projected, strict=True)
             ]
-            shown = inside(view.levels[0].camera, *projected[0])
+            shown = appearance.inside(view.levels[0].camera, *projected[0])
             found.append(Sample(view.key, levels, basis, own * shown))
         return found
 
@@ -224,28 +185,28 @@ class DenseHead:
         self, views: Views, visible: np.ndarray, values: np.ndarray, level: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gauss–Newton terms of a level's points by their positions: H (M, 3, 3) and b (M, 3)."""
-        at = self.level_positions(values, level)
+        at = self.positions(values, level)
         matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
         basis, rows = self.light_basis(values, level), self.rows[level]
         for view, seen in zip(views, visible, strict=True):
             own = view.levels[level]
             pixels, depth = own.camera.project(at)
-            weight = seen[rows] * self._texture.trust[rows] * inside(own.camera, pixels, depth)
+            within = appearance.inside(own.camera, pixels, depth)
+            weight = seen[rows] * self._texture.trust[rows] * within
             near = np.flatnonzero(weight)
             if not len(near):
                 continue
-            shown, *slopes = sampled([own.channels, *own.gradient], pixels[near])
+            shown, *slopes = appearance.sampled([own.channels, *own.gradient], pixels[near])
             lit = basis[near], weight[near], rows[near]
             residual = self._residual(view, shown, *lit, level)
-            trust = 1 / (1 + residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]) ** 2
-            used = POINT_SHARE * weight[near] * trust
-            by_x, by_y = (slope / NOISE_LEVELS for slope in slopes)
+            used = weight[near] * appearance.point_weights(residual, level)
+            by_x, by_y = (slope / appearance.NOISE_LEVELS for slope in slopes)
             # The channels' slopes along x and y, multiplied and summed, before they become those by
             # position.
             pairs = (by_x, by_x), (by_x, by_y), (by_y, by_y), (by_x, residual), (by_y, residual)
-            sums = [(used * ((one * other) @ CHANNEL_WEIGHTS))[:, None] for one, other in pairs]
-            xx, xy, yy, x, y = sums
-            of_x, of_y = projection_derivative(own.camera, at[near]).swapaxes(0, 1)
+            sums = ((one * other) @ appearance.CHANNEL_WEIGHTS for one, other in pairs)
+            xx, xy, yy, x, y = ((used * own)[:, None] for own in sums)
+            of_x, of_y = appearance.projection_derivative(own.camera, at[near]).swapaxes(0, 1)
             along_x, along_y = xx * of_x + xy * of_y, xy * of_x + yy * of_y
             matrix[near] += of_x[:, :, None] * along_x[:, None]
             matrix[near] += of_y[:, :, None] * along_y[:, None]
@@ -256,17 +217,16 @@ class DenseHead:
         self, views: Views, visible: np.ndarray, values: np.ndarray, points: int, level: int
     ) -> Misfit:
         """How badly a level's images are explained at the points of a level."""
-        at, basis = self.level_positions(values, points), self.light_basis(values, points)
+        at, basis = self.positions(values, points), self.light_basis(values, points)
         rows = self.rows[points]
         total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
         for view, seen in zip(views, visible, strict=True):
             weight, own = seen[rows] * self._texture.trust[rows], view.levels[level]
             pixels, depth = own.camera.project(at)
-            shown = inside(own.camera, pixels, depth)
-            (found,) = sampled([own.channels], pixels)
+            shown = appearance.inside(own.camera, pixels, depth)
+            (found,) = appearance.sampled([own.channels], pixels)
             residual = self._residual(view, found, basis, weight * shown, rows, level)
-            squared = residual**2 @ CHANNEL_WEIGHTS
-            share = np.where(shown, squared / (OUTLIER_SQUARED[level] + squared), 1.0)
+            share = np.where(shown, appearance.unexplained(residual, level), 1.0)
             total += np.bincount(self.region[rows], weight * share, len(REGIONS))
             weights += np.bincount(self.region[rows], weight, len(REGIONS))
         regions = total / np.maximum(weights, 1e-9)
@@ -283,49 +243,30 @@ class DenseHead:
     ) -> np.ndarray:
         """Channels (M, 3) that the view shows minus those of the lit texture, in NOISE_LEVELS."""
         target = self._texture.values[view.key][level][rows]
-        light = fitted_light(shown, target, basis, weight, self._texture.lights[view.key])
-        return np.asarray((shown - target * shading(basis, light)) / NOISE_LEVELS)
+        usual = self._texture.lights[view.key]
+        light = appearance.fitted_light(shown, target, basis, weight, usual)
+        difference = shown - target * appearance.shading(basis, light)
+        return np.asarray(difference / appearance.NOISE_LEVELS)
 
     def flow_start(
         self, before: Views, visible: np.ndarray, values: np.ndarray, now: Views
     ) -> np.ndarray:
         """Parameters at a timestep to which optical flow carries the head of another one, of which
         are `before`, visible (C, N) and values."""
-        targets = list(flow_targets(self.level_positions(values, FLOW_POINTS), before, now))
-        rows, moved = self.rows[FLOW_POINTS], values
+        start = self.positions(values, appearance.FLOW_POINTS)
+        targets = list(appearance.flow_targets(start, before, now))
+        rows, moved = self.rows[appearance.FLOW_POINTS], values
         weights = {view.key: own[rows] for view, own in zip(before, visible, strict=True)}
-        for _ in range(FLOW_ITERATIONS):
-            at, jacobian = self.linearized(moved, FLOW_POINTS)
+        for _ in range(appearance.FLOW_ITERATIONS):
+            at, jacobian = self.linearized(moved, appearance.FLOW_POINTS)
             precision, right = prior_terms(self.head, moved)
             matrix = np.diag(precision)
             for key, camera, target in targets:
                 miss = camera.project(at)[0] - target
-                trust = robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
-                weight = np.repeat(FLOW_SHARE * weights[key] * trust, 2)
-                flat = (projection_derivative(camera, at) @ jacobian).reshape(len(weight), -1)
+                weight = np.repeat(weights[key] * appearance.flow_weights(miss), 2)
+                rate = appearance.projection_derivative(camera, at) @ jacobian
+                flat = rate.reshape(len(weight), -1)
                 matrix = matrix + (flat.T * weight) @ flat
                 right = right - flat.T @ (weight * miss.ravel())
             moved = moved + np.linalg.solve(matrix, right)
         return moved
-
-
-def _on_lids(model: FlameModel, places: SurfacePoints) -> np.ndarray:
-    """(N,) bool: places next to an eyeball."""
-    from scipy.spatial import cKDTree
-
-    eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
-    inside = model.v_template[(eyeballs > EYEBALL_WEIGHT).any(1)]
-    if not len(inside):
-        return np.zeros(len(places), bool)
-    distance, _ = cKDTree(inside).query(places.on(model.v_template, model.faces))
-    return np.asarray(distance < LID_DISTANCE_M)
-
-
-def _face_points(head: HeadModel, places: SurfacePoints, used: np.ndarray) -> SurfacePoints:
-    """Points near the landmarks, and those of the landmarks' places that are used."""
-    from scipy.spatial import cKDTree
-
-    model, points, own = head.model, surface_points(head, HEAD_POINTS), places[used]
-    centers = cKDTree(own.on(model.v_template, model.faces))
-    distance, _ = centers.query(points.on(model.v_template, model.faces))
-    return points[distance < FACE_RADIUS_M] + own

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -54,13 +54,6 @@ SCORE_NAMES = [
 ]  # fmt: skip
 
 
-class Detector(Protocol):
-    """Finds faces in an image; every face has the same N landmarks."""
-
-    def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        """Landmarks (N, 2) of each face in an image (H, W, 3) uint8; pixel centers lie at .5."""
-
-
 @dataclass(frozen=True)
 class FaceScores:
     """What the networks say of a face: its blend shapes by name, 0 to 1, and its landmarks.
@@ -95,7 +88,8 @@ class FaceNetworks:
         return {}
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
-        """Landmarks (478, 2) in pixels of at most two faces; see `Detector`."""
+        """Landmarks (478, 2) of at most two faces in an image (H, W, 3) uint8, in pixels, whose
+        centers lie at .5."""
         return [points[:, :2] for points in self._landmarks(image, MAX_FACES)]
 
     def score(self, image: np.ndarray) -> FaceScores | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import Similarity, similarity, vertex_normals, weighted_procrustes
+from ..capture.mesh_geometry import Similarity, similarity, vertex_normals
 from ..capture.model import evenly_spread
 from ..flame.forward import POSE_SIZE, RIGID_SIZE, flame_forward, frame_of
 from ..worker.helpers import Step
@@ -22,8 +22,9 @@ Images = Callable[..., Pictures]
 spread over the rig."""
 
 ITERATIONS = 15
-OUTLIER_SCALE = 1.5
-"""Distances from a ray, in medians of the landmark's, at which its weight is a quarter."""
+OUTLIER_SCALE = (
+    1.5  # Distances from a ray, in the landmark's medians, at which its weight is a quarter
+)
 MIN_DISTANCE_SHARE = 1e-5
 """Of outliers' scale, as a share of the distance to the cameras; below is rounding."""
 RANK_GUARD = 1e-9
@@ -40,9 +41,7 @@ MAX_RESIDUALS = 25.0
 """In RESIDUAL_SCALE_M, beyond which a landmark's weight no longer falls: it would vanish below the
 smallest number."""
 MIN_LANDMARKS = 4  # Of a timestep that the head is fitted to: fewer do not determine a pose
-MIN_FACE_PIXELS, MIN_FACE_M = 1.0, 0.01
-"""Extents of the landmarks in an image and on the head, below which they are no face but a
-point."""
+MIN_FACE_M = 0.01  # Extent of the landmarks on the head, below which they are but a point
 POSIT_ITERATIONS = 20
 
 
@@ -116,11 +115,12 @@ def _median(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class TimestepLandmarks:
     """What the cameras that found a face at one timestep found: points (C, N, 2) pixels and
-    confidence (C, N)."""
+    confidence (C, N); the cameras' names, where these are asked for."""
 
     cameras: tuple[Camera, ...]
     points: np.ndarray
     confidence: np.ndarray
+    names: tuple[str, ...] = ()
 
 
 def no_pictures(*_: int | None) -> Pictures:
@@ -184,26 +184,16 @@ def in_cameras_world(fit: HeadFit) -> HeadFit:
     """
     from scipy.spatial.transform import Rotation
 
-    model, world = fit.head.model, fit.to_capture
-    expressions = model.shapedirs[:, :, model.n_identity :]
-    joint = model.j_regressor[0] @ model.v_template
-    joint_dirs = np.einsum("v,vak->ak", model.j_regressor[0], expressions)
-    moved = {}
+    model, world, moved = fit.head.model, fit.to_capture, {}
     for timestep, parameters in fit.parameters.items():
-        root = joint + joint_dirs @ parameters[:-RIGID_SIZE]
-        rigid = parameters[-RIGID_SIZE:].copy()
+        expression, rigid = split(parameters.copy())
+        root = model.j_regressor[0] @ (model.v_template + model.shapedirs @ expression)
         turned = world.rotation.T @ Rotation.from_rotvec(rigid[:3]).as_matrix()
         rigid[:3] = Rotation.from_matrix(turned).as_rotvec()
         rigid[POSE_SIZE:] = (root + rigid[POSE_SIZE:] - world.translation) @ world.rotation - root
-        moved[timestep] = np.concatenate([parameters[:-RIGID_SIZE], rigid])
+        moved[timestep] = np.concatenate([expression, rigid])
     kept = Similarity(world.scale, np.eye(3), np.zeros(3))
     return replace(fit, parameters=moved, to_capture=kept)
-
-
-def is_face(pixels: np.ndarray) -> bool:
-    """Whether one camera's landmarks (N, 2) pixels have an extent, in place of all being one
-    point."""
-    return len(pixels) > 0 and bool((np.ptp(pixels, axis=0) >= MIN_FACE_PIXELS).all())
 
 
 def scaled_down(world: Similarity, factor: float) -> Similarity:
@@ -219,8 +209,6 @@ def determines_pose(
 
     neutral (N, 3) meters: the landmarks' places on the neutral head.
     """
-    if not landmarks.cameras:
-        return False
     seen = (landmarks.confidence > 0).sum(0) >= min(2, len(landmarks.cameras))
     use = seen & reliable
     return use.sum() >= MIN_LANDMARKS and bool(np.ptp(neutral[use], axis=0).max() >= MIN_FACE_M)
@@ -338,6 +326,15 @@ def observed_landmarks(
     return Observation(world.apply(found.position), root, weight)
 
 
+def landmarks_in_capture(
+    landmarks: TimestepLandmarks, take: RecordedTake, fit: HeadFit
+) -> Observation:
+    """The landmarks of a timestep of the take, triangulated in the world of the fit."""
+    at = take.places.on(fit.head.model.v_template, fit.head.model.faces)
+    found = triangulated(landmarks, take.reliable, at, fit.to_capture.scale)
+    return observed_landmarks(found, fit.to_capture, take.reliable)
+
+
 def _aligned(
     found: Triangulation, neutral: np.ndarray, reliable: np.ndarray, metric: bool
 ) -> Similarity:
@@ -354,12 +351,9 @@ def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:
     # no cameras agree: all of them, and the fit will show by how much they do not
     if use.sum() < MIN_LANDMARKS:
         use = observed.weight > 0
-    pairs = neutral[use], observed.position[use]
-    rotation, translation = weighted_procrustes(*pairs, np.ones(use.sum()))
-    rigid = np.zeros(RIGID_SIZE)
-    rigid[:3] = Rotation.from_matrix(rotation).as_rotvec()
-    rigid[POSE_SIZE:] = translation
-    return rigid
+    moved = similarity(neutral[use], observed.position[use], metric=True)
+    turn = Rotation.from_matrix(moved.rotation).as_rotvec()
+    return np.concatenate([turn, np.zeros(POSE_SIZE - 3), moved.translation])
 
 
 class LandmarkVisibility:

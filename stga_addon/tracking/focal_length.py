@@ -9,25 +9,17 @@ import numpy as np
 from ..capture.mesh_geometry import Similarity
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE
-from .fit import (
-    HeadFit,
-    LandmarkVisibility,
-    RecordedTake,
-    TimestepLandmarks,
-    observed_landmarks,
-    rigid_start,
-    triangulated,
-)
-from .footage.model import Footage
+from . import fit as head_fit
+from .fit import HeadFit, RecordedTake, TimestepLandmarks
 from .head_model import HeadModel
-from .landmarks import CameraLandmarks
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
 CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
 """Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
-MIN_TURN_DEG = 20.0
-"""Between two timesteps; below it, what lies nearer cannot be told from what is larger."""
+MIN_TURN_DEG = (
+    20.0  # Between two timesteps; below it, what is near cannot be told from what is large
+)
 USUAL_SIGMA = 0.35  # Standard deviation of the inverse focal length about that of a phone, relative
 NEAREST, FARTHEST = 2.0, 0.2
 """Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
@@ -47,8 +39,9 @@ MIN_VISIBILITY = 0.1
 """Squared cosine of the angle between a landmark's surface and a camera that may use it."""
 MAX_COMPARED_TIMESTEPS = 40
 SCALE_ITERATIONS, OUTLIER_SCALE = 8, 1.5
-HERE = Similarity(1.0, np.eye(3), np.zeros(3))
-"""The head is fitted in the camera's own world, in meters."""
+HERE = Similarity(
+    1.0, np.eye(3), np.zeros(3)
+)  # The camera's own world, in meters, in which the head is fitted
 
 
 def solved_focal(head: HeadModel, take: RecordedTake) -> float | None:
@@ -132,9 +125,9 @@ def _observed(
 ) -> tuple[list[Observation], np.ndarray]:
     """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
     neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
-    points = (triangulated(view, used, neutral, 1.0) for view in views)
-    found = [observed_landmarks(own, HERE, used) for own in points]
-    return found, np.stack([rigid_start(neutral, own) for own in found])
+    points = (head_fit.triangulated(view, used, neutral, 1.0) for view in views)
+    found = [head_fit.observed_landmarks(own, HERE, used) for own in points]
+    return found, np.stack([head_fit.rigid_start(neutral, own) for own in found])
 
 
 def _slope(
@@ -153,7 +146,7 @@ def _slope(
     for _ in range(ROUNDS):
         seen, starts = _observed(subject, places, views)
         frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
-        visibility = LandmarkVisibility(subject, places)
+        visibility = head_fit.LandmarkVisibility(subject, places)
         observed, factor = [], LANDMARK_SIGMA_M / NOISE_SIGMA_M
         for view, own, values in zip(views, seen, frames, strict=True):
             weight = own.weight * visibility.weighted(view, values, HERE).confidence[0]
@@ -174,29 +167,24 @@ def _slope(
     return total
 
 
-def scale_warnings(
-    fit: HeadFit, take: RecordedTake, footage: Footage, found: Mapping[str, CameraLandmarks]
-) -> tuple[str, ...]:
+def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
     """One sentence for each camera whose landmarks are of another size than the fitted head is
     there: the sign of a wrong focal length. Faces seen from the side do not count."""
-    visibility, used = LandmarkVisibility(fit.head, take.places), take.reliable
-    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
+    visibility, used = head_fit.LandmarkVisibility(fit.head, take.places), take.reliable
     timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]
     scales: dict[str, dict[int, float]] = {}
     for timestep in timesteps:
-        for name, own in found.items():
-            rows = np.flatnonzero(own.timesteps == timestep)
-            if not len(rows):
-                continue
-            parameters, eye = fit.parameters[timestep], cameras[name].position
-            at, (visible,) = visibility.seen(parameters, eye[None])
-            away = (eye - at[used].mean(0)) @ head_rotation(parameters)
+        parameters, seen = fit.parameters[timestep], take.landmarks[timestep]
+        cameras = [fit.to_capture.camera(camera) for camera in seen.cameras]
+        eyes = np.stack([camera.position for camera in cameras])
+        at, squared = visibility.seen(parameters, eyes)
+        for row, (name, camera) in enumerate(zip(seen.names, cameras, strict=True)):
+            away = (camera.position - at[used].mean(0)) @ head_rotation(parameters)
             if away[2] < np.cos(np.radians(MAX_SIDE_DEG)) * np.linalg.norm(away):
                 continue
-            use = used & (own.confidence[rows[0]] > 0) & (visible > MIN_VISIBILITY)
+            use = used & (seen.confidence[row] > 0) & (squared[row] > MIN_VISIBILITY)
             if use.sum() > RIGID_SIZE:
-                projected, pixels = cameras[name].project(at[use])[0], own.points[rows[0]][use]
-                scale = _scale(projected, pixels, visible[use])
+                scale = _scale(camera.project(at[use])[0], seen.points[row][use], squared[row][use])
                 scales.setdefault(name, {})[timestep] = scale
     if len(scales) < MIN_CAMERAS:
         return ()

@@ -50,6 +50,11 @@ def is_tracked(out: Path) -> bool:
     return (out / LANDMARKS_FOLDER / PLACES_FILE).is_file() and (out / REPORT_FILE).is_file()
 
 
+def rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
+    """What the report has of values by camera or region, and timestep."""
+    return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}
+
+
 @dataclass(frozen=True)
 class TorsoMotion:
     """Which of MOTIONS the torso follows, and what speaks for it.

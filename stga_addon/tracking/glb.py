@@ -24,6 +24,8 @@ PRIMITIVE_NUMBERS = 100
 UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
 """What a damaged document leads to."""
 Json = dict[str, Any]
+Placed = tuple[Json, list[tuple[str, Json]], np.ndarray]
+"""A primitive, its morph targets with their names, and the transform (4, 4) of its node."""
 READABLE_EXTENSIONS = {"KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
 
 
@@ -55,47 +57,43 @@ def read_glb(path: Path) -> MorphMesh:
             if any("uri" in buffer for buffer in document.get("buffers", ())):
                 other = "refers to other files; export a GLB that holds its buffers"
                 raise StgaError(f"{path}: {other}")
-            nodes = list(_mesh_nodes(document))
-            _require_bounded(path, document, nodes, len(content))
-            parts = [own for each in nodes for own in _placed(document, data, *each)]
+            placed = _placed_primitives(path, document, len(content))
+            parts = [_part(document, data, *each) for each in placed]
     except UNREADABLE as error:
         reason = f"{type(error).__name__}: {error!s:.100}"
         raise StgaError(f"{path}: is not a readable GLB ({reason})") from error
     if not parts:
         raise StgaError(f"{path}: its scene has no triangle mesh")
-    return _merged(_joined(parts))
+    return _joined(parts)
 
 
-def _require_bounded(
-    path: Path, document: Json, nodes: list[tuple[Json, np.ndarray]], size: int
-) -> None:
-    """Raise StgaError where the joined mesh would hold more numbers than such a file may."""
+def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
+    """The triangle primitives of the scene's meshes. Raises StgaError where these hold more numbers
+    than a file of this size may."""
     allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
     vertices, corners, accessors, names = 0, 0, document["accessors"], set[str]()
-    for primitive, targets in (own for node, _ in nodes for own in _primitives(document, node)):
-        vertices += _count(accessors[primitive["attributes"]["POSITION"]])
-        corners += PRIMITIVE_NUMBERS
-        corners += _count(accessors[primitive["indices"]]) if "indices" in primitive else 0
-        names.update(name for name, _ in targets)
-        numbers = 3 * vertices * (1 + len(names)) + corners
-        if numbers > allowed:
-            limit = f"more than the {allowed} allowed to a file of this size"
-            raise StgaError(f"{path}: its meshes hold {numbers} numbers, {limit}")
-
-
-def _primitives(
-    document: Json, node: Json
-) -> Iterator[tuple[Json, list[tuple[str, dict[str, int]]]]]:
-    """Triangle primitives of a node's mesh, with the names of their morph targets and these."""
-    mesh = document["meshes"][node["mesh"]]
-    extras = mesh.get("extras")
-    names = extras.get("targetNames", ()) if isinstance(extras, dict) else ()
-    for primitive in mesh["primitives"]:
-        if primitive.get("mode", TRIANGLES) == TRIANGLES:
+    placed: list[Placed] = []
+    for node, matrix in _mesh_nodes(document):
+        mesh = document["meshes"][node["mesh"]]
+        extras = mesh.get("extras")
+        own = extras.get("targetNames", ()) if isinstance(extras, dict) else ()
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", TRIANGLES) != TRIANGLES:
+                continue
             targets = primitive.get("targets", ())
-            if len(names) != len(targets):
-                names = [f"target {number}" for number in range(len(targets))]
-            yield primitive, [(str(names[k]), target) for k, target in enumerate(targets)]
+            if len(own) != len(targets):
+                own = [f"target {number}" for number in range(len(targets))]
+            named = [(str(own[k]), target) for k, target in enumerate(targets)]
+            vertices += _count(accessors[primitive["attributes"]["POSITION"]])
+            corners += PRIMITIVE_NUMBERS
+            corners += _count(accessors[primitive["indices"]]) if "indices" in primitive else 0
+            names.update(name for name, _ in named)
+            numbers = 3 * vertices * (1 + len(names)) + corners
+            if numbers > allowed:
+                limit = f"more than the {allowed} allowed to a file of this size"
+                raise StgaError(f"{path}: its meshes hold {numbers} numbers, {limit}")
+            placed.append((primitive, named, matrix))
+    return placed
 
 
 def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
@@ -106,8 +104,7 @@ def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
         if not waiting:
             return
         row, above = waiting.pop()
-        node = nodes[row]
-        own = np.eye(4)
+        node, own = nodes[row], np.eye(4)
         if "matrix" in node:
             own = np.array(node["matrix"], float).reshape(4, 4).T
         else:
@@ -120,26 +117,25 @@ def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
             yield node, np.eye(4) if "skin" in node else matrix
 
 
-def _placed(document: Json, data: bytes, node: Json, matrix: np.ndarray) -> list[MorphMesh]:
-    """The triangle primitives of a node's mesh, in the scene's axes."""
-    parts = []
-    for primitive, morphs in _primitives(document, node):
-        positions = _accessor(document, data, primitive["attributes"]["POSITION"])
-        count = len(positions)
-        targets = np.zeros((count, 3, len(morphs)))
-        for column, (_, morph) in enumerate(morphs):
-            if "POSITION" in morph:
-                targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
-        corners = np.arange(count)
-        if "indices" in primitive:
-            values = _accessor(document, data, primitive["indices"], width=1)[:, 0]
-            corners = values.astype(np.int64)
-        if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
-            raise ValueError("a primitive's indices do not fit its vertices")
-        turn, faces = matrix[:3, :3], corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        names, moved = tuple(name for name, _ in morphs), np.einsum("ab,vbk->vak", turn, targets)
-        parts.append(MorphMesh(positions @ turn.T + matrix[:3, 3], faces, names, moved))
-    return parts
+def _part(
+    document: Json, data: bytes, primitive: Json, morphs: list[tuple[str, Json]], matrix: np.ndarray
+) -> MorphMesh:
+    """The mesh of a primitive, in the scene's axes."""
+    positions = _accessor(document, data, primitive["attributes"]["POSITION"])
+    count = len(positions)
+    targets = np.zeros((count, 3, len(morphs)))
+    for column, (_, morph) in enumerate(morphs):
+        if "POSITION" in morph:
+            targets[:, :, column] = _accessor(document, data, morph["POSITION"], count)
+    corners = np.arange(count)
+    if "indices" in primitive:
+        values = _accessor(document, data, primitive["indices"], width=1)[:, 0]
+        corners = values.astype(np.int64)
+    if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
+        raise ValueError("a primitive's indices do not fit its vertices")
+    turn, faces = matrix[:3, :3], corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    names, moved = tuple(name for name, _ in morphs), np.einsum("ab,vbk->vak", turn, targets)
+    return MorphMesh(positions @ turn.T + matrix[:3, 3], faces, names, moved)
 
 
 def _count(accessor: Json) -> int:
@@ -187,7 +183,8 @@ def _view(
 
 
 def _joined(parts: list[MorphMesh]) -> MorphMesh:
-    """One mesh of all parts; a part without a target of some name is not moved by it."""
+    """One mesh of all parts; a part without a target of some name is not moved by it. Vertices are
+    merged that no target parts, and triangles that collapse are left out."""
     names = tuple(dict.fromkeys(name for part in parts for name in part.names))
     starts = np.cumsum([0, *(len(part.positions) for part in parts)]).tolist()
     targets = np.zeros((starts[-1], 3, len(names)))
@@ -195,21 +192,16 @@ def _joined(parts: list[MorphMesh]) -> MorphMesh:
         for own, name in enumerate(part.names):
             rows = slice(start, start + len(part.positions))
             targets[rows, :, names.index(name)] += part.targets[:, :, own]
-    faces = [part.faces + start for start, part in zip(starts, parts, strict=False)]
+    joined = [part.faces + start for start, part in zip(starts, parts, strict=False)]
     positions = np.concatenate([part.positions for part in parts])
-    return MorphMesh(positions, np.concatenate(faces), names, targets)
-
-
-def _merged(mesh: MorphMesh) -> MorphMesh:
-    """The mesh with vertices merged that no target parts, without triangles that collapse."""
-    rows = np.column_stack([mesh.positions, mesh.targets.reshape(len(mesh.positions), -1)])
-    rows = np.ascontiguousarray(rows + 0.0)  # no -0
-    keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))[:, 0]
+    values = np.column_stack([positions, targets.reshape(len(positions), -1)])
+    values = np.ascontiguousarray(values + 0.0)  # no -0
+    keys = values.view(np.dtype((np.void, values.dtype.itemsize * values.shape[1])))[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     order = np.argsort(first)  # vertices in the order of the file
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
-    faces = rank[inverse.ravel()][mesh.faces]
+    faces = rank[inverse.ravel()][np.concatenate(joined)]
     collapsed = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
     kept = first[order]
-    return MorphMesh(mesh.positions[kept], faces[~collapsed], mesh.names, mesh.targets[kept])
+    return MorphMesh(positions[kept], faces[~collapsed], names, targets[kept])

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from ..capture.model import parts_of
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from ..worker.helpers import MAX_HELPERS, Helpers, Step
-from .face_networks import Detector
+from .face_networks import FaceNetworks
 from .fit import MIN_LANDMARKS
 from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
@@ -48,17 +47,16 @@ class CameraLandmarks:
 def landmark_file(folder: Path, camera: str) -> Path:
     """The file of a camera; characters that not all file systems allow are percent-encoded, as in
     `walk%2F1.npz`."""
-    name = (
-        re.sub(
-            r"[^\w.-]", lambda found: "".join(f"%{byte:02X}" for byte in found[0].encode()), camera
-        )
-        + ".npz"
-    )
+
+    def encoded(found: re.Match[str]) -> str:
+        return "".join(f"%{byte:02X}" for byte in found[0].encode())
+
+    name = re.sub(r"[^\w.-]", encoded, camera) + ".npz"
     return folder / (name if name != PLACES_FILE else name.replace("h", "%68", 1))
 
 
 def detect_landmarks(
-    footage: Footage, detector: Detector, folder: Path, helpers: Helpers, report: Report
+    footage: Footage, detector: FaceNetworks, folder: Path, helpers: Helpers, report: Report
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
@@ -69,19 +67,33 @@ def detect_landmarks(
     total = sum(len(camera.timesteps) for camera in footage.cameras)
     found: dict[str, CameraLandmarks] = {}
     done = 0
+
+    def count(steps: int) -> None:
+        report("Landmarks", done + steps, total)
+
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)
         if not path.exists():
             limit = max(MIN_PART_TIMESTEPS, -(-len(camera.timesteps) // MAX_HELPERS))
             parts = [(camera, part, detector) for part in parts_of(camera.timesteps, limit)]
-            count = partial(counted, report, "Landmarks", done, total)
-            detected = helpers.map(_detect, parts, count)
-            seen = [faces for part in detected for faces in part]
-            write_camera(path, _of_one_person(camera, seen))
+            seen = [faces for part in helpers.map(_detect, parts, count) for faces in part]
+            several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
+            if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
+                raise StgaError(
+                    f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of "
+                    f"{len(camera.timesteps)} frames with two faces, the first at timestep "
+                    f"{several[0]}; expected one person"
+                )
+            faces = [own[0] if len(own) == 1 else None for own in seen]
+            number = next((len(face) for face in faces if face is not None), 0)
+            points = [np.zeros((number, 2)) if face is None else face for face in faces]
+            confidence = np.tile([[float(face is not None)] for face in faces], (1, number))
+            timesteps = np.array(camera.timesteps)
+            write_camera(path, CameraLandmarks(timesteps, np.stack(points), confidence))
         # in the file's precision, whether it was detected now or before
         found[camera.name] = read_camera(path, camera)
         done += len(camera.timesteps)
-        report("Landmarks", done, total)
+        count(0)
     return found
 
 
@@ -189,43 +201,21 @@ def write_landmarks(
     write_places(folder / PLACES_FILE, places, used)
 
 
-def counted(report: Report, stage: str, before: int, total: int, done: int) -> None:
-    """Report steps of a part of a stage."""
-    report(stage, before + done, total)
-
-
 def _detect(
-    camera: FootageCamera, timesteps: list[int], detector: Detector, step: Step
+    camera: FootageCamera, timesteps: list[int], detector: FaceNetworks, step: Step
 ) -> list[list[np.ndarray]]:
-    """The faces (N, 2) of each timestep."""
+    """The faces (N, 2) of each timestep; those whose bounding boxes overlap are one."""
     found = []
     for timestep in timesteps:
         faces = detector.detect(camera.image(timestep))
-        others = [face for face in faces[1:] if _overlap(faces[0], face) < MIN_OVERLAP]
+        others = []
+        for face in faces[1:]:
+            low = np.maximum(faces[0].min(0), face.min(0))
+            high = np.minimum(faces[0].max(0), face.max(0))
+            common = np.maximum(high - low, 0).prod()
+            union = np.ptp(faces[0], axis=0).prod() + np.ptp(face, axis=0).prod() - common
+            if union and common / union < MIN_OVERLAP:
+                others.append(face)
         found.append(faces[:1] + others)
         step()
     return found
-
-
-def _of_one_person(camera: FootageCamera, seen: list[list[np.ndarray]]) -> CameraLandmarks:
-    """Raises StgaError where too many of the timesteps show several faces."""
-    several = [t for t, own in zip(camera.timesteps, seen, strict=True) if len(own) > 1]
-    faces = [own[0] if len(own) == 1 else None for own in seen]
-    if len(several) > MAX_TWO_FACES_SHARE * len(camera.timesteps):
-        raise StgaError(
-            f"{camera.source(several[0])}: camera {camera.name} sees {len(several)} of "
-            f"{len(camera.timesteps)} frames with two faces, the first at timestep {several[0]}; "
-            "expected one person"
-        )
-    count = next((len(face) for face in faces if face is not None), 0)
-    points = np.stack([np.zeros((count, 2)) if face is None else face for face in faces])
-    confidence = np.tile([[float(face is not None)] for face in faces], (1, count))
-    return CameraLandmarks(np.array(camera.timesteps), points, confidence)
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of the bounding boxes of points (N, 2); 1 for boxes without area."""
-    low, high = np.maximum(a.min(0), b.min(0)), np.minimum(a.max(0), b.max(0))
-    common = np.maximum(high - low, 0).prod()
-    union = np.ptp(a, axis=0).prod() + np.ptp(b, axis=0).prod() - common
-    return float(common / union) if union else 1.0

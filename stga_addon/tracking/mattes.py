@@ -9,7 +9,6 @@ the pixel's color lies at; where both colors are alike, the band is a smooth edg
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from ..worker.helpers import Helpers, Step
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
-from .landmarks import Report, counted
+from .landmarks import Report
 
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
@@ -42,8 +41,7 @@ NEIGHBORHOOD_SHARES = (0.03, 0.12)
 FAR_WEIGHT = 0.02
 MIN_NEIGHBORHOOD_PX = 2.0
 """Standard deviation of the smaller neighborhood, in pixels of the image of the means."""
-REACH_SHARE = 1.0
-"""Distance from the head, of its size, that hair reaches; clothes reach farther, below."""
+REACH_SHARE = 1.0  # From the head, of its size, that hair reaches; clothes reach farther, below
 SIMILAR_COLORS_LEVELS = 30.0
 """Difference of both sides' colors at which half of the coverage is a smooth edge's."""
 PLATE_NOISE_LEVELS, PLATE_SURE_LEVELS = 10.0, 40.0
@@ -73,6 +71,10 @@ def with_mattes(
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
     unseen, cameras = list[str](), []
+
+    def count(steps: int) -> None:
+        report("Mattes", done + steps, total)
+
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}
         kept = {t: file for t, file in files.items() if continues and file.exists()}
@@ -80,10 +82,9 @@ def with_mattes(
         parts = [part for part in parts_of(left, PART_TIMESTEPS) if part]
         work = [(camera, {t: files[t] for t in part}, head_pixels) for part in parts]
         done += len(kept)
-        count = partial(counted, report, "Mattes", done, total)
         found = helpers.map(_write_mattes, work, count)
         done += len(left)
-        report("Mattes", done, total)
+        count(0)
         known = {t: is_seen for part in found for t, is_seen in part.items()}
         unseen += [f"{camera.name} at timestep {t}" for t in left if not known.get(t, True)]
         mattes = {t: file for t, file in files.items() if t in kept or t in known}
@@ -126,7 +127,22 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     pixels, likely, heads = (cv2.resize(v, small, interpolation=cv2.INTER_AREA) for v in seeds)
     cut = _cut(cv2, pixels, likely, heads > 0.5, scale * size).astype(np.float32)
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
-    return _soft_edge(cv2, image, person, size)
+    # coverage in a band along the person's outline
+    band = max(1.0, BAND_SHARE * size)
+    inside, outside = _shrunk(cv2, person, band), ~_grown(cv2, person, band)
+    unknown = ~inside & ~outside
+    if not (unknown.any() and inside.any() and outside.any()):
+        return np.where(person, 255, 0).astype(np.uint8)
+    backdrop = _mean_around(cv2, image, outside, size)[unknown]
+    towards = _mean_around(cv2, image, inside, size)[unknown] - backdrop
+    contrast = (towards**2).sum(axis=1)
+    share = ((image[unknown] - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
+    smooth = cv2.GaussianBlur(person.astype(np.float32), (0, 0), max(0.7, band / 3))[unknown]
+    trust = contrast / (contrast + 3 * SIMILAR_COLORS_LEVELS**2)
+    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * smooth
+    matte = np.where(inside, 255, 0).astype(np.uint8)
+    matte[unknown] = (255 * coverage + 0.5).astype(np.uint8)
+    return matte
 
 
 def by_plate(image: np.ndarray, plate: np.ndarray) -> np.ndarray:
@@ -166,25 +182,6 @@ def _cut(
     filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_SHARE * head.sum()
     filled[0] = False
     return np.asarray(kept | filled[label])
-
-
-def _soft_edge(cv2: Any, image: np.ndarray, person: np.ndarray, size: float) -> np.ndarray:
-    """(H, W) uint8: coverage in a band along the person's outline, 0 and 255 elsewhere."""
-    band = max(1.0, BAND_SHARE * size)
-    inside, outside = _shrunk(cv2, person, band), ~_grown(cv2, person, band)
-    matte = np.where(inside, 255, 0).astype(np.uint8)
-    unknown = ~inside & ~outside
-    if not (unknown.any() and inside.any() and outside.any()):
-        return np.where(person, 255, 0).astype(np.uint8)
-    backdrop = _mean_around(cv2, image, outside, size)[unknown]
-    towards = _mean_around(cv2, image, inside, size)[unknown] - backdrop
-    contrast = (towards**2).sum(axis=1)
-    share = ((image[unknown] - backdrop) * towards).sum(axis=1) / np.maximum(contrast, 1e-3)
-    smooth = cv2.GaussianBlur(person.astype(np.float32), (0, 0), max(0.7, band / 3))[unknown]
-    trust = contrast / (contrast + 3 * SIMILAR_COLORS_LEVELS**2)
-    coverage = trust * np.clip(share, 0, 1) + (1 - trust) * smooth
-    matte[unknown] = (255 * coverage + 0.5).astype(np.uint8)
-    return matte
 
 
 def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:

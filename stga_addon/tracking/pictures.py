@@ -1,7 +1,7 @@
 """Pictures of the head over the footage: for whoever watches the tracking, and the contact sheet of
 a tracked take, with errors of all views and the mesh drawn over the worst."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +57,10 @@ def picture_of_first_frame(
     seeing = evenly_spread(seeing, FIRST_CAMERAS)
     found = [(camera, detector.detect(camera.image(timestep))) for camera in seeing]
     alone = [(camera.camera, faces[0]) for camera, faces in found if len(faces) == 1]
+    if not alone:
+        return None
+    points = np.stack([face for _, face in alone])
     cameras = tuple(camera for camera, _ in alone)
-    points = np.array([face for _, face in alone]).reshape(-1, len(places), 2)
     seen = TimestepLandmarks(cameras, points, np.ones(points.shape[:2]))
     if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
         return None
@@ -119,8 +121,7 @@ def write_contact_sheet(
         by_images = unexplained.get(view[1], 0.0) / max(usual, 1e-9)
         return every[view] / max(median, 1e-9) + by_images, *view
 
-    rows = [*_chart_rows(errors, median), *_chart_rows(misfit, usual)]
-    chart = _chart(rows, footage.timesteps)
+    chart = _chart([(errors, median), (misfit, usual)], footage.timesteps)
     shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
     (width, height), top = TILE_SIZE, MARGIN + CAPTION + chart.height + MARGIN
     lines = -(-len(shown) // COLUMNS)
@@ -144,26 +145,24 @@ def write_contact_sheet(
         sheet.save(partial, format="PNG")
 
 
-def _chart_rows(errors: Errors, median: float) -> list[tuple[str, Mapping[int, float], float]]:
-    """Name, errors and their median: of many, those with the largest errors."""
-    worst = sorted(errors, key=lambda name: -max(errors[name].values(), default=0.0))
-    return [(name, errors[name], median) for name in errors if name in worst[:MAX_CHART_ROWS]]
-
-
-def _chart(
-    rows: list[tuple[str, Mapping[int, float], float]], timesteps: tuple[int, ...]
-) -> Image.Image:
-    """A row a camera or region, and a column a timestep."""
+def _chart(groups: Sequence[tuple[Errors, float]], timesteps: tuple[int, ...]) -> Image.Image:
+    """A row a camera or region, of many those with the largest errors, and a column a timestep;
+    each group of errors in multiples of its median."""
+    rows = []
+    for errors, median in groups:
+        worst = sorted(errors, key=lambda name: -max(errors[name].values(), default=0.0))
+        shown = [name for name in errors if name in worst[:MAX_CHART_ROWS]]
+        rows += [(name, errors[name], max(median, 1e-9 / COLOR_SCALE_END)) for name in shown]
     width = COLUMNS * (TILE_SIZE[0] + GAP) - GAP
     chart = Image.new("RGB", (width, CELL_HEIGHT * len(rows)), BACKGROUND)
     stops = np.linspace(0, COLOR_SCALE_END, len(ERROR_COLORS))
-    for row, (name, errors, median) in enumerate(rows):
+    for row, (name, own, median) in enumerate(rows):
         _write(chart, (0, row * CELL_HEIGHT), name[-22:], CELL_HEIGHT - 3)
         cells = np.empty((1, len(timesteps), 3), np.uint8)
         for column, timestep in enumerate(timesteps):
-            share = errors.get(timestep, 0.0) / max(median, 1e-9 / COLOR_SCALE_END)
+            share = own.get(timestep, 0.0) / median
             color = [np.interp(share, stops, channel) for channel in ERROR_COLORS.T]
-            cells[0, column] = color if timestep in errors else NO_FACE
+            cells[0, column] = color if timestep in own else NO_FACE
         size = width - NAME_WIDTH, CELL_HEIGHT - 1
         strip = Image.fromarray(cells).resize(size, Image.Resampling.NEAREST)
         chart.paste(strip, (NAME_WIDTH, row * CELL_HEIGHT))

@@ -93,19 +93,33 @@ class PosedPoints:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
         posed, count = self._posed(coefficients, rigid), len(self.barycentric)
-        turns = [left_jacobian(angles) for angles in posed.angles]
+        turns = np.stack([left_jacobian(angles) for angles in posed.angles])
         first, share = self.dirs.shape[2], self._corner_weights.sum(2)
         found = np.empty((count, 3, first + RIGID_SIZE))
+        by_pose = found[..., first:-TRANSLATION_SIZE]
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).
         skin = self._weighted(posed.skin).transpose(0, 2, 1, 3).reshape(count, 3, 9)
         moved: np.ndarray = self._placed(posed.rotations, self.joint_dirs)
         moved = moved - posed.rotations @ self.joint_dirs
         found[..., :first] = skin @ self.dirs.reshape(count, 9, first)
         found[..., :first] += np.tensordot(share.T, moved, 1)
-        found[..., first:-TRANSLATION_SIZE] = self._by_joints(posed, turns)
-        if self.posedirs is not None:
-            bent = self._corrective_dirs(self.posedirs, posed, turns).reshape(count, 9, -1)
-            found[..., first:-TRANSLATION_SIZE] += skin @ bent
+        # Turning a joint turns about it what it and the joints below it carry, each with its share
+        # of the skin.
+        turned = posed.corrected @ posed.rotations.swapaxes(1, 2) + posed.moved[:, None]
+        corners = turned.reshape(*self._corner_weights.shape, 3)
+        carried = np.einsum("jnc,jncx->jnx", self._corner_weights, corners)
+        below = (self._below @ share)[..., None] * posed.places[:, None]
+        arms = np.tensordot(self._below, carried, 1) - below
+        parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
+        across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), parents @ turns)
+        by_joint = (arms @ across.reshape(-1, 3, 9)).reshape(*arms.shape, 3)
+        by_pose[:] = by_joint.transpose(1, 2, 0, 3).reshape(count, 3, POSE_SIZE)
+        if self.posedirs is not None:  # by all joints but the root
+            bent = np.zeros((self.posedirs.shape[2], POSE_SIZE))
+            for joint in range(1, len(turns)):
+                changes = (cross_matrices(turns[joint].T) @ posed.local[joint]).reshape(3, 9)
+                bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.T
+            by_pose += skin @ (self.posedirs.reshape(-1, len(bent)) @ bent).reshape(count, 9, -1)
         found[..., -TRANSLATION_SIZE:] = np.eye(3)
         return posed.positions, found
 
@@ -132,36 +146,6 @@ class PosedPoints:
         found = _Posed(positions, angles, local, rotations, places, moved, corrected, skin, posed)
         self._last = key, found
         return found
-
-    @staticmethod
-    def _corrective_dirs(
-        posedirs: np.ndarray, posed: "_Posed", turns: list[np.ndarray]
-    ) -> np.ndarray:
-        """Derivatives (3 N, 3, 15) of the corners' correctives by the joints' axis-angles; the root
-        has none."""
-        bent = np.zeros((posedirs.shape[2], POSE_SIZE))
-        for joint in range(1, len(turns)):
-            changes = cross_matrices(turns[joint].T) @ posed.local[joint]
-            bent[9 * (joint - 1) : 9 * joint, 3 * joint : 3 * joint + 3] = changes.reshape(3, 9).T
-        return np.asarray((posedirs.reshape(-1, len(bent)) @ bent).reshape(-1, 3, POSE_SIZE))
-
-    def _by_joints(self, posed: "_Posed", turns: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (N, 3, 15) by the axis-angles of the joints, whose `left_jacobian` is given;
-        no correctives.
-
-        Turning a joint turns about it what it and the joints below it carry, each with its share of
-        the skin.
-        """
-        turned = posed.corrected @ posed.rotations.swapaxes(1, 2) + posed.moved[:, None]
-        corners = turned.reshape(*self._corner_weights.shape, 3)
-        carried = np.einsum("jnc,jncx->jnx", self._corner_weights, corners)
-        share = self._below @ self._corner_weights.sum(2)
-        arms = np.tensordot(self._below, carried, 1) - share[..., None] * posed.places[:, None]
-        parents = [np.eye(3) if parent < 0 else posed.rotations[parent] for parent in self.parents]
-        rates = parents @ np.stack(turns)
-        across = np.einsum("yxz,jyc->jzxc", cross_matrices(np.eye(3)), rates).reshape(-1, 3, 9)
-        by_joint = (arms @ across).reshape(*arms.shape, 3)
-        return np.asarray(by_joint.transpose(1, 2, 0, 3).reshape(len(by_joint[0]), 3, POSE_SIZE))
 
     def _placed(self, rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
         """World positions (5, 3, K) of joints (5, 3, K), or their derivatives, in which the result

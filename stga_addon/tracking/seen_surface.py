@@ -14,18 +14,14 @@ from .posed_points import SurfacePoints, head_rotation, unit
 
 PATCH_SAMPLES = 9  # Samples along each side of a patch
 MAX_CAMERAS = 6  # Cameras that a patch is compared in: those that see it most squarely
-MIN_COSINE = 0.35
-"""Of the angle between normal and camera: beyond 70°, a patch is too foreshortened."""
+MIN_COSINE = 0.35  # Of the angle between normal and camera: patches beyond 70° are foreshortened
 MIN_CORRELATION = 0.5
-NOISE_LEVELS = 2.0
-"""Standard deviation of image noise, of 255: patches of less contrast do not correlate."""
+NOISE_LEVELS = 2.0  # Standard deviation of noise, of 255: patches of less contrast do not correlate
 OCCLUSION_M = 0.004  # A point this far behind the nearest surface is hidden
 DEPTH_IMAGE_SIDE = 300
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
-POINT_SHARE = 0.25
-"""Weight of a surface point: patches of neighboring points share most of their pixels."""
-DIRECTIONS = 6
-"""Steps of a direction's coordinates, about 10°."""
+POINT_SHARE = 0.25  # Weight of a surface point, whose patch shares most pixels with its neighbors
+DIRECTIONS = 6  # Steps of a direction's coordinates, about 10°
 MIN_PART_SHARE = 0.33
 """Connected parts smaller than this share of the head (eyeballs, teeth) have no surface points."""
 MAX_OUTLINE_DISTANCE_M = 0.0005
@@ -34,8 +30,7 @@ those of the skin: mattes are often a pixel or two too wide, and hair hangs over
 MIN_OUTLINE_POINTS = 100
 OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
-MAX_COSINE = 0.25
-"""Of the angle between normal and camera: points within 15° of the outline move it."""
+MAX_COSINE = 0.25  # Of the angle between normal and camera: those within 15° of the outline move it
 RIM_COSINE = 0.5  # The same of a triangle: those farther from the outline are not drawn
 PICTURE_SIDE, MAX_ENLARGEMENT = 600, 2
 """The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
@@ -56,6 +51,16 @@ class Sweep:
     def offsets(self) -> np.ndarray:
         count = round(self.reach / self.step)
         return self.step * np.arange(-count, count + 1)
+
+
+@dataclass(frozen=True)
+class Sought:
+    """Surface points (N) that are looked for, by a sweep; near (N,) bool: of which masks may
+    tell."""
+
+    points: SurfacePoints
+    near: np.ndarray
+    sweep: Sweep
 
 
 def gray_view(
@@ -96,11 +101,7 @@ def in_sight(
 
 
 def surface_offsets(
-    views: Pictures,
-    cosines: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    sweep: Sweep,
+    views: Pictures, cosines: np.ndarray, points: np.ndarray, normals: np.ndarray, sweep: Sweep
 ) -> tuple[np.ndarray, np.ndarray]:
     """Offset (N,) in meters along the normals at which the images agree best, and their correlation
     (N,) there.
@@ -203,28 +204,39 @@ def large_parts(model: FlameModel) -> np.ndarray:
 def seen_surface(
     fit: HeadFit,
     timestep: int,
-    points: SurfacePoints,
+    sought: Sought,
     images: Pictures,
-    sweep: Sweep,
+    masks: Pictures,
     visible: VisiblePoints,
 ) -> SeenSurface:
-    """Where the images show the surface near the fitted head, along its normals; weight 0 for what
-    they do not show.
+    """Where images show the surface near the fitted head, along its normals, and masks its outline;
+    weight 0 for what they do not show.
 
     `visible` is filled with what is in sight from where, and read for directions that are in it
     already.
     """
-    vertices, at, normals = _posed(fit, timestep, points)
-    turn, cosines, views = head_rotation(fit.parameters[timestep]), [], []
+    vertices, at, normals = _posed(fit, timestep, sought.points)
+    near, sweep = sought.near, sought.sweep
+    faces, turn = fit.head.model.faces, head_rotation(fit.parameters[timestep])
+    cosines, views = [], []
     for recording, image in images:
         camera = fit.to_capture.camera(recording)
         views.append(gray_view(camera, image, at.mean(0), sweep.spacing))
         key = rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
         if key not in visible:
-            visible[key] = in_sight(camera, vertices, fit.head.model.faces, at)
+            visible[key] = in_sight(camera, vertices, faces, at)
         cosines.append(facing(camera, at, normals) * visible[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
-    return SeenSurface(at + offset[:, None] * normals, normals, POINT_SHARE * correlation)
+    weight = POINT_SHARE * correlation
+    moved = weight * offset
+    for recording, mask in masks:
+        camera = fit.to_capture.camera(recording)
+        places = vertices, faces, at[near], normals[near]
+        offset, known = outline_offsets(camera, mask, *places, sweep.reach)
+        weight[near] += POINT_SHARE * known
+        moved[near] += POINT_SHARE * offset
+    mean = moved / np.maximum(weight, 1e-9)
+    return SeenSurface(at + mean[:, None] * normals, normals, weight)
 
 
 def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
@@ -241,34 +253,10 @@ def _posed(
     return vertices, points.on(vertices, faces), normals
 
 
-def with_outlines(
-    seen: SeenSurface,
-    fit: HeadFit,
-    timestep: int,
-    points: SurfacePoints,
-    masks: Pictures,
-    near: np.ndarray,
-    reach: float,
-) -> SeenSurface:
-    """The surface with what masks say about points at the outline; near (N,) bool: of which."""
-    vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
-    at = points.on(vertices, faces)
-    total, moved = seen.weight.copy(), seen.weight * ((seen.position - at) * seen.normal).sum(1)
-    places = at[near], seen.normal[near]
-    for recording, mask in masks:
-        camera = fit.to_capture.camera(recording)
-        offset, known = outline_offsets(camera, mask, vertices, faces, *places, reach)
-        total[near] += POINT_SHARE * known
-        moved[near] += POINT_SHARE * offset
-    mean = moved / np.maximum(total, 1e-9)
-    return replace(seen, position=at + mean[:, None] * seen.normal, weight=total)
-
-
-def outlines_agree(
-    fit: HeadFit, take: RecordedTake, points: SurfacePoints, near: np.ndarray, reach: float
-) -> bool:
-    """Whether masks, if any, end where the surface in the images does; reach: meters searched."""
-    distances, faces, chosen = [np.zeros(0)], fit.head.model.faces, points[near]
+def outlines_agree(fit: HeadFit, take: RecordedTake, sought: Sought) -> bool:
+    """Whether masks, if any, end where the surface in the images does."""
+    distances, faces = [np.zeros(0)], fit.head.model.faces
+    chosen, reach = sought.points[sought.near], sought.sweep.reach
     for timestep in fit.parameters:
         vertices, at, normals = _posed(fit, timestep, chosen)
         for recording, mask in take.masks(timestep):
@@ -301,6 +289,8 @@ def outline_offsets(
     move, in meters. Both outlines are crossed along the projected normal, so that a point need not
     lie on the outline itself.
     """
+    from scipy.spatial import cKDTree
+
     found, known = np.zeros(len(points)), np.zeros(len(points), bool)
     rows = np.flatnonzero(np.abs(facing(camera, points, normals)) < MAX_COSINE)
     begin, depth = camera.project(points[rows])
@@ -315,7 +305,15 @@ def outline_offsets(
     steps = np.linspace(-pixels, pixels, 2 * math.ceil(SAMPLES_PER_PIXEL * pixels) + 1)
     at = begin[:, None] + steps[:, None] * (along / length[:, None])[:, None]
     factor = int(np.clip(PICTURE_SIDE / max(camera.width, camera.height), 1, MAX_ENLARGEMENT))
-    rim = _rim(camera, vertices, faces, begin, pixels)
+    # of the mesh, few triangles are drawn: those of the outline near the points
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = unit(np.cross(b - a, c - a), 1e-20)
+    rim = faces[np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE]
+    corners = camera.project(vertices)[0][rim]
+    center = corners.mean(1)
+    radius = np.linalg.norm(corners - center[:, None], axis=2).max(1)
+    distance, _ = cKDTree(begin).query(np.nan_to_num(center, nan=1e9))
+    rim = rim[distance < pixels + radius]
     drawn = (rasterize(vertices, rim, camera.scaled(factor))[0] >= 0).astype(np.float32)
     # the mask's edge, where there is one; the last one of the drawn mesh, which has holes
     level, own = _sampled(mask / np.float32(255), at), _sampled(drawn, factor * at)
@@ -328,22 +326,6 @@ def outline_offsets(
     inside = np.abs(np.nan_to_num(move, nan=np.inf)) <= reach
     found[rows[inside]], known[rows[inside]] = move[inside], True
     return found, known
-
-
-def _rim(
-    camera: Camera, vertices: np.ndarray, faces: np.ndarray, around: np.ndarray, pixels: float
-) -> np.ndarray:
-    """Triangles (R, 3) of the outline near pixels `around` (N, 2): few of the mesh's are drawn."""
-    from scipy.spatial import cKDTree
-
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = unit(np.cross(b - a, c - a), 1e-20)
-    rows = np.flatnonzero(np.abs(facing(camera, (a + b + c) / 3, normal)) < RIM_COSINE)
-    corners = camera.project(vertices)[0][faces[rows]]
-    center = corners.mean(1)
-    radius = np.linalg.norm(corners - center[:, None], axis=2).max(1)
-    distance, _ = cKDTree(around).query(np.nan_to_num(center, nan=1e9))
-    return np.asarray(faces[rows[distance < pixels + radius]])
 
 
 def _sampled(mask: np.ndarray, at: np.ndarray) -> np.ndarray:

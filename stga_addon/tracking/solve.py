@@ -8,13 +8,12 @@ import numpy as np
 from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE
 from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
-from .posed_points import PosedPoints, SurfacePoints, head_rotation
+from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 
 LANDMARK_SIGMA_M = 0.002
 """Standard deviation of a landmark over people and views; coefficients have a standard deviation of
 1."""
-SCALE_SIGMA = 0.3
-"""Of the capture's scale, relative: the first guess comes from the average head."""
+SCALE_SIGMA = 0.3  # Of the capture's scale, relative: the first guess comes from the average head
 JOINT_SIGMA_RAD = {
     "root": (3.0, 3.0, 3.0),
     "neck": (0.1, 0.1, 0.1),
@@ -24,8 +23,7 @@ JOINT_SIGMA_RAD = {
 }
 """Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes
 the root's."""
-WEIGHT_EXCESS_SIGMA = 0.1
-"""By which a coefficient that is a weight from 0 to 1 leaves that range."""
+WEIGHT_EXCESS_SIGMA = 0.1  # By which a coefficient that is a weight from 0 to 1 leaves that range
 LID_SHAPES = {"eyeBlink": 1.0, "eyeLookDown": 0.57}
 """Shares by which shapes close an eye; it is closed where their weights, times these, add up to
 1."""
@@ -35,8 +33,7 @@ EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.
 """Standard deviations of second differences from one timestep to the next."""
 LID_ACCELERATION = 1.0
 """The same of LID_SHAPES: a blink closes the eyes within two or three frames of a video."""
-JUMP_SCALE = 3.0
-"""Standard deviations of a second difference beyond which it is a cut rather than a motion."""
+JUMP_SCALE = 3.0  # Standard deviations of a second difference beyond which it is a cut, no motion
 MAX_ORDERED_CHANGE = 0.7
 """Mean squared change of expression and jaw from one timestep to the next, as a share of that
 between any two, up to which timesteps follow each other in time."""
@@ -50,8 +47,7 @@ take."""
 
 
 Terms = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Timestep's number and parameters (E + 18,) -> its Gauss–Newton matrix and right-hand side, which
-are changed."""
+"""Timestep's number and parameters (P,) -> its Gauss–Newton matrix and right-hand side."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +136,8 @@ def solve_take(
     def terms(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return normal_equations(points, values, observations[row])
 
-    return _solve_windows(head, terms, start, _stiffness(head, ordered))
+    stiffness = acceleration_precision(head.model) if ordered else None
+    return _solve_windows(head, terms, start, stiffness)
 
 
 def in_order(
@@ -155,60 +152,46 @@ def in_order(
     """
     if len(alone) < 3:
         return True
-    prior = parameter_precision(head)
+    points, prior = PosedPoints(head.model, places), parameter_precision(head)
+    missed, variances = [], []
+    for values, own in zip(alone, observations, strict=True):
+        away = points.positions(*split(values)) - own.position
+        missed.append(np.einsum("nij,nj->ni", own.root, away) @ head_rotation(values))
+        information, _ = normal_equations(points, values, own)
+        covariance = np.linalg.inv(information + np.diag(prior))
+        variances.append(np.diag(covariance @ information @ covariance))
+    # landmarks move about their usual places
+    weight = np.mean([own.weight for own in observations], axis=0)
+    spread = (weight[:, None] * np.var(missed, axis=0)).sum() / max(3 * weight.sum(), 1e-9)
+    noises = spread / LANDMARK_SIGMA_M**2 * np.mean(variances, axis=0)
     jaw = head.model.n_expression + 3 * JOINTS.index("jaw")
     moving = np.r_[: head.model.n_expression, jaw : jaw + 3]
-    noise = float((_landmark_noise(head, places, observations, alone) * prior)[moving].sum())
+    noise = float((noises * prior)[moving].sum())
     expressions = (alone * np.sqrt(prior))[:, moving]
     variance = expressions.var(axis=0, ddof=1).sum() - noise
     change = ((expressions[1:] - expressions[:-1]) ** 2).sum(1).mean() - 2 * noise
     return bool(change <= MAX_ORDERED_CHANGE * 2 * variance)
 
 
-def _landmark_noise(
-    head: HeadModel, places: SurfacePoints, observations: Sequence[Observation], alone: np.ndarray
-) -> np.ndarray:
-    """(E + 18,) mean variance in a timestep's parameters of landmarks that move about their usual
-    places."""
-    points, prior = PosedPoints(head.model, places), np.diag(parameter_precision(head))
-    missed, variance = [], []
-    for values, own in zip(alone, observations, strict=True):
-        away = points.positions(values[:-RIGID_SIZE], values[-RIGID_SIZE:]) - own.position
-        missed.append(np.einsum("nij,nj->ni", own.root, away) @ head_rotation(values))
-        information, _ = normal_equations(points, values, own)
-        covariance = np.linalg.inv(information + prior)
-        variance.append(np.diag(covariance @ information @ covariance))
-    weight = np.mean([own.weight for own in observations], axis=0)
-    spread = (weight[:, None] * np.var(missed, axis=0)).sum() / max(3 * weight.sum(), 1e-9)
-    return np.asarray(spread / LANDMARK_SIGMA_M**2 * np.mean(variance, axis=0))
-
-
-def smooth_take(
-    head: HeadModel,
+def smoothed(
     start: np.ndarray,
-    terms: Sequence[tuple[np.ndarray, np.ndarray]],
-    ordered: bool,
+    information: np.ndarray,
+    stiffness: np.ndarray | None,
+    right: np.ndarray | float = 0.0,
+    head: HeadModel | None = None,
 ) -> np.ndarray:
-    """Parameters (T, E + 18) of consecutive timesteps from the Gauss–Newton matrix and right-hand
-    side that each has at `start`, with the prior and, of a take that is ordered, smoothness over
-    time."""
+    """Parameters (T, P) of consecutive timesteps from the Gauss–Newton matrices (T, P, P) and
+    right-hand sides (T, P) that they have at `start`: where these are 0, their inverse covariances.
+
+    stiffness (P,): inverse variances of second differences over time, which are penalized but for
+    jumps, such as cuts; None: they are not. head: whose prior parameters (T, E + 18) have.
+    """
+    pull = np.broadcast_to(right, start.shape)
 
     def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        matrix, right = terms[row]
-        return matrix.copy(), right - matrix @ (values - start[row])
+        return information[row], pull[row] - information[row] @ (values - start[row])
 
-    return _solve_windows(head, linear, start, _stiffness(head, ordered))
-
-
-def smoothed(start: np.ndarray, information: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-    """Parameters (T, P) of consecutive timesteps that are known up to their information (T, P, P),
-    an inverse covariance, with second differences over time of inverse variances stiffness (P,),
-    but for jumps, such as cuts."""
-
-    def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return information[row], information[row] @ (start[row] - values)
-
-    return _solve_windows(None, linear, start, stiffness)
+    return _solve_windows(head, linear, start, stiffness)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:
@@ -224,7 +207,7 @@ def normal_equations(
     points: PosedPoints, parameters: np.ndarray, observation: Observation
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jᵀ W J and −Jᵀ W r of one timestep by its parameters (K + 18,), with soft-L1 weights."""
-    positions, jacobian = points.linearized(parameters[:-RIGID_SIZE], parameters[-RIGID_SIZE:])
+    positions, jacobian = points.linearized(*split(parameters))
     residual = (
         np.einsum("nij,nj->ni", observation.root, positions - observation.position)
         / LANDMARK_SIGMA_M
@@ -235,55 +218,41 @@ def normal_equations(
     return flat.T @ flat, -flat.T @ (np.sqrt(weight)[:, None] * residual).ravel()
 
 
-def _stiffness(head: HeadModel, ordered: bool) -> np.ndarray | None:
-    return acceleration_precision(head.model) if ordered else None
-
-
 def _solve_windows(
     head: HeadModel | None, terms: Terms, start: np.ndarray, stiffness: np.ndarray | None
 ) -> np.ndarray:
     """Parameters (T, P). head: whose prior they have; stiffness (P,): of second differences."""
-    solved = start.copy()
+    solved, size = start.copy(), start.shape[1]
     for first in range(0, len(start), WINDOW - OVERLAP):
-        window = slice(first, min(first + WINDOW, len(start)))
-        found = _solve_window(head, terms, first, solved[window], stiffness)
+        last = min(first + WINDOW, len(start))
+        state = solved[first:last].copy()
+        blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
+        for _ in range(TAKE_ITERATIONS):
+            for number, values in enumerate(state):
+                blocks[number], right[number] = terms(first + number, values)
+            if head is not None:
+                precision, pull = prior_terms(head, state)
+                blocks[:, np.arange(size), np.arange(size)] += precision
+                right += pull
+            if stiffness is not None and len(state) > 2:
+                step = _smooth_step(blocks, right, state, stiffness)
+            else:
+                step = np.linalg.solve(blocks, right[..., None])[..., 0]
+            state = state + step
+            if np.abs(step).max() < CONVERGED_STEP:
+                break
         kept = 0 if first == 0 else OVERLAP // 2
-        solved[first + kept : window.stop] = found[kept:]
-        if window.stop == len(start):
+        solved[first + kept : last] = state[kept:]
+        if last == len(start):
             break
     return solved
-
-
-def _solve_window(
-    head: HeadModel | None,
-    terms: Terms,
-    first: int,
-    start: np.ndarray,
-    stiffness: np.ndarray | None,
-) -> np.ndarray:
-    state, size = start.copy(), start.shape[1]
-    blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
-    for _ in range(TAKE_ITERATIONS):
-        for number, values in enumerate(state):
-            blocks[number], right[number] = terms(first + number, values)
-        if head is not None:
-            precision, pull = prior_terms(head, state)
-            blocks[:, np.arange(size), np.arange(size)] += precision
-            right += pull
-        if stiffness is not None and len(state) > 2:
-            step = _smooth_step(blocks, right, state, stiffness)
-        else:
-            step = np.linalg.solve(blocks, right[..., None])[..., 0]
-        state = state + step
-        if np.abs(step).max() < CONVERGED_STEP:
-            break
-    return state
 
 
 def _smooth_step(
     blocks: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray
 ) -> np.ndarray:
-    """(T, E + 18) Gauss–Newton step of all timesteps together."""
+    """(T, P) Gauss–Newton step of all timesteps together, with the penalty of second differences
+    by Geman-McClure weights."""
     from scipy.linalg import solveh_banded
 
     count, size = state.shape
@@ -291,16 +260,6 @@ def _smooth_step(
     for number, block in enumerate(blocks):
         for offset in range(size):
             band[offset, number * size : (number + 1) * size - offset] = np.diagonal(block, offset)
-    _add_smoothness(band, right, state, stiffness)
-    return np.asarray(solveh_banded(band, right.ravel(), lower=True).reshape(count, size))
-
-
-def _add_smoothness(
-    band: np.ndarray, right: np.ndarray, state: np.ndarray, stiffness: np.ndarray
-) -> None:
-    """Add the penalty of second differences to lower bands and right-hand side, with Geman-McClure
-    weights."""
-    size = state.shape[1]
     second = state[:-2] - 2 * state[1:-1] + state[2:]
     jump = second**2 * stiffness / JUMP_SCALE**2
     # a cut changes all parameters
@@ -311,6 +270,7 @@ def _add_smoothness(
             for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
                 at = (number + column) * size
                 band[(row - column) * size, at : at + size] += share * first * other
+    return np.asarray(solveh_banded(band, right.ravel(), lower=True).reshape(count, size))
 
 
 def parameter_precision(head: HeadModel) -> np.ndarray:

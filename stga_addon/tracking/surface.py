@@ -12,30 +12,20 @@ from ..capture.model import evenly_spread, parts_of
 from ..flame.forward import RIGID_SIZE
 from ..flame.model import faces_within
 from ..worker.helpers import Helpers, Step
-from .fit import (
-    HeadFit,
-    LandmarkVisibility,
-    RecordedTake,
-    excerpt,
-    no_pictures,
-    observed_landmarks,
-    posed_mesh,
-    rigid_start,
-    scaled_down,
-    triangulated,
-)
+from . import fit as head_fit
+from .fit import HeadFit, RecordedTake, posed_mesh
 from .head_model import HeadModel
 from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .seen_surface import (
     SeenSurface,
+    Sought,
     Sweep,
     VisiblePoints,
     near_landmarks,
     outlines_agree,
     seen_surface,
     surface_points,
-    with_outlines,
 )
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
 
@@ -74,8 +64,7 @@ dense tracking are nearer to the truth than those of the surface (docs/experimen
 OFFSET_DENSITY = 1.5e10
 """Weight of SURFACE_POINTS points over a head, in 1/m⁴: the two priors below are relative to it."""
 SMOOTHING_M = 0.009  # Length over which offsets are smoothed
-OFFSET_SIGMA_M = 0.03
-"""Prior of an offset; it decides how fast offsets vanish where no surface is seen."""
+OFFSET_SIGMA_M = 0.03  # Prior of an offset: how fast offsets vanish where no surface is seen
 OFFSET_ITERATIONS = 5
 MAX_COTANGENT = 5.0  # Of an angle, 11°: those of needles would outweigh all others
 SURFACE_SIGMA_M = 0.0005
@@ -106,53 +95,42 @@ def fit_surface(
     if not several:
         return fit
     chosen = evenly_spread(several, SURFACE_TIMESTEPS)
-    visibility = LandmarkVisibility(fit.head, take.places)
+    visibility = head_fit.LandmarkVisibility(fit.head, take.places)
     visible = {
         t: visibility.weighted(own, fit.parameters[t], fit.to_capture)
         for t, own in take.landmarks.items()
     }
     take = replace(take, landmarks=visible)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
-    steps = early + len(timesteps)
-    points = surface_points(head, SURFACE_POINTS)
+    points, done = surface_points(head, SURFACE_POINTS), 0
     near = near_landmarks(head, points, take)
+    by_skin, by_outline = (
+        [Sought(points, near, sweep) for sweep in sweeps]
+        for sweeps in (IDENTITY_SWEEPS, OUTLINE_SWEEPS)
+    )
 
-    def search(work: Callable[..., list], parts: Sequence[tuple], before: int) -> list:
-        results = helpers.map(work, parts, lambda done: report("Surface", before + done, steps))
-        return [one for result in results for one in result]
-
-    def identity(
-        found: HeadFit, take: RecordedTake, sweeps: Sequence[Sweep], before: int
-    ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
-        """Identity, scale and offsets from the timesteps of `found`, and the surfaces that they
-        were solved from; None where the images do not show enough of the surface."""
-        offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
-        for number, sweep in enumerate(sweeps):
-            parts = [(*excerpt(found, take, [t]), points, near, sweep) for t in found.parameters]
-            surfaces = search(_seen_part, parts, before + number * len(parts))
-            seen = dict(zip(found.parameters, surfaces, strict=True))
-            if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
-                return None
-            found, seen = _solved(with_offset(head, offset), found, take, points, seen)
-            if number:
-                offset = offset + _offsets(found, points, seen)
-                subject = person(with_offset(head, offset), found.shape)
-                found = replace(found, head=subject, static_offset=offset)
-        return found, seen
+    def search(work: Callable[..., list], parts: Sequence[tuple]) -> list:
+        nonlocal done
+        total = early + len(timesteps)
+        results = helpers.map(work, parts, lambda steps: report("Surface", done + steps, total))
+        found = [one for result in results for one in result]
+        done += len(found)
+        return found
 
     start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
-    without = replace(take, masks=no_pictures)
-    solved = identity(start, without, IDENTITY_SWEEPS, 0)
+    without = replace(take, masks=head_fit.no_pictures)
+    solved = _identity(head, start, without, by_skin, search)
     if solved is None:
         return fit
-    if outlines_agree(solved[0], take, points, near, OUTLINE_SWEEPS[0].reach):
-        start, begin = replace(solved[0], static_offset=None), len(IDENTITY_SWEEPS) * len(chosen)
-        solved = identity(start, take, OUTLINE_SWEEPS, begin) or solved
+    if outlines_agree(solved[0], take, by_outline[0]):
+        start = replace(solved[0], static_offset=None)
+        solved = _identity(head, start, take, by_outline, search) or solved
     else:
         take = without
-    found, seen = solved
+    (found, seen), done = solved, early
     if not dense:
-        observed = {t: _landmarks(found, t, take) for t in timesteps}
+        marks = take.landmarks
+        observed = {t: head_fit.landmarks_in_capture(marks[t], take, found) for t in timesteps}
     else:
         observed = _fitted_landmarks(found, fit, take)
         if np.median([len(own.cameras) for own in take.landmarks.values()]) <= FEW_CAMERAS:
@@ -162,25 +140,18 @@ def fit_surface(
             return replace(found, parameters=dict(zip(observed, poses, strict=True)))
     often = np.mean([own.weight > 0 for own in seen.values()], axis=0) >= MIN_SEEN_SHARE
     rows = np.flatnonzero(often)
-    some = [points[rows[:: 1 + len(rows) // count]] for _, count in TAKE_SWEEPS]
-    return _whole_take(
-        found, fit, take, observed, some, lambda work, parts: search(work, parts, early)
-    )
+    sought = []
+    for sweep, count in TAKE_SWEEPS:
+        on = points[rows[:: 1 + len(rows) // count]]
+        sought.append(Sought(on, near_landmarks(found.head, on, take), sweep))
+    return _whole_take(found, fit, take, observed, sought, search)
 
 
-def _seen_part(
-    fit: HeadFit,
-    take: RecordedTake,
-    points: SurfacePoints,
-    near: np.ndarray,
-    sweep: Sweep,
-    step: Step,
-) -> list[SeenSurface]:
+def _seen_part(fit: HeadFit, take: RecordedTake, sought: Sought, step: Step) -> list[SeenSurface]:
     """The surface at each of the fit's timesteps, from images and masks."""
     seen = []
     for t in fit.parameters:
-        surface = seen_surface(fit, t, points, take.images(t), sweep, {})
-        seen.append(with_outlines(surface, fit, t, points, take.masks(t), near, sweep.reach))
+        seen.append(seen_surface(fit, t, sought, take.images(t), take.masks(t), {}))
         step()
     return seen
 
@@ -190,42 +161,51 @@ def with_offset(head: HeadModel, offset: np.ndarray) -> HeadModel:
     return replace(head, model=replace(head.model, v_template=head.model.v_template + offset))
 
 
-def _solved(
-    base: HeadModel,
+def _identity(
+    head: HeadModel,
     fit: HeadFit,
     take: RecordedTake,
-    points: SurfacePoints,
-    seen: Mapping[int, SeenSurface],
-) -> tuple[HeadFit, dict[int, SeenSurface]]:
-    """Scale, identity, expressions and poses that fit surface and landmarks; and the surface in the
-    new scale."""
-    share = _landmark_shares(base, take.places)
-    together = [_joined(_landmarks(fit, t, take), share, own) for t, own in seen.items()]
-    starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
-    identity = solve_identity(base, take.places + points, together, starts, take.metric)
-    moved = replace(
-        fit,
-        head=person(base, identity.shape),
-        shape=identity.shape,
-        parameters=dict(zip(seen, identity.frames, strict=True)),
-        to_capture=scaled_down(fit.to_capture, identity.scale),
-    )
-    rescaled = {t: replace(own, position=own.position / identity.scale) for t, own in seen.items()}
-    return moved, rescaled
-
-
-def _offsets(fit: HeadFit, points: SurfacePoints, seen: Mapping[int, SeenSurface]) -> np.ndarray:
-    """(V, 3) along the normals of the person's template, from what is left between it and the
-    surfaces."""
-    model, missing = fit.head.model, []
-    for t, own in seen.items():
-        at = points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
-        missing.append(((own.position - at) * own.normal).sum(1))
-    repeated = points[np.tile(np.arange(len(points)), len(seen))]
-    weight = np.concatenate([own.weight for own in seen.values()]) / len(seen)
-    residual = np.concatenate(missing)
-    values = smooth_offsets(model.v_template, model.faces, repeated, residual, weight)
-    return np.asarray(values[:, None] * vertex_normals(model.v_template, model.faces))
+    sought: Sequence[Sought],
+    search: Callable[..., list[SeenSurface]],
+) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
+    """Identity, scale and offsets from the timesteps of the fit, in rounds of what is sought, and
+    the surfaces that they were solved from; None where the images do not show enough of the
+    surface."""
+    offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
+    for number, on in enumerate(sought):
+        parts = [(*head_fit.excerpt(fit, take, [t]), on) for t in fit.parameters]
+        seen = dict(zip(fit.parameters, search(_seen_part, parts), strict=True))
+        if np.median([(own.weight > 0).sum() for own in seen.values()]) < MIN_SEEN_POINTS:
+            return None
+        base = with_offset(head, offset)
+        share = _landmark_shares(base, take.places)
+        together = [
+            _joined(head_fit.landmarks_in_capture(take.landmarks[t], take, fit), share, own)
+            for t, own in seen.items()
+        ]
+        starts = np.stack([fit.parameters[t][-RIGID_SIZE:] for t in seen])
+        found = solve_identity(base, take.places + on.points, together, starts, take.metric)
+        fit = replace(
+            fit,
+            head=person(base, found.shape),
+            shape=found.shape,
+            parameters=dict(zip(seen, found.frames, strict=True)),
+            to_capture=head_fit.scaled_down(fit.to_capture, found.scale),
+        )
+        seen = {t: replace(own, position=own.position / found.scale) for t, own in seen.items()}
+        if number:  # what is left between the person's template and the surfaces, along its normals
+            model, missing = fit.head.model, []
+            for t, own in seen.items():
+                at = on.points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
+                missing.append(((own.position - at) * own.normal).sum(1))
+            repeated = on.points[np.tile(np.arange(len(on.points)), len(seen))]
+            weight = np.concatenate([own.weight for own in seen.values()]) / len(seen)
+            left = repeated, np.concatenate(missing), weight
+            values = smooth_offsets(model.v_template, model.faces, *left)
+            offset = offset + values[:, None] * vertex_normals(model.v_template, model.faces)
+            subject = person(with_offset(head, offset), fit.shape)
+            fit = replace(fit, head=subject, static_offset=offset)
+    return fit, seen
 
 
 def _whole_take(
@@ -233,14 +213,13 @@ def _whole_take(
     first: HeadFit,
     take: RecordedTake,
     observed: Mapping[int, Observation],
-    points: Sequence[SurfacePoints],
+    sought: Sequence[Sought],
     search: Callable[..., list],
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 
-    observed: the landmarks; points: for each of TAKE_SWEEPS; search(work, parts): results of the
-    helping processes. What a landmark misses at the timesteps of `fit`, it misses in all: it is
-    taken off.
+    observed: the landmarks; sought: for each of TAKE_SWEEPS. What a landmark misses at the
+    timesteps of `fit`, it misses in all: it is taken off.
     """
     timesteps, model = list(observed), fit.head.model
     missed = [
@@ -255,19 +234,18 @@ def _whole_take(
     }
     landmarks, at = list(corrected.values()), take.places.on(model.v_template, model.faces)
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
-    start[:, -RIGID_SIZE:] = [rigid_start(at, own) for own in landmarks]
+    start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
     rough = replace(fit, parameters=dict(zip(timesteps, start, strict=True)))
-    near = [near_landmarks(fit.head, on, take) for on in points]
     share = np.full(len(take.reliable), TAKE_LANDMARK_SHARE)
     if len(fit.parameters) == 1:
         share = _landmark_shares(fit.head, take.places)
     parts = [
-        (*excerpt(rough, take, part), [corrected[t] for t in part], share, points, near)
+        (*head_fit.excerpt(rough, take, part), [corrected[t] for t in part], share, sought)
         for part in parts_of(timesteps, PART_TIMESTEPS)
     ]
     found, together = zip(*search(_found_part, parts), strict=True)
-    every = take.places + points[-1]
+    every = take.places + sought[-1].points
     solved = solve_take(fit.head, every, together, np.stack(found), fit.ordered)
     return replace(fit, parameters=dict(zip(timesteps, solved, strict=True)))
 
@@ -277,22 +255,20 @@ def _found_part(
     take: RecordedTake,
     landmarks: Sequence[Observation],
     share: np.ndarray,
-    points: Sequence[SurfacePoints],
-    near: Sequence[np.ndarray],
+    sought: Sequence[Sought],
     step: Step,
 ) -> list[tuple[np.ndarray, Observation]]:
     """Parameters (E + 18,) of each of the fit's timesteps, and landmarks and surface that they were
     solved from."""
     results = []
-    visible_points: list[VisiblePoints] = [{} for _ in points]
+    visible_points: list[VisiblePoints] = [{} for _ in sought]
     for (t, here), own in zip(fit.parameters.items(), landmarks, strict=True):
-        images, masks = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
-        for stage, ((sweep, _), on) in enumerate(zip(TAKE_SWEEPS, points, strict=True)):
+        pictures = take.images(t), take.masks(t, MAX_OUTLINE_CAMERAS)
+        for on, visible in zip(sought, visible_points, strict=True):
             rough = replace(fit, parameters={t: here})
-            seen = seen_surface(rough, t, on, images, sweep, visible_points[stage])
-            seen = with_outlines(seen, rough, t, on, masks, near[stage], sweep.reach)
-            joined = _joined(own, share, seen)
-            (here,) = solve_take(fit.head, take.places + on, [joined], here[None], ordered=False)
+            joined = _joined(own, share, seen_surface(rough, t, on, *pictures, visible))
+            places = take.places + on.points
+            (here,) = solve_take(fit.head, places, [joined], here[None], ordered=False)
         results.append((here, joined))
         step()
     return results
@@ -306,12 +282,6 @@ def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[
         at = scale * points.positions(*split(first.parameters[t]))
         found[t] = Observation(at, np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
     return found
-
-
-def _landmarks(fit: HeadFit, timestep: int, take: RecordedTake) -> Observation:
-    world, at = fit.to_capture, take.places.on(fit.head.model.v_template, fit.head.model.faces)
-    found = triangulated(take.landmarks[timestep], take.reliable, at, world.scale)
-    return observed_landmarks(found, world, take.reliable)
 
 
 def _landmark_shares(head: HeadModel, places: SurfacePoints) -> np.ndarray:

@@ -18,42 +18,15 @@ from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices, cross_matrices
 from ..flame.model import torso_faces
 from ..worker.helpers import Helpers, Step
-from .appearance import (
-    CHANNEL_WEIGHTS,
-    FLOW_ITERATIONS,
-    FLOW_SCALE_PX,
-    FLOW_SHARE,
-    NOISE_LEVELS,
-    OUTLIER_SQUARED,
-    POINT_SHARE,
-    flow_targets,
-    projection_derivative,
-    robust,
-    sampled,
-)
-from .fit import HeadFit
+from . import appearance, torso_take
+from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_derivative, sampled
+from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
 from .landmarks import Report
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
-from .torso_take import (
-    NECK,
-    BothWays,
-    Carrier,
-    Motion,
-    PosedTorso,
-    Rows,
-    SeenPoints,
-    TorsoPose,
-    TorsoShot,
-    TorsoTake,
-    at_depth,
-    axis_angle,
-    compared,
-    head_turn,
-    seen_points,
-)
+from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
 
 MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
 """Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
@@ -92,6 +65,10 @@ class FollowedTorso:
     motion: TorsoMotion | None = None
     points: TorsoPoints | None = None
 
+    def mesh(self, timestep: int) -> np.ndarray:
+        """Vertices (V, 3) of a timestep in the capture's world, in meters."""
+        return posed_mesh(self.fit, self.parameters[timestep], self.offsets.get(timestep))
+
 
 def follow_torso(
     fit: HeadFit,
@@ -108,8 +85,8 @@ def follow_torso(
     takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
     bends: whether cloth may; the model is drawn over it then.
     """
-    unchanged, torso = dict(parameters), torso_faces(fit.head.model)
-    if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso.any():
+    unchanged, model = dict(parameters), fit.head.model
+    if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso_faces(model).any():
         return FollowedTorso(fit, unchanged)
     # The timestep with the head's most average turn, where the torso is taken to be straight; of a
     # head that does not turn, the middle of the take
@@ -120,14 +97,14 @@ def follow_torso(
     some = evenly_spread(sorted(unchanged), COMPARED_TIMESTEPS)
     present = [camera for camera in footage.cameras if middle in camera.timesteps]
     masked = [camera for camera in present if camera.mask(middle) is not None]
-    take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS), torso)
-    seen = seen_points(take, middle)
+    take = TorsoTake(fit, unchanged, evenly_spread(masked, MAX_CAMERAS))
+    seen = torso_take.seen_points(take, middle)
     if sum(map(len, seen.rows.values())) < MIN_POINTS:
         return FollowedTorso(fit, unchanged)
-    walk = BothWays(helpers, report, len(some) + 3 * len(unchanged))
+    walk = torso_take.BothWays(helpers, report, len(some) + 3 * len(unchanged))
     motions = _motions(take, seen, some, walk)
-    deep = at_depth(take, seen, motions)
-    found = compared(take, deep, motions, some)
+    deep = torso_take.at_depth(take, seen, motions)
+    found = torso_take.compared(take, deep, motions, some)
     own = "shifted" if found["shifted"] < (1 - MIN_OWN_GAIN) * found["turned"] else "turned"
     misfit = {"head": found["head"], "still": found["still"], "own": found[own]}
     # what explains the images best; a simpler motion unless the gain is clear
@@ -169,12 +146,12 @@ def _followed(
 
 
 def _motions(
-    take: TorsoTake, seen: SeenPoints, some: Sequence[int], walk: BothWays
+    take: TorsoTake, seen: torso_take.SeenPoints, some: Sequence[int], walk: torso_take.BothWays
 ) -> dict[str, Motion]:
     """The motions that a torso may have; some: first followed to find the points' depth."""
-    seen = at_depth(take, seen, {})["stereo"]
+    seen = torso_take.at_depth(take, seen, {})["stereo"]
     (rough,) = _poses(walk, [_Follower(take, seen, False)], some)
-    seen = at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
+    seen = torso_take.at_depth(take, seen, {"own": take.motion(rough, rigid=False)})["own"]
     both = [_Follower(take, seen, shifts) for shifts in (False, True)]
     turned, shifted = _poses(walk, both, take.parameters)
     still = dict.fromkeys(take.parameters, turned[seen.timestep])
@@ -187,7 +164,7 @@ def _motions(
 
 
 def _poses(
-    walk: BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
+    walk: torso_take.BothWays, followers: Sequence["_Follower"], timesteps: Iterable[int]
 ) -> list[dict[int, TorsoPose]]:
     """For each follower, the torso's pose by timestep."""
     found = walk.along(_Follower.follow, followers, followers[0].seen.timestep, timesteps)
@@ -197,22 +174,23 @@ def _poses(
 class _Follower:
     """The pose of the torso over a take, by Gauss–Newton on the images of points below the head."""
 
-    def __init__(self, take: TorsoTake, seen: SeenPoints, shifts: bool) -> None:
+    def __init__(self, take: TorsoTake, seen: torso_take.SeenPoints, shifts: bool) -> None:
         """shifts: whether the torso is rigid, and shifted as well as turned."""
         self._take, self.seen, self._shifts = take, seen, shifts
         self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
-        self._carrier = Carrier(take, take.with_torso(seen.timestep, self._first, shifts), seen.at)
+        first = take.with_torso(seen.timestep, self._first, shifts)
+        self._carrier = torso_take.Carrier(take, first, seen.at)
 
-    def follow(self, way: Sequence[int], step: Step) -> Rows:
+    def follow(self, way: Sequence[int], step: Step) -> torso_take.Rows:
         """Poses at the timesteps of a way, which begins with the one whose points are followed."""
         poses, shot = [self._first], self._take.shot(way[0])
         for before, timestep in pairwise(way):
             now, pose = self._take.shot(timestep), poses[-1]
-            starts = [pose, self._by_flow(timestep, now, before, shot, pose)]
+            starts = [pose, self._by_flow(now, shot, pose)]
             if self._shifts:  # where it was in the world
                 moved = self._take.pivot(before) - self._take.pivot(timestep)
                 starts.append(TorsoPose(pose.turn, pose.shift + moved))
-            starts = [self._descended(timestep, now, start, pose, COARSE_STEPS) for start in starts]
+            starts = [self._descended(now, start, pose, COARSE_STEPS) for start in starts]
             misfits = []
             for start in starts:
                 at = self._posed(timestep, start)
@@ -220,18 +198,18 @@ class _Follower:
                 use = shown & self.seen.fitted
                 misfits.append(float(share[use].mean()) if use.any() else 1.0)
             best = starts[int(np.argmin(misfits))]
-            poses.append(self._descended(timestep, now, best, pose, FINE_STEPS))
+            poses.append(self._descended(now, best, pose, FINE_STEPS))
             shot = now
             step()
         return {name: np.stack([getattr(own, name) for own in poses]) for name in ("turn", "shift")}
 
     def _descended(
-        self, timestep: int, shot: TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Plan
+        self, shot: torso_take.TorsoShot, pose: TorsoPose, usual: TorsoPose, plan: Plan
     ) -> TorsoPose:
         """The pose after up to so many steps in each level of the plan; usual: the prior's."""
         for level, steps in plan:
             for _ in range(steps):
-                at, by_pose = self._linearized(timestep, pose)
+                at, by_pose = self._linearized(shot.timestep, pose)
                 terms = []
                 for number, rows in self._visible(shot, at):
                     own = shot.views[number].levels[level]
@@ -239,8 +217,7 @@ class _Follower:
                     pixels, _ = own.camera.project(at[rows])
                     slope = np.stack(sampled(list(own.gradient), pixels), axis=2) / NOISE_LEVELS
                     rate = slope @ projection_derivative(own.camera, at[rows]) @ by_pose[rows]
-                    share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
-                    weight = (POINT_SHARE / (1 + share) ** 2)[:, None] * CHANNEL_WEIGHTS
+                    weight = np.outer(point_weights(residual, level), appearance.CHANNEL_WEIGHTS)
                     terms.append((weight, rate, residual))
                 pose, size = self._moved(pose, usual, terms)
                 if size < CONVERGED_STEP:
@@ -248,26 +225,27 @@ class _Follower:
         return pose
 
     def _by_flow(
-        self, timestep: int, shot: TorsoShot, before: int, shot_before: TorsoShot, pose: TorsoPose
+        self, shot: torso_take.TorsoShot, before: torso_take.TorsoShot, pose: TorsoPose
     ) -> TorsoPose:
         """The pose to which optical flow leads from `pose`, that at the timestep before."""
-        old, found = self._posed(before, pose), pose
-        flows = flow_targets(old, list(shot_before.views.values()), list(shot.views.values()))
+        old, found = self._posed(before.timestep, pose), pose
+        views = list(before.views.values()), list(shot.views.values())
+        flows = appearance.flow_targets(old, *views)
         targets = {key[0]: (camera, target) for key, camera, target in flows}
-        shown = [own for own in self._visible(shot_before, old) if own[0] in targets]
-        for _ in range(FLOW_ITERATIONS):
-            at, by_pose = self._linearized(timestep, found)
+        shown = [own for own in self._visible(before, old) if own[0] in targets]
+        for _ in range(appearance.FLOW_ITERATIONS):
+            at, by_pose = self._linearized(shot.timestep, found)
             terms = []
             for number, rows in shown:
                 camera, target = targets[number]
                 miss = camera.project(at[rows])[0] - target[rows]
-                weight = FLOW_SHARE * robust(np.linalg.norm(miss, axis=1), FLOW_SCALE_PX)
+                weight = flow_weights(miss)
                 rate = projection_derivative(camera, at[rows]) @ by_pose[rows]
                 terms.append((np.repeat(weight[:, None], 2, 1), rate, miss))
             found, _ = self._moved(found, pose, terms)
         return found
 
-    def _visible(self, shot: TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    def _visible(self, shot: torso_take.TorsoShot, at: np.ndarray) -> list[tuple[int, np.ndarray]]:
         """Number of each camera that sees any of its fitted points, and the rows of these."""
         known = [(number, rows) for number, rows in self.seen.rows.items() if number in shot.views]
         chosen = [(n, r[self.seen.fitted[r] & shot.shows(n, at[r])]) for n, r in known]

@@ -19,21 +19,14 @@ import numpy as np
 from ..capture.mesh_geometry import rasterize
 from ..flame.model import FlameModel, torso_faces
 from ..worker.helpers import Step
-from .appearance import (
-    MIN_FLOW_SIDE_PX,
-    NOISE_LEVELS,
-    inside,
-    luma,
-    projection_derivative,
-    sampled,
-)
+from . import appearance
+from .appearance import NOISE_LEVELS, inside, luma, sampled
 from .fit import posed_mesh
 from .folder import TorsoPoints
 from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake
 
-BLOCK_PX = 12
-"""Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether bending is right."""
+BLOCK_PX = 12  # Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend
 ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
 FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
@@ -217,14 +210,27 @@ class _Cloth:
         torso's axes; first: the timestep that the others are compared with."""
         from scipy.sparse import diags_array, eye_array, kron
 
-        self._take, self._sheet, self._motion = take, sheet, motion
-        self._first, self._drape = first, drape
+        self._take, self._sheet, self._motion, self._drape = take, sheet, motion, drape
         mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
         held = HELD * ~drape.any(1)
         own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
         self._precision = kron(own, eye_array(3)).tocsr()
-        shot = take.shot(first)
-        self._references = {number: self._reference(shot, number) for number in shot.views}
+        shot, model = take.shot(first), take.model
+        mesh = posed_mesh(take.fit, motion[first].parameters)
+        mesh[sheet.vertices] = self._positions(first, np.zeros_like(drape))
+        self._references: dict[int, _Reference] = {}
+        for number, view in shot.views.items():
+            triangle, barycentric = rasterize(mesh, model.faces, view.levels[0].camera)
+            shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
+            rows, columns = np.nonzero(shown)
+            corners = np.searchsorted(sheet.vertices, model.faces[triangle[rows, columns]])
+            weights = barycentric[rows, columns]
+            at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
+            visible = self._visible(shot, number, at)
+            shown[rows, columns] = visible
+            fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
+            chosen = corners[visible], weights[visible], fitted[visible]
+            self._references[number] = _Reference(shown, luma(view.levels[0]), *chosen)
 
     def follow(self, way: Sequence[int], step: Step) -> Rows:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
@@ -232,7 +238,7 @@ class _Cloth:
         for timestep in way[1:]:
             shot, bend = self._take.shot(timestep), bends[-1]
             for _ in range(STEPS):
-                bend = self._moved(timestep, shot, bend)
+                bend = self._moved(shot, bend)
             bends.append(bend)
             step()
         return {"bend": np.stack(bends)}
@@ -245,7 +251,7 @@ class _Cloth:
             for number in self._numbers(shot):
                 reference = self._references[number]
                 each = rigid, bends[timestep]
-                both = [self._returned(timestep, shot, number, bend) for bend in each]
+                both = [self._returned(shot, number, bend) for bend in each]
                 use = both[0].visible & both[1].visible & ~reference.fitted
                 change = np.stack([own.luma.astype(float) - reference.luma for own in both])
                 squared = change[:, *reference.pixels][:, use] ** 2
@@ -261,25 +267,8 @@ class _Cloth:
             if number in shot.views
             and own.corners.size
             and shot.views[number].levels[0].channels.shape[:2] == own.shown.shape
-            and min(own.shown.shape) >= MIN_FLOW_SIDE_PX
+            and min(own.shown.shape) >= appearance.MIN_FLOW_SIDE_PX
         ]
-
-    def _reference(self, shot: TorsoShot, number: int) -> _Reference:
-        model, sheet, camera = self._take.model, self._sheet, shot.views[number].levels[0].camera
-        mesh = posed_mesh(self._take.fit, self._motion[self._first].parameters)
-        mesh[sheet.vertices] = self._positions(self._first, np.zeros_like(self._drape))
-        triangle, barycentric = rasterize(mesh, model.faces, camera)
-        shown = (triangle >= 0) & sheet.triangles[np.maximum(triangle, 0)]
-        rows, columns = np.nonzero(shown)
-        corners = np.searchsorted(sheet.vertices, model.faces[triangle[rows, columns]])
-        weights = barycentric[rows, columns]
-        at = np.einsum("pk,pki->pi", weights, mesh[sheet.vertices][corners])
-        visible = self._visible(shot, number, at)
-        shown[rows, columns] = visible
-        fitted = (rows // BLOCK_PX + columns // BLOCK_PX) % HELD_OUT != 0
-        shown_luma = luma(shot.views[number].levels[0])
-        chosen = corners[visible], weights[visible], fitted[visible]
-        return _Reference(shown, shown_luma, *chosen)
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
@@ -296,9 +285,9 @@ class _Cloth:
         within = inside(finest, *finest.project(at)) & (share > 127)
         return np.asarray(shot.shows(number, at) & within)
 
-    def _returned(self, timestep: int, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
+    def _returned(self, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
-        corners = self._positions(timestep, bend)[reference.corners]
+        corners = self._positions(shot.timestep, bend)[reference.corners]
         at = np.einsum("pk,pki->pi", reference.barycentric, corners)
         source, _ = shot.views[number].levels[0].camera.project(at)
         returned = reference.luma.copy()
@@ -306,17 +295,20 @@ class _Cloth:
         returned[reference.pixels] = values.astype(np.uint8)
         return _Returned(returned, at, source, self._visible(shot, number, at))
 
-    def _moved(self, timestep: int, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
+    def _moved(self, shot: TorsoShot, bend: np.ndarray) -> np.ndarray:
         """The offsets after a Gauss–Newton step."""
         from scipy.sparse import csr_array, diags_array
 
         matrix, right = self._precision, -(self._precision @ bend.ravel())
-        axes = head_rotation(self._motion[timestep].parameters)
+        axes = head_rotation(self._motion[shot.timestep].parameters)
         for number in self._numbers(shot):
-            reference, now = self._references[number], self._returned(timestep, shot, number, bend)
+            reference, now = self._references[number], self._returned(shot, number, bend)
             miss, weight = _missed(reference, now)
             used = np.flatnonzero(weight)[::PIXEL_STEP]
-            turned = projection_derivative(shot.views[number].levels[0].camera, now.at[used]) @ axes
+            turned = (
+                appearance.projection_derivative(shot.views[number].levels[0].camera, now.at[used])
+                @ axes
+            )
             rates = turned[:, :, None, :] * reference.barycentric[used][:, None, :, None]
             rows = np.broadcast_to(np.arange(2 * len(used)).reshape(-1, 2, 1, 1), rates.shape)
             moved = 3 * reference.corners[used][..., None] + np.arange(3)

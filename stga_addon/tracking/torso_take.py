@@ -13,26 +13,18 @@ from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..flame.forward import RIGID_SIZE, axis_angle_matrices
-from ..flame.model import JOINTS, MIN_TORSO_WEIGHT
+from ..flame.model import JOINTS, MIN_TORSO_WEIGHT, torso_faces
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..worker.helpers import Helpers
-from .appearance import (
-    CHANNEL_WEIGHTS,
-    NOISE_LEVELS,
-    OUTLIER_SQUARED,
-    PyramidView,
-    inside,
-    pyramid,
-    sampled,
-)
+from . import appearance
+from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
 from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
 
 ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
-HEAD_MARGIN = 0.03
-"""Around the head's silhouette, where hair and chin may be; share of the image's height."""
+HEAD_MARGIN = 0.03  # Share of the image's height around the head, where hair and chin may be
 PLAIN_LEVEL = 128  # Gray that stands for everything outside the mask
 OFFSET_STEPS = 6  # After which offsets, which move joints, which move vertices, are those wanted
 EVIDENCE_LEVEL = 1  # Level of the pyramid in which motions are compared
@@ -45,7 +37,7 @@ DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
 """Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
 DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
 """Timesteps at which depths are compared; points that count for each other; cost unseen."""
-ALONG_CAMERAS = CHANNEL_WEIGHTS * [0, 1, 1]
+ALONG_CAMERAS = appearance.CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
 
 
@@ -76,6 +68,7 @@ class TorsoShot:
     """A timestep: by number of the camera its image, its mask (H, W) uint8, and the pixels (H, W)
     bool of the head at EVIDENCE_LEVEL."""
 
+    timestep: int
     views: Mapping[int, PyramidView]
     masks: Mapping[int, np.ndarray]
     heads: Mapping[int, np.ndarray]
@@ -90,17 +83,16 @@ class TorsoShot:
 
 class TorsoTake:
     """The take: images by timestep, and the head's parameters with any turn of the torso, whose
-    triangles (F,) bool are given."""
+    triangles are `torso` (F,) bool."""
 
     def __init__(
         self,
         fit: HeadFit,
         parameters: Mapping[int, np.ndarray],
         cameras: Sequence[FootageCamera],
-        torso: np.ndarray,
     ) -> None:
         self.model, self.parameters = fit.head.model, parameters
-        self.cameras, self.torso, self.fit = cameras, torso, fit
+        self.cameras, self.torso, self.fit = cameras, torso_faces(self.model), fit
         regressor = self.model.j_regressor[[ROOT, NECK]]
         self._joints = regressor @ self.model.v_template
         self._joint_dirs = np.einsum("jv,vak->jak", regressor, self.model.shapedirs)
@@ -172,10 +164,10 @@ class TorsoTake:
                 image[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
                 image[mask == 0] = PLAIN_LEVEL
                 camera = self.fit.to_capture.camera(source.camera)
-                levels = pyramid(camera, image, self._center)
+                levels = appearance.pyramid(camera, image, self._center)
                 views[number], masks[number] = PyramidView(bytes([number]), camera, levels), mask
                 heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
-        return TorsoShot(views, masks, heads)
+        return TorsoShot(timestep, views, masks, heads)
 
     def head_pixels(self, mesh: np.ndarray, camera: Camera) -> np.ndarray:
         """(H, W) bool: the head without its torso, and what is beside it."""
@@ -267,7 +259,7 @@ class SeenPoints:
         for number, rows in self.rows.items():
             if number in shot.views:
                 residual = self.residual(shot, number, rows, at[rows], level)
-                share[rows] = explained_share(residual, level)
+                share[rows] = unexplained(residual, level)
                 seen[rows] = shot.shows(number, at[rows])
         return share, seen
 
@@ -280,21 +272,13 @@ class SeenPoints:
         return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
 
 
-def explained_share(
-    residual: np.ndarray, level: int, weights: np.ndarray = CHANNEL_WEIGHTS
-) -> np.ndarray:
-    """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
-    squared = residual**2 @ weights
-    return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
-
-
 def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
     shot, mesh = take.shot(timestep), posed_mesh(take.fit, take.parameters[timestep])
     none, dark = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
-    found = [(none, none, np.zeros(0, bool), *(dark for _ in OUTLIER_SQUARED))]
+    found = [(none, none, np.zeros(0, bool), *(dark for _ in appearance.OUTLIER_SQUARED))]
     rows_of, count = {}, 0
     for number, view in shot.views.items():
         camera, mask = view.camera, shot.masks[number]
@@ -379,7 +363,7 @@ def at_depth(take: TorsoTake, seen: SeenPoints, motions: Motions) -> dict[str, S
         for other in shot.views.keys() - {number}:
             for cost, at in zip(stereo, candidates, strict=True):
                 residual = seen.residual(shot, other, rows, at[rows], EVIDENCE_LEVEL)
-                share = explained_share(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
+                share = unexplained(residual, EVIDENCE_LEVEL, ALONG_CAMERAS)
                 cost[rows] += np.where(shot.shows(other, at[rows]), share, UNSEEN_COST)
     costs = {"stereo": stereo, **{name: stereo.copy() for name in motions}}
     carriers = {name: Carrier(take, own[seen.timestep], seen.at) for name, own in motions.items()}

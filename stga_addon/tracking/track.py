@@ -2,10 +2,10 @@
 
 import hashlib
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from os.path import realpath
 from pathlib import Path
 from typing import Any
@@ -20,38 +20,14 @@ from ..files import read_json, replacing, write_json
 from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
+from . import fit as head_fit
+from . import folder
 from .correspondence import calibrate
 from .dense import fit_dense
 from .dense_head import REGIONS
 from .face_networks import FaceNetworks
-from .fit import (
-    MAX_HEAD_SCALE,
-    MIN_FACE_M,
-    ROUNDS,
-    HeadFit,
-    Pictures,
-    RecordedTake,
-    TimestepLandmarks,
-    determines_pose,
-    fit_head,
-    in_cameras_world,
-    is_face,
-    is_metric,
-    posed_mesh,
-)
+from .fit import HeadFit, Pictures, RecordedTake, TimestepLandmarks, posed_mesh
 from .focal_length import scale_warnings, solved_focal
-from .folder import (
-    KEPT_FOLDER,
-    LANDMARKS_FOLDER,
-    PLACES_FILE,
-    REPORT_FILE,
-    SHEET_FILE,
-    TORSO_KEY,
-    TorsoMotion,
-    image_name,
-    is_written,
-    write_torso_points,
-)
 from .footage.model import Footage, FootageCamera
 from .head_model import HeadModel, read_head_model
 from .landmarks import (
@@ -77,10 +53,11 @@ and by this share of the face's size."""
 MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
+MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
+LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
 
-
-LONG_TAKE = 50
-"""From which the fit is worth a helping process: its small matrices are slower in threads."""
+Errors = dict[str, dict[int, tuple[float, float]]]
+"""Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +66,7 @@ class TrackingReport:
 
     reprojection_px  camera -> timestep -> median distance in pixels of its landmarks from those of
                      the fitted head
+    median_px        of all of these
     interpolated     timesteps without a face, filled from their neighbors
     scale            meters per unit of the cameras' world
     warnings         one sentence each
@@ -100,17 +78,14 @@ class TrackingReport:
     """
 
     reprojection_px: Mapping[str, Mapping[int, float]]
+    median_px: float
     interpolated: tuple[int, ...]
     scale: float
     warnings: tuple[str, ...]
-    image_misfit: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
-    torso: TorsoMotion | None = None
-    focal_px: float | None = None
-    focal: str = "calibration"
-
-    @property
-    def median_px(self) -> float:
-        return _median_px(self.reprojection_px)
+    image_misfit: Mapping[str, Mapping[int, float]]
+    torso: folder.TorsoMotion | None
+    focal_px: float | None
+    focal: str
 
 
 def track(
@@ -141,32 +116,39 @@ def track(
     expressions and poses are sought, and `end_tracking` is the caller's.
     Raises StgaError.
     """
-    if is_written(out):
+    if folder.is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
     head = read_head_model(head_file) if person is None else person.head
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks, head)
-    with Helpers(folder=out / KEPT_FOLDER) as helpers:
+    with Helpers(folder=out / folder.KEPT_FOLDER) as helpers:
         if landmarks is None:
-            seen = _detected(head, head_file, footage, source, out, helpers, report, show)
+            places, reliable, detected = _detected(
+                head, head_file, footage, source, out, helpers, report, show
+            )
         else:
             detected = read_landmarks(footage, landmarks)
             _check_faces(footage, detected)
-            places, reliable = read_places(landmarks / PLACES_FILE, len(head.model.faces))
-            seen = _Seen(places, reliable, detected)
+            places, reliable = read_places(landmarks / folder.PLACES_FILE, len(head.model.faces))
             for timestep, camera in footage.views():
                 if camera.kept:
                     camera.image(timestep)  # in order, before helping processes ask for some
             _begin(out, source)
-        check_count(seen.detected, seen.places)
-        neutral = seen.places.on(head.model.v_template, head.model.faces)
-        if np.ptp(neutral[seen.reliable], axis=0).max() < MIN_FACE_M:
+        check_count(detected, places)
+        neutral = places.on(head.model.v_template, head.model.faces)
+        if np.ptp(neutral[reliable], axis=0).max() < head_fit.MIN_FACE_M:
             raise StgaError(
-                f"{(landmarks or out / LANDMARKS_FOLDER) / PLACES_FILE}: face: its landmarks lie "
-                "in one point of the head model; expected a face"
+                f"{(landmarks or out / folder.LANDMARKS_FOLDER) / folder.PLACES_FILE}: face: its "
+                "landmarks lie in one point of the head model; expected a face"
             )
-        take = _take(footage, seen, neutral)
+        found = {  # confidence 0 for those that are not reliable; without a face, there are none
+            name: replace(own, confidence=own.confidence * reliable)
+            if own.confidence.any()
+            else own
+            for name, own in detected.items()
+        }
+        take = _take(footage, found, places, reliable, neutral)
         if not take.landmarks:
             few = "shows too few landmarks of a face in each of its frames"
             raise StgaError(f"{footage.root}: {few}")
@@ -177,86 +159,89 @@ def track(
                 (camera,) = footage.cameras
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal="solved")
-            take = _take(footage, seen, neutral)
+            take = _take(footage, found, places, reliable, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
-        take = replace(take, metric=keep and is_metric(head, take))
-        report("Fit", 0, ROUNDS)
+        take = replace(take, metric=keep and head_fit.is_metric(head, take))
+        report("Fit", 0, head_fit.ROUNDS)
 
         def count(rounds: int) -> None:
-            report("Fit", rounds, ROUNDS)
+            report("Fit", rounds, head_fit.ROUNDS)
 
         fit: HeadFit = (
-            helpers.map(fit_head, [(head, take)], count)[0]
+            helpers.map(head_fit.fit_head, [(head, take)], count)[0]
             if len(take.landmarks) < LONG_TAKE
-            else helpers.run(fit_head, (head, take), count)
+            else helpers.run(head_fit.fit_head, (head, take), count)
         )
-        errors = reprojection_errors(fit, take, footage, seen.found)
-        _check_cameras(footage, errors)
+        errors = reprojection_errors(fit, take, footage)
+        _check_cameras(errors)
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
-        take = replace(take, images=partial(_images, footage), masks=partial(_masks, footage))
+        images, masks = (
+            partial(_pictures, footage, of) for of in (FootageCamera.image, FootageCamera.mask)
+        )
+        take = replace(take, images=images, masks=masks)
         fit, misfits = by_images(head, fit, take, helpers, report, person is not None)
         if person is not None:
             fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
-        fit = in_cameras_world(fit) if keep else fit
-        errors = reprojection_errors(fit, take, footage, seen.found)
+        fit = head_fit.in_cameras_world(fit) if keep else fit
+        errors = reprojection_errors(fit, take, footage)
         shares = [share for own in misfits.values() for share in own.values()]
         quality = {"error_px": _median_px(errors)}
         quality |= {"unexplained": float(np.mean(shares))} if shares else {}
         show(partial(picture_of_fit, fit, footage), quality)
         parameters = interpolated(fit.parameters, footage.timesteps)
-        matte_warnings: tuple[str, ...] = ()
+        warnings = _warnings(footage, found, fit, keep and not take.metric)
+        warnings += scale_warnings(fit, take)
         if mattes:
             plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
             source = {**source, "plates": [list(map(str, plates)), _state(plates)]}
             head_pixels = partial(_head_pixels, fit, parameters)
-            footage, matte_warnings = with_mattes(
-                footage, head_pixels, out, source, helpers, report
-            )
+            footage, unseen = with_mattes(footage, head_pixels, out, source, helpers, report)
+            warnings += unseen
         torso = follow_torso(fit, parameters, footage, helpers, report, person is None)
     result = TrackingReport(
         {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
+        _median_px(errors),
         tuple(t for t in footage.timesteps if t not in fit.parameters),
         fit.to_capture.scale,
-        _warnings(footage, seen.found, fit, keep and not take.metric)
-        + scale_warnings(fit, take, footage, seen.found)
-        + matte_warnings,
+        warnings,
         misfits,
         torso.motion,
         None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x,
         footage.focal,
     )
     write_json(
-        out / REPORT_FILE,
+        out / folder.REPORT_FILE,
         {
             "median_reprojection_px": round(result.median_px, 3),
             "meters_per_unit": result.scale,
             "interpolated": list(result.interpolated),
             "in_order": fit.ordered,
             "warnings": list(result.warnings),
-            "reprojection_px": _rounded(result.reprojection_px),
-            "image_misfit": _rounded(result.image_misfit),
+            "reprojection_px": folder.rounded(result.reprojection_px),
+            "image_misfit": folder.rounded(result.image_misfit),
             "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
             "focal_length_from": result.focal,
-            TORSO_KEY: None if result.torso is None else to_json(result.torso),
+            folder.TORSO_KEY: None if result.torso is None else to_json(result.torso),
         },
     )
     report("Contact sheet", 0, 1)
-    cameras = {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras}
-    pixels_of, misfit_of = result.reprojection_px, result.image_misfit
-
-    def mesh(timestep: int) -> np.ndarray:
-        return posed_mesh(torso.fit, torso.parameters[timestep], torso.offsets.get(timestep))
-
-    faces = fit.head.model.faces
-    write_contact_sheet(out / SHEET_FILE, footage, cameras, mesh, faces, pixels_of, misfit_of)
+    write_contact_sheet(
+        out / folder.SHEET_FILE,
+        footage,
+        {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras},
+        torso.mesh,
+        fit.head.model.faces,
+        result.reprojection_px,
+        misfits,
+    )
     if landmarks is not None:  # what a correction of the capture starts from
-        write_landmarks(out / LANDMARKS_FOLDER, seen.detected, seen.places, seen.reliable)
+        write_landmarks(out / folder.LANDMARKS_FOLDER, detected, places, reliable)
     if torso.points is not None:
-        write_torso_points(out, torso.points)
+        folder.write_torso_points(out, torso.points)
     if head_file is None:
         with replacing(out / BUNDLED_MODEL) as copy:
             shutil.copyfile(BUNDLED_HEAD, copy)
-    write_capture(out, footage, torso.fit, torso.parameters, torso.offsets, meshes, report)
+    write_capture(out, footage, torso, meshes, report)
     if person is None:
         end_tracking(out)
     return result
@@ -264,48 +249,31 @@ def track(
 
 def end_tracking(out: Path) -> None:
     """Remove what an interrupted tracking goes on from: the capture is whole."""
-    shutil.rmtree(out / KEPT_FOLDER, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """Landmarks: places on the head model, which are reliable, and by camera as detected."""
-
-    places: SurfacePoints
-    reliable: np.ndarray
-    detected: Mapping[str, CameraLandmarks]
-
-    @cached_property
-    def found(self) -> dict[str, CameraLandmarks]:
-        """Confidence 0 for those that are not reliable; cameras without a face have none."""
-        return {
-            name: replace(own, confidence=own.confidence * self.reliable)
-            if own.confidence.any()
-            else own
-            for name, own in self.detected.items()
-        }
+    shutil.rmtree(out / folder.KEPT_FOLDER, ignore_errors=True)
 
 
 def _detected(
     head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path,
     helpers: Helpers, report: Report, show: Show,
-) -> _Seen:  # fmt: skip
-    """The landmarks that the networks find, kept in `out`."""
+) -> tuple[SurfacePoints, np.ndarray, dict[str, CameraLandmarks]]:  # fmt: skip
+    """The landmarks' places on the head model, which of them are reliable, and where the networks
+    find them, kept in `out`."""
     is_new, detector = not out.exists(), FaceNetworks()
     report("Head model", 0, 1)
     places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
     _begin(out, source)
-    write_places(out / LANDMARKS_FOLDER / PLACES_FILE, places, reliable)
+    kept = out / folder.LANDMARKS_FOLDER
+    write_places(kept / folder.PLACES_FILE, places, reliable)
     show(partial(picture_of_first_frame, head, footage, detector, places, reliable), {})
     try:
-        detected = detect_landmarks(footage, detector, out / LANDMARKS_FOLDER, helpers, report)
+        detected = detect_landmarks(footage, detector, kept, helpers, report)
         _check_faces(footage, detected)
     except StgaError:
         if is_new:  # what it holds is of no use for other footage
             helpers.end()  # which may be writing frames
             shutil.rmtree(out)
         raise
-    return _Seen(places, reliable, detected)
+    return places, reliable, detected
 
 
 def _head_pixels(
@@ -339,12 +307,6 @@ def by_images(
     return dense.fit, {name: {t: own[name] for t, own in misfits.items()} for name in REGIONS}
 
 
-def _median_px(errors: Mapping[str, Mapping[int, float | tuple[float, float]]]) -> float:
-    """Of `reprojection_errors`, or of the pixels in them."""
-    every = [np.ravel(error)[0] for own in errors.values() for error in own.values()]
-    return float(np.median(every))
-
-
 def interpolated(
     parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
 ) -> dict[int, np.ndarray]:
@@ -355,17 +317,13 @@ def interpolated(
     return dict(zip(timesteps, columns, strict=True))
 
 
-def reprojection_errors(
-    fit: HeadFit, take: RecordedTake, footage: Footage, found: Mapping[str, CameraLandmarks]
-) -> dict[str, dict[int, tuple[float, float]]]:
-    """Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
+def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> Errors:
+    """How far the landmarks of all cameras lie from those of the fitted head."""
     points = PosedPoints(fit.head.model, take.places)
-    errors: dict[str, dict[int, tuple[float, float]]]
-    errors = {camera.name: {} for camera in footage.cameras}
+    errors: Errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
         head, own = points.positions(*split(parameters)), take.landmarks[timestep]
-        cameras = [name for name, seen in found.items() if _row(seen, timestep) is not None]
-        seen = zip(cameras, own.cameras, own.points, own.confidence, strict=True)
+        seen = zip(own.names, own.cameras, own.points, own.confidence, strict=True)
         for name, camera, pixels, confidence in seen:
             use = take.reliable & (confidence > 0)
             away = fit.to_capture.camera(camera).project(head[use])[0] - pixels[use]
@@ -375,24 +333,44 @@ def reprojection_errors(
     return errors
 
 
+def _median_px(errors: Errors) -> float:
+    return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
+
+
 def _source(
     footage: Footage, head_file: Path | None, landmarks: Path | None, head: HeadModel
 ) -> dict[str, Any]:
-    """What landmarks and mattes are of; landmarks: the folder that they were read from."""
+    """What landmarks and mattes are of: of each camera the first frame, the state of all files, and
+    the undistortion; landmarks: the folder that they were read from."""
+    cameras = {}
+    for camera in footage.cameras:
+        own: list[Any] = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
+        if camera.undistortion is not None:
+            pinhole = camera.camera
+            intrinsics = pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy
+            own += [repr(camera.undistortion.lens), *intrinsics]
+        cameras[camera.name] = own
     model = str(head_file.resolve()) if head_file else ""
     template = hashlib.sha256(head.model.v_template.tobytes()).hexdigest()[:16]
     return {
         "footage": str(footage.root),
-        "cameras": {camera.name: _recording(camera) for camera in footage.cameras},
+        "cameras": cameras,
         "timesteps": list(footage.timesteps),
         "head_model": [model, _state([head_file or BUNDLED_HEAD]), template],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
 
 
+def _state(files: Iterable[Path]) -> str:
+    """Changes with the size or the time of modification of one of the files."""
+    states = [file.stat() for file in files]
+    sizes = repr([(state.st_size, state.st_mtime_ns) for state in states])
+    return hashlib.sha256(sizes.encode()).hexdigest()[:16]
+
+
 def _begin(out: Path, source: dict[str, Any]) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError for other footage's."""
-    path = out / LANDMARKS_FOLDER / "footage.json"
+    path = out / folder.LANDMARKS_FOLDER / "footage.json"
     if path.exists() and read_json(path) != source:
         other = "holds landmarks of other footage; give another --out, or delete it"
         raise StgaError(f"{out}: {other}")
@@ -405,72 +383,57 @@ def _stored(footage: Footage, out: Path) -> Footage:
     cameras = []
     for number, camera in enumerate(footage.cameras):
         if camera.undistortion is None and camera.file(camera.timesteps[0]) is None:
-            kept = {t: out / image_name(t, number) for t in camera.timesteps}
+            kept = {t: out / folder.image_name(t, number) for t in camera.timesteps}
             camera = replace(camera, kept=kept)
         cameras.append(camera)
     return replace(footage, cameras=tuple(cameras))
 
 
-def _recording(camera: FootageCamera) -> list[Any]:
-    """The first frame, the state of all files, and the undistortion; offsets change it."""
-    pinhole = camera.camera
-    first = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
-    if camera.undistortion is None:
-        return first
-    intrinsics = pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy
-    return [*first, repr(camera.undistortion.lens), *intrinsics]
-
-
-def _state(files: Iterable[Path]) -> str:
-    """Changes with the size or the time of modification of one of the files."""
-    states = [file.stat() for file in files]
-    sizes = repr([(state.st_size, state.st_mtime_ns) for state in states])
-    return hashlib.sha256(sizes.encode()).hexdigest()[:16]
-
-
-def _row(camera: CameraLandmarks, timestep: int) -> int | None:
-    """The row of a timestep at which the camera sees a face."""
-    rows = np.flatnonzero(camera.timesteps == timestep)
-    if not len(rows) or not is_face(camera.points[rows[0]][camera.confidence[rows[0]] > 0]):
-        return None
-    return int(rows[0])
-
-
-def _take(footage: Footage, seen: _Seen, neutral: np.ndarray) -> RecordedTake:
+def _take(
+    footage: Footage,
+    found: Mapping[str, CameraLandmarks],
+    places: SurfacePoints,
+    reliable: np.ndarray,
+    neutral: np.ndarray,
+) -> RecordedTake:
     """The timesteps that the head is fitted to. neutral (N, 3): landmarks on the neutral head."""
-    cameras = {camera.name: camera.camera for camera in footage.cameras}
+    seen: dict[int, list[tuple[FootageCamera, np.ndarray, np.ndarray]]]
+    seen = {timestep: [] for timestep in footage.timesteps}
+    for camera in footage.cameras:
+        if camera.name in found:
+            own = found[camera.name]
+            rows = zip(own.timesteps.tolist(), own.points, own.confidence, strict=True)
+            for timestep, points, confidence in rows:
+                shown = points[confidence > 0]
+                if len(shown) and (np.ptp(shown, axis=0) >= MIN_FACE_PIXELS).all():
+                    seen[timestep].append((camera, points, confidence))
     take = {}
-    for timestep in footage.timesteps:
-        rows = {name: _row(own, timestep) for name, own in seen.found.items()}
-        found = [(name, row) for name, row in rows.items() if row is not None]
-        points = np.array([seen.found[name].points[row] for name, row in found])
-        confidence = np.array([seen.found[name].confidence[row] for name, row in found])
-        own = TimestepLandmarks(
-            tuple(cameras[name] for name, _ in found),
-            points.reshape(-1, len(neutral), 2),
-            confidence.reshape(-1, len(neutral)),
-        )
-        if determines_pose(own, seen.reliable, neutral):
-            take[timestep] = own
-    return RecordedTake(seen.places, seen.reliable, take)
+    for timestep, views in seen.items():
+        if views:
+            cameras, points, confidence = zip(*views, strict=True)
+            take[timestep] = TimestepLandmarks(
+                tuple(camera.camera for camera in cameras),
+                np.stack(points),
+                np.stack(confidence),
+                tuple(camera.name for camera in cameras),
+            )
+    sound = {t: own for t, own in take.items() if head_fit.determines_pose(own, reliable, neutral)}
+    return RecordedTake(places, reliable, sound)
 
 
-def _images(footage: Footage, timestep: int, most: int | None = None) -> Pictures:
-    cameras = _recording_at(footage, timestep, most)
+def _pictures(
+    footage: Footage,
+    picture: Callable[[FootageCamera, int], np.ndarray | None],
+    timestep: int,
+    most: int | None = None,
+) -> Pictures:
+    """The cameras that recorded a timestep, at most so many of them, with their pictures."""
+    cameras = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    cameras = cameras if most is None else evenly_spread(cameras, most)
     with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
-        images = list(pool.map(lambda camera: camera.image(timestep), cameras))
-    return [(camera.camera, image) for camera, image in zip(cameras, images, strict=True)]
-
-
-def _masks(footage: Footage, timestep: int, most: int | None = None) -> Pictures:
-    cameras = _recording_at(footage, timestep, most)
-    found = [(camera.camera, camera.mask(timestep)) for camera in cameras]
-    return [(camera, mask) for camera, mask in found if mask is not None]
-
-
-def _recording_at(footage: Footage, timestep: int, most: int | None) -> Sequence[FootageCamera]:
-    seen = [camera for camera in footage.cameras if timestep in camera.timesteps]
-    return seen if most is None else evenly_spread(seen, most)
+        pictures = list(pool.map(lambda camera: picture(camera, timestep), cameras))
+    pairs = zip(cameras, pictures, strict=True)
+    return [(camera.camera, own) for camera, own in pairs if own is not None]
 
 
 def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
@@ -481,9 +444,7 @@ def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None
         raise StgaError(f"{first}: shows no face, nor does any other of {len(views)} frames")
 
 
-def _check_cameras(
-    footage: Footage, errors: Mapping[str, Mapping[int, tuple[float, float]]]
-) -> None:
+def _check_cameras(errors: Errors) -> None:
     """Raise StgaError for a camera that does not fit what others see, or where none fits."""
     seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
     share = {name: float(np.median(own)) for name, own in seen.items()}
@@ -522,12 +483,9 @@ def _warnings(
         "the images do not show the skin's surface sharply enough: the head is fitted to "
         "landmarks alone": not single and fit.static_offset is None,
         "the cameras' world is kept but for its scale: in meters, the head would be more than "
-        f"{MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by {scale}": is_scaled,
+        f"{head_fit.MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by "
+        f"{scale}": is_scaled,
         "the focal length is a guess, as the head turns too little to tell; "
         "give it if it is known": footage.focal == "usual",
     }
     return *footage.warnings, *(text for text, holds in own.items() if holds)
-
-
-def _rounded(values: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
-    return {name: {str(t): round(v, 3) for t, v in own.items()} for name, own in values.items()}

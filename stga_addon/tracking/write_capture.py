@@ -1,7 +1,6 @@
 """Writing of a tracked take: VHAP's layout for FLAME, the mesh layout for other models."""
 
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +13,27 @@ from ..capture.transforms import camera_entry
 from ..files import replacing, write_json, write_npz
 from ..flame.forward import frame_of
 from ..flame.sequence import FRAME_FIELDS
-from .fit import HeadFit, posed_mesh
+from .fit import posed_mesh
 from .folder import SPLIT_FILES, image_name, mask_name
 from .footage.model import Footage, FootageCamera
 from .landmarks import Report
+from .torso import FollowedTorso
 
 MIN_CAMERAS_TO_HOLD_OUT = 4
 
 
 def write_capture(
-    out: Path,
-    footage: Footage,
-    fit: HeadFit,
-    parameters: Mapping[int, np.ndarray],
-    offsets: Mapping[int, np.ndarray],
-    meshes: bool,
-    report: Report,
+    out: Path, footage: Footage, torso: FollowedTorso, meshes: bool, report: Report
 ) -> None:
     """Write images, masks, the tracked head of each timestep, and at last the transforms that make
     it a capture.
 
-    parameters: timestep -> (E + 18,), interpolated ones included; offsets: timestep -> (V, 3),
-    where there are any. With four cameras or more, the one nearest to the middle is held out as
-    `val`; timesteps at which no camera saw a face, as behind a hand, are `test`. Raises StgaError
-    where `out` cannot be written.
+    torso: of all timesteps, interpolated ones included. With four cameras or more, the one nearest
+    to the middle is held out as `val`; timesteps at which no camera saw a face, as behind a hand,
+    are `test`. Raises StgaError where `out` cannot be written.
     """
-    views = [view for view in footage.views() if view[0] in parameters]
+    fit, parameters = torso.fit, torso.parameters
+    views = list(footage.views())
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
     splits: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
     centers, held_out = np.array([own.camera.position for own in footage.cameras]), None
@@ -64,15 +58,14 @@ def write_capture(
     person = {} if own is None else {"static_offset": own.astype(np.float32)}
     person["shape"] = fit.shape.astype(np.float32)
     for number, (timestep, values) in enumerate(parameters.items()):
-        offset = offsets.get(timestep)
         if flame:
             arrays = {**moving_arrays(values), **person}
-            if offset is not None:
-                arrays["dynamic_offset"] = offset[None].astype(np.float32)
+            if timestep in torso.offsets:
+                arrays["dynamic_offset"] = torso.offsets[timestep][None].astype(np.float32)
             write_npz(out / PARAMETERS / f"{timestep:05d}.npz", arrays)
         if meshes or not flame:
-            mesh = posed_mesh(fit, values, offset)
-            write_obj(out / "meshes" / f"{timestep:05d}.obj", mesh, model.faces)
+            path = out / "meshes" / f"{timestep:05d}.obj"
+            write_obj(path, torso.mesh(timestep), model.faces)
         report("Heads", number + 1, len(parameters))
     if meshes or not flame:
         write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), model.faces)

@@ -22,7 +22,14 @@ from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import RecordedTake, fit_head
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import PosedPoints
-from stga_addon.tracking.solve import Observation, normal_equations, person, smooth_take, solve_take
+from stga_addon.tracking.solve import (
+    Observation,
+    acceleration_precision,
+    normal_equations,
+    person,
+    smoothed,
+    solve_take,
+)
 from stga_addon.tracking.track import by_images
 from stga_addon.worker.helpers import Helpers
 
@@ -170,7 +177,10 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms(head):
     solved = solve_take(one, places, observed, start, ordered=True)
     points = PosedPoints(one.model, places)
     terms = [normal_equations(points, row, own) for row, own in zip(solved, observed, strict=True)]
-    np.testing.assert_allclose(smooth_take(one, solved, terms, ordered=True), solved, atol=5e-3)
+    information, right = map(np.stack, zip(*terms, strict=True))
+    stiffness = acceleration_precision(one.model)
+    found = smoothed(solved, information, stiffness, right, one)
+    np.testing.assert_allclose(found, solved, atol=5e-3)
 
 
 def test_a_short_take_is_left_to_landmarks_and_surface():

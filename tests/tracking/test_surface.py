@@ -14,6 +14,7 @@ from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
 from stga_addon.tracking.posed_points import SurfacePoints
 from stga_addon.tracking.seen_surface import (
+    Sought,
     Sweep,
     facing,
     gray_view,
@@ -327,7 +328,7 @@ def test_mattes_that_are_too_wide_are_not_followed(head):
     mesh, faces = flame_forward(head.model, shape, frame), head.model.faces
     fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, world)
     points, take = surface_points(head, 2000), RecordedTake(places, used, {}, no_image)
-    near = near_landmarks(head, points, take)
+    near, sweep = near_landmarks(head, points, take), Sweep(0.003, 0.0005, 0.001)
     for wide, agree in ((0, True), (2, False)):
         shown = []
         for camera in rig(5):
@@ -335,5 +336,5 @@ def test_mattes_that_are_too_wide_are_not_followed(head):
             mask = binary_dilation(mask, iterations=wide) if wide else mask
             shown.append((camera, 255 * mask.astype(np.uint8)))
         masked = replace(take, masks=lambda t, own=shown: own)
-        assert outlines_agree(fit, masked, points, near, 0.003) is agree
-    assert not outlines_agree(fit, take, points, np.ones(len(points), bool), 0.003)
+        assert outlines_agree(fit, masked, Sought(points, near, sweep)) is agree
+    assert not outlines_agree(fit, take, Sought(points, np.ones(len(points), bool), sweep))

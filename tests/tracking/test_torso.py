@@ -239,7 +239,7 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     slides = np.array([slide * near for slide in SLIDE_M])
     shifts = LIFT_M[:, None] + slides
     fit, parameters, footage = take(fine_head, SWING_DEG / 2, 0 * SWING_DEG, shifts=shifts)
-    posed = TorsoTake(fit, parameters, footage.cameras, torso_faces(fine_head.model))
+    posed = TorsoTake(fit, parameters, footage.cameras)
     motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
     first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
@@ -320,7 +320,7 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     drape[cloth] = rng.normal(0, 0.01, (len(cloth), 3))
     bent = {t: rng.normal(0, 0.004, (len(cloth), 3)) for t in posed}
     bending = Bending(cloth, drape, bent) if bends else None
-    take = TorsoTake(fit, tracked, (), torso_faces(model))
+    take = TorsoTake(fit, tracked, ())
     decided = TorsoMotion("own", {"head": 0.5, "still": 0.4, "own": 0.2}, 0.0)
     followed = _followed(fit, take, posed, bending, decided)
     share = np.minimum(model.weights[:, [ROOT]] / MIN_TORSO_WEIGHT, 1)

@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,19 +22,13 @@ from stga_addon.flame.teeth import flame_model
 from stga_addon.jobs.perform import perform
 from stga_addon.jobs.track import STAGES, Track
 from stga_addon.tracking.correspondence import nearest_points, shaded_image
-from stga_addon.tracking.fit import HeadFit, RecordedTake
+from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import scale_warnings
 from stga_addon.tracking.folder import PLACES_FILE
-from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel
-from stga_addon.tracking.landmarks import (
-    CameraLandmarks,
-    detect_landmarks,
-    landmark_file,
-    read_camera,
-)
+from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
@@ -304,17 +297,17 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
     fit = HeadFit(person(head, shape), shape, parameters, world)
     at = places.on(head.model.v_template, head.model.faces)
-    cameras, found = [], {}
+    cameras, points = [], []
     for number, angle in enumerate(np.radians([-30, -10, 10, 30, side_deg])):
         eye = at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)])
         camera = look_at(eye, at.mean(0), 200, 200, 500.0)
         pixels, _ = camera.project(at)
         size = 0.93 if number == 4 else 1.0
-        points = np.stack([pixels.mean(0) + size * (pixels - pixels.mean(0))] * 3)
-        found[f"cam{number}"] = CameraLandmarks(np.arange(3), points, np.ones(points.shape[:2]))
-        cameras.append(FootageCamera(f"cam{number}", camera, None))
-    footage = Footage(Path("footage"), tuple(cameras), (0, 1, 2))
-    warnings = scale_warnings(fit, RecordedTake(places, used, {}), footage, found)
+        points.append(pixels.mean(0) + size * (pixels - pixels.mean(0)))
+        cameras.append(camera)
+    names = tuple(f"cam{number}" for number in range(5))
+    own = TimestepLandmarks(tuple(cameras), np.stack(points), np.ones((5, LANDMARKS)), names)
+    warnings = scale_warnings(fit, RecordedTake(places, used, dict.fromkeys(range(3), own)))
     told = ["camera cam4: shows the head 7.0% smaller"]
     assert [text[:40] for text in warnings] == (told if is_told else [])
 
