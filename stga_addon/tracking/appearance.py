@@ -195,6 +195,18 @@ def fitted_light(
     return np.asarray(light)
 
 
+def relit(
+    values: np.ndarray,
+    texture: np.ndarray,
+    basis: np.ndarray,
+    weight: np.ndarray,
+    usual: np.ndarray,
+) -> np.ndarray:
+    """The texture (N, 3) in the lighting of a view; arguments as of `fitted_light`."""
+    light = fitted_light(values, texture, basis, weight, usual)
+    return np.asarray(texture * shading(basis, light))
+
+
 def robust(residual: np.ndarray, scale: float) -> np.ndarray:
     """Geman-McClure weights."""
     return np.asarray(1 / (1 + (residual / scale) ** 2) ** 2)

@@ -130,7 +130,7 @@ def fit_dense(
     if len(timesteps) < MIN_TIMESTEPS:
         return None
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
-    head, total = DenseHead(fit.head, take.places, take.reliable), 2 * len(chosen) + len(timesteps)
+    head, total = DenseHead(fit.head, take), 2 * len(chosen) + len(timesteps)
 
     def in_parts(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
@@ -151,8 +151,7 @@ def fit_dense(
     found = in_parts(_solved_part, parts, 2 * len(chosen), keep=True)
     solved = {name: np.concatenate([part[name] for part in found]) for name in found[0]}
     stiffness = acceleration_precision(fit.head.model) if fit.ordered else None
-    solved_for = solved["values"], solved["matrix"], stiffness, solved["right"]
-    smooth = smoothed(*solved_for, fit.head)
+    smooth = smoothed(solved["values"], solved["matrix"], stiffness, solved["right"], fit.head)
     moved = replace(fit, parameters=dict(zip(timesteps, smooth, strict=True)))
     landmarks = _agreeing(head, moved, take, solved["missed"], solved["better"])
     return DenseFit(moved, landmarks, dict(zip(timesteps, solved["misfit"], strict=True)))
@@ -204,13 +203,9 @@ class _Solver:
     """Gauss–Newton at the timesteps of a take."""
 
     def __init__(
-        self,
-        fit: HeadFit,
-        take: RecordedTake,
-        texture: Texture = NO_TEXTURE,
-        min_gain: float = 0.0,
+        self, fit: HeadFit, take: RecordedTake, texture: Texture = NO_TEXTURE, min_gain: float = 0.0
     ) -> None:
-        self.head = DenseHead(fit.head, take.places, take.reliable, texture)
+        self.head = DenseHead(fit.head, take, texture)
         self._fit, self._take, self._min_gain = fit, take, min_gain
         self._visibility = LandmarkVisibility(fit.head, take.places)
 
@@ -247,7 +242,7 @@ class _Solver:
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
             best = self._descended(shot, shot.start, visible, START_STEPS)
             best, visible = self._refined(shot, best)
-        by_images = self._by_images(shot, visible)
+        by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
         old, new = (self._evidence(shot, own, by_images) for own in (shot.start, best))
         better = new.all < old.all and (old.regions - new.regions).max() > self._min_gain
         if better:
@@ -262,10 +257,6 @@ class _Solver:
     def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
         """How badly the points that are not fitted are explained."""
         return self.head.misfit(shot.views, visible, values, HELD_OUT_LEVEL, EVIDENCE_LEVEL)
-
-    def _by_images(self, shot: _Shot, visible: np.ndarray) -> np.ndarray:
-        """Visibility (C, N), 0 for points in regions where landmarks are the better evidence."""
-        return np.where(shot.by_landmarks[self.head.region], 0.0, visible)
 
     def _astray(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
@@ -322,7 +313,7 @@ class _Solver:
         """Matrix and right-hand side (K + 18,) of images and landmarks, without the prior, and
         derivatives (M, 3, K + 18) of the level's points."""
         _, jacobian = self.head.linearized(values, level)
-        by_images = self._by_images(shot, visible)
+        by_images = np.where(shot.by_landmarks[self.head.region], 0.0, visible)
         curvature, slope = self.head.photo_term(shot.views, by_images, values, level)
         # a level weighs the same with fewer points
         share = len(self.head.rows[0]) / len(jacobian)

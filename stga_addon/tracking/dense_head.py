@@ -11,9 +11,10 @@ from ..capture.mesh_geometry import vertex_normals
 from ..flame.forward import RIGID_SIZE, flame_forward, frame_of
 from ..flame.model import EYEBALL_WEIGHT, JOINTS
 from . import appearance
-from .appearance import PyramidView, Sample, Texture, Views
+from .appearance import Sample, Texture, Views
+from .fit import RecordedTake
 from .head_model import HeadModel
-from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
+from .posed_points import PosedPoints, head_rotation, split, unit
 from .seen_surface import (
     VisiblePoints,
     facing,
@@ -64,17 +65,12 @@ class Misfit:
 class DenseHead:
     """N points on a person's face; parameters (E + 18,) are those of `HeadFit`."""
 
-    def __init__(
-        self,
-        person: HeadModel,
-        places: SurfacePoints,
-        reliable: np.ndarray,
-        texture: Texture = NO_TEXTURE,
-    ) -> None:
+    def __init__(self, head: HeadModel, take: RecordedTake, texture: Texture = NO_TEXTURE) -> None:
         """texture: of the points, which `photo_term` and `misfit` compare with images."""
         from scipy.spatial import cKDTree
 
-        self.head, self._texture, model = person, texture, person.model
+        self.head, self._texture, model = head, texture, head.model
+        places, reliable = take.places, take.reliable
         template, faces = model.v_template, model.faces
         self.landmarks, at = PosedPoints(model, places), places.on(template, faces)
         skin = large_parts(model)[places.face]
@@ -85,7 +81,7 @@ class DenseHead:
         """(L,) bool: landmarks on eyeballs and teeth, and at what covers and uncovers eyeballs."""
         used = reliable & skin
         used = used if used.any() else reliable
-        points = surface_points(person, HEAD_POINTS)
+        points = surface_points(head, HEAD_POINTS)
         distance, _ = cKDTree(at[used]).query(points.on(template, faces))
         self.points = points[distance < FACE_RADIUS_M] + places[used]
         held = np.arange(len(self.points)) % HELD_OUT == 0
@@ -197,8 +193,9 @@ class DenseHead:
             if not len(near):
                 continue
             shown, *slopes = appearance.sampled([own.channels, *own.gradient], pixels[near])
-            lit = basis[near], weight[near], rows[near]
-            residual = self._residual(view, shown, *lit, level)
+            known = self._texture.values[view.key][level][rows[near]], basis[near], weight[near]
+            lit = appearance.relit(shown, *known, self._texture.lights[view.key])
+            residual = (shown - lit) / appearance.NOISE_LEVELS
             used = weight[near] * appearance.point_weights(residual, level)
             by_x, by_y = (slope / appearance.NOISE_LEVELS for slope in slopes)
             # The channels' slopes along x and y, multiplied and summed, before they become those by
@@ -225,28 +222,14 @@ class DenseHead:
             pixels, depth = own.camera.project(at)
             shown = appearance.inside(own.camera, pixels, depth)
             (found,) = appearance.sampled([own.channels], pixels)
-            residual = self._residual(view, found, basis, weight * shown, rows, level)
+            known = self._texture.values[view.key][level][rows], basis, weight * shown
+            lit = appearance.relit(found, *known, self._texture.lights[view.key])
+            residual = (found - lit) / appearance.NOISE_LEVELS
             share = np.where(shown, appearance.unexplained(residual, level), 1.0)
             total += np.bincount(self.region[rows], weight * share, len(REGIONS))
             weights += np.bincount(self.region[rows], weight, len(REGIONS))
         regions = total / np.maximum(weights, 1e-9)
         return Misfit(float(total.sum() / max(weights.sum(), 1e-9)), regions)
-
-    def _residual(
-        self,
-        view: PyramidView,
-        shown: np.ndarray,
-        basis: np.ndarray,
-        weight: np.ndarray,
-        rows: np.ndarray,
-        level: int,
-    ) -> np.ndarray:
-        """Channels (M, 3) that the view shows minus those of the lit texture, in NOISE_LEVELS."""
-        target = self._texture.values[view.key][level][rows]
-        usual = self._texture.lights[view.key]
-        light = appearance.fitted_light(shown, target, basis, weight, usual)
-        difference = shown - target * appearance.shading(basis, light)
-        return np.asarray(difference / appearance.NOISE_LEVELS)
 
     def flow_start(
         self, before: Views, visible: np.ndarray, values: np.ndarray, now: Views

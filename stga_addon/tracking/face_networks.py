@@ -104,23 +104,27 @@ class FaceNetworks:
 
     def _landmarks(self, image: np.ndarray, most: int) -> list[np.ndarray]:
         """(478, 3) of each face: pixels, and depth in pixels, which grows away from the camera."""
+        import cv2
+        from scipy.special import expit
+
         found, (height, width) = [], image.shape[:2]
         whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
         matrix, scale = whole.matrix(DETECTOR_SIZE_PX), whole.side / DETECTOR_SIZE_PX
         small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
-        self._faces.setInput(_blob(small, low=-1.0))
+        self._faces.setInput(cv2.dnn.blobFromImage(small, 2 / 255, mean=(127.5,) * 3))  # −1 to 1
         boxes, scores = self._faces.forward(["regressors", "classificators"])
         for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores))[:most]:
             center, side, (right_eye, left_eye) = box[:2], box[2:4].max(), box[4:8].reshape(2, 2)
             angle = float(np.arctan2(*(left_eye - right_eye)[::-1]))
             center = center @ matrix[:, :2].T + matrix[:, 2]
             crop = _Crop(center, CROP_SCALE * scale * side, angle)
-            self._mesh.setInput(_blob(_resampled(image, crop.matrix(CROP_SIZE_PX), CROP_SIZE_PX)))
+            to_image = crop.matrix(CROP_SIZE_PX)
+            square = _resampled(image, to_image, CROP_SIZE_PX)
+            self._mesh.setInput(cv2.dnn.blobFromImage(square, 1 / 255))
             points, presence = self._mesh.forward(["Identity", "Identity_1"])
-            if _sigmoid(float(np.ravel(presence)[0])) < MIN_PRESENCE:
+            if expit(float(np.ravel(presence)[0])) < MIN_PRESENCE:
                 continue
             points = np.reshape(points, (MESH_POINTS, 3)).astype(np.float64)
-            to_image = crop.matrix(CROP_SIZE_PX)
             flat = points[:, :2] @ to_image[:, :2].T + to_image[:, 2]
             found.append(np.column_stack([flat, points[:, 2] * (crop.side / CROP_SIZE_PX)]))
         return found
@@ -146,7 +150,8 @@ class PersonNetwork:
         import cv2
 
         size = PERSON_SIZE_PX, PERSON_SIZE_PX
-        self._network.setInput(_blob(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
+        reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        self._network.setInput(cv2.dnn.blobFromImage(reduced, 1 / 255))
         small = np.reshape(self._network.forward(), size)
         return np.clip(cv2.resize(small, image.shape[1::-1], interpolation=cv2.INTER_LINEAR), 0, 1)
 
@@ -186,20 +191,15 @@ def _resampled(
     return np.asarray(warped)
 
 
-def _blob(image: np.ndarray, low: float = 0.0) -> np.ndarray:
-    """(1, 3, H, W) float32 from `low` to 1 of an image (H, W, 3) uint8."""
-    values = image.astype(np.float32).transpose(2, 0, 1)[None]
-    return np.ascontiguousarray(values * ((1.0 - low) / 255) + low)
-
-
 def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
     """Detected faces, the clearest first: (16,) center, size and six points, in the detector's
     pixels.
 
     Boxes that overlap are one face, their mean weighted by score.
     """
-    share = _sigmoid(np.clip(scores, -100, 100))
-    boxes = boxes.copy()
+    from scipy.special import expit
+
+    share, boxes = expit(scores.astype(np.float64)), boxes.copy()
     boxes[:, :2] += _anchors()
     boxes[:, 4:] += np.tile(_anchors(), 6)
     left = np.argsort(-share, kind="stable")
@@ -226,7 +226,3 @@ def _anchors() -> np.ndarray:
         y, x = np.meshgrid(centers, centers, indexing="ij")
         rows.append(np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), count, axis=0))
     return np.concatenate(rows)
-
-
-def _sigmoid(value: Any) -> Any:
-    return 1 / (1 + np.exp(-np.asarray(value, np.float64)))

@@ -223,14 +223,10 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     step: follows each of ROUNDS.
     """
     places, reliable, take = recorded.places, recorded.reliable, recorded.landmarks
-    metric = recorded.metric
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
     spread = evenly_spread(several or timesteps, IDENTITY_TIMESTEPS)
-    neutral = places.on(head.model.v_template, head.model.faces)
-    # without several cameras, the head's own size decides
-    found = {t: triangulated(take[t], reliable, neutral, 1.0) for t in spread}
-    aligned = [_aligned(found[t], neutral, reliable, metric) for t in spread]
+    aligned = _alignments(head, recorded, spread, recorded.metric)
     size = float(np.median([one.scale for one in aligned]))
     u, _, vt = np.linalg.svd(np.sum([one.rotation for one in aligned], axis=0))
     centers = [-one.rotation.T @ one.translation / one.scale for one in aligned]
@@ -241,11 +237,11 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     for number in range(ROUNDS):
         at = places.on(subject.model.v_template, subject.model.faces)
         found = {t: triangulated(seen[t], reliable, at, world.scale) for t in timesteps}
-        observed = {t: observed_landmarks(found[t], world, reliable) for t in spread}
-        starts = np.stack([rigid_start(at, observed[t]) for t in spread])
+        observed = [observed_landmarks(found[t], world, reliable) for t in spread]
+        starts = np.stack([rigid_start(at, own) for own in observed])
         # Of one camera's rays, a head shrunk into the camera itself misses all by the least.
-        known, sized = [observed[t] for t in spread], metric or not several
-        identity = solve_identity(head, places, known, starts, sized)
+        sized = recorded.metric or not several
+        identity = solve_identity(head, places, observed, starts, sized)
         world = scaled_down(world, identity.scale)
         shape, subject = identity.shape, person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
@@ -266,10 +262,8 @@ def is_metric(head: HeadModel, take: RecordedTake) -> bool:
     """Whether the face is as large in the cameras' world as a person's in meters; True of one
     camera, which does not see size."""
     several = [t for t in sorted(take.landmarks) if len(take.landmarks[t].cameras) > 1]
-    neutral, scales = take.places.on(head.model.v_template, head.model.faces), []
-    for t in evenly_spread(several, IDENTITY_TIMESTEPS):
-        found = triangulated(take.landmarks[t], take.reliable, neutral, 1.0)
-        scales.append(_aligned(found, neutral, take.reliable, metric=False).scale)
+    spread = evenly_spread(several, IDENTITY_TIMESTEPS)
+    scales = [one.scale for one in _alignments(head, take, spread, metric=False)]
     return not scales or 1 / MAX_HEAD_SCALE <= float(np.median(scales)) <= MAX_HEAD_SCALE
 
 
@@ -335,12 +329,16 @@ def landmarks_in_capture(
     return observed_landmarks(found, fit.to_capture, take.reliable)
 
 
-def _aligned(
-    found: Triangulation, neutral: np.ndarray, reliable: np.ndarray, metric: bool
-) -> Similarity:
-    """The similarity that brings the landmarks onto the neutral head."""
-    use = found.seen & reliable
-    return similarity(found.position[use], neutral[use], metric)
+def _alignments(
+    head: HeadModel, take: RecordedTake, timesteps: Sequence[int], metric: bool
+) -> list[Similarity]:
+    """What brings each timestep's landmarks onto the neutral head. Without several cameras, the
+    head's own size decides."""
+    neutral = take.places.on(head.model.v_template, head.model.faces)
+    found = [triangulated(take.landmarks[t], take.reliable, neutral, 1.0) for t in timesteps]
+    used = [one.seen & take.reliable for one in found]
+    pairs = zip(found, used, strict=True)
+    return [similarity(one.position[use], neutral[use], metric) for one, use in pairs]
 
 
 def rigid_start(neutral: np.ndarray, observed: Observation) -> np.ndarray:

@@ -192,15 +192,6 @@ def write_places(path: Path, places: SurfacePoints, used: np.ndarray) -> None:
     write_npz(path, {"face": np.where(used, places.face, -1), "barycentric": places.barycentric})
 
 
-def write_landmarks(
-    folder: Path, found: Mapping[str, CameraLandmarks], places: SurfacePoints, used: np.ndarray
-) -> None:
-    """Write all files that `read_landmarks` and `read_places` read."""
-    for name, camera in found.items():
-        write_camera(landmark_file(folder, name), camera)
-    write_places(folder / PLACES_FILE, places, used)
-
-
 def _detect(
     camera: FootageCamera, timesteps: list[int], detector: FaceNetworks, step: Step
 ) -> list[list[np.ndarray]]:

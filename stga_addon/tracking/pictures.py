@@ -19,7 +19,6 @@ from .face_networks import FaceNetworks
 from .fit import HeadFit, RecordedTake, TimestepLandmarks, determines_pose, fit_head, posed_mesh
 from .footage.model import Footage
 from .head_model import HeadModel
-from .posed_points import SurfacePoints
 
 SIZE = 256  # Width and height of a picture in pixels: Blender's icons are square
 FIRST_CAMERAS, SHOWN_FRAMES = 3, 4
@@ -45,13 +44,10 @@ nothing to see; and with figures of how well the head fits (`format.describe_fig
 
 
 def picture_of_first_frame(
-    head: HeadModel,
-    footage: Footage,
-    detector: FaceNetworks,
-    places: SurfacePoints,
-    reliable: np.ndarray,
+    head: HeadModel, footage: Footage, detector: FaceNetworks, take: RecordedTake
 ) -> np.ndarray | None:
-    """The head on the first frame, within seconds; None where no face, or several, are seen."""
+    """The head on the first frame, within seconds; None where no face, or several, are seen. take:
+    of which landmarks are not known yet."""
     timestep = footage.timesteps[0]
     seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
     seeing = evenly_spread(seeing, FIRST_CAMERAS)
@@ -62,11 +58,11 @@ def picture_of_first_frame(
     points = np.stack([face for _, face in alone])
     cameras = tuple(camera for camera, _ in alone)
     seen = TimestepLandmarks(cameras, points, np.ones(points.shape[:2]))
-    if not determines_pose(seen, reliable, places.on(head.model.v_template, head.model.faces)):
+    neutral = take.places.on(head.model.v_template, head.model.faces)
+    if not determines_pose(seen, take.reliable, neutral):
         return None
     with suppress(StgaError):  # the whole take may still be tracked, and says what is wrong
-        take = RecordedTake(places, reliable, {timestep: seen})
-        return picture_of_fit(fit_head(head, take), footage)
+        return picture_of_fit(fit_head(head, replace(take, landmarks={timestep: seen})), footage)
     return None
 
 

@@ -51,7 +51,6 @@ class PosedTorso:
 
 
 Motion = Mapping[int, PosedTorso]  # By timestep
-Motions = Mapping[str, Motion]
 Rows = dict[str, np.ndarray]
 
 
@@ -86,10 +85,7 @@ class TorsoTake:
     triangles are `torso` (F,) bool."""
 
     def __init__(
-        self,
-        fit: HeadFit,
-        parameters: Mapping[int, np.ndarray],
-        cameras: Sequence[FootageCamera],
+        self, fit: HeadFit, parameters: Mapping[int, np.ndarray], cameras: Sequence[FootageCamera]
     ) -> None:
         self.model, self.parameters = fit.head.model, parameters
         self.cameras, self.torso, self.fit = cameras, torso_faces(self.model), fit
@@ -338,7 +334,10 @@ class Carrier:
 
 
 def compared(
-    take: TorsoTake, seen: Mapping[str, SeenPoints], motions: Motions, timesteps: Sequence[int]
+    take: TorsoTake,
+    seen: Mapping[str, SeenPoints],
+    motions: Mapping[str, Motion],
+    timesteps: Sequence[int],
 ) -> dict[str, float]:
     """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
     start, total, count = seen["head"].timestep, np.zeros(len(motions)), 0
@@ -354,7 +353,9 @@ def compared(
     return dict(zip(motions, (total / max(count, 1)).tolist(), strict=True))
 
 
-def at_depth(take: TorsoTake, seen: SeenPoints, motions: Motions) -> dict[str, SeenPoints]:
+def at_depth(
+    take: TorsoTake, seen: SeenPoints, motions: Mapping[str, Motion]
+) -> dict[str, SeenPoints]:
     """Motion -> the points at the depths along their rays at which other cameras, and other
     timesteps of the motion, look like them; "stereo": of other cameras alone."""
     candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]

@@ -35,14 +35,15 @@ from .landmarks import (
     Report,
     check_count,
     detect_landmarks,
+    landmark_file,
     read_landmarks,
     read_places,
-    write_landmarks,
+    write_camera,
     write_places,
 )
 from .mattes import with_mattes
 from .pictures import Show, picture_of_first_frame, picture_of_fit, write_contact_sheet
-from .posed_points import PosedPoints, SurfacePoints, split
+from .posed_points import PosedPoints, split
 from .surface import fit_surface
 from .torso import follow_torso
 from .write_capture import write_capture
@@ -62,27 +63,19 @@ Errors = dict[str, dict[int, tuple[float, float]]]
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """What `track` found, as written to tracking.json.
+    """What a person is told of a tracking; tracking.json has more.
 
-    reprojection_px  camera -> timestep -> median distance in pixels of its landmarks from those of
-                     the fitted head
-    median_px        of all of these
-    interpolated     timesteps without a face, filled from their neighbors
+    median_px        median distance in pixels of all landmarks from those of the fitted head
     scale            meters per unit of the cameras' world
     warnings         one sentence each
-    image_misfit     region of the face -> timestep -> share of the images' points that are not
-                     explained, from 0 to 1; empty for takes too short for dense tracking
     torso            how the torso moves; None where that cannot be told
     focal_px, focal  focal length of a single camera without a calibration, else None; and
                      `Footage.focal`
     """
 
-    reprojection_px: Mapping[str, Mapping[int, float]]
     median_px: float
-    interpolated: tuple[int, ...]
     scale: float
     warnings: tuple[str, ...]
-    image_misfit: Mapping[str, Mapping[int, float]]
     torso: folder.TorsoMotion | None
     focal_px: float | None
     focal: str
@@ -124,31 +117,30 @@ def track(
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks, head)
     with Helpers(folder=out / folder.KEPT_FOLDER) as helpers:
         if landmarks is None:
-            places, reliable, detected = _detected(
-                head, head_file, footage, source, out, helpers, report, show
-            )
+            take, detected = _detected(head, head_file, footage, source, out, helpers, report, show)
         else:
             detected = read_landmarks(footage, landmarks)
             _check_faces(footage, detected)
-            places, reliable = read_places(landmarks / folder.PLACES_FILE, len(head.model.faces))
+            places = read_places(landmarks / folder.PLACES_FILE, len(head.model.faces))
+            take = RecordedTake(*places, {})
             for timestep, camera in footage.views():
                 if camera.kept:
                     camera.image(timestep)  # in order, before helping processes ask for some
             _begin(out, source)
-        check_count(detected, places)
-        neutral = places.on(head.model.v_template, head.model.faces)
-        if np.ptp(neutral[reliable], axis=0).max() < head_fit.MIN_FACE_M:
+        check_count(detected, take.places)
+        neutral = take.places.on(head.model.v_template, head.model.faces)
+        if np.ptp(neutral[take.reliable], axis=0).max() < head_fit.MIN_FACE_M:
             raise StgaError(
                 f"{(landmarks or out / folder.LANDMARKS_FOLDER) / folder.PLACES_FILE}: face: its "
                 "landmarks lie in one point of the head model; expected a face"
             )
         found = {  # confidence 0 for those that are not reliable; without a face, there are none
-            name: replace(own, confidence=own.confidence * reliable)
+            name: replace(own, confidence=own.confidence * take.reliable)
             if own.confidence.any()
             else own
             for name, own in detected.items()
         }
-        take = _take(footage, found, places, reliable, neutral)
+        take = _recorded(footage, found, take, neutral)
         if not take.landmarks:
             few = "shows too few landmarks of a face in each of its frames"
             raise StgaError(f"{footage.root}: {few}")
@@ -159,7 +151,7 @@ def track(
                 (camera,) = footage.cameras
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal="solved")
-            take = _take(footage, found, places, reliable, neutral)
+            take = _recorded(footage, found, take, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
         report("Fit", 0, head_fit.ROUNDS)
@@ -198,30 +190,21 @@ def track(
             footage, unseen = with_mattes(footage, head_pixels, out, source, helpers, report)
             warnings += unseen
         torso = follow_torso(fit, parameters, footage, helpers, report, person is None)
-    result = TrackingReport(
-        {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()},
-        _median_px(errors),
-        tuple(t for t in footage.timesteps if t not in fit.parameters),
-        fit.to_capture.scale,
-        warnings,
-        misfits,
-        torso.motion,
-        None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x,
-        footage.focal,
-    )
+    pixels_of = {name: {t: px for t, (px, _) in own.items()} for name, own in errors.items()}
+    focal = None if footage.focal == "calibration" else footage.cameras[0].camera.fl_x
     write_json(
         out / folder.REPORT_FILE,
         {
-            "median_reprojection_px": round(result.median_px, 3),
-            "meters_per_unit": result.scale,
-            "interpolated": list(result.interpolated),
+            "median_reprojection_px": round(_median_px(errors), 3),
+            "meters_per_unit": fit.to_capture.scale,
+            "interpolated": [t for t in footage.timesteps if t not in fit.parameters],
             "in_order": fit.ordered,
-            "warnings": list(result.warnings),
-            "reprojection_px": folder.rounded(result.reprojection_px),
-            "image_misfit": folder.rounded(result.image_misfit),
-            "focal_length_px": None if result.focal_px is None else round(result.focal_px, 1),
-            "focal_length_from": result.focal,
-            folder.TORSO_KEY: None if result.torso is None else to_json(result.torso),
+            "warnings": list(warnings),
+            "reprojection_px": folder.rounded(pixels_of),
+            "image_misfit": folder.rounded(misfits),
+            "focal_length_px": None if focal is None else round(focal, 1),
+            "focal_length_from": footage.focal,
+            folder.TORSO_KEY: None if torso.motion is None else to_json(torso.motion),
         },
     )
     report("Contact sheet", 0, 1)
@@ -231,11 +214,14 @@ def track(
         {camera.name: fit.to_capture.camera(camera.camera) for camera in footage.cameras},
         torso.mesh,
         fit.head.model.faces,
-        result.reprojection_px,
+        pixels_of,
         misfits,
     )
     if landmarks is not None:  # what a correction of the capture starts from
-        write_landmarks(out / folder.LANDMARKS_FOLDER, detected, places, reliable)
+        kept = out / folder.LANDMARKS_FOLDER
+        for name, own in detected.items():
+            write_camera(landmark_file(kept, name), own)
+        write_places(kept / folder.PLACES_FILE, take.places, take.reliable)
     if torso.points is not None:
         folder.write_torso_points(out, torso.points)
     if head_file is None:
@@ -244,7 +230,8 @@ def track(
     write_capture(out, footage, torso, meshes, report)
     if person is None:
         end_tracking(out)
-    return result
+    scale = fit.to_capture.scale
+    return TrackingReport(_median_px(errors), scale, warnings, torso.motion, focal, footage.focal)
 
 
 def end_tracking(out: Path) -> None:
@@ -255,16 +242,16 @@ def end_tracking(out: Path) -> None:
 def _detected(
     head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path,
     helpers: Helpers, report: Report, show: Show,
-) -> tuple[SurfacePoints, np.ndarray, dict[str, CameraLandmarks]]:  # fmt: skip
-    """The landmarks' places on the head model, which of them are reliable, and where the networks
-    find them, kept in `out`."""
+) -> tuple[RecordedTake, dict[str, CameraLandmarks]]:  # fmt: skip
+    """A take without landmarks yet, and where the networks find them, kept in `out`."""
     is_new, detector = not out.exists(), FaceNetworks()
     report("Head model", 0, 1)
     places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
     _begin(out, source)
     kept = out / folder.LANDMARKS_FOLDER
     write_places(kept / folder.PLACES_FILE, places, reliable)
-    show(partial(picture_of_first_frame, head, footage, detector, places, reliable), {})
+    take = RecordedTake(places, reliable, {})
+    show(partial(picture_of_first_frame, head, footage, detector, take), {})
     try:
         detected = detect_landmarks(footage, detector, kept, helpers, report)
         _check_faces(footage, detected)
@@ -273,7 +260,7 @@ def _detected(
             helpers.end()  # which may be writing frames
             shutil.rmtree(out)
         raise
-    return places, reliable, detected
+    return take, detected
 
 
 def _head_pixels(
@@ -389,12 +376,8 @@ def _stored(footage: Footage, out: Path) -> Footage:
     return replace(footage, cameras=tuple(cameras))
 
 
-def _take(
-    footage: Footage,
-    found: Mapping[str, CameraLandmarks],
-    places: SurfacePoints,
-    reliable: np.ndarray,
-    neutral: np.ndarray,
+def _recorded(
+    footage: Footage, found: Mapping[str, CameraLandmarks], take: RecordedTake, neutral: np.ndarray
 ) -> RecordedTake:
     """The timesteps that the head is fitted to. neutral (N, 3): landmarks on the neutral head."""
     seen: dict[int, list[tuple[FootageCamera, np.ndarray, np.ndarray]]]
@@ -407,18 +390,19 @@ def _take(
                 shown = points[confidence > 0]
                 if len(shown) and (np.ptp(shown, axis=0) >= MIN_FACE_PIXELS).all():
                     seen[timestep].append((camera, points, confidence))
-    take = {}
+    landmarks = {}
     for timestep, views in seen.items():
         if views:
             cameras, points, confidence = zip(*views, strict=True)
-            take[timestep] = TimestepLandmarks(
+            together = TimestepLandmarks(
                 tuple(camera.camera for camera in cameras),
                 np.stack(points),
                 np.stack(confidence),
                 tuple(camera.name for camera in cameras),
             )
-    sound = {t: own for t, own in take.items() if head_fit.determines_pose(own, reliable, neutral)}
-    return RecordedTake(places, reliable, sound)
+            if head_fit.determines_pose(together, take.reliable, neutral):
+                landmarks[timestep] = together
+    return replace(take, landmarks=landmarks)
 
 
 def _pictures(

@@ -2,6 +2,7 @@
 detector's do."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,7 +34,7 @@ from stga_addon.tracking.solve import (
 from stga_addon.tracking.track import by_images
 from stga_addon.worker.helpers import Helpers
 
-from .test_fit import in_cameras_world, places_on, seen
+from .test_fit import in_cameras_world, places_on, seen, shown
 from .test_surface import no_image
 
 JAW = 2
@@ -49,16 +50,6 @@ class Scene:
     head: HeadModel
     meshes: list
     take: RecordedTake
-
-
-@dataclass(frozen=True)
-class Pictures:
-    """Images of a take; a helping process can be handed them."""
-
-    by_timestep: dict
-
-    def __call__(self, timestep, most=None):
-        return self.by_timestep[timestep]
 
 
 def frame_at(opening, timestep):
@@ -104,7 +95,7 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
         pictures[t] = [(c, shaded_image(fine, pictured.faces, c, colors)) for c in cameras]
-    used, images = np.ones(300, bool), Pictures(pictures)
+    used, images = np.ones(300, bool), partial(shown, pictures)
     return Scene(head, meshes, RecordedTake(places, used, landmarks, images, metric=True))
 
 
@@ -121,13 +112,8 @@ def brow_errors(take, fit):
 
 
 def errors_of(moved, take, fit):
-    return np.array(
-        [
-            1000
-            * np.linalg.norm(in_cameras_world(fit, t)[: len(true)] - true, axis=1)[moved].mean()
-            for t, true in enumerate(take.meshes)
-        ]
-    )
+    missed = [in_cameras_world(fit, t)[moved] - true[moved] for t, true in enumerate(take.meshes)]
+    return 1000 * np.linalg.norm(missed, axis=2).mean(axis=1)
 
 
 def test_texture_is_free_of_lighting_and_distrusts_what_changes():
@@ -240,13 +226,11 @@ def test_raised_brows_are_not_lowered_by_images_that_prove_little():
     eyes, still = np.radians([-50, 0, 50]), [0.0] * 8
     take, lowered = (scene(eyes, still, brows=brows) for brows in (1.5, -1.5))
 
-    def images(timestep, most=None):
-        pairs = zip(take.take.images(timestep), lowered.take.images(timestep), strict=True)
-        return [
-            (camera, (0.4 * raised + 0.6 * low).astype(np.uint8))
-            for (camera, raised), (_, low) in pairs
-        ]
-
+    mixed = []
+    for t in range(8):
+        pairs = zip(take.take.images(t), lowered.take.images(t), strict=True)
+        mixed.append([(c, (0.4 * up + 0.6 * low).astype(np.uint8)) for (c, up), (_, low) in pairs])
+    images = partial(shown, mixed)
     first = fit_head(take.head, take.take)
     found = fit_dense(first, replace(take.take, images=images), Helpers(1))
     assert brow_errors(take, first).max() < 1

@@ -97,7 +97,8 @@ def test_masks_of_the_footage_stay(tmp_path, halves):
 
 
 def test_clean_plate_of_a_camera(tmp_path, halves):
-    """Catches a plate that is taken for a camera, or not found; no network is asked."""
+    """Catches a plate that is taken for a camera, or not found, and one of another size that ends
+    in OpenCV's error; no network is asked."""
     (tmp_path / "footage/plates").mkdir(parents=True)
     Image.new("RGB", (WIDTH, HEIGHT), (220, 220, 220)).save(tmp_path / "footage/plates/left.png")
     footage = take(tmp_path)
@@ -106,13 +107,9 @@ def test_clean_plate_of_a_camera(tmp_path, halves):
     assert (halves.asked, warnings) == (0, ())
     assert found.cameras[0].mask(2)[:, : WIDTH // 2 - 2].min() == 255
     assert found.cameras[0].mask(2)[:, WIDTH // 2 + 2 :].max() == 0
-
-
-def test_a_plate_of_another_size(tmp_path):
-    """Catches a plate of another size that ends in OpenCV's error."""
     write_image(tmp_path / "footage/plates/left.png", size=(7, 5))
     with pytest.raises(StgaError, match=r"left\.png: the image has 7 x 5 pixels"):
-        made(take(tmp_path), tmp_path)
+        made(footage, tmp_path, {"head": "another"})
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

@@ -13,6 +13,7 @@ from stga_addon.capture.model import View
 from stga_addon.tracking import pictures
 from stga_addon.tracking.correspondence import calibrate
 from stga_addon.tracking.face_networks import FaceNetworks
+from stga_addon.tracking.fit import RecordedTake
 from stga_addon.tracking.footage.model import Footage, FootageCamera, ImageFrames
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
@@ -137,13 +138,13 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
     pytest.importorskip("av")
     write_head_video(tmp_path / "head.mp4", 2)
     head, networks = read_head_model(None), FaceNetworks()
-    places, reliable = calibrate(head.model, networks, "head")
+    take = RecordedTake(*calibrate(head.model, networks, "head"), {})
     shown = []
     draw = pictures.with_mesh
     for with_mesh in (draw, lambda picture, *_: picture):
         monkeypatch.setattr(pictures, "with_mesh", with_mesh)
         footage = open_footage(tmp_path / "head.mp4")
-        shown.append(pictures.picture_of_first_frame(head, footage, networks, places, reliable))
+        shown.append(pictures.picture_of_first_frame(head, footage, networks, take))
     over, plain = (picture.astype(int) for picture in shown)
     assert over.shape == (pictures.SIZE, pictures.SIZE, 3)
     drawn, skin = np.abs(over - plain).max(2) > 8, plain[..., 0] - plain[..., 2] > 20

@@ -1,6 +1,7 @@
 """Heads moved onto the surface that the cameras see, against surfaces that are known."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from stga_addon.tracking.solve import person
 from stga_addon.tracking.surface import fit_surface, smooth_offsets
 from stga_addon.worker.helpers import Helpers
 
-from .test_fit import frame_at, in_cameras_world, places_on, seen
+from .test_fit import frame_at, in_cameras_world, places_on, recorded, seen, shown
 
 RADIUS_M = 0.09
 SWEEP = Sweep(0.004, 0.0005, 0.001)
@@ -117,25 +118,19 @@ def test_large_images_are_reduced_to_the_size_of_a_sample():
     np.testing.assert_allclose(found, camera.project(points)[0], atol=1e-9)
 
 
-def test_hidden_points_are_not_in_sight(head):
-    """Catches the back of the head compared in images of the face."""
-    vertices, faces = head.model.v_template, head.model.faces
-    points = surface_points(head, 300).on(vertices, faces)
-    camera = look_at((0, 0, 1.2), (0, 0, 0), 400, 400, 1300)
-    visible = in_sight(camera, vertices, faces, points)
-    back, front = np.quantile(vertices[:, 2], [0.15, 0.85])
-    assert visible[points[:, 2] > front].mean() > 0.8
-    assert not visible[points[:, 2] < back].any()
-
-
-def test_surface_points_leave_out_eyeballs_and_teeth(head):
-    """Catches points on parts that reflections and lids make look elsewhere."""
+def test_points_are_of_skin_that_is_in_sight(head):
+    """Catches the back of the head compared in images of the face, and points on eyeballs and
+    teeth, which reflections and lids make look elsewhere."""
+    vertices, faces, masks = head.model.v_template, head.model.faces, head.model.masks
     points = surface_points(head, 400)
-    inner = np.concatenate(
-        [head.model.masks[name] for name in ("left_eyeball", "right_eyeball", "teeth")]
-    )
+    inner = [masks[name] for name in ("left_eyeball", "right_eyeball", "teeth")]
     assert len(points) > 250
-    assert not np.isin(head.model.faces[points.face], inner).any()
+    assert not np.isin(faces[points.face], np.concatenate(inner)).any()
+    at, camera = points.on(vertices, faces), look_at((0, 0, 1.2), (0, 0, 0), 400, 400, 1300)
+    visible = in_sight(camera, vertices, faces, at)
+    back, front = np.quantile(vertices[:, 2], [0.15, 0.85])
+    assert visible[at[:, 2] > front].mean() > 0.8
+    assert not visible[at[:, 2] < back].any()
 
 
 def test_offsets_are_smooth_robust_and_local(head):
@@ -176,7 +171,7 @@ def pictured(head, cameras, meshes):
     count, faces = len(head.model.v_template), head.model.faces
     colors = np.random.default_rng(2).uniform(0.25, 1, (count, 1)) * np.ones(3)
     pictures = [[(c, shaded_image(mesh, faces, c, colors)) for c in cameras] for mesh in meshes]
-    return lambda timestep, most=None: pictures[timestep]
+    return partial(shown, pictures)
 
 
 def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
@@ -187,12 +182,8 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     shape, front = rng.normal(0, 0.7, model.n_identity), model.v_template[:, 2] > 0.04
     bump = 0.002 * np.sin(model.v_template[:, :1] * 60) * front[:, None] * [0, 0, 1]
     meshes = [flame_forward(model, shape, frame_at(head, t), bump) for t in (0, 6)]
-    places = places_on(head, 150)
-    wrong = rng.normal(0, 0.0018, (150, 3))
-    at = [places.on(mesh, model.faces) + wrong for mesh in meshes]
-    landmarks = {t: seen(cameras, own) for t, own in enumerate(at)}
-    images, reliable = pictured(head, cameras, meshes), np.ones(150, bool)
-    take = RecordedTake(places, reliable, landmarks, images)
+    images, wrong = pictured(head, cameras, meshes), rng.normal(0, 0.0018, (150, 3))
+    take = recorded(head, cameras, meshes, places_on(head, 150), wrong=wrong, images=images)
     first = fit_head(head, take)
     fit = fit_surface(head, first, take, Helpers(1))
     before, after = (
@@ -209,11 +200,10 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
 def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     """Catches landmarks that count as corrected for the person, although their errors may be the
     one expression."""
-    model, cameras, places, reliable = head.model, rig(5), places_on(head, 150), np.ones(150, bool)
+    model, cameras, wrong = head.model, rig(5), np.random.default_rng(5).normal(0, 0.0018, (150, 3))
     mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
-    wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
-    landmarks = {0: seen(cameras, places.on(mesh, model.faces) + wrong)}
-    take = RecordedTake(places, reliable, landmarks, pictured(head, cameras, [mesh]))
+    images = pictured(head, cameras, [mesh])
+    take = recorded(head, cameras, [mesh], places_on(head, 150), wrong=wrong, images=images)
     first, found = fit_head(head, take), []
     for share in (0.2, 5.0):
         monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
@@ -234,18 +224,14 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each
     timestep another."""
     model, cameras, places = head.model, rig(count, 280), places_on(head, 150)
-    shape, reliable, front = (
-        np.zeros(model.n_identity),
-        np.ones(150, bool),
-        model.v_template[:, 2] > 0.04,
-    )
+    shape, front = np.zeros(model.n_identity), model.v_template[:, 2] > 0.04
     meshes = [flame_forward(model, shape, frame_at(head, t)) for t in (0, 3, 6)]
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
-    at = [places.on(mesh, model.faces) for mesh in meshes]
-    right = {t: seen(cameras, own) for t, own in enumerate(at)}
-    wrong = {t: seen(cameras, own + (t - 1) * lower) for t, own in enumerate(at)}
-    images, errors = pictured(head, cameras, meshes), []
-    take = RecordedTake(places, reliable, wrong, images, metric=True)
+    right, errors = recorded(head, cameras, meshes, places).landmarks, []
+    at = [places.on(mesh, model.faces) + (t - 1) * lower for t, mesh in enumerate(meshes)]
+    wrong = {t: seen(cameras, own) for t, own in enumerate(at)}
+    images = pictured(head, cameras, meshes)
+    take = RecordedTake(places, np.ones(150, bool), wrong, images, metric=True)
     for dense, landmarks in ((False, wrong), (True, right)):
         first = fit_head(head, replace(take, landmarks=landmarks))
         fit = fit_surface(head, first, take, Helpers(1), dense=dense)
@@ -253,16 +239,6 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
         slips = [in_cameras_world(fit, t) - mesh for t, mesh in enumerate(meshes)]
         errors.append(np.linalg.norm(slips, axis=2)[:, front].mean())
     assert errors[1] < share * errors[0]
-
-
-def test_one_camera_leaves_the_fit_as_it_is(head):
-    """Catches a surface made up from one camera."""
-    places = places_on(head, 100)
-    mesh = flame_forward(head.model, np.zeros(head.model.n_identity), frame_at(head, 0))
-    landmarks = {0: seen(rig(1), places.on(mesh, head.model.faces))}
-    take = RecordedTake(places, np.ones(100, bool), landmarks, no_image)
-    fit = fit_head(head, take)
-    assert fit_surface(head, fit, take, Helpers(1)) is fit
 
 
 def no_image(*_):
