@@ -8,15 +8,13 @@ import platform
 import re
 import secrets
 import stat
-import struct
 import time
 import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import cache
-from functools import partial as partial_call
+from functools import cache, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,7 +26,6 @@ MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
 MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
-MAX_HEADER_BYTES = 1 << 16
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
 )  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
@@ -51,8 +48,8 @@ def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Pat
     patience_s: how long the rename is tried again while another program has `path` open, on
     Windows. Raises StgaError where the folder cannot be written, or `path` is a folder or a device.
     """
-    with replacing_together(patience_s) as new_file, new_file(path) as partial:
-        yield partial
+    with replacing_together(patience_s) as new_file, new_file(path) as content:
+        yield content
 
 
 @contextmanager
@@ -70,36 +67,32 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
     def new_file(path: Path) -> Iterator[Path]:
         if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
             raise StgaError(f"{path}: cannot be written (is not a regular file)")
-        partial = path.with_name(
-            f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
-        )
+        name = f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
+        partials[path] = path.with_name(name)
         with naming(path):
-            folder = path.parent
-            missing = []
             try:
-                while not folder.is_dir() and folder != folder.parent:
-                    missing.append(folder)
-                    folder = folder.parent
-                for name in reversed(missing):
-                    name.mkdir(exist_ok=True)
-                    made_folders.append(name)
+                missing = [each for each in path.parents if not each.is_dir()]
+                for folder in reversed(missing):
+                    folder.mkdir(exist_ok=True)
+                    made_folders.append(folder)
+                _remove_leftovers_once(path.parent)
+                # O_EXCL follows no symbolic link
+                os.close(os.open(partials[path], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             except ValueError as error:  # a null character or a lone surrogate
                 raise OSError(str(error)) from error
-            partials[path] = partial
-            _create(partial)
-            yield partial
-            with partial.open("rb+") as written:
+            yield partials[path]
+            with partials[path].open("rb+") as written:
                 os.fsync(written.fileno())
 
     try:
         yield new_file
-        for path, partial in partials.items():
+        for path, content in partials.items():
             with naming(path):
-                _once_free(partial_call(os.replace, partial, path), patience_s)
+                _once_free(partial(os.replace, content, path), patience_s)
     except BaseException:
-        for partial in partials.values():
+        for content in partials.values():
             with suppress(OSError, ValueError):  # where it was never created, or is renamed
-                partial.unlink()
+                content.unlink()
         for folder in reversed(made_folders):
             with suppress(OSError):  # others have written there
                 folder.rmdir()
@@ -144,8 +137,8 @@ class NumberedFiles:
             if path.name not in self._written:
                 with naming(path, "removed"):
                     _once_free(path.unlink, RENAME_PATIENCE_S)
-        with replacing(self._list) as partial:
-            partial.write_text("".join(f"{line}\n" for line in self._written.values()))
+        with replacing(self._list) as content:
+            content.write_text("".join(f"{line}\n" for line in self._written.values()))
 
     def _found(self) -> list[Path]:
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
@@ -187,16 +180,6 @@ def check_writable(path: Path) -> None:
 
 class _Checked(Exception):
     pass
-
-
-def _create(partial: Path) -> None:
-    """Create the file. Raises OSError, also for a name that no file can have."""
-    try:
-        _remove_leftovers_once(partial.parent)
-        # O_EXCL follows no symbolic link
-        os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-    except ValueError as error:  # a null character or a lone surrogate
-        raise OSError(str(error)) from error
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -278,23 +261,29 @@ def parse_json(data: bytes) -> Any:
 
 def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) -> None:
     """Write `value` as indented JSON, atomically; `patience_s` as in `replacing`."""
-    with replacing(path, patience_s) as partial:
-        partial.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+    with replacing(path, patience_s) as content:
+        content.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read every array of an npz without pickle. Raises StgaError where it is missing, truncated,
     above 4 GiB unpacked, or holds objects."""
     file_size(path)  # refuses pipes, whose reading need never end
+    arrays = {}
     with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
         unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > MAX_UNPACKED_BYTES:
             problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
             raise StgaError(f"{path}: {problem}")
-        return {
-            entry.filename.removesuffix(".npy"): _read_entry(archive, entry)
-            for entry in archive.infolist()
-        }
+        for entry in archive.infolist():
+            if not entry.filename.endswith(".npy"):
+                raise ValueError(f"entry '{entry.filename}' is no array")
+            # LZMA's own header makes it allocate gigabytes
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("is packed as no npz is")
+            with archive.open(entry) as stream:
+                arrays[entry.filename.removesuffix(".npy")] = _read_array(stream, entry.file_size)
+    return arrays
 
 
 def read_npy(path: Path) -> np.ndarray:
@@ -318,31 +307,12 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
         raise StgaError(f"{path}: {problem}") from error
 
 
-def _read_entry(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
-    if not entry.filename.endswith(".npy"):
-        raise ValueError(f"entry '{entry.filename}' is no array")
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("is packed as no npz is")  # LZMA's own header makes it allocate gigabytes
-    with archive.open(entry) as stream:
-        return _read_array(stream, entry.file_size)
-
-
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """The array of a npy stream of `size` bytes, which bounds what its header promises."""
-    start = stream.read(12).ljust(12, b"\0")
-    size_format, end = ("<H", 10) if start[6] == 1 else ("<L", 12)
-    (length,) = struct.unpack(size_format, start[8:end])
-    if length > MAX_HEADER_BYTES:
-        raise ValueError(f"an array header of {length} bytes")
-    stream.seek(0)
     version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in readers:
+    if version != (1, 0):  # newer ones are for headers of more than 64 kB, of many named columns
         raise ValueError(f"npy format {version} is not supported")
-    shape, _, dtype = readers[version](stream)  # type: ignore[no-untyped-call]
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)  # type: ignore[no-untyped-call]
     promised = stream.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject or not dtype.itemsize or min(shape, default=0) < 0 or promised != size:
         raise ValueError(f"an array of {dtype} {shape} in {size} bytes")
@@ -352,8 +322,8 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:
     """Write arrays as npz, atomically."""
-    with replacing(path) as partial:
-        save_npz(partial, arrays, compressed)
+    with replacing(path) as content:
+        save_npz(content, arrays, compressed)
 
 
 def save_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:

@@ -78,19 +78,23 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
             groups[asked["group"]] = parser.add_mutually_exclusive_group()
         has_default = {spec.default, spec.default_factory} != {dataclasses.MISSING}
         is_required = not has_default and spec.name not in may_lack
-        form = {"help": _help(spec), "default": None, **_form(spec, hint, is_required)}
+        form = _form(spec, hint, is_required)
         groups[asked["group"]].add_argument(*form.pop("names"), **form)
 
 
 def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     """What `add_argument` takes for a field, by its type."""
     (kind,) = (k for k in alternatives(hint) if k is not NoneType)
-    asked = spec.metadata
-    flag = flag_of(spec)
-    is_named = flag.startswith("-")
-    form: dict[str, Any] = {"names": (flag,), "dest": spec.name, "required": is_required}
-    if not is_named:
-        form = {"names": (spec.name,), "metavar": flag, **({} if is_required else {"nargs": "?"})}
+    asked, default, flag = spec.metadata, spec.default, flag_of(spec)
+    is_named, help = flag.startswith("-"), str(asked["help"])
+    is_told = isinstance(default, str | int | float) and default and default is not True
+    if is_told and "default" not in help:
+        help += f" (default {default})"
+    form: dict[str, Any] = {"help": help.replace("%", "%%"), "default": None}
+    if is_named:
+        form |= {"names": (flag,), "dest": spec.name, "required": is_required}
+    else:
+        form |= {"names": (spec.name,), "metavar": flag, **({} if is_required else {"nargs": "?"})}
     if kind is bool:
         return {**form, "action": "store_true"}
     several = get_origin(kind) is tuple and get_args(kind)[-1] is Ellipsis
@@ -106,30 +110,18 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     return {**form, "metavar": asked["metavar"]} if asked["metavar"] else form
 
 
-def _help(spec: Any) -> str:
-    help, default = str(spec.metadata["help"]), spec.default
-    is_told = isinstance(default, str | int | float) and default and default is not True
-    if is_told and "default" not in help:
-        help += f" (default {default})"
-    return help.replace("%", "%%")
-
-
 def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
     """Field -> value of what was given on the command line."""
     hints, found = type_hints(kind), dict[str, Any]()
     for spec in option_fields(kind):
-        hint = hints[spec.name]
+        hint, value = hints[spec.name], getattr(options, spec.name, None)
         if dataclasses.is_dataclass(hint):
-            nested: Any = hint
-            found[spec.name] = nested(**given_options(options, nested))
-            continue
-        value = getattr(options, spec.name, None)
-        if value is None:
-            continue
-        if isinstance(value, list):
+            value = hint(**given_options(options, hint))  # type: ignore[operator]
+        elif isinstance(value, list):
             is_mapping = any(get_origin(part) is Mapping for part in alternatives(hint))
             value = dict(value) if is_mapping else tuple(value)
-        found[spec.name] = value
+        if value is not None:
+            found[spec.name] = value
     return found
 
 
@@ -139,23 +131,20 @@ def refuse_useless(value: Any) -> None:
     for spec in option_fields(type(value)):
         for needed in spec.metadata["needs"] if _is_changed(value, spec) else ():
             names = (needed,) if isinstance(needed, str) else needed
-            if not any(_is_changed(value, specs[name]) for name in names):
-                without = " or ".join(flag_of(specs[name]) for name in names)
-                raise StgaError(f"{_flag_of_change(value, spec)}: has no effect without {without}")
+            if any(_is_changed(value, specs[name]) for name in names):
+                continue
+            useless, without = spec, " or ".join(flag_of(specs[name]) for name in names)
+            nested = getattr(value, spec.name)
+            if dataclasses.is_dataclass(nested):
+                inner: Any = type(nested)
+                useless = next(own for own in option_fields(inner) if _is_changed(nested, own))
+            raise StgaError(f"{flag_of(useless)}: has no effect without {without}")
 
 
 def _is_changed(value: Any, spec: Any) -> bool:
     is_made = spec.default_factory is not dataclasses.MISSING
     default = spec.default_factory() if is_made else spec.default
     return bool(getattr(value, spec.name) != default)
-
-
-def _flag_of_change(value: Any, spec: Any) -> str:
-    nested = getattr(value, spec.name)
-    if not dataclasses.is_dataclass(nested):
-        return flag_of(spec)
-    inner = option_fields(type(nested))
-    return next(flag_of(spec) for spec in inner if _is_changed(nested, spec))
 
 
 # Values on the command line
@@ -170,6 +159,8 @@ def _parser(kind: Any, limits: Mapping[str, Any]) -> Callable[[str], Any]:
             value = convert(text)
         except StgaError as error:
             raise ArgumentTypeError(str(error)) from error
+        except ValueError:
+            value = text  # which is not what is expected
         wrong = None if get_origin(kind) is Mapping else expectation(value, kind, limits)
         if wrong is not None:
             raise ArgumentTypeError(f"expected {wrong}, got {shorten(text)}")
@@ -197,13 +188,6 @@ def usable_path(text: str) -> Path:
 
 def _whole_number(text: str) -> Any:
     return int(text) if re.fullmatch(rf"-?\d{{1,{MAX_DIGITS}}}", text, re.ASCII) else text
-
-
-def _number(text: str) -> Any:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def frame_span(text: str) -> tuple[int, int]:
@@ -247,7 +231,7 @@ _CONVERSIONS: dict[Any, Callable[[str], Any]] = {
     str: str,
     Path: usable_path,
     int: _whole_number,
-    float: _number,
+    float: float,
     tuple[int, int]: frame_span,
     tuple[float, float, float]: color,
 }  # Type of a field -> what reads its values; what it cannot read, `schema.expectation` refuses

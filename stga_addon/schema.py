@@ -61,8 +61,11 @@ def validate(value: Any, prefix: str = "") -> None:
         expected = expectation(found, hint, spec.metadata)
         if expected is not None:
             raise StgaError(complaint(prefix + spec.name, expected, found))
-        for name, part in _parts(spec.name, found):
-            validate(part, f"{prefix}{name}.")
+        several = isinstance(found, tuple)
+        for row, part in enumerate(found if several else (found,)):
+            if dataclasses.is_dataclass(part):
+                name = f"{spec.name}.{row}" if several else spec.name
+                validate(part, f"{prefix}{name}.")
     if hasattr(value, "check"):
         value.check()
 
@@ -70,16 +73,6 @@ def validate(value: Any, prefix: str = "") -> None:
 def complaint(name: str, expected: str, value: Any) -> str:
     """The message for a field with a value that is not allowed."""
     return f"setting {name}: expected {expected}, got {shorten(value)}"
-
-
-def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
-    """The dataclasses that a field holds, with their names."""
-    if dataclasses.is_dataclass(value):
-        return [(name, value)]
-    items = value if isinstance(value, tuple) else ()
-    return [
-        (f"{name}.{row}", item) for row, item in enumerate(items) if dataclasses.is_dataclass(item)
-    ]
 
 
 @cache
@@ -116,9 +109,18 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
         found = (expectation(item, hints[0], limits) for item in value)
         return next((f"a tuple, each item {text}" for text in found if text is not None), None)
     if origin in (dict, Mapping):
-        return _expected_mapping(value, get_args(kind), limits)
+        if not isinstance(value, Mapping):
+            return "an object of Mapping"
+        names, values = get_args(kind)
+        if all(
+            isinstance(key, names) and expectation(item, values, limits) is None
+            for key, item in value.items()
+        ):
+            return None
+        return "texts by name" if (names, values) == (str, str) else "values by name"
     if kind in (int, float):
-        low, high, above = (limits.get(name, end) for name, end in _UNBOUNDED.items())
+        low, above = limits.get("minimum", -math.inf), limits.get("above", -math.inf)
+        high = limits.get("maximum", math.inf)
         if kind is int:
             fits = isinstance(value, int)
         else:
@@ -126,56 +128,40 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
             fits = fits or (isinstance(value, int) and abs(value) <= MAX_COUNT)
         if fits and not isinstance(value, bool) and low <= value <= high and value > above:
             return None
-        bounds = (
-            [f"above {above}"] if above > -math.inf else [f"from {low}"] if low > -math.inf else []
-        )
-        bounds += [f"up to {high}"] if high < math.inf else []
-        return " ".join(["a whole number" if kind is int else "a finite number", *bounds])
-    choices = limits.get("choices")
-    if kind is str and choices is not None:
-        return (
-            None if isinstance(value, str) and value in choices else f"one of {', '.join(choices)}"
-        )
-    names = {str: "a text", bool: "True or False", Path: "a path", np.ndarray: "an array"}
-    return (
-        None if isinstance(value, origin) else names.get(origin, f"an object of {origin.__name__}")
-    )
-
-
-def _expected_mapping(value: Any, hints: tuple[Any, ...], limits: Mapping[str, Any]) -> str | None:
-    if not isinstance(value, Mapping):
-        return "an object of Mapping"
-    fits = all(
-        isinstance(key, hints[0]) and expectation(item, hints[1], limits) is None
-        for key, item in value.items()
-    )
-    return None if fits else "texts by name" if hints == (str, str) else "values by name"
-
-
-_UNBOUNDED = {"minimum": -math.inf, "maximum": math.inf, "above": -math.inf}
+        expected = "a whole number" if kind is int else "a finite number"
+        if above > -math.inf:
+            expected += f" above {above}"
+        elif low > -math.inf:
+            expected += f" from {low}"
+        return f"{expected} up to {high}" if high < math.inf else expected
+    choices = limits.get("choices") if kind is str else None
+    if isinstance(value, origin) and (choices is None or value in choices):
+        return None
+    if choices is not None:
+        return f"one of {', '.join(choices)}"
+    known = {str: "a text", bool: "True or False", Path: "a path", np.ndarray: "an array"}
+    return known.get(origin, f"an object of {origin.__name__}")
 
 
 # JSON
 
 
-def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None) -> Any:
+def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None, name: str = "") -> Any:
     """A dataclass as plain values of JSON, which `from_json` reads back.
 
     Paths become texts, tuples lists, and a dataclass where a field allows several an object with
     its `kind`. Arrays are put into `arrays`, which must then be kept beside the JSON. kinds: type
-    hint of `value`; default: its type.
+    hint of `value`; default: its type. name: its place in the whole, of which arrays are named.
     """
-    return _plain(value, kinds or type(value), arrays, "")
+    kinds = alternatives(kinds or type(value))
 
+    def plain(key: Any, item: Any, hint: Any) -> Any:
+        return to_json(item, arrays, hint, _joined(name, str(key)))
 
-def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
     if dataclasses.is_dataclass(value):
         hints = type_hints(type(value))  # type: ignore[arg-type]
-        fields = {}
-        for spec in dataclasses.fields(value):
-            found, path = getattr(value, spec.name), _joined(name, spec.name)
-            fields[spec.name] = _plain(found, hints[spec.name], arrays, path)
-        several = sum(dataclasses.is_dataclass(kind) for kind in alternatives(hint)) > 1
+        fields = {key: plain(key, getattr(value, key), hint) for key, hint in hints.items()}
+        several = sum(dataclasses.is_dataclass(kind) for kind in kinds) > 1
         return {KIND: type(value).__name__, **fields} if several else fields
     if isinstance(value, np.ndarray):
         assert arrays is not None, f"{name}: an array, and nothing to keep it in"
@@ -183,18 +169,13 @@ def _plain(value: Any, hint: Any, arrays: Arrays | None, name: str) -> Any:
         return {ARRAY: name}
     if isinstance(value, Path):
         return str(value)
-    (kind,) = [kind for kind in alternatives(hint) if kind is not types.NoneType][:1]
-    items = get_args(kind) or (Any, Any)
+    hints = next((get_args(kind) for kind in kinds if kind is not types.NoneType), ())
     if isinstance(value, Mapping):
-        return {
-            str(key): _plain(item, items[1], arrays, _joined(name, str(key)))
-            for key, item in value.items()
-        }
+        hint = hints[1] if hints else Any
+        return {str(key): plain(key, item, hint) for key, item in value.items()}
     if isinstance(value, tuple):
-        return [
-            _plain(item, items[0], arrays, _joined(name, str(row)))
-            for row, item in enumerate(value)
-        ]
+        hint = hints[0] if hints else Any
+        return [plain(row, item, hint) for row, item in enumerate(value)]
     return value
 
 

@@ -1,13 +1,11 @@
 """Selection of the triangles that move in a timestep, whose splats it trains."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from .capture.model import Capture
-from .errors import StgaError, shorten
 from .flame.sequence import ZERO_POSES
 from .options import option
 
@@ -22,7 +20,6 @@ class SelectionOptions:
     zero_pose  "head": rotation, translation and neck do not count as motion; "all": nor do jaw and
                eyes
     regions    names of key regions, each selected as a whole
-    Raises StgaError for other values.
     """
 
     threshold: float = option(
@@ -33,14 +30,6 @@ class SelectionOptions:
     )
     zero_pose: str = option("motion that does not count as expression", "head", choices=ZERO_POSES)
     regions: tuple[str, ...] = KEY_REGIONS
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.threshold, int | float) and 0 <= self.threshold < math.inf):
-            problem = f"got {shorten(self.threshold)}"
-            raise StgaError(f"selection threshold must be a distance in meters, {problem}")
-        if self.zero_pose not in ZERO_POSES:
-            expected = f"expected one of {', '.join(ZERO_POSES)}"
-            raise StgaError(f"zero_pose is {shorten(self.zero_pose)}, {expected}")
 
 
 def select_faces(
