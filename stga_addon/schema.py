@@ -169,12 +169,12 @@ def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None, name: s
         return {ARRAY: name}
     if isinstance(value, Path):
         return str(value)
-    hints = next((get_args(kind) for kind in kinds if kind is not types.NoneType), ())
+    items: Any = next((get_args(kind) for kind in kinds if kind is not types.NoneType), ())
     if isinstance(value, Mapping):
-        hint = hints[1] if hints else Any
+        hint = items[1] if items else Any
         return {str(key): plain(key, item, hint) for key, item in value.items()}
     if isinstance(value, tuple):
-        hint = hints[0] if hints else Any
+        hint = items[0] if items else Any
         return [plain(row, item, hint) for row, item in enumerate(value)]
     return value
 

@@ -30,14 +30,14 @@ from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
-from stga_addon.tracking.footage.calibrations import read_nerfstudio
-from stga_addon.tracking.footage.colmap import read_colmap
-from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
-from stga_addon.tracking.footage.photogrammetry import (
+from stga_addon.tracking.footage.calibrations import (
     read_metashape,
+    read_nerfstudio,
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
+from stga_addon.tracking.footage.colmap import read_colmap
+from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
 from stga_addon.tracking.footage.shots import Shot, undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.calibrations import read_metashape
 from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.photogrammetry import read_metashape
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
 

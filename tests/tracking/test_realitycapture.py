@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.photogrammetry import (
+from stga_addon.tracking.footage.calibrations import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
+from stga_addon.tracking.footage.open import open_footage
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
 

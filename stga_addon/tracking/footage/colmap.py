@@ -71,15 +71,22 @@ def read_colmap(folder: Path) -> list[Shot]:
         if camera not in cameras:
             raise StgaError(f"{where}: names camera {camera}, which {cameras_file} does not have")
         model, size, values = cameras[camera]
-        focal, center, lens = _split(model, values, f"{cameras_file}: camera {camera}")
+        if model not in LENSES:
+            unknown = f"model {shorten(model)} is not one of {', '.join(LENSES)}"
+            raise StgaError(f"{cameras_file}: camera {camera}: {unknown}")
+        _, focals, count, lens = LENSES[model]
+        if len(values) != focals + 2 + count:
+            expected = f"expected {focals + 2 + count} parameters of {model}, not {len(values)}"
+            raise StgaError(f"{cameras_file}: camera {camera}: {expected}")
+        *focal, cx, cy = values[: focals + 2]
         length = math.hypot(*pose[:4])
         if not 0.5 < length < 2:
             raise StgaError(f"{where}: expected a rotation quaternion of length 1, not {length:g}")
         rotation = to_matrices(np.array(pose[:4]))
         with np.errstate(over="ignore", invalid="ignore"):  # `pinhole` refuses what is not finite
             position = -rotation.T @ np.array(pose[4:])
-        posed = pinhole(size, focal, center, rotation, position, where)
-        shots.append(Shot(name, posed, lens, where))
+        posed = pinhole(size, (focal[0], focal[-1]), (cx, cy), rotation, position, where)
+        shots.append(Shot(name, posed, lens(*values[focals + 2 :]), where))
     return shots
 
 
@@ -88,20 +95,6 @@ def _suffix(folder: Path) -> str | None:
         if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
             return suffix
     return None
-
-
-def _split(
-    model: str, values: Sequence[float], where: str
-) -> tuple[tuple[float, float], tuple[float, float], Lens]:
-    """Focal lengths, principal point and lens of a model's parameters."""
-    if model not in LENSES:
-        raise StgaError(f"{where}: model {shorten(model)} is not one of {', '.join(LENSES)}")
-    _, focals, count, lens = LENSES[model]
-    if len(values) != focals + 2 + count:
-        expected = f"{focals + 2 + count} parameters of {model}"
-        raise StgaError(f"{where}: expected {expected}, not {len(values)}")
-    *focal, cx, cy = values[: focals + 2]
-    return (focal[0], focal[-1]), (cx, cy), lens(*values[focals + 2 :])
 
 
 # Text

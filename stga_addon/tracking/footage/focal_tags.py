@@ -1,8 +1,10 @@
 """Focal lengths that recordings state: photos' EXIF, metadata of QuickTime's and MP4's tracks."""
 
+import mmap
 import re
 import struct
 from collections.abc import Iterator
+from itertools import islice
 from math import hypot
 from pathlib import Path
 
@@ -23,7 +25,7 @@ MAX_ASPECT_DIFFERENCE = 0.01
 EQUIVALENT_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 VALUE_FORMATS = {21: ">i", 22: ">I", 23: ">f", 24: ">d", 67: ">i", 77: ">I"}
 """Well-known types of QuickTime's metadata, but for text."""
-MAX_BOXES, MAX_HEADER_BYTES = 1000, 1 << 26
+MAX_BOXES, MAX_MOVIE_BYTES = 1000, 1 << 26
 
 
 def photo_focal(path: Path, width: int, height: int) -> float | None:
@@ -50,10 +52,18 @@ def video_focal(path: Path, width: int, height: int) -> float | None:
     Phones write it into the video's track, where FFmpeg does not look.
     """
     try:
-        movie = _movie(path)
+        with (
+            path.open("rb") as stream,
+            mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
+        ):
+            boxes = islice(_boxes(data), MAX_BOXES)
+            first, end = next(
+                ((first, end) for kind, first, end in boxes if kind == b"moov"), (0, 0)
+            )
+            movie = data[first : min(end, first + MAX_MOVIE_BYTES)]
         tracks = [movie[first:end] for kind, first, end in _boxes(movie) if kind == b"trak"]
         found = [value for part in (*tracks, movie) if (value := _equivalent(part)) is not None]
-    except (OSError, struct.error):
+    except (OSError, ValueError, struct.error):  # ValueError: of an empty file
         return None
     return _pixels(found[0], width, height) if found else None
 
@@ -63,30 +73,16 @@ def _pixels(equivalent_mm: float, width: int, height: int) -> float | None:
     return equivalent_mm / FULL_FRAME_DIAGONAL_MM * hypot(width, height) if plausible else None
 
 
-def _movie(path: Path) -> bytes:
-    """What the box "moov" of a file holds; nothing where there is none."""
-    with path.open("rb") as stream:
-        for _ in range(MAX_BOXES):
-            head = stream.read(8)
-            if len(head) < 8:
-                break
-            size, kind = struct.unpack(">I4s", head)
-            size = struct.unpack(">Q", stream.read(8))[0] - 16 if size == 1 else size - 8
-            if kind == b"moov":
-                return stream.read(max(0, min(size, MAX_HEADER_BYTES)))
-            if not 0 <= size < 1 << 62:
-                break
-            stream.seek(size, 1)
-    return b""
-
-
-def _boxes(data: bytes, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
+def _boxes(data: bytes | mmap.mmap, start: int = 0) -> Iterator[tuple[bytes, int, int]]:
     """(kind, first byte of the content, end) of the boxes one after another from `start` on."""
     while start + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, start)
-        if size < 8:
+        head = 8
+        if size == 1:  # a long one
+            (size,), head = struct.unpack_from(">Q", data, start + 8), 16
+        if size < head:
             return
-        yield kind, start + 8, start + size
+        yield kind, start + head, start + size
         start += size
 
 

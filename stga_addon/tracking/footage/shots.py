@@ -60,7 +60,8 @@ class Lens:
             points = points * self._radius(tangent) / tangent
         x, y = np.moveaxis(points, -1, 0)
         square = x * x + y * y
-        factor = _polynomial(self.radial, square) / _polynomial(self.rational, square)
+        factor = np.polyval((*self.radial[::-1], 1.0), square)
+        factor = factor / np.polyval((*self.rational[::-1], 1.0), square)
         (p1, p2), (s1, s2, s3, s4), (b1, b2) = self.tangential, self.prism, self.affine
         u = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x) + square * (s1 + s2 * square)
         v = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y + square * (s3 + s4 * square)
@@ -75,14 +76,6 @@ class Lens:
             return np.asarray(np.arctan(2 * tangent * np.tan(self.parameter / 2)) / self.parameter)
         with np.errstate(invalid="ignore"):  # NaN beyond the widest angle that the lens shows
             return np.asarray(2 * tangent / (1 + np.sqrt(1 - 4 * self.parameter * tangent**2)))
-
-
-def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarray:
-    """1 + k1 r² + k2 r⁴ + … at r² = `square`."""
-    total = np.zeros_like(square)
-    for coefficient in reversed(coefficients):
-        total = (total + coefficient) * square
-    return total + 1
 
 
 @dataclass(frozen=True)
@@ -248,24 +241,23 @@ def pinhole(
     unit is free. Raises StgaError, beginning with `where`, for a size, focal length, principal
     point or pose that no camera has.
     """
-    if not is_image_size(*size):
-        raise StgaError(f"{where}: expected an image size in pixels, not {size[0]:g} x {size[1]:g}")
-    if not all(1 <= value <= MAX_FOCAL_PIXELS for value in focal):
-        raise StgaError(
-            f"{where}: expected a focal length of 1 to 1e7 pixels, not {focal[0]:g}, {focal[1]:g}"
-        )
-    if not all(abs(value) <= MAX_FOCAL_PIXELS for value in center):  # also where it is not a number
-        found = f"{center[0]:g}, {center[1]:g}"
-        raise StgaError(
-            f"{where}: expected a principal point within {MAX_FOCAL_PIXELS:g} pixels, not {found}"
-        )
-    if not (np.abs(position) <= MAX_POSITION).all():
-        raise StgaError(f"{where}: expected a camera within {MAX_POSITION:g} units of the origin")
-    bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE
-    if not bounded or np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise StgaError(f"{where}: expected a rotation without scale or shear")
+    (width, height), (fl_x, fl_y), (cx, cy), limit = size, focal, center, MAX_FOCAL_PIXELS
+    bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE  # else, products overflow
+    skewed = np.abs(rotation @ rotation.T - np.eye(3)).max() if bounded else np.inf
+    for fits, expected in (
+        (is_image_size(width, height), f"an image size in pixels, not {width:g} x {height:g}"),
+        (all(1 <= value <= limit for value in focal),
+         f"a focal length of 1 to 1e7 pixels, not {fl_x:g}, {fl_y:g}"),
+        (all(abs(value) <= limit for value in center),  # nor NaN
+         f"a principal point within {limit:g} pixels, not {cx:g}, {cy:g}"),
+        ((np.abs(position) <= MAX_POSITION).all(),
+         f"a camera within {MAX_POSITION:g} units of the origin"),
+        (skewed <= ROTATION_TOLERANCE, "a rotation without scale or shear"),
+    ):  # fmt: skip
+        if not fits:
+            raise StgaError(f"{where}: expected {expected}")
     if np.linalg.det(rotation) < 0:
         raise StgaError(f"{where}: its axes are mirrored; expected a right-handed rotation")
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
-    return Camera(int(size[0]), int(size[1]), *focal, *center, pose)
+    return Camera(int(width), int(height), fl_x, fl_y, cx, cy, pose)
