@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -137,7 +138,6 @@ class FootageCamera:
 class Footage:
     """What was filmed: cameras with unique names, in the order of the calibration.
 
-    timesteps   all that any camera has a frame of, ascending
     fps         frames per second of the videos, the average where it varies; None where not known,
                 as for most images. Timesteps are numbers of frames
     focal       where focal lengths are from: "calibration"; of a single camera without one, "given"
@@ -149,11 +149,15 @@ class Footage:
 
     root: Path
     cameras: tuple[FootageCamera, ...]
-    timesteps: tuple[int, ...]
     fps: float | None = None
     focal: str = "calibration"
     keeps_world: bool = False
     warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def timesteps(self) -> tuple[int, ...]:
+        """All that any camera has a frame of, ascending."""
+        return tuple(sorted({t for camera in self.cameras for t in camera.timesteps}))
 
     def views(self) -> Iterator[tuple[int, FootageCamera]]:
         """(timestep, camera) of every frame, camera by camera: the fast order for videos."""

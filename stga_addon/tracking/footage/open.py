@@ -86,25 +86,25 @@ def _calibrated(
 ) -> Footage:
     timed = any(shot.timestep is not None for shot in shots)
     names = [] if timed else sequence_names(sources, (shot.label for shot in shots))
-    if any(names):
-        return _rig(sources, _by_name(shots, names, sources.root), frames)
+    if any(names):  # a folder of images or a video for each camera
+        found: dict[str, Shot] = {}
+        for shot, name in zip(shots, names, strict=True):
+            if name is None:
+                missing = "has no folder or video of this camera, though it has of others"
+                raise StgaError(f"{shot.where}: {sources.root} {missing}")
+            if name in found:
+                same = f"are both of camera {name}; expected different names"
+                raise StgaError(f"{shot.where}: and {found[name].where} {same}")
+            found[name] = shot
+        sequences = {name: open_sequence(sequence_files(sources, name)) for name in found}
+        return _rig(sources, found, sequences, frames)
     if frames.offsets or frames.sync != "none":
         lists = "lists images, which offsets do not apply to; expected none"
         raise StgaError(f"{calibration}: {lists}")
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
     chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
     listed = _listed_cameras(chosen if timed else _with_stills(shots, sources), calibration)
-    return _footage(sources.root, listed, fps)
-
-
-def _footage(
-    root: Path,
-    cameras: tuple[FootageCamera, ...],
-    fps: float | None = None,
-    warnings: tuple[str, ...] = (),
-) -> Footage:
-    timesteps = {timestep for camera in cameras for timestep in camera.timesteps}
-    return Footage(root, cameras, tuple(sorted(timesteps)), fps, warnings=warnings)
+    return Footage(sources.root, listed, fps)
 
 
 def _masked(
@@ -132,36 +132,17 @@ def _masked(
     return replace(camera, frames=ImageFrames(views))
 
 
-# Sequences: a folder of images or a video for each camera
-
-
-def _by_name(shots: list[Shot], names: list[str | None], root: Path) -> dict[str, Shot]:
-    """Camera -> its shot. Raises StgaError for one without recording, and two of the same."""
-    found: dict[str, Shot] = {}
-    for shot, name in zip(shots, names, strict=True):
-        if name is None:
-            missing = "has no folder or video of this camera, though it has of others"
-            raise StgaError(f"{shot.where}: {root} {missing}")
-        if name in found:
-            same = f"are both of camera {name}; expected different names"
-            raise StgaError(f"{shot.where}: and {found[name].where} {same}")
-        found[name] = shot
-    return found
-
-
 def _rig(
     sources: Sources,
     shots: Mapping[str, Shot],
+    sequences: Mapping[str, Sequence],
     frames: FrameRange,
-    opened: Mapping[str, Sequence] | None = None,
 ) -> Footage:
-    """opened: the sequences, where they are."""
-    sequences = opened or {name: open_sequence(sequence_files(sources, name)) for name in shots}
     videos = [own for own in sequences.values() if isinstance(own, Video)]
     warnings = [warning for video in videos for warning in video.warnings]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
     cameras = tuple(_camera(name, shots[name], recorded[name]) for name in shots)
-    return _footage(sources.root, cameras, fps, (*warnings, *sentences))
+    return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences))
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
@@ -185,14 +166,14 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
             focal, known = video_focal(sequence.path, width, height), "file"
         else:
             focal, known = photo_focal(sequence[0], width, height), "file"
-        if focal is None:
-            focal, known = usual_focal(width, height), "usual"
+    if focal is None:
+        focal, known = usual_focal(width, height), "usual"
     if focal < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {focal:g}")
     camera = camera_from_gl(np.eye(4), width, height, focal, focal, width / 2, height / 2)
     name = names[0] or root.name
     shot = Shot(name, camera, Lens(), str(root))
-    return replace(_rig(sources, {name: shot}, frames, {name: sequence}), focal=known)
+    return replace(_rig(sources, {name: shot}, {name: sequence}, frames), focal=known)
 
 
 def usual_focal(width: int, height: int) -> float:
@@ -250,25 +231,22 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
         if unique in (camera.name for camera in cameras):
             same = f"two cameras are named {unique}; expected different names"
             raise StgaError(f"{group[0].where}: {same}")
-        cameras.append(_camera(unique, group[0], ImageFrames(_views(unique, group))))
+        views: dict[int, View] = {}
+        for shot in sorted(group, key=lambda shot: shot.timestep or 0):
+            timestep = shot.timestep or 0
+            if shot.image is None:
+                raise StgaError(f"{shot.where}: names no image")
+            if timestep in views and views[timestep].image != shot.image:
+                two = f"camera {unique} has two images at timestep {timestep}"
+                raise StgaError(f"{shot.where}: {two}")
+            for path in filter(None, (shot.image, shot.mask)):
+                if not isfile(path):
+                    raise StgaError(f"{path}: does not exist, but {shot.where} names it")
+            views[timestep] = View(timestep, 0, shot.camera, shot.label, shot.image, shot.mask)
+        cameras.append(_camera(unique, group[0], ImageFrames(views)))
     return tuple(cameras)
 
 
 def _pose(shot: Shot) -> bytes:
     # Adding zero turns -0 into 0, whose bytes differ.
     return bytes((np.round(shot.camera.world_to_camera, 6) + 0.0).tobytes())
-
-
-def _views(name: str, shots: list[Shot]) -> dict[int, View]:
-    views: dict[int, View] = {}
-    for shot in sorted(shots, key=lambda shot: shot.timestep or 0):
-        timestep = shot.timestep or 0
-        if shot.image is None:
-            raise StgaError(f"{shot.where}: names no image")
-        if timestep in views and views[timestep].image != shot.image:
-            raise StgaError(f"{shot.where}: camera {name} has two images at timestep {timestep}")
-        for path in filter(None, (shot.image, shot.mask)):
-            if not isfile(path):
-                raise StgaError(f"{path}: does not exist, but {shot.where} names it")
-        views[timestep] = View(timestep, 0, shot.camera, shot.label, shot.image, shot.mask)
-    return views

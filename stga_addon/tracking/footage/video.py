@@ -16,17 +16,14 @@ from ...capture.model import View
 from ...errors import StgaError
 
 MIN_HD_LINES = 720  # From here on, videos without a stated color matrix are in that of HD (BT.709)
-
 TIMED_CONTAINERS = ("mov", "matroska")
 """FFmpeg's names of containers that store when each packet is shown."""
 SEEKABLE_CONTAINERS = (*TIMED_CONTAINERS, "mpegts")
 """Containers in which a frame has the same presentation time after a seek as in order."""
 CODECS_WITH_HIDDEN_PACKETS = ("vp8",)
 """Whose reference frames that are not shown are packets of their own."""
-
 DISPLAY_MATRIX_ONE = 1 << 16
 """In the fixed-point numbers of a display matrix (ISO/IEC 14496-12, track header)."""
-
 CHECKED_FRAMES = 8
 """Frames at the beginning of a video that are decoded to check the times of its packets."""
 MAX_FRAMES_AHEAD = 100
