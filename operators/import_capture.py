@@ -9,7 +9,7 @@ import bpy
 
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
-from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, has_transforms
+from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head
@@ -75,7 +75,7 @@ class ImportCapture(Edit, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> None:
         path = file_path(self.filepath or self.directory, "capture")
         inside = [] if path.is_dir() else path.parents[:FOLDERS_ABOVE_FILE]
-        folder = next((parent for parent in inside if has_transforms(parent)), path)
+        folder = next((parent for parent in inside if transforms_files(parent)), path)
         if folder.is_file():
             raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
         point, set_up, correctives = self.principal_point, self.set_up_scene, self.correctives

@@ -16,6 +16,12 @@ MIN_PROJECTION_DEPTH = 1e-6
 # Camera axes: OpenGL and Blender (x right, y up, looks along -z) to OpenCV (x right, y down, looks
 # along +z).
 GL_TO_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+TURNTABLE_S = 6.0
+"""Duration of a turntable, unless the motion is longer."""
+UP = (0.0, 1.0, 0.0)
+"""Captures are y-up."""
+MAX_GAP_RAD = np.radians(100)
+"""Radians without a camera from which on a side counts as unseen."""
 
 
 def is_image_size(width: float, height: float) -> bool:
@@ -115,26 +121,19 @@ def camera_from_gl(
 
 
 def look_at(
-    eye: Sequence[float],
-    target: Sequence[float],
-    width: int,
-    height: int,
-    focal_length: float,
-    up: Sequence[float] = (0.0, 1.0, 0.0),
-) -> Camera:
+    eye: Sequence[float], target: Sequence[float], width: int, height: int, focal_length: float,
+    up: Sequence[float] = UP,
+) -> Camera:  # fmt: skip
     """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the
     image's center.
 
-    width, height, focal_length in pixels. up: the world direction that points up in the image;
-    FLAME's is +y. Raises ValueError where `eye` is at `target`, or `up` is parallel to the viewing
-    direction.
+    width, height, focal_length in pixels. up: the world direction that points up in the image.
+    Raises ValueError where it is parallel to the viewing direction, or that is none.
     """
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     right = np.cross(forward, np.asarray(up, np.float64))
     if not np.linalg.norm(right):
-        raise ValueError(
-            f"look_at needs a viewing direction that is not parallel to up, got {forward} and {up}"
-        )
+        raise ValueError(f"the viewing direction {forward} is parallel to up {up}")
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = right, np.cross(forward, right), forward
@@ -142,21 +141,10 @@ def look_at(
     return Camera(width, height, focal_length, focal_length, width / 2, height / 2, pose)
 
 
-TURNTABLE_S = 6.0
-"""Duration of a turntable, unless the motion is longer."""
-UP = (0.0, 1.0, 0.0)
-"""Captures are y-up."""
-MAX_GAP_RAD = np.radians(100)
-"""Radians without a camera from which on a side counts as unseen."""
-
-
 def turntable(
-    start: Camera,
-    center: np.ndarray,
-    count: int,
-    angles: tuple[float, float],
+    start: Camera, center: np.ndarray, count: int, angles: tuple[float, float],
     up: Sequence[float] = UP,
-) -> list[Camera]:
+) -> list[Camera]:  # fmt: skip
     """`count` cameras that orbit the vertical axis through `center` (3,), from where `start` is.
 
     angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings

@@ -3,7 +3,8 @@
 import io
 import stat
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -34,17 +35,26 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) as displayed. Raises StgaError where it is no image, or too large a one."""
-    try:
-        _require_regular(path)
-        with Image.open(path, formats=FORMATS) as image:
-            width, height = _displayed_size(image)
-    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        width, height = _displayed_size(image)
     if not is_image_size(width, height):
-        raise StgaError(
-            f"{path}: claims {width} x {height} pixels; at most {MAX_IMAGE_PIXELS} are read"
-        )
+        most = f"at most {MAX_IMAGE_PIXELS} are read"
+        raise StgaError(f"{path}: claims {width} x {height} pixels; {most}")
     return width, height
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The image of a file. Raises StgaError for whatever fails while it is open."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe or device may never end
+            raise OSError("not a regular file")
+        with Image.open(path, formats=FORMATS) as image:
+            yield image
+    except FileNotFoundError as error:
+        raise StgaError(f"{path}: does not exist; expected an image") from error
+    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
+        raise StgaError(f"{path}: is not a readable image ({error})") from error
 
 
 def is_plain(path: Path) -> bool:
@@ -114,22 +124,17 @@ def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
 def _decode(path: Path, view: View, kind: str) -> np.ndarray:
     """Pixels (H, W) gray or (H, W, 2 to 4) uint8, the last of an even number of channels alpha."""
     expected = view.camera.width, view.camera.height
-    try:
-        _require_regular(path)
-        with Image.open(path, formats=FORMATS) as image:
-            stored, size = image.size, _displayed_size(image)
-            # before any pixel is unpacked
-            if expected in (stored, size) and is_image_size(*expected):
-                convert = _conversion(image, path) if kind == "image" else None
-                turn = size == expected and _orientation(image) != 1
-                turned = ImageOps.exif_transpose(image) if turn else image
-                return _as_uint8(turned if convert is None else convert(turned))
-    except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
-        raise _unreadable(path, error) from error
+    with _opened(path) as image:
+        stored, size = image.size, _displayed_size(image)
+        # before any pixel is unpacked
+        if expected in (stored, size) and is_image_size(*expected):
+            convert = _conversion(image, path) if kind == "image" else None
+            turn = size == expected and _orientation(image) != 1
+            turned = ImageOps.exif_transpose(image) if turn else image
+            return _as_uint8(turned if convert is None else convert(turned))
     if size == expected:
-        raise StgaError(
-            f"{path}: has {size[0]} x {size[1]} pixels, more than are read ({MAX_IMAGE_PIXELS})"
-        )
+        more = f"more than are read ({MAX_IMAGE_PIXELS})"
+        raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {more}")
     camera = f"the camera of {view.name} has {expected[0]} x {expected[1]}"
     if kind == "mask":
         camera = f"the image {view.image} and its camera have {expected[0]} x {expected[1]}"
@@ -253,15 +258,3 @@ def _transparency(pixels: np.ndarray) -> np.ndarray | None:
     if pixels.ndim == 2 or pixels.shape[2] == 3 or (pixels[..., -1] == 255).all():
         return None
     return pixels[..., -1]
-
-
-def _require_regular(path: Path) -> None:
-    """Raise OSError for a pipe or device, which may never end."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise OSError("not a regular file")
-
-
-def _unreadable(path: Path, error: Exception) -> StgaError:
-    if isinstance(error, FileNotFoundError):
-        return StgaError(f"{path}: does not exist; expected an image")
-    return StgaError(f"{path}: is not a readable image ({error})")

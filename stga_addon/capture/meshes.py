@@ -19,6 +19,13 @@ from .model import Capture
 MAGIC, VERSION, JSON_KIND = b"glTF", 2, b"JSON"
 HEADER_BYTES, CHUNK_HEADER_BYTES = 20, 8
 """The file's header and that of its first chunk; and that of any later chunk."""
+MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+CACHE_BYTES = 8 << 20
+MAX_MESH_BYTES = 512 << 20
+MIN_EXTENT_M = 1e-9
+"""A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
+SELECTED_WEIGHT = 0.5
+"""Least weight of a triangle that belongs to the region."""
 
 
 def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -39,13 +46,6 @@ def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     rest = data[HEADER_BYTES + length :]
     size = struct.unpack_from("<I", rest)[0] if len(rest) >= CHUNK_HEADER_BYTES else 0
     return document, rest[CHUNK_HEADER_BYTES : CHUNK_HEADER_BYTES + size]
-
-
-MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
-CACHE_BYTES = 8 << 20
-MAX_MESH_BYTES = 512 << 20
-MIN_EXTENT_M = 1e-9
-"""A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
 
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -71,15 +71,13 @@ def checked_mesh(
     """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
     triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
     if not triples or not len(faces):
-        raise StgaError(
-            f"{path}: holds no triangles; expected vertices with three coordinates, and triangles"
-        )
+        expected = "expected vertices with three coordinates, and triangles"
+        raise StgaError(f"{path}: holds no triangles; {expected}")
     if not np.isfinite(vertices).all():
         raise StgaError(f"{path}: vertex {np.argwhere(~np.isfinite(vertices))[0, 0]} is not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise StgaError(
-            f"{path}: a triangle names a vertex outside the {len(vertices)} that the file has"
-        )
+        outside = f"a vertex outside the {len(vertices)} that the file has"
+        raise StgaError(f"{path}: a triangle names {outside}")
     vertices = np.array(vertices, np.float64)
     check_extent(str(path), vertices)
     return vertices, np.array(faces, np.int32)
@@ -88,21 +86,17 @@ def checked_mesh(
 def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
     """The same vertices (V, 3). Raises StgaError for a point, and for what lies far away."""
     if not np.abs(vertices).max() <= MAX_COORDINATE_M:  # also where it is not a number
-        raise StgaError(
-            f"{source}: the mesh reaches farther than {MAX_COORDINATE_M:g} m from the origin"
-        )
+        far = f"farther than {MAX_COORDINATE_M:g} m from the origin"
+        raise StgaError(f"{source}: the mesh reaches {far}")
     if np.ptp(vertices, axis=0).max() < MIN_EXTENT_M:
         raise StgaError(f"{source}: all vertices of the mesh lie in one point; expected a head")
     return vertices
 
 
 def tracked_meshes(
-    files: Mapping[int, Path],
-    count: int,
-    faces: np.ndarray,
-    canonical: Path,
+    files: Mapping[int, Path], count: int, faces: np.ndarray, canonical: Path,
     read: Callable[[Path], tuple[np.ndarray, np.ndarray]],
-) -> Callable[[int], np.ndarray]:
+) -> Callable[[int], np.ndarray]:  # fmt: skip
     """timestep -> its vertices (V, 3), parsed when called and cached.
 
     Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file
@@ -113,22 +107,16 @@ def tracked_meshes(
         path = file_of(files, timestep)
         vertices, triangles = read(path)
         if triangles.shape != faces.shape:
-            raise StgaError(
-                f"{path}: has {len(triangles)} triangles, but {canonical} has {len(faces)}; "
-                "the topology must not change"
-            )
-        if not np.array_equal(triangles, faces):
-            different = int(np.argmax((triangles != faces).any(axis=1)))
-            raise StgaError(
-                f"{path}: triangle {different} joins vertices {triangles[different].tolist()}, "
-                f"but {faces[different].tolist()} in {canonical}; the topology must not change"
-            )
-        if len(vertices) != count:
-            raise StgaError(
-                f"{path}: has {len(vertices)} vertices, but {canonical} has {count}; "
-                "the topology must not change"
-            )
-        return vertices
+            other = f"has {len(triangles)} triangles, but {canonical} has {len(faces)}"
+        elif not np.array_equal(triangles, faces):
+            row = int(np.argmax((triangles != faces).any(axis=1)))
+            found, expected = triangles[row].tolist(), faces[row].tolist()
+            other = f"triangle {row} joins vertices {found}, but {expected} in {canonical}"
+        elif len(vertices) != count:
+            other = f"has {len(vertices)} vertices, but {canonical} has {count}"
+        else:
+            return vertices
+        raise StgaError(f"{path}: {other}; the topology must not change")
 
     return cached_meshes(mesh, count)
 
@@ -148,9 +136,8 @@ def cached_meshes(mesh: Callable[[int], np.ndarray], vertices: int) -> Callable[
 def file_of(files: Mapping[int, Path], timestep: int) -> Path:
     """The timestep's file. Raises StgaError where there is none, naming the range there is."""
     if timestep not in files:
-        raise StgaError(
-            f"timestep {timestep} has no tracked mesh; the capture has {min(files)} to {max(files)}"
-        )
+        known = f"the capture has {min(files)} to {max(files)}"
+        raise StgaError(f"timestep {timestep} has no tracked mesh; {known}")
     return files[timestep]
 
 
@@ -166,9 +153,8 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     for name, value in values.items():
         ids = value if isinstance(value, list) else [None]
         if not all(type(index) is int and 0 <= index < vertices for index in ids):
-            raise StgaError(
-                f"{path}: {name}: expected a list of vertex indices from 0 to {vertices - 1}"
-            )
+            expected = f"a list of vertex indices from 0 to {vertices - 1}"
+            raise StgaError(f"{path}: {name}: expected {expected}")
     return {name: faces_within(faces, np.array(value, np.int64)) for name, value in values.items()}
 
 
@@ -176,9 +162,8 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
     try:
         import trimesh
     except ImportError as error:
-        raise StgaError(
-            f"{path}: reading {file_type.upper()} needs the Python package trimesh"
-        ) from error
+        needed = "needs the Python package trimesh"
+        raise StgaError(f"{path}: reading {file_type.upper()} {needed}") from error
     try:
         if file_type == "ply":  # trimesh allocates what the header promises
             header = data[: max(0, data.find(b"end_header"))]
@@ -199,8 +184,8 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.nda
 
 
 def _check_glb(data: bytes) -> None:
-    """trimesh allocates what accessors promise, and follows nodes without end. Raises ValueError
-    where that is more than the file can hold, and where nodes are no trees."""
+    """Raises ValueError where accessors promise more than the file can hold, which trimesh would
+    allocate, and where nodes are no trees, which it would follow without end."""
     document, _ = glb_chunks(data)
     nodes = document.get("nodes", [])
     counts = [accessor["count"] for accessor in document.get("accessors", [])]
@@ -238,12 +223,8 @@ def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
-    """(F, 3) of an OBJ's face lines, polygons as fans; cached, because all files of a sequence have
-    the same lines.
-
-    OBJ counts vertices from 1 up, or backwards from the latest of the `earlier` ones of each line.
-    Raises ValueError.
-    """
+    """(F, 3) of an OBJ's face lines, which all files of a sequence share; polygons as fans. OBJ
+    counts vertices from 1 up, or backwards from the latest of each line's `earlier` ones."""
     corners = [line.split()[1:] for line in text.splitlines()]
     count = np.array([len(words) for words in corners], int)
     if (count < 3).any():
@@ -257,10 +238,6 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     first = np.repeat(np.cumsum(count) - count, fan)
     second = first + 1 + np.arange(fan.sum()) - np.repeat(np.cumsum(fan) - fan, fan)
     return np.asarray(index[np.stack([first, second, second + 1], axis=1)])
-
-
-SELECTED_WEIGHT = 0.5
-"""Least weight of a triangle that belongs to the region."""
 
 
 def is_region_file(name: str) -> bool:
@@ -284,20 +261,16 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
         weights = read_npz(path).get("weights", np.zeros(0, int))
         if weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != shape:
             found = f"{weights.dtype} {weights.shape}" if weights.size else "no such array"
-            raise StgaError(
-                f"{path}: expected 'weights', one number from 0 to 1 per triangle {shape}, "
-                f"found {found}"
-            )
+            expected = f"'weights', one number from 0 to 1 per triangle {shape}"
+            raise StgaError(f"{path}: expected {expected}, found {found}")
         region = np.asarray(weights >= SELECTED_WEIGHT)
     elif path.suffix.lower() == ".json":
         regions = read_regions(path, capture.faces, len(capture.neutral))
         region = np.asarray(np.any([np.zeros(shape, bool), *regions.values()], axis=0))
     else:
         known = ", ".join(dict.fromkeys([*capture.regions, *masks])) or "none"
-        raise StgaError(
-            f"region '{name}': is neither a region of the capture ({known}) nor an .npz or .json "
-            "file"
-        )
+        neither = f"is neither a region of the capture ({known}) nor an .npz or .json file"
+        raise StgaError(f"region '{name}': {neither}")
     if not region.any():
         raise StgaError(f"region '{name}': holds no triangle")
     return region

@@ -17,6 +17,14 @@ Item = TypeVar("Item")
 
 FPS_LIMIT = 1000.0
 """Frame rates are below it."""
+RATE_TOLERANCE = 0.01
+"""Relative difference up to which the frame rates of takes are the same."""
+MAX_NEUTRAL_DIFFERENCE_M = 1e-4
+"""Between neutral meshes of takes of one head: trackers write rounded shape coefficients."""
+MAX_SCALE_FACTOR = 5.0
+"""Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
+COMPARED = 8
+"""Views, and timesteps, of a take whose scale is looked at."""
 
 
 @dataclass(frozen=True)
@@ -128,24 +136,14 @@ def format_ranges(numbers: Sequence[int]) -> str:
     """Ascending whole numbers as count, ranges and gaps: "5: 0–2, 6–7 (gap 3–5)"."""
     starts = [n for i, n in enumerate(numbers) if i == 0 or numbers[i - 1] != n - 1]
     ends = [n for i, n in enumerate(numbers) if i == len(numbers) - 1 or numbers[i + 1] != n + 1]
-    text = f"{len(numbers)}: " + ", ".join(_span(*pair) for pair in zip(starts, ends, strict=True))
-    gaps = [_span(end + 1, start - 1) for end, start in zip(ends[:-1], starts[1:], strict=True)]
-    return text + (f" ({'gap' if len(gaps) == 1 else 'gaps'} {', '.join(gaps)})" if gaps else "")
 
+    def spans(firsts: Sequence[int], lasts: Sequence[int]) -> str:
+        pairs = zip(firsts, lasts, strict=True)
+        return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in pairs)
 
-def _span(first: int, last: int) -> str:
-    return str(first) if first == last else f"{first}–{last}"
-
-
-MAX_NEUTRAL_DIFFERENCE_M = 1e-4
-"""Between neutral meshes of takes of one head: trackers write rounded shape coefficients."""
-MAX_SCALE_FACTOR = 5.0
-"""Largest ratio of the head's sizes in two takes; another unit makes it 10 or more."""
-COMPARED = 8
-"""Views, and timesteps, of a take whose scale is looked at."""
-
-RATE_TOLERANCE = 0.01
-"""Relative difference up to which the frame rates of takes are the same."""
+    gaps = spans([end + 1 for end in ends[:-1]], [start - 1 for start in starts[1:]])
+    several = "gaps" if len(starts) > 2 else "gap"
+    return f"{len(numbers)}: {spans(starts, ends)}" + (f" ({several} {gaps})" if gaps else "")
 
 
 def join_takes(takes: Sequence[Capture]) -> Capture:
@@ -165,9 +163,9 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
     starts, views = first_timesteps(takes), dict[str, tuple[View, ...]]()
     numbered = list(zip(takes, starts, strict=True))
     for take, start in numbered:
-        free = _first_free_index(take, start, first, views)
-        for split, members in take.views.items():
-            views[split] = (*views.get(split, ()), *_shifted(members, start, first, free))
+        taken = {view.camera_index for members in views.values() for view in members}
+        for split, members in _renumbered(take, start, first, taken).items():
+            views[split] = (*views.get(split, ()), *members)
     timesteps = tuple(start + timestep for take, start in numbered for timestep in take.timesteps)
     flame = [take.flame for take in takes if take.flame is not None]
     frame = _dispatch([each.frame for each in flame], starts)
@@ -198,17 +196,14 @@ def first_timesteps(takes: Sequence[Capture]) -> list[int]:
 
 def require_same_head(first: Capture, other: Capture) -> None:
     """Raise StgaError where `other` has another mesh, or another neutral shape, than `first`."""
+    same = "a take must be of the same head"
     if not np.array_equal(first.faces, other.faces):
-        raise StgaError(
-            f"{other.root}: its mesh has other triangles than {first.root}; "
-            "a take must be of the same head"
-        )
+        raise StgaError(f"{other.root}: its mesh has other triangles than {first.root}; {same}")
     distance = float(np.linalg.norm(first.neutral - other.neutral, axis=1).max())
     if distance > MAX_NEUTRAL_DIFFERENCE_M:
-        raise StgaError(
-            f"{other.root}: its neutral mesh is up to {1000 * distance:.2g} mm from that of "
-            f"{first.root}; a take must be of the same head, tracked with the same shape"
-        )
+        apart = f"up to {1000 * distance:.2g} mm from that of {first.root}"
+        same += ", tracked with the same shape"
+        raise StgaError(f"{other.root}: its neutral mesh is {apart}; {same}")
 
 
 def require_same_scale(first: Capture, other: Capture) -> None:
@@ -221,17 +216,14 @@ def require_same_scale(first: Capture, other: Capture) -> None:
     posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
-        raise StgaError(
-            f"{other.root}: its tracked meshes are {factor:.3g} times as large as the neutral "
-            "mesh; expected meters"
-        )
+        large = f"{factor:.3g} times as large as the neutral mesh; expected meters"
+        raise StgaError(f"{other.root}: its tracked meshes are {large}")
     factor = _share_of_images(first) / _share_of_images(other)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:
         apart = f"{factor:.3g} times smaller" if factor > 1 else f"{1 / factor:.3g} times larger"
-        raise StgaError(
-            f"{other.root}: its head appears {apart} in the images than in those of {first.root}; "
-            "expected cameras and tracking in meters"
-        )
+        apart += f" in the images than in those of {first.root}"
+        expected = "expected cameras and tracking in meters"
+        raise StgaError(f"{other.root}: its head appears {apart}; {expected}")
 
 
 def _extent(vertices: np.ndarray) -> float:
@@ -249,32 +241,28 @@ def _share_of_images(take: Capture) -> float:
     return float(np.median(shares))
 
 
-def _first_free_index(
-    take: Capture, start: int, first: Capture, joined: Mapping[str, Sequence[View]]
-) -> int:
-    """What is added to the indices of a take's own cameras, so that none is that of a camera in
-    `joined`.
-
-    Where possible it counts from the take's start: the identities of runs hold these indices.
-    """
-    taken = {view.camera_index for members in joined.values() for view in members}
-    known = [view.camera_index for members in first.views.values() for view in members]
-    own = [view.camera_index for members in take.views.values() for view in members]
-    free = 1 + start + max(known, default=-1)
-    return 1 + max(taken) if any(free + index in taken for index in own) else free
-
-
-def _shifted(views: Sequence[View], start: int, first: Capture, free: int) -> list[View]:
-    """The views at the joined timesteps; `free`: added to indices that the first take lacks."""
+def _renumbered(
+    take: Capture, start: int, first: Capture, taken: set[int]
+) -> dict[str, tuple[View, ...]]:
+    """The views at the joined timesteps. Their cameras keep an index under which the first take has
+    the same; others are counted from the take's start, as the identities of runs hold them, or
+    above all that are `taken`."""
+    if start == 0:
+        return dict(take.views)
     known = [view for members in first.views.values() for view in members]
     poses = {view.camera_index: view.camera.world_to_camera for view in known}
-    shifted = []
-    for view in views:
-        pose, own = poses.get(view.camera_index), view.camera.world_to_camera
-        same = pose is not None and np.allclose(pose, own, atol=1e-6)
-        index = view.camera_index if start == 0 or same else free + view.camera_index
-        shifted.append(replace(view, timestep=start + view.timestep, camera_index=index))
-    return shifted
+    own = {view.camera_index for members in take.views.values() for view in members}
+    free = 1 + start + max(poses, default=-1)
+    if any(free + index in taken for index in own):
+        free = 1 + max(taken)
+
+    def moved(view: View) -> View:
+        pose, index = poses.get(view.camera_index), free + view.camera_index
+        if pose is not None and np.allclose(pose, view.camera.world_to_camera, atol=1e-6):
+            index = view.camera_index
+        return replace(view, timestep=start + view.timestep, camera_index=index)
+
+    return {split: tuple(map(moved, members)) for split, members in take.views.items()}
 
 
 def _dispatch(

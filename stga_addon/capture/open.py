@@ -25,17 +25,8 @@ from ..flame.sequence import (
     sequence_mesh,
 )
 from ..flame.teeth import flame_model
+from . import meshes
 from .mesh_geometry import without_head_motion
-from .meshes import (
-    MESH_SUFFIXES,
-    cached_meshes,
-    check_extent,
-    checked_mesh,
-    file_of,
-    read_mesh,
-    read_regions,
-    tracked_meshes,
-)
 from .model import Capture, View, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
@@ -43,17 +34,21 @@ from .transforms import (
     SPLITS,
     Frame,
     Transforms,
-    has_transforms,
     read_splits,
     tracked_files,
+    transforms_files,
     with_principal_point,
 )
 
 MIN_HEAD_EXTENT_M, TYPICAL_HEAD_EXTENT_M, MAX_HEAD_EXTENT_M = 0.05, 0.3, 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
-
 MAX_COMPARED_VIEWS = 4
 MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
+CANONICAL_NAME, PARAMETERS = "canonical_flame_param.npz", "flame_param"
+OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
+"""Names of a FLAME model file in the folder of a capture, which is used where none is given."""
+BUNDLED_MODEL = "bundled_head.npz"
+"""Copy of the head model of this package in the folder of a capture that was tracked with it."""
 
 
 def open_capture(
@@ -71,10 +66,8 @@ def open_capture(
     any image, mask or tracked file that is missing.
     """
     if principal_point not in PRINCIPAL_POINTS:
-        raise StgaError(
-            f"principal point convention {shorten(principal_point)} is not one of "
-            f"{', '.join(PRINCIPAL_POINTS)}"
-        )
+        one = f"is not one of {', '.join(PRINCIPAL_POINTS)}"
+        raise StgaError(f"principal point convention {shorten(principal_point)} {one}")
     if folder.suffix.lower() == ".npz" and isfile(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
@@ -84,7 +77,7 @@ def open_capture(
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root, transforms = folder.resolve(), Transforms({}, None, None)
-    if has_transforms(root):
+    if transforms_files(root):
         transforms = read_splits(root, principal_point)
     # A missing file is reported now rather than an hour into the training.
     seen, keys = set[Path](), ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
@@ -112,35 +105,30 @@ def open_capture(
 
 def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capture:
     frames, given = transforms.frames, transforms.splits
-    views = {split: tuple(frame.view for frame in own) for split, own in given.items()}
+    paths = [] if given else sorted(root.iterdir())
+    bare = [p for p in paths if p.suffix.lower() in meshes.MESH_SUFFIXES and p.is_file()]
     if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
-        return _open_flame_capture(root, transforms, views, flame)
+        return _open_flame_capture(root, transforms, flame)
     if any(frame.mesh for frame in frames):
-        files = tracked_files(frames, "mesh")
-        canonical, regions = transforms.canonical_mesh, transforms.regions
-        return _mesh_capture(root, "mesh", files, canonical, views, regions)
+        return _mesh_capture(root, "mesh", tracked_files(frames, "mesh"), transforms)
     if any((root / "meshes").glob("mesh_*.json")):
-        return _open_release(root, views)
-    if not given and mesh_files(root):
-        return _open_mesh_folder(root)
+        return _open_release(root, transforms)
+    if bare:
+        return _open_mesh_folder(root, bare)
     if not given and (root / PARAMETERS).is_dir():
-        return _open_flame_capture(root, transforms, views, flame)
+        return _open_flame_capture(root, transforms, flame)
+    expected = f"transforms_{'|'.join(SPLITS)}.json, transforms.json or meshes"
     if given:
         expected = "a frame with flame_param_path or mesh_path in the transforms"
-    else:
-        expected = f"transforms_{'|'.join(SPLITS)}.json, transforms.json or meshes"
     raise StgaError(f"{root}: is not a capture; expected {expected}")
 
 
 def _principal_point_warning(
     frames: Sequence[Frame], mesh: Callable[[int], np.ndarray], chosen: str
 ) -> str | None:
-    """A warning where another convention puts clearly more of the mesh inside the masks.
-
-    A few views are checked in which the conventions differ. Only vertices outside of a mask count:
-    hair and shoulders lie inside the mask but beside the mesh. Nothing is checked without Pillow,
-    which Blender lacks. Raises StgaError where a mask cannot be read.
-    """
+    """A warning where another convention puts clearly more of the mesh inside the masks of a few
+    views. Vertices outside count: hair lies inside the mask but beside the mesh. None without
+    Pillow, which Blender lacks."""
     if find_spec("PIL") is None:
         return None
     from .images import read_mask
@@ -175,66 +163,51 @@ def _principal_point_warning(
     )
 
 
-def _open_mesh_folder(root: Path) -> Capture:
+def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
 
     Timesteps are the numbers at the end of the names, or the alphabetical order where a name has
     none. A mesh called `neutral` or `canonical` is the canonical one, and `regions.json` the
-    regions file. Raises StgaError.
+    regions file.
     """
-    meshes, regions = mesh_files(root), root / "regions.json"
-    names = ("neutral", "canonical")
-    canonical = next((path for path in meshes if path.stem.lower() in names), None)
-    tracked = [path for path in meshes if path != canonical]
+    names, regions = ("neutral", "canonical"), root / "regions.json"
+    canonical = next((path for path in listed if path.stem.lower() in names), None)
+    tracked = [path for path in listed if path != canonical]
     if not tracked:
-        raise StgaError(
-            f"{root}: holds no tracked mesh besides {canonical}; expected one file per timestep"
-        )
+        expected = f"holds no tracked mesh besides {canonical}; expected one file per timestep"
+        raise StgaError(f"{root}: {expected}")
     numbers = [re.search(r"(\d+)$", path.stem, re.ASCII) for path in tracked]
     numbered = {int(match[1]): path for match, path in zip(numbers, tracked, strict=True) if match}
     files = dict(sorted(numbered.items()))
     files = files if len(files) == len(tracked) else dict(enumerate(tracked))
-    return _mesh_capture(root, "mesh", files, canonical, {}, regions if regions.is_file() else None)
-
-
-def mesh_files(folder: Path) -> list[Path]:
-    """The meshes directly in a folder, by name."""
-    files = (path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
-    return sorted(path for path in files if path.is_file())
+    whole = Transforms({}, canonical, regions if regions.is_file() else None)
+    return _mesh_capture(root, "mesh", files, whole)
 
 
 def _mesh_capture(
-    root: Path,
-    layout: str,
-    files: dict[int, Path],
-    canonical: Path | None,
-    views: Mapping[str, tuple[View, ...]],
-    regions_file: Path | None = None,
-    read: Callable[[Path], tuple[np.ndarray, np.ndarray]] = read_mesh,
-) -> Capture:
-    warnings = []
+    root: Path, layout: str, files: dict[int, Path], transforms: Transforms,
+    read: Callable[[Path], tuple[np.ndarray, np.ndarray]] = meshes.read_mesh,
+) -> Capture:  # fmt: skip
+    warnings, canonical, regions_file = [], transforms.canonical_mesh, transforms.regions
     if canonical is None:
         canonical = files[min(files)]
-        warnings.append(
-            f"no canonical mesh is given: {canonical.name}, the first timestep, is the neutral mesh"
-        )
+        first = f"{canonical.name}, the first timestep, is the neutral mesh"
+        warnings.append(f"no canonical mesh is given: {first}")
     neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
-        warnings.append(
-            "STL has no shared vertices: of the topology, only the number of triangles can be "
-            "checked"
-        )
-    regions = {} if regions_file is None else read_regions(regions_file, faces, len(neutral))
+        checked = "of the topology, only the number of triangles can be checked"
+        warnings.append(f"STL has no shared vertices: {checked}")
+    regions = {} if regions_file is None else meshes.read_regions(regions_file, faces, len(neutral))
     empty = [name for name, members in regions.items() if not members.any()]
     if empty:
         warnings.append(f"{regions_file}: no triangle lies in {', '.join(empty)}")
-    mesh = tracked_meshes(files, len(neutral), faces, canonical, read)
+    mesh = meshes.tracked_meshes(files, len(neutral), faces, canonical, read)
     return Capture(
         root=root,
         layout=layout,
         faces=faces,
         neutral=neutral,
-        views=views,
+        views=transforms.views,
         timesteps=tuple(files),
         regions=regions,
         mesh=mesh,
@@ -243,21 +216,16 @@ def _mesh_capture(
     )
 
 
-def _open_release(root: Path, views: Mapping[str, tuple[View, ...]]) -> Capture:
+def _open_release(root: Path, transforms: Transforms) -> Capture:
     """Capture of layout "release": `meshes/mesh_%04d.json` and `training_faces/%04d.npy` by
-    `keyframe`.
-
-    The layout names neither a neutral mesh nor regions. Raises StgaError naming the file and the
-    field.
-    """
-    timesteps = sorted({view.timestep for split in views.values() for view in split})
+    `keyframe`; without a neutral mesh and regions."""
+    timesteps = sorted({frame.view.timestep for frame in transforms.frames})
     files = {timestep: root / "meshes" / f"mesh_{timestep:04d}.json" for timestep in timesteps}
     if not files:
-        raise StgaError(
-            f"{root}: its transforms hold no frame; "
-            f"expected a keyframe for each mesh in {root / 'meshes'}"
-        )
-    capture = _mesh_capture(root, "release", files, None, views, read=read_soup)
+        expected = f"expected a keyframe for each mesh in {root / 'meshes'}"
+        raise StgaError(f"{root}: its transforms hold no frame; {expected}")
+    bare = replace(transforms, canonical_mesh=None, regions=None)
+    capture = _mesh_capture(root, "release", files, bare, read_soup)
     chosen = {t: root / "training_faces" / f"{t:04d}.npy" for t in timesteps}
     listed = {t: path for t, path in chosen.items() if path.is_file()}
     selection = {t: read_face_ids(path, len(capture.faces)) for t, path in listed.items()}
@@ -273,16 +241,13 @@ def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
     document = read_json(path)
     try:
         corners = np.array([triangle["Vertices"] for triangle in document["triangles"]], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise StgaError(
-            f"{path}: triangles: expected a list of objects with Vertices, three points each"
-        ) from error
+    except (KeyError, TypeError, ValueError, OverflowError):
+        corners = np.zeros(0)
     if corners.ndim != 3 or corners.shape[1:] != (3, 3):
-        raise StgaError(
-            f"{path}: triangles: expected three Vertices with three coordinates each in every "
-            "triangle"
-        )
-    return checked_mesh(path, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+        points = "three Vertices with three coordinates each"
+        raise StgaError(f"{path}: triangles: expected a list of objects with {points}")
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    return meshes.checked_mesh(path, corners.reshape(-1, 3), faces)
 
 
 def read_face_ids(path: Path, faces: int) -> np.ndarray:
@@ -292,36 +257,17 @@ def read_face_ids(path: Path, faces: int) -> np.ndarray:
     if ids.dtype.kind not in "iu" or ids.ndim != 1:
         raise StgaError(f"{path}: expected a list of triangle numbers")
     if ids.size and not 0 <= int(ids.min()) <= int(ids.max()) < faces:
-        raise StgaError(
-            f"{path}: names triangles {ids.min()} to {ids.max()}, but the mesh has 0 to {faces - 1}"
-        )
+        named = f"names triangles {ids.min()} to {ids.max()}"
+        raise StgaError(f"{path}: {named}, but the mesh has 0 to {faces - 1}")
     selected = np.zeros(faces, bool)
     selected[ids] = True
     return selected
 
 
-CANONICAL_NAME = "canonical_flame_param.npz"
-PARAMETERS = "flame_param"
-OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
-"""Names of a FLAME model file in the folder of a capture, which is used where none is given."""
-BUNDLED_MODEL = "bundled_head.npz"
-"""Copy of the head model of this package in the folder of a capture that was tracked with it."""
-
-
-def _open_flame_capture(
-    root: Path,
-    transforms: Transforms,
-    views: Mapping[str, tuple[View, ...]],
-    model_file: Path | None,
-) -> Capture:
+def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | None) -> Capture:
     """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by
-    timestep.
-
-    A model with FLAME's published 5023 vertices gets teeth, because VHAP and GaussianAvatars use
-    them; a model of any other size is used as it is. Shape and static offset come from the first
-    timestep. Raises StgaError, also where no model file is given, and none lies in the folder
-    (OWN_MODELS): FLAME's license forbids passing it on.
-    """
+    timestep; shape and static offset come from the first. A model with FLAME's published 5023
+    vertices gets teeth, because VHAP and GaussianAvatars use them."""
     model_file = _model_file(root, model_file)
     model = flame_model(model_file)
     frames, folder = transforms.frames, root / PARAMETERS
@@ -334,17 +280,15 @@ def _open_flame_capture(
         listed = [p for p in folder.glob("*.npz") if re.fullmatch(r"\d+", p.stem, re.ASCII)]
         files = dict(sorted((int(path.stem), path) for path in listed))
     if not files:
-        raise StgaError(
-            f"{folder}: holds no parameters; expected one .npz per timestep, such as 00000.npz"
-        )
-    first = files[min(files)]
-    shape, static_offset = read_identity(first, model)
+        expected = "expected one .npz per timestep, such as 00000.npz"
+        raise StgaError(f"{folder}: holds no parameters; {expected}")
+    shape, static_offset = read_identity(files[min(files)], model)
 
     def frame(timestep: int) -> FlameFrame:
-        return read_frame(file_of(files, timestep), model)
+        return read_frame(meshes.file_of(files, timestep), model)
 
     sequence = FlameSequence(model, shape, static_offset, tuple(files), frame)
-    return sequence_capture(root, sequence, model_file, views)
+    return sequence_capture(root, sequence, model_file, transforms.views)
 
 
 def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
@@ -353,28 +297,22 @@ def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
 
 
 def sequence_capture(
-    root: Path,
-    sequence: FlameSequence,
-    model_file: Path | None,
+    root: Path, sequence: FlameSequence, model_file: Path | None,
     views: Mapping[str, tuple[View, ...]],
-) -> Capture:
+) -> Capture:  # fmt: skip
     """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
-    model = sequence.model
-    regions = key_regions(model)
-    missing = (
-        "the FLAME model has no vertex masks (FLAME_masks.pkl beside it): "
-        "triangles are selected one by one"
-    )
+    model, regions = sequence.model, key_regions(sequence.model)
+    missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it)"
     return Capture(
         root=root,
         layout="flame",
         faces=model.faces,
-        neutral=check_extent(f"{root}: neutral mesh", neutral_mesh(sequence)),
+        neutral=meshes.check_extent(f"{root}: neutral mesh", neutral_mesh(sequence)),
         views=views,
         timesteps=sequence.timesteps,
         regions=regions,
         flame_file=model_file,
-        warnings=() if regions else (missing,),
+        warnings=() if regions else (f"{missing}: triangles are selected one by one",),
         **_posed(root, sequence),
     )
 
@@ -383,17 +321,19 @@ def _posed(root: Path, sequence: FlameSequence) -> dict[str, Any]:
     """The fields of a capture that depend on its motion."""
 
     def mesh(timestep: int) -> np.ndarray:
-        return check_extent(f"{root}: timestep {timestep}", sequence_mesh(sequence, timestep))
+        vertices = sequence_mesh(sequence, timestep)
+        return meshes.check_extent(f"{root}: timestep {timestep}", vertices)
 
     return {
-        "mesh": cached_meshes(mesh, len(sequence.model.v_template)),
+        "mesh": meshes.cached_meshes(mesh, len(sequence.model.v_template)),
         "expression_mesh": partial(expression_mesh, sequence),
         "flame": sequence,
     }
 
 
 def _model_file(root: Path, given: Path | None) -> Path:
-    """The capture's bundled head, else the given FLAME model file, else the one in its folder."""
+    """The capture's bundled head, else the given FLAME model file, else the one in its folder.
+    Raises StgaError where there is none: FLAME's license forbids passing it on."""
     if (root / BUNDLED_MODEL).is_file():
         return root / BUNDLED_MODEL
     beside = (root / name for name in OWN_MODELS)

@@ -18,6 +18,7 @@ from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, 
 from .model import FPS_LIMIT, Item, View
 
 SPLITS = ("train", "val", "test")
+WHOLE_FILE, SPLIT_FILES = "transforms.json", {s: f"transforms_{s}.json" for s in SPLITS}
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
 DEFAULT_PRINCIPAL_POINT = PRINCIPAL_POINTS[0]
 ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
@@ -72,10 +73,15 @@ class Transforms:
     def frames(self) -> tuple[Frame, ...]:
         return tuple(frame for split in self.splits.values() for frame in split)
 
+    @property
+    def views(self) -> dict[str, tuple[View, ...]]:
+        return {split: tuple(frame.view for frame in own) for split, own in self.splits.items()}
 
-def has_transforms(folder: Path) -> bool:
-    """Whether the folder holds a transforms file of any split."""
-    return any((folder / name).is_file() for name in ("transforms.json", *map(_split_file, SPLITS)))
+
+def transforms_files(folder: Path) -> list[Path]:
+    """The folder's transforms files: the whole one, and those of splits."""
+    files = (folder / name for name in (WHOLE_FILE, *SPLIT_FILES.values()))
+    return [path for path in files if path.is_file()]
 
 
 def read_transforms(
@@ -100,30 +106,23 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
 
     Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
     """
-    names = {split: _split_file(split) for split in SPLITS}
-    names = {split: name for split, name in names.items() if (folder / name).is_file()}
-    documents = {}
-    for split, name in (names or {"train": "transforms.json"}).items():
-        values = read_json(folder / name)
-        if not isinstance(values, dict):
-            raise StgaError(f"{folder / name}: expected a JSON object with the field frames")
-        documents[split] = _Record(folder / name, folder.resolve(), "", values)
-    records = documents.values()
-    frames = {
-        split: _read_frames(record.path, record.values, principal_point)
-        for split, record in documents.items()
-    }
-    rates = [frame_rate(record.path, record.values) for record in records]
+    names = {split: name for split, name in SPLIT_FILES.items() if (folder / name).is_file()}
+    frames, meshes, regions, rates = dict[str, list[Frame]](), [], [], []
+    for split, name in (names or {"train": WHOLE_FILE}).items():
+        path, values = folder / name, read_json(folder / name)
+        frames[split] = _read_frames(path, values, principal_point)
+        record = _Record(path, folder.resolve(), "", values)
+        meshes.append(record.path_of("canonical_mesh_path"))
+        regions.append(record.path_of("regions_path"))
+        rates.append(frame_rate(path, values))
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
     counts = {split: len(frames.get(split, ())) for split in SPLITS}
     splits = {split: tuple(itertools.islice(numbered, n)) for split, n in counts.items()}
-    meshes = [record.path_of("canonical_mesh_path") for record in records]
-    regions = [record.path_of("regions_path") for record in records]
-    return Transforms(splits, _first(meshes), _first(regions), _first(rates))
 
+    def first(values: list[Item | None]) -> Item | None:
+        return next((value for value in values if value is not None), None)
 
-def _first(values: Iterable[Item | None]) -> Item | None:
-    return next((value for value in values if value is not None), None)
+    return Transforms(splits, first(meshes), first(regions), first(rates))
 
 
 def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
@@ -134,10 +133,6 @@ def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
     """The camera with the principal point that the file's (cx, cy) mean (`read_transforms`)."""
-    if convention not in PRINCIPAL_POINTS:
-        raise StgaError(
-            f"principal point convention {convention!r} is not one of {', '.join(PRINCIPAL_POINTS)}"
-        )
     if convention == "center":
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2)
     cx, cy = written
@@ -154,14 +149,11 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
     for frame in frames:
         path, timestep = getattr(frame, field), frame.view.timestep
         if path is None:
-            raise StgaError(
-                f"{frame.where}.{key}: is missing; expected the tracked file of timestep {timestep}"
-            )
+            expected = f"expected the tracked file of timestep {timestep}"
+            raise StgaError(f"{frame.where}.{key}: is missing; {expected}")
         if files.setdefault(timestep, path) != path:
-            raise StgaError(
-                f"{frame.where}.{key}: is {path}, "
-                f"but timestep {timestep} already has {files[timestep]}"
-            )
+            other = f"timestep {timestep} already has {files[timestep]}"
+            raise StgaError(f"{frame.where}.{key}: is {path}, but {other}")
     return dict(sorted(files.items()))
 
 
@@ -229,10 +221,6 @@ class _Record:
         return inside(self.folder, value, self.where(key))
 
 
-def _split_file(split: str) -> str:
-    return f"transforms_{split}.json"
-
-
 def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
@@ -244,47 +232,33 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         record = replace(shared, place=f"frames[{number}].", values=entry)
-        frames.append(_frame(record, shared, timed, principal_point, cameras))
+        image, where = record.path_of("file_path"), record.where
+        if image is None:
+            raise StgaError(f"{where('file_path')}: is missing; expected the path of the image")
+        if not image.suffix:  # as Blender's NeRF exporters write it
+            image = image.with_name(image.name + ".png")
+        key = _timestep_key(entry)
+        if timed and key is None:
+            raise StgaError(f"{where('timestep_index')}: is missing, though other frames have it")
+        size = width, height = _image_size(record, shared, image)
+        written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
+        focal = _focal(record, shared, width, height)
+        try:
+            matrix = np.array(entry["transform_matrix"], np.float64)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise StgaError(f"{where('transform_matrix')}: expected {MATRIX}") from error
+        known = matrix.tobytes(), *size, *focal, *written  # most frames share a camera
+        if known not in cameras:
+            camera = camera_from_gl(_pose(record, matrix), *size, *focal, *written)
+            cameras[known] = with_principal_point(camera, written, principal_point)
+        timestep = record.natural(key) if key else 0
+        index = record.natural("camera_index") if record.has("camera_index") else -1
+        name = entry["file_path"].replace("\\", "/")  # files are named after views
+        view = View(timestep, index, cameras[known], name, image, record.path_of("fg_mask_path"))
+        camera_id = str(entry["camera_id"]) if record.has("camera_id") else None
+        mesh, flame = record.path_of("mesh_path"), record.path_of("flame_param_path")
+        frames.append(Frame(view, written, camera_id, mesh, flame, where("").rstrip(".")))
     return frames
-
-
-def _frame(
-    record: _Record,
-    shared: _Record,
-    timed: bool,
-    principal_point: str,
-    cameras: dict[tuple[bytes | float, ...], Camera],
-) -> Frame:
-    """cameras: those of earlier frames by their numbers in the file; most frames share theirs."""
-    image = record.path_of("file_path")
-    if image is None:
-        raise StgaError(f"{record.where('file_path')}: is missing; expected the path of the image")
-    if not image.suffix:  # as Blender's NeRF exporters write it
-        image = image.with_name(image.name + ".png")
-    key = _timestep_key(record.values)
-    if timed and key is None:
-        raise StgaError(
-            f"{record.where('timestep_index')}: is missing, though other frames have it"
-        )
-    size = width, height = _image_size(record, shared, image)
-    written = _principal(record, shared, "cx", width), _principal(record, shared, "cy", height)
-    focal = _focal(record, shared, width, height)
-    try:
-        matrix = np.array(record.values["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise StgaError(f"{record.where('transform_matrix')}: expected {MATRIX}") from error
-    known = matrix.tobytes(), *size, *focal, *written
-    if known not in cameras:
-        camera = camera_from_gl(_pose(record, matrix), *size, *focal, *written)
-        cameras[known] = with_principal_point(camera, written, principal_point)
-    timestep = record.natural(key) if key else 0
-    index = record.natural("camera_index") if record.has("camera_index") else -1
-    name = record.values["file_path"].replace("\\", "/")  # files are named after views
-    mask = record.path_of("fg_mask_path")
-    view = View(timestep, index, cameras[known], name, image, mask)
-    camera_id = str(record.values["camera_id"]) if record.has("camera_id") else None
-    mesh, flame = record.path_of("mesh_path"), record.path_of("flame_param_path")
-    return Frame(view, written, camera_id, mesh, flame, record.where("").rstrip("."))
 
 
 def _timestep_key(values: dict[str, Any]) -> str | None:
@@ -305,18 +279,15 @@ def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
         if not isfile(image):
-            raise StgaError(
-                f"{record.where('w')}: w and h are missing, "
-                f"and so is the image {image} to take them from"
-            )
+            missing = f"w and h are missing, and so is the image {image} to take them from"
+            raise StgaError(f"{record.where('w')}: {missing}")
         from .images import image_size
 
         return image_size(image)
     width, height = source.number("w", low=0), source.number("h", low=0)
     if not is_image_size(width, height):
-        raise StgaError(
-            f"{source.where('w')}: expected an image size in pixels, not {width:g} x {height:g}"
-        )
+        expected = f"expected an image size in pixels, not {width:g} x {height:g}"
+        raise StgaError(f"{source.where('w')}: {expected}")
     return int(width), int(height)
 
 
@@ -337,9 +308,8 @@ def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[f
         fl_y = of_angle("camera_angle_y", height)
     for name, value in (("fl_x", fl_x), ("fl_y", fl_y)):
         if not 1 <= value <= MAX_FOCAL_PIXELS:
-            raise StgaError(
-                f"{record.where(name)}: expected a focal length of 1 to 1e7 pixels, not {value:g}"
-            )
+            expected = f"expected a focal length of 1 to 1e7 pixels, not {value:g}"
+            raise StgaError(f"{record.where(name)}: {expected}")
     return fl_x, fl_y
 
 
@@ -349,16 +319,13 @@ def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
     if not finite or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     if np.abs(matrix).max() > MAX_COORDINATE_M:
-        raise StgaError(
-            f"{where}: the camera lies farther than {MAX_COORDINATE_M:g} from the origin"
-        )
+        far = f"farther than {MAX_COORDINATE_M:g} from the origin"
+        raise StgaError(f"{where}: the camera lies {far}")
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
-        raise StgaError(
-            f"{where}: expected a rotation without scale, shear or mirroring in its upper left "
-            "3x3 part"
-        )
+        expected = "a rotation without scale, shear or mirroring in its upper left 3x3 part"
+        raise StgaError(f"{where}: expected {expected}")
     return matrix
 
 

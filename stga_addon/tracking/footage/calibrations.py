@@ -14,14 +14,20 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ...capture.camera import GL_TO_CV, MAX_FOCAL_PIXELS
-from ...capture.transforms import MAX_NUMBER, SPLITS, frame_rate, inside, read_transforms
+from ...capture.transforms import (
+    MAX_NUMBER,
+    WHOLE_FILE,
+    frame_rate,
+    inside,
+    read_transforms,
+    transforms_files,
+)
 from ...errors import StgaError, shorten
 from ...files import read_json
 from ...flame.forward import axis_angle_matrices
 from .colmap import find_colmap, read_colmap
 from .shots import Lens, Shot, numbers, pinhole, read_text, read_xml
 
-TRANSFORMS = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
 EXPECTED = (
     "transforms.json, a COLMAP model (sparse/0), Metashape's cameras.xml, "
     "RealityCapture's CSV or XMP files"
@@ -47,10 +53,9 @@ def find_calibration(root: Path) -> Path | None:
 
     A folder stands for transforms_train.json and its like, for a COLMAP model or for XMP files.
     """
-    if (root / TRANSFORMS[0]).is_file():
-        return root / TRANSFORMS[0]
-    if any((root / name).is_file() for name in TRANSFORMS):
-        return root
+    listed = transforms_files(root)
+    if listed:
+        return listed[0] if listed[0].name == WHOLE_FILE else root
     colmap = find_colmap(root)
     if colmap is not None:
         return colmap
@@ -74,7 +79,7 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
     that names file and field.
     """
     suffix, without_pose = path.suffix.lower(), list[str]()
-    splits = [path / name for name in TRANSFORMS if (path / name).is_file()]
+    splits = transforms_files(path)
     colmap = find_colmap(path if isdir(path) else path.parent)
     if splits:
         shots = [shot for name in splits for shot in read_nerfstudio(name)]
