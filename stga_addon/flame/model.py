@@ -77,12 +77,10 @@ def read_flame(path: Path) -> FlameModel:
 
     Vertex masks come from an npz model's own `masks/<region>` entries, else from FLAME_masks.pkl
     beside the model where there is one. Any sizes that agree with each other are accepted. An npz
-    may name its
-    expressions (`expression_names`), have `shape_steps` in place of shapedirs, and no posedirs.
-    Raises StgaError naming the file and key that is missing, of the wrong shape or not finite, and
-    any class in a pickle that is not an array.
+    may name its expressions (`expression_names`), have `shape_steps` in place of shapedirs, and no
+    posedirs. Raises StgaError naming the file and key that is missing, of the wrong shape or not
+    finite, and any class in a pickle that is not an array.
     """
-    path = Path(path)
     if path.suffix.lower() == ".npz":
         arrays = dict(read_npz(path))
         if "shape_steps" in arrays and "v_template" in arrays:
@@ -101,39 +99,43 @@ def read_flame(path: Path) -> FlameModel:
     components = shapedirs.shape[2]
     n_identity = FULL_IDENTITY if components == FULL_COMPONENTS else components * 3 // 4
     if components != FULL_COMPONENTS and "n_identity" in arrays:
-        given = _integers(path, "n_identity", arrays["n_identity"])
-        if given.size != 1 or not 0 <= int(given.reshape(())) <= components:
+        given = _integers(path, "n_identity", arrays["n_identity"]).ravel().tolist()
+        if len(given) != 1 or not 0 <= given[0] <= components:
             expected = f"one number from 0 to {components}"
-            raise StgaError(f"{path}: n_identity is {given.tolist()}, expected {expected}")
-        n_identity = int(given.reshape(()))
+            raise StgaError(f"{path}: n_identity is {given}, expected {expected}")
+        n_identity = given[0]
     posedirs = _floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES))
     regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), vertices))
     _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
     parents = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
     parents[0] = -1  # the published files write the root's parent as 2**32 - 1
     if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
-        raise StgaError(
-            f"{path}: kintree_table names the parents {parents.tolist()}, "
-            "expected each before its child"
-        )
+        wrong = f"names the parents {parents.tolist()}, expected each before its child"
+        raise StgaError(f"{path}: kintree_table {wrong}")
     weights = _floats(path, arrays, "weights", (vertices, len(JOINTS)))
     _check_shape(path, "f", arrays["f"], (None, 3))
     faces = _integers(path, "f", arrays["f"]).astype(np.int64)
     if faces.min() < 0 or faces.max() >= vertices:
-        raise StgaError(
-            f"{path}: f names vertices {faces.min()} to {faces.max()}, expected 0 to {vertices - 1}"
-        )
-    masks, names = _masks(path, arrays, vertices), arrays.get(EXPRESSION_NAMES)
+        expected = f"expected 0 to {vertices - 1}"
+        raise StgaError(f"{path}: f names vertices {faces.min()} to {faces.max()}, {expected}")
     count = components - n_identity
-    if names is not None and (
-        names.dtype.kind != "U" or names.shape != (count,) or len(set(names.tolist())) != count
-    ):
-        raise StgaError(
-            f"{path}: expression_names: expected {count} different names, one per expression"
-        )
-    named, faces = () if names is None else tuple(names.tolist()), faces.astype(np.int32)
-    skeleton = posedirs, regressor, parents, weights
-    return FlameModel(template, shapedirs, n_identity, *skeleton, faces, masks, named)
+    names = arrays.get(EXPRESSION_NAMES, np.zeros(0, "U1"))
+    named = names.dtype.kind == "U" and len(set(names.ravel().tolist())) == count
+    if EXPRESSION_NAMES in arrays and not (named and names.shape == (count,)):
+        expected = f"expected {count} different names, one per expression"
+        raise StgaError(f"{path}: {EXPRESSION_NAMES}: {expected}")
+    return FlameModel(
+        v_template=template,
+        shapedirs=shapedirs,
+        n_identity=n_identity,
+        posedirs=posedirs,
+        j_regressor=regressor,
+        parents=parents,
+        weights=weights,
+        faces=faces.astype(np.int32),
+        masks=_masks(path, arrays, vertices),
+        expression_names=tuple(names.tolist()),
+    )
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | None, ...]) -> None:
@@ -175,9 +177,8 @@ def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[
     for name, ids in found.items():
         flat = _integers(source, name, ids).astype(np.int64)
         if flat.ndim != 1 or (flat.size and not 0 <= flat.min() <= flat.max() < vertices):
-            raise StgaError(
-                f"{source}: mask {name} is not a list of vertex ids from 0 to {vertices - 1}"
-            )
+            expected = f"a list of vertex ids from 0 to {vertices - 1}"
+            raise StgaError(f"{source}: mask {name} is not {expected}")
         masks[name] = np.unique(flat)
     return masks
 

@@ -26,8 +26,6 @@ ZERO_POSES = {
     "all": "head motion, jaw and eyes",
 }
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
-COEFFICIENT_FIELDS = ("expr", "shape")
-REQUIRED_FIELDS = ("expr", "rotation", "translation")
 # What trackers other than VHAP call the fields.
 FIELD_ALIASES = {
     "exp": "expr", "expression": "expr", "global_orient": "rotation", "transl": "translation",
@@ -59,10 +57,14 @@ class FlameSequence:
     timesteps: tuple[int, ...]
     frame: Callable[[int], FlameFrame]
 
+    def mesh(self, frame: FlameFrame) -> np.ndarray:
+        """The person's mesh (V, 3) in meters with a frame's parameters."""
+        return flame_forward(self.model, self.shape, frame, self.static_offset)
+
 
 def sequence_mesh(sequence: FlameSequence, timestep: int) -> np.ndarray:
     """The tracked mesh of a timestep in world space: (V, 3) meters."""
-    return _mesh(sequence, sequence.frame(timestep))
+    return sequence.mesh(sequence.frame(timestep))
 
 
 def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> np.ndarray:
@@ -77,12 +79,12 @@ def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> n
     frame = replace(sequence.frame(timestep), rotation=zero, translation=zero, neck_pose=zero)
     if zero_pose == "all":
         frame = replace(frame, jaw_pose=zero, eyes_pose=np.zeros(6))
-    return _mesh(sequence, frame)
+    return sequence.mesh(frame)
 
 
 def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
     """The canonical mesh (V, 3): the person's shape and static offset, everything else zero."""
-    return _mesh(sequence, neutral_frame(sequence.model))
+    return sequence.mesh(neutral_frame(sequence.model))
 
 
 def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np.ndarray:
@@ -116,10 +118,6 @@ def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
     return np.asarray(np.degrees(angles.max(axis=0)))
 
 
-def _mesh(sequence: FlameSequence, frame: FlameFrame) -> np.ndarray:
-    return flame_forward(sequence.model, sequence.shape, frame, sequence.static_offset)
-
-
 def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without
     a leading 1.
@@ -129,7 +127,7 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     naming the file and the field.
     """
     arrays = read_npz(path)
-    for name in REQUIRED_FIELDS:
+    for name in ("expr", "rotation", "translation"):
         if name not in arrays:
             raise StgaError(f"{path}: has no {name}, which a FLAME frame needs")
     return _frame(path, arrays, model)
@@ -180,16 +178,13 @@ def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
         arrays = dict(zip(fields, parts, strict=True)) | arrays
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
     if not moving:
-        raise StgaError(
-            f"{path}: has none of {', '.join(FRAME_FIELDS)}, which a FLAME motion is made of"
-        )
-    count: int | None = None
+        none = f"has none of {', '.join(FRAME_FIELDS)}"
+        raise StgaError(f"{path}: {none}, which a FLAME motion is made of")
+    count = next((len(array) for array in moving.values() if array.ndim), 0)
     for name, array in moving.items():
-        if array.ndim < 2 or len(array) != (count or len(array)) or not len(array):
-            expected = "(timesteps, coefficients)" if count is None else f"{count} timesteps first"
-            raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
-        count = len(array)
-    assert count is not None
+        if array.ndim < 2 or len(array) != count or not count:
+            expected = f"expected ({count or 'timesteps'}, coefficients)"
+            raise StgaError(f"{path}: {name} has shape {array.shape}, {expected}")
     if "shape" in arrays and arrays["shape"].ndim == 2:
         arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
@@ -254,11 +249,11 @@ def _identity(
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
-    if not (np.abs(array.astype(np.float64)) <= MAX_PARAMETER).all():
-        raise StgaError(
-            f"{path}: {name} holds values that are not finite, or beyond {MAX_PARAMETER:g}"
-        )
-    return array.astype(np.float64)
+    array = array.astype(np.float64)
+    if not (np.abs(array) <= MAX_PARAMETER).all():
+        beyond = f"that are not finite, or beyond {MAX_PARAMETER:g}"
+        raise StgaError(f"{path}: {name} holds values {beyond}")
+    return array
 
 
 def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
@@ -268,11 +263,10 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) 
         return vector
     array = _finite(path, name, arrays[name])
     given = array[0] if array.ndim == 2 and len(array) == 1 else array
-    fits = given.size == size or (name in COEFFICIENT_FIELDS and given.size < size)
+    fits = given.size == size or (name in ("expr", "shape") and given.size < size)
     if given.ndim != 1 or not fits:
-        raise StgaError(
-            f"{path}: {name} has shape {array.shape}, expected ({size},) or (1, {size})"
-        )
+        expected = f"expected ({size},) or (1, {size})"
+        raise StgaError(f"{path}: {name} has shape {array.shape}, {expected}")
     vector[: given.size] = given
     return vector
 

@@ -7,8 +7,8 @@ its first corner. Shape, size, place and rigging of the teeth are this project's
 from the mesh.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -45,48 +45,23 @@ MAX_LIP_DISTANCE_M = 0.002
 """Between opposite vertices of closed lips."""
 
 
-@dataclass(frozen=True)
-class _Mouth:
-    """The inside of the mouth from the open end of the throat to the lips.
-
-    rings  vertex ids of each ring of neighbours, from the open end outwards; the last is the
-           foremost of the lips
-    lips   (N,) the last ring in order around the mouth
-    """
-
-    rings: tuple[np.ndarray, ...]
-    lips: np.ndarray
-
-    @property
-    def inside(self) -> np.ndarray:
-        return np.concatenate(self.rings)
-
-
 def flame_model(path: Path | None) -> FlameModel:
     """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head.
     Raises StgaError."""
-    if path is None:
-        return _bundled_head()
+    path = path or BUNDLED_HEAD
     try:
         state, masks = path.stat(), path.parent.stat()  # its masks may lie beside it
     except OSError:  # which reading it names
-        return _read_with_teeth(path)
+        return read_flame(path)
     return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
 
 
-def _read_with_teeth(path: Path) -> FlameModel:
-    model = read_flame(path)
-    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
-
-
-_bundled_head = cache(partial(read_flame, BUNDLED_HEAD))
-
-
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _remembered(path: Path, *state: int) -> FlameModel:
     """The model of a file whose times and size are `state`: every button that needs the head reads
-    it again."""
-    return _read_with_teeth(path)
+    it again, and some the bundled one besides."""
+    model = read_flame(path)
+    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
 
 
 def with_teeth(model: FlameModel) -> FlameModel:
@@ -94,18 +69,14 @@ def with_teeth(model: FlameModel) -> FlameModel:
 
     The upper row follows the neck joint, which turns the head, and the lower row the jaw; both
     follow identity as the inside of the mouth does, neither expression nor pose correctives. Adds
-    the mask "teeth". Raises StgaError for any other topology.
+    the mask "teeth". Raises StgaError for a mesh without an open mouth.
     """
-    if len(model.v_template) != TEMPLATE_VERTICES:
-        raise StgaError(
-            f"teeth: the model has {len(model.v_template)} vertices, "
-            f"expected FLAME's topology of {TEMPLATE_VERTICES}"
-        )
-    mouth = _mouth(model)
-    teeth = _positions(model.v_template, mouth)
+    rings, lips = _mouth(model)
+    inside = np.concatenate(rings)
+    teeth = _positions(model.v_template, rings, lips)
     shapedirs = np.zeros((TEETH_VERTICES, *model.shapedirs.shape[1:]))
-    identity = model.shapedirs[mouth.inside, :, : model.n_identity]
-    shapedirs[:, :, : model.n_identity] = _followed(model.v_template[mouth.inside], identity, teeth)
+    identity = model.shapedirs[inside, :, : model.n_identity]
+    shapedirs[:, :, : model.n_identity] = _followed(model.v_template[inside], identity, teeth)
     weights = np.zeros((TEETH_VERTICES, len(JOINTS)))
     for row, name in enumerate(TEETH_ROWS):
         joint = JOINTS.index("neck" if name.startswith("U") else "jaw")
@@ -138,7 +109,7 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
         distances = np.linalg.norm(at[upper, None] - at[lower], axis=2)
         near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
         return upper[near], lower[distances[near].argmin(axis=1)]
-    lips = _mouth(model).lips
+    _, lips = _mouth(model)
     half = len(lips) // 2
     sides = lips[1:half], lips[:half:-1]
     heights = [model.v_template[side, 1].mean() for side in sides]
@@ -156,18 +127,17 @@ def teeth_faces(first: int) -> np.ndarray:
     return np.array(faces, np.int32).reshape(-1, 3)
 
 
-def _mouth(model: FlameModel) -> _Mouth:
-    """Rings of neighbours from the mesh's foremost hole up to the one that lies foremost."""
+def _mouth(model: FlameModel) -> tuple[list[np.ndarray], np.ndarray]:
+    """Vertex ids of rings of neighbors from the open end of the throat, the mesh's foremost hole,
+    up to the one that lies foremost: the lips; and this one in order around the mouth."""
     faces = model.faces[(model.faces < TEMPLATE_VERTICES).all(axis=1)]
     depth = model.v_template[:, 2]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     # the neck's is farther back
     holes = [hole for hole in _holes(edges) if depth[hole].mean() > depth[faces].mean()]
     if not holes:
-        raise StgaError(
-            "teeth: the FLAME model's mesh has a closed mouth, "
-            "expected one that is open at the throat"
-        )
+        closed = "has a closed mouth, expected one that is open at the throat"
+        raise StgaError(f"teeth: the FLAME model's mesh {closed}")
     rings = [max(holes, key=lambda hole: float(depth[hole].mean()))]
     reached = np.zeros(len(model.v_template), bool)
     for _ in range(MAX_MOUTH_RINGS):
@@ -180,7 +150,7 @@ def _mouth(model: FlameModel) -> _Mouth:
     lips = _ring_order(edges, rings[-1])
     x = model.v_template[lips, 0]  # from the left corner on; the right one is half a ring further
     lips = np.roll(lips, -int((x - np.roll(x, len(lips) // 2)).argmax()))
-    return _Mouth(tuple(rings), lips)
+    return rings, lips
 
 
 def _holes(edges: np.ndarray) -> list[np.ndarray]:
@@ -212,23 +182,21 @@ def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
         ordered.append(min(following))
         left.discard(ordered[-1])
     if left or len(ring) % 2 or any(len(others) != 2 for others in beside.values()):
-        raise StgaError(
-            "teeth: the FLAME model's mesh has no ring of vertices around its lips, "
-            "expected FLAME's mesh"
-        )
+        none = "has no ring of vertices around its lips, expected FLAME's mesh"
+        raise StgaError(f"teeth: the FLAME model's mesh {none}")
     return np.array(ordered)
 
 
-def _positions(vertices: np.ndarray, mouth: _Mouth) -> np.ndarray:
+def _positions(vertices: np.ndarray, rings: list[np.ndarray], lip_ids: np.ndarray) -> np.ndarray:
     """(120, 3) teeth: an upper arch curved like the lips, as far forward as their inner surface
     allows, and a lower one behind it."""
-    lips, inside = vertices[mouth.lips], vertices[mouth.inside]
+    lips, inside = vertices[lip_ids], vertices[np.concatenate(rings)]
     left, right = lips[0], lips[len(lips) // 2]
     width, middle = left[0] - right[0], (left[0] + right[0]) / 2
     curvature = max(0.0, -float(np.polyfit((lips[:, 0] - middle) ** 2, lips[:, 2], 1)[0]))
     arch, outward = _arch(ARCH_WIDTH * width / 2, curvature)
     bite = (lips[:, 1].max() + lips[:, 1].min()) / 2
-    height = np.ptp(vertices[mouth.rings[0], 1]) / 2  # both rows together fill the open end
+    height = np.ptp(vertices[rings[0], 1]) / 2  # both rows together fill the open end
     edge = bite - OVERBITE * width
     # on the axis
     reach = inside[:, 2] + curvature * (inside[:, 0] - middle) ** 2 - CLEARANCE * width
@@ -258,11 +226,9 @@ def _arch(half_width: float, curvature: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _followed(points: np.ndarray, displacements: np.ndarray, teeth: np.ndarray) -> np.ndarray:
-    """Displacements (T, 3, K) of the teeth (T, 3): smooth ones that fit those (M, 3, K) of the
-    mouth's points (M, 3).
-
-    Linear in width and height and quadratic in width, so that the arch grows and bends as a whole.
-    """
+    """Displacements (T, 3, K) of the teeth (T, 3): those (M, 3, K) of the mouth's points (M, 3)
+    fitted linearly in width and height and quadratically in width, so that the arch grows and bends
+    as a whole."""
     center, size = points.mean(0), np.ptp(points[:, 0]) / 2
 
     def terms(at: np.ndarray) -> np.ndarray:

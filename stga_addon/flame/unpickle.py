@@ -13,6 +13,7 @@ import pickletools
 import re
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ MAX_DENSE_ELEMENTS = 1 << 22
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
 )
+CHUMPY_CLASS = re.compile(r"chumpy(\.\w+)+")
 
 
 class _NotAnArray(Exception):
@@ -34,58 +36,38 @@ class _NotAnArray(Exception):
 
 
 class _Inert:
-    """Stands for an object: keeps its arguments and state, does nothing."""
+    """Stands for an object of the class `source`: keeps its arguments and state, does nothing."""
 
     source = "object"
+    arguments: tuple[Any, ...] = ()
+    state: Any = None
 
     def __new__(cls, *arguments: Any, **keywords: Any) -> "_Inert":
         made = super().__new__(cls)
         made.arguments = arguments
-        made.state = None
         return made
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         pass
 
-    arguments: tuple[Any, ...]
-    state: Any
-
     def __setstate__(self, state: Any) -> None:
         self.state = state
 
 
-class _Array(_Inert):
-    source = "numpy.ndarray"
+@cache
+def _inert(source: str) -> type[_Inert]:
+    return type("_Inert", (_Inert,), {"source": source})
 
 
-class _Dtype(_Inert):
-    source = "numpy.dtype"
-
-
-class _Scalar(_Inert):
-    source = "numpy.scalar"
-
-
-class _Buffer(_Inert):  # an array of pickle protocol 5: buffer, dtype, shape, order
-    source = "numpy.frombuffer"
-
-
-class _Sparse(_Inert):
-    source = "scipy.sparse"
-    format = "csc"
-
-
-class _Chumpy(_Inert):
-    source = "chumpy"
-
-
+ARRAY, DTYPE, SCALAR = "numpy.ndarray", "numpy.dtype", "numpy.scalar"
+BUFFER = "numpy.frombuffer"  # an array of pickle protocol 5: buffer, dtype, shape, order
 CORES, BUILTINS = ("numpy.core", "numpy._core"), ("__builtin__", "builtins")
-GLOBALS: dict[str, type] = {
-    "numpy.ndarray": _Array,
-    "numpy.dtype": _Dtype,
-    **{f"{core}.multiarray.scalar": _Scalar for core in CORES},
-    **{f"{core}.numeric._frombuffer": _Buffer for core in CORES},
-    **{f"{module}.object": _Inert for module in BUILTINS},
+CLASSES = {
+    ARRAY: ARRAY,
+    DTYPE: DTYPE,
+    **{f"{core}.multiarray.scalar": SCALAR for core in CORES},
+    **{f"{core}.numeric._frombuffer": BUFFER for core in CORES},
+    **{f"{module}.object": "object" for module in BUILTINS},
 }
 
 
@@ -115,7 +97,7 @@ class _RestrictedUnpickler(pickle.Unpickler):
             "_codecs.encode": self.encode,
             "collections.OrderedDict": OrderedDict,
             # numpy's own would allocate the shape at once; the contents arrive with the state
-            **{f"{core}.multiarray._reconstruct": lambda *_: _Array() for core in CORES},
+            **{f"{core}.multiarray._reconstruct": lambda *_: _inert(ARRAY)() for core in CORES},
             **{f"{module}._reconstructor": self.rebuild for module in ("copy_reg", "copyreg")},
             **{f"{module}.set": set for module in BUILTINS},
         }
@@ -125,12 +107,8 @@ class _RestrictedUnpickler(pickle.Unpickler):
         wanted = f"{module}.{name}"
         if wanted in self.functions:
             return self.functions[wanted]
-        if wanted in GLOBALS:
-            return GLOBALS[wanted]
-        if sparse := SPARSE_CLASS.fullmatch(wanted):
-            return type("_Sparse", (_Sparse,), {"source": wanted, "format": sparse["format"]})
-        if re.fullmatch(r"chumpy(\.\w+)*", module) and name.isidentifier():
-            return type("_Chumpy", (_Chumpy,), {"source": wanted})
+        if wanted in CLASSES or SPARSE_CLASS.fullmatch(wanted) or CHUMPY_CLASS.fullmatch(wanted):
+            return _inert(CLASSES.get(wanted, wanted))
         raise _Refused(wanted)
 
     def persistent_load(self, pid: Any) -> Any:
@@ -164,9 +142,8 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
                 raise pickle.UnpicklingError(f"memo slot {slot} in a file of {len(data)} bytes")
         loaded = _RestrictedUnpickler(data).load()
     except _Refused as error:
-        raise StgaError(
-            f"{path}: asks for the class {error}, refused: only arrays are read"
-        ) from error
+        refused = f"asks for the class {error}, refused: only arrays are read"
+        raise StgaError(f"{path}: {refused}") from error
     except Exception as error:  # a damaged pickle raises anything from the opcodes that it spells
         reason = str(error) or type(error).__name__
         raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
@@ -190,21 +167,22 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
 
 
 def _dense(value: Any) -> np.ndarray:
-    if isinstance(value, _Array):
+    source = value.source if isinstance(value, _Inert) else type(value).__name__
+    if source == ARRAY:
         if not isinstance(value.state, tuple) or len(value.state) < 4:
             raise _NotAnArray("an incomplete array")
         shape, dtype, fortran, raw = value.state[-4:]
         return _from_bytes(raw, _dtype(dtype), shape, "F" if fortran else "C")
-    if isinstance(value, _Buffer):
+    if source == BUFFER:
         if len(value.arguments) != 4:
             raise _NotAnArray("an incomplete array")
         raw, dtype, shape, order = value.arguments
         return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
-    if isinstance(value, _Scalar) and len(value.arguments) == 2:
+    if source == SCALAR and len(value.arguments) == 2:
         return _from_bytes(value.arguments[1], _dtype(value.arguments[0]), (), "C")
-    if isinstance(value, _Sparse):
-        return _sparse(value)
-    if isinstance(value, _Chumpy):
+    if sparse := SPARSE_CLASS.fullmatch(source):
+        return _sparse(value, sparse["format"])
+    if CHUMPY_CLASS.fullmatch(source):
         return _chumpy(value)
     if isinstance(value, list | tuple | int | float):
         try:
@@ -213,15 +191,12 @@ def _dense(value: Any) -> np.ndarray:
             raise _NotAnArray("a ragged list") from error
         if plain.dtype.kind in "biuf":
             return plain
-    raise _NotAnArray(f"a {value.source if isinstance(value, _Inert) else type(value).__name__}")
+    raise _NotAnArray(f"a {source}")
 
 
 def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.ndarray:
     if isinstance(raw, str):  # Python 2 bytes, read as latin1
-        try:
-            raw = raw.encode("latin1")
-        except UnicodeEncodeError as error:
-            raise _NotAnArray("an array of text") from error
+        raw = raw.encode("latin1")
     if not isinstance(raw, bytes | bytearray):
         raise _NotAnArray("an array of objects")
     if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
@@ -233,7 +208,8 @@ def _from_bytes(raw: Any, dtype: np.dtype[Any], shape: Any, order: str) -> np.nd
 
 
 def _dtype(value: Any) -> np.dtype[Any]:
-    code = value.arguments[0] if isinstance(value, _Dtype) and value.arguments else None
+    is_dtype = isinstance(value, _Inert) and value.source == DTYPE
+    code = value.arguments[0] if is_dtype and value.arguments else None
     if not isinstance(code, str):
         raise _NotAnArray("an array of unknown type")
     if not re.fullmatch(r"[iu][1248]|f[248]|b1", code):
@@ -242,8 +218,8 @@ def _dtype(value: Any) -> np.dtype[Any]:
     return np.dtype(code).newbyteorder(">" if order == ">" else "<")
 
 
-def _sparse(value: _Sparse) -> np.ndarray:
-    """Dense (rows, columns) matrix of a pickled compressed or coordinate matrix."""
+def _sparse(value: _Inert, form: str) -> np.ndarray:
+    """Dense (rows, columns) matrix of a pickled compressed (csc, csr) or coordinate (coo) one."""
     state = value.state if isinstance(value.state, dict) else {}
     shape: Any = state.get("_shape", state.get("shape"))
     is_shape = isinstance(shape, tuple) and len(shape) == 2
@@ -252,7 +228,7 @@ def _sparse(value: _Sparse) -> np.ndarray:
     if math.prod(shape) > MAX_DENSE_ELEMENTS:
         raise _NotAnArray(f"a sparse matrix of shape {shape}, too large to fill in")
     data = _dense(state.get("data"))
-    if value.format == "coo":
+    if form == "coo":
         coords = state.get("coords", ())
         pair = coords if len(coords) == 2 else (state.get("row"), state.get("col"))
         rows, columns = map(_integers, pair)
@@ -262,7 +238,7 @@ def _sparse(value: _Sparse) -> np.ndarray:
         if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
             raise _NotAnArray("a sparse matrix whose index pointers do not match its indices")
         outer = np.repeat(np.arange(len(counts)), counts)
-        rows, columns = (inner, outer) if value.format == "csc" else (outer, inner)
+        rows, columns = (inner, outer) if form == "csc" else (outer, inner)
     if not (data.shape == rows.shape == columns.shape):
         raise _NotAnArray("a sparse matrix whose indices do not match its data")
     for indices, size in zip((rows, columns), shape, strict=True):
@@ -280,7 +256,7 @@ def _integers(value: Any) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _chumpy(value: _Chumpy) -> np.ndarray:
+def _chumpy(value: _Inert) -> np.ndarray:
     """The value of a chumpy leaf (`x`) or of a selection of a leaf's elements (`a`, `idxs`)."""
     state = value.state if isinstance(value.state, dict) else {}
     if "x" in state:
