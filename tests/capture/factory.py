@@ -28,28 +28,21 @@ def ball() -> tuple[np.ndarray, np.ndarray]:
 def pose(camera: int) -> np.ndarray:
     """Camera-to-world, OpenGL axes, one meter from the ball and looking at it."""
     angle = 0.4 * camera - 0.5
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)],
-    ]  # fmt: skip
-    matrix[:3, 3] = matrix[:3, 2]
-    return matrix
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, 0, sin, sin], [0, 1, 0, 0], [-sin, 0, cos, cos], [0, 0, 0, 1]])
 
 
 def silhouette() -> np.ndarray:
     """(HEIGHT, WIDTH) bool: which pixels' rays meet the ball; the same from every camera."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    sine = np.hypot(columns - CX, rows - CY) / np.sqrt(
-        (columns - CX) ** 2 + (rows - CY) ** 2 + FOCAL**2
-    )
-    return sine < RADIUS
+    off_axis = np.hypot(columns - CX, rows - CY)
+    return off_axis / np.hypot(off_axis, FOCAL) < RADIUS
 
 
 def picture(timestep: int, camera: int) -> np.ndarray:
     """(HEIGHT, WIDTH, 3) uint8 on white, of a color that only this view has."""
-    return np.where(silhouette()[..., None], [10 * timestep, 10 * camera, 128], 255).astype(
-        np.uint8
-    )
+    color = np.array([10 * timestep, 10 * camera, 128]).astype(np.uint8)
+    return np.where(silhouette()[..., None], color, np.uint8(255))
 
 
 def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
@@ -88,26 +81,20 @@ def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -
 
 def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> None:
     """The last camera is `val`, the last timestep `test`, all else `train`."""
-    last_camera, last_timestep = (
-        max(f["camera_index"] for f in frames),
-        max(f["timestep_index"] for f in frames),
-    )
+    last_camera = max(f["camera_index"] for f in frames)
+    last_timestep = max(f["timestep_index"] for f in frames)
     splits: dict[str, list[dict[str, Any]]] = {name: [] for name in SPLITS}
     for entry in frames:
-        late = entry["timestep_index"] == last_timestep
-        splits[
-            "test" if late else "val" if entry["camera_index"] == last_camera else "train"
-        ].append(entry)
+        name = "val" if entry["camera_index"] == last_camera else "train"
+        splits["test" if entry["timestep_index"] == last_timestep else name].append(entry)
     for name, entries in splits.items():
         (root / f"transforms_{name}.json").write_text(json.dumps({**shared, "frames": entries}))
 
 
 def write_mesh_capture(
-    root: Path,
-    timesteps: Sequence[int] = (0, 1, 3),
-    cameras: Sequence[int] = (0, 1, 2),
+    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2),
     suffix: str = ".obj",
-) -> Path:
+) -> Path:  # fmt: skip
     """Layout "mesh" with a canonical mesh and one region, `mouth`."""
     write_images(root, timesteps, cameras)
     (root / "meshes").mkdir()
@@ -115,13 +102,11 @@ def write_mesh_capture(
     write_mesh(root / f"meshes/neutral{suffix}", vertices, faces)
     for timestep in timesteps:
         write_mesh(root / f"meshes/{timestep:05d}{suffix}", moved(timestep, vertices), faces)
-    (root / "regions.json").write_text(
-        json.dumps({"mouth": np.flatnonzero(vertices[:, 1] < -0.06).tolist()})
-    )
+    mouth = np.flatnonzero(vertices[:, 1] < -0.06).tolist()
+    (root / "regions.json").write_text(json.dumps({"mouth": mouth}))
     frames = [frame(t, c, mesh_path=f"meshes/{t:05d}{suffix}") for t in timesteps for c in cameras]
-    write_splits(
-        root, frames, canonical_mesh_path=f"meshes/neutral{suffix}", regions_path="regions.json"
-    )
+    named = {"canonical_mesh_path": f"meshes/neutral{suffix}", "regions_path": "regions.json"}
+    write_splits(root, frames, **named)
     return root
 
 
@@ -183,14 +168,9 @@ def write_flame_capture(
     for timestep in timesteps:
         np.savez(root / f"flame_param/{timestep:05d}.npz", **flame_parameters(timestep))
     np.savez(root / "canonical_flame_param.npz", **flame_parameters(timesteps[0]))
-    write_splits(
-        root,
-        [
-            frame(t, c, flame_param_path=f"flame_param/{t:05d}.npz")
-            for t in timesteps
-            for c in cameras
-        ],
-    )
+    paths = {t: f"flame_param/{t:05d}.npz" for t in timesteps}
+    frames = [frame(t, c, flame_param_path=paths[t]) for t in timesteps for c in cameras]
+    write_splits(root, frames)
     return root, write_flame_model(root / "model.npz")
 
 

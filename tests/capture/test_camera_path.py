@@ -39,9 +39,7 @@ def test_orbit() -> None:
     ((110, 150, 180, 220, 250), 180, (-70, 70)), ((0, 90, 180, 270), 0, (-180, 180)),
     ((30,), 30, (0, 0)),
 ])  # fmt: skip
-def test_covered_angles(
-    angles: tuple[float, ...], start: float, expected: tuple[float, float]
-) -> None:
+def test_covered_angles(angles, start, expected):
     """Catches a turntable that shows a side which no camera saw, or leaves out one that they
     did."""
     covered = covered_angles([camera(angle) for angle in angles], camera(start), CENTER)

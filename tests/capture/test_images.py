@@ -1,28 +1,43 @@
-"""Images and masks: every kind of file a studio hands over, and every way one can be broken."""
+"""Images and masks: every kind of file that a studio hands over, as phones and editors store them,
+turned by EXIF or in other colors than sRGB; and every way one can be broken."""
 
+import io
+import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from stga_addon.capture.camera import camera_from_gl
-from stga_addon.capture.images import image_size, read_image, read_mask, read_view
+from stga_addon.capture.images import image_size, is_plain, read_image, read_mask, read_view
 from stga_addon.capture.model import View
 from stga_addon.errors import StgaError
+from stga_addon.tracking.footage.open import open_footage
 
-WIDTH, HEIGHT = 7, 5
+WIDTH, HEIGHT = 48, 32
 RANDOM = np.random.default_rng(3)
 COLOUR = RANDOM.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 GREY = RANDOM.integers(0, 256, (HEIGHT, WIDTH), np.uint8)
 ALPHA = RANDOM.integers(0, 255, (HEIGHT, WIDTH), np.uint8)
+LEVELS = {"a": 30, "b": 90, "c": 150, "d": 210}
+# How a viewer shows the corners a b / c d of the stored picture (EXIF 2.32, tag Orientation).
+ORIENTATIONS = {
+    1: "ab cd", 2: "ba dc", 3: "dc ba", 4: "cd ab", 5: "ac bd", 6: "ca db", 7: "db ca", 8: "bd ac",
+}  # fmt: skip
 
 
-def view_of(image: Path, mask: Path | None = None) -> View:
-    camera = camera_from_gl(np.eye(4), WIDTH, HEIGHT, 10, 10, WIDTH / 2, HEIGHT / 2)
+def view_of(
+    image: Path, width: int = WIDTH, height: int = HEIGHT, mask: Path | None = None
+) -> View:
+    camera = camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2)
     return View(0, 0, camera, image.name, image, mask)
+
+
+def chunk(name, data):
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def saved(path: Path, pixels: np.ndarray) -> Path:
@@ -66,13 +81,13 @@ def test_gray_and_palette(tmp_path: Path) -> None:
 def test_size_mismatch_names_both(tmp_path: Path) -> None:
     """Catches an image that is resized in silence, or broadcast later on."""
     wrong = saved(tmp_path / "wrong.png", COLOUR[:-1])
-    expected = r"wrong\.png: the image has 7 x 4 pixels, but the camera of wrong\.png has 7 x"
+    expected = r"wrong\.png: the image has 48 x 31 pixels, but the camera of wrong\.png has 48 x 32"
     with pytest.raises(StgaError, match=expected):
         read_image(view_of(wrong))
     right = saved(tmp_path / "right.png", COLOUR)
-    expected = r"wrong\.png: the mask has 7 x 4 pixels, but the image .*right\.png .* 7 x 5"
+    expected = r"wrong\.png: the mask has 48 x 31 pixels, but the image .*right\.png .* 48 x 32"
     with pytest.raises(StgaError, match=expected):
-        read_mask(view_of(right, wrong))
+        read_mask(view_of(right, mask=wrong))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -84,10 +99,8 @@ def test_truncated_images(tmp_path: Path, suffix: str, kept: float) -> None:
     saved(path, big)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * kept)])
-    view = view_of(path)
-    view = replace(view, camera=replace(view.camera, width=64, height=64))
     with pytest.raises(StgaError, match=rf"x\{suffix}: is not a readable image"):
-        read_image(view)
+        read_image(view_of(path, 64, 64))
 
 
 def test_missing_and_foreign_images(tmp_path: Path) -> None:
@@ -95,7 +108,7 @@ def test_missing_and_foreign_images(tmp_path: Path) -> None:
     runs other programs."""
     with pytest.raises(StgaError, match=r"none\.png: does not exist"):
         read_image(view_of(tmp_path / "none.png"))
-    for text in (b"hello", b"P6 7 5 255 " + bytes(WIDTH * HEIGHT * 3)):
+    for text in (b"hello", b"P6 48 32 255 " + bytes(WIDTH * HEIGHT * 3)):
         (tmp_path / "x.png").write_bytes(text)
         with pytest.raises(StgaError, match=r"x\.png: is not a readable image"):
             read_image(view_of(tmp_path / "x.png"))
@@ -105,11 +118,6 @@ def test_missing_and_foreign_images(tmp_path: Path) -> None:
 
 def test_decompression_bomb(tmp_path: Path) -> None:
     """Catches a tiny file that claims gigapixels and would fill the memory."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        check = zlib.crc32(kind + data).to_bytes(4, "big")
-        return len(data).to_bytes(4, "big") + kind + data + check
-
     header = (60000).to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
     body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
     (tmp_path / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
@@ -133,7 +141,148 @@ def test_scaled_view(tmp_path: Path) -> None:
     assert image.shape == (small.camera.height, small.camera.width, 3)
     np.testing.assert_allclose(image.mean((0, 1)), COLOUR.mean((0, 1)), atol=1)
     assert mask.shape == image.shape[:2]
-    assert small.camera.fl_x == pytest.approx(10 * small.camera.width / WIDTH)
+    assert small.camera.fl_x == pytest.approx(60 * small.camera.width / WIDTH)
     same, image, mask = read_view(view)
     assert same is view
     np.testing.assert_array_equal(image, COLOUR)
+
+
+def corners(image):
+    """Letters of the four quarters, row by row."""
+    height, width = image.shape[:2]
+    gray = image.reshape(height, width, -1)[..., 0].astype(int)
+    gray = gray[height // 4 :: height // 2, width // 4 :: width // 2]
+    names = np.array(list("abcd"))[np.abs(gray[..., None] - list(LEVELS.values())).argmin(-1)]
+    return " ".join("".join(row) for row in names)
+
+
+def write_turned(path, orientation):
+    quarters = np.reshape(list(LEVELS.values()), (2, 2, 1)).astype(np.uint8)
+    pixels = quarters.repeat(HEIGHT // 2, 0).repeat(WIDTH // 2, 1).repeat(3, 2)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(path, exif=exif, quality=95)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif", ".png"])
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_orientation(tmp_path, orientation, suffix):
+    """Catches a phone's photo that is tracked and trained lying, upside down or mirrored."""
+    path = tmp_path / f"x{suffix}"
+    write_turned(path, orientation)
+    size = (WIDTH, HEIGHT) if orientation < 5 else (HEIGHT, WIDTH)
+    assert image_size(path) == size
+    assert corners(read_image(view_of(path, *size))) == ORIENTATIONS[orientation]
+    assert corners(read_mask(view_of(path, *size, mask=path))) == ORIENTATIONS[orientation]
+    camera = open_footage(tmp_path, focal=50).cameras[0]
+    assert corners(camera.image(0)) == ORIENTATIONS[orientation]
+    # A file that other programs would show turned is not copied into a capture; TIFF is turned by
+    # all.
+    assert is_plain(path) == (camera.file(0) is not None) == (orientation == 1 or suffix == ".tif")
+
+
+def test_camera_of_the_stored_pixels(tmp_path):
+    """Catches a capture whose cameras were calibrated without EXIF refused, or turned."""
+    path = tmp_path / "x.jpg"
+    write_turned(path, 6)
+    assert corners(read_image(view_of(path, WIDTH, HEIGHT))) == "ab cd"
+    sentence = r"x.jpg: the image has 32 x 48 pixels, but the camera of x.jpg has 40 x 40"
+    with pytest.raises(StgaError, match=sentence):
+        read_image(view_of(path, 40, 40))
+
+
+def profile(colorants, gamma, name):
+    """A minimal ICC profile (ICC.1:2010): a display with the given colorants (D50), and one
+    exponent."""
+
+    def xyz(values):
+        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(65536 * value) for value in values))
+
+    text = name.encode() + b"\0"
+    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma))
+    tags = {
+        b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(78),
+        b"wtpt": xyz((0.9642, 1.0, 0.8249)),
+        **dict(zip((b"rXYZ", b"gXYZ", b"bXYZ"), map(xyz, colorants), strict=True)),
+        **dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve),
+        b"cprt": b"text\0\0\0\0none\0",
+    }
+    tags = {tag: data + bytes(-len(data) % 4) for tag, data in tags.items()}
+    table, body, at = struct.pack(">I", len(tags)), b"", 128 + 4 + 12 * len(tags)
+    for tag, data in tags.items():
+        table += tag + struct.pack(">2I", at + len(body), len(data))
+        body += data
+    size = 128 + len(table) + len(body)
+    head = struct.pack(">I4sI4s4s4s", size, bytes(4), 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head += bytes(12) + b"acsp" + bytes(28) + struct.pack(">3i", 63190, 65536, 54061)
+    return head.ljust(128, b"\0") + table + body
+
+
+P3 = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
+DISPLAY_P3 = profile(P3, 2.2, "P3")
+"""Colorants as published with Apple's profile."""
+
+
+def icc(data):
+    return chunk(b"iCCP", b"p\0\0" + zlib.compress(data))
+
+
+def png(path, color, *chunks, mode="RGB"):
+    """A PNG of one color with chunks before its pixels."""
+    stream = io.BytesIO()
+    Image.new(mode, (WIDTH, HEIGHT), color).save(stream, format="PNG")
+    data = stream.getvalue()
+    path.write_bytes(data[:33] + b"".join(chunks) + data[33:])
+
+
+# In Display P3 sRGB's red is (0.9175, 0.2003, 0.1386) by CSS Color 4; it is near that with an
+# exponent of 2.2 as well.
+RED_IN_P3 = (234, 51, 35)
+STORED = {
+    "profile": (RED_IN_P3, [icc(DISPLAY_P3)], (255, 0, 0)),
+    "sRGB's profile": (
+        RED_IN_P3,
+        [icc(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())],
+        RED_IN_P3
+    ),
+    "damaged profile": (RED_IN_P3, [icc(DISPLAY_P3[:140])], RED_IN_P3),
+    "cICP of Display P3": (RED_IN_P3, [chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
+    "cICP of sRGB before a profile": (
+        RED_IN_P3,
+        [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)],
+        RED_IN_P3
+    ),
+    "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
+    "linear gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 100000))], (128, 128, 128)),
+    "usual gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
+    "gAMA beside sRGB": (
+        (55, 55, 55),
+        [chunk(b"gAMA", struct.pack(">I", 100000)), chunk(b"sRGB", b"\0")],
+        (55, 55, 55)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_colors_become_srgb(tmp_path, name):
+    """Catches skin that is pale or dark because the file's colors are not sRGB's; and sRGB that is
+    converted."""
+    color, chunks, expected = STORED[name]
+    path = tmp_path / "x.png"
+    png(path, color, *chunks)
+    np.testing.assert_allclose(read_image(view_of(path))[5, 5], expected, atol=7)
+    if expected == color:
+        np.testing.assert_array_equal(read_image(view_of(path))[5, 5], color)
+    assert is_plain(path) == (expected == color)
+
+
+def test_profile_beside_transparency_and_in_jpeg(tmp_path):
+    """Catches alpha lost in the conversion, a mask that is converted, and profiles of JPEG left
+    out."""
+    path = tmp_path / "x.png"
+    png(path, (*RED_IN_P3, 128), icc(DISPLAY_P3), mode="RGBA")
+    np.testing.assert_allclose(read_image(view_of(path), (0, 0, 0))[5, 5], (128, 0, 0), atol=4)
+    assert read_mask(view_of(path))[5, 5] == 128
+    red = Image.new("RGB", (WIDTH, HEIGHT), RED_IN_P3)
+    red.save(tmp_path / "x.jpg", quality=98, icc_profile=DISPLAY_P3)
+    np.testing.assert_allclose(read_image(view_of(tmp_path / "x.jpg"))[5, 5], (255, 0, 0), atol=8)

@@ -88,19 +88,9 @@ def test_scales_by_position(views: list[View], decoded: list[str]) -> None:
     assert len(decoded) == 3
 
 
-def test_queue_is_bounded(views: list[View], decoded: list[str]) -> None:
-    """Catches a thread that runs ahead without limit on an endless order of views."""
-    with ViewLoader(itertools.cycle(views), queue_bytes=2 * VIEW_BYTES, cache_bytes=0) as loader:
-        next(loader)
-        wait_until(lambda: len(decoded) == 4)
-        time.sleep(0.1)
-        # One taken, two ready, and one in the thread's hands.
-        assert len(decoded) == 4
-
-
 def test_errors_come_where_their_view_would(views: list[View]) -> None:
-    """Catches an error lost in the thread, or raised before the good views ahead of it; and a hang
-    afterwards."""
+    """Catches an error lost in the thread, or raised before the good views ahead of it; a hang
+    afterwards; and an exception of the given iterator taken for its end."""
     views[2].image.write_bytes(b"broken")
     with ViewLoader(views) as loader:
         assert next(loader)[0] is views[0]
@@ -109,10 +99,6 @@ def test_errors_come_where_their_view_would(views: list[View]) -> None:
             with pytest.raises(StgaError, match="is not a readable image"):
                 next(loader)
     assert loader_threads() == 0
-
-
-def test_error_of_the_order_itself(views: list[View]) -> None:
-    """Catches an exception of the given iterator being taken for its end."""
 
     def order() -> Iterator[View]:
         yield views[0]
@@ -157,7 +143,8 @@ def test_waiting_is_counted(views: list[View], monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_meshes_are_read_in_the_thread_and_bounded(views: list[View]) -> None:
-    """Catches meshes of another timestep, read by the consumer, or queued without limit."""
+    """Catches meshes of another timestep, or read by the consumer, and a thread that runs ahead
+    without limit on an endless order of views."""
     read: list[tuple[int, str]] = []
 
     def mesh(timestep: int) -> np.ndarray:

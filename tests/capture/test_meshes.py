@@ -26,28 +26,19 @@ from stga_addon.files import write_npz
 from . import factory
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
 def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
-    """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused
-    vertex."""
+    """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused vertex;
+    and STL triangles welded by position, which would join lips and eyelids that merely touch."""
     vertices, faces = factory.ball()
-    vertices = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices])
-    path = tmp_path / f"mesh{suffix}"
-    factory.write_mesh(path, vertices, faces + 2)
-    read, triangles = read_mesh(path)
+    vertices, faces = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices]), faces + 2
+    factory.write_mesh(tmp_path / f"mesh{suffix}", vertices, faces)
+    read, triangles = read_mesh(tmp_path / f"mesh{suffix}")
+    if suffix == ".stl":  # which has no shared vertices
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
     np.testing.assert_allclose(read, vertices, atol=1e-7)
-    np.testing.assert_array_equal(triangles, faces + 2)
+    np.testing.assert_array_equal(triangles, faces)
     assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
-
-
-def test_stl_is_a_soup_in_order(tmp_path: Path) -> None:
-    """Catches STL triangles welded by position, which would join lips and eyelids that merely
-    touch."""
-    vertices, faces = factory.ball()
-    factory.write_mesh(tmp_path / "mesh.stl", vertices, faces)
-    read, triangles = read_mesh(tmp_path / "mesh.stl")
-    np.testing.assert_allclose(read[triangles], vertices[faces], atol=1e-7)
-    assert len(read) == 3 * len(faces)
 
 
 def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
@@ -108,22 +99,20 @@ def test_topology_must_not_change(tmp_path: Path) -> None:
     swapped = faces.copy()
     swapped[[7, 8]] = swapped[[8, 7]]
     files = {number: tmp_path / f"{number}.obj" for number in range(4)}
+    more = np.vstack([vertices, [0, 0, 0]])
     for path, triangles in zip(files.values(), (faces, faces[:-1], swapped, faces), strict=True):
-        factory.write_mesh(
-            path, vertices if path != files[3] else np.vstack([vertices, [0, 0, 0]]), triangles
-        )
-    mesh = tracked_meshes(
-        files, len(vertices), faces.astype(np.int32), tmp_path / "neutral.obj", read_mesh
-    )
+        factory.write_mesh(path, more if path == files[3] else vertices, triangles)
+    canonical = tmp_path / "neutral.obj"
+    mesh = tracked_meshes(files, len(vertices), faces.astype(np.int32), canonical, read_mesh)
     np.testing.assert_allclose(mesh(0), vertices, atol=1e-9)
-    with pytest.raises(StgaError, match=r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"):
-        mesh(1)
-    with pytest.raises(StgaError, match=r"2\.obj: triangle 7 joins vertices"):
-        mesh(2)
-    with pytest.raises(StgaError, match=r"3\.obj: has 163 vertices, but .*neutral\.obj has 162"):
-        mesh(3)
-    with pytest.raises(StgaError, match="timestep 9 has no tracked mesh; the capture has 0 to 3"):
-        mesh(9)
+    for timestep, message in (
+        (1, r"1\.obj: has 319 triangles, but .*neutral\.obj has 320"),
+        (2, r"2\.obj: triangle 7 joins vertices"),
+        (3, r"3\.obj: has 163 vertices, but .*neutral\.obj has 162"),
+        (9, "timestep 9 has no tracked mesh; the capture has 0 to 3"),
+    ):
+        with pytest.raises(StgaError, match=message):
+            mesh(timestep)
 
 
 def test_meshes_are_kept_within_bounds() -> None:
@@ -214,9 +203,8 @@ def by_equations(
     y, x = np.mgrid[: camera.height, : camera.width]
     centers = np.stack([x.ravel() + 0.5, y.ravel() + 0.5, np.ones(x.size)])
     systems = np.concatenate([flat[faces], np.ones((len(faces), 3, 1))], 2).transpose(0, 2, 1)
-    inside = np.linalg.solve(
-        systems, np.broadcast_to(centers, (len(faces), *centers.shape))
-    ).transpose(2, 0, 1)
+    centers = np.broadcast_to(centers, (len(faces), *centers.shape))
+    inside = np.linalg.solve(systems, centers).transpose(2, 0, 1)
     closeness = np.where((inside >= 0).all(2), (inside / depth[faces]).sum(2), 0)
     nearest = closeness.argmax(1)
     shown = closeness.max(1) > 0

@@ -22,6 +22,7 @@ from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame
 from stga_addon.selection import SelectionOptions, select_capture
+from stga_addon.training.effects.samples import take_samples
 
 from . import factory
 
@@ -63,9 +64,7 @@ def test_mesh_capture(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize(("timesteps", "cameras"), [((5,), (0, 1)), ((0, 1), (3,)), ((7,), (2,))])
-def test_one_timestep_or_camera(
-    tmp_path: Path, timesteps: tuple[int, ...], cameras: tuple[int, ...]
-) -> None:
+def test_one_timestep_or_camera(tmp_path, timesteps, cameras):
     """Catches a capture of a single frame or camera being refused by a division or a split."""
     root = factory.write_mesh_capture(tmp_path / "mesh", timesteps, cameras)
     assert open_capture(root).timesteps == timesteps
@@ -206,9 +205,9 @@ def test_union_set(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(view), factory.picture(0, 0))
 
 
-def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
-    """Catches a capture of the other convention opened silently, and a warning where all is
-    well."""
+def test_principal_point_is_checked_against_the_masks(tmp_path: Path, shared_data: Path) -> None:
+    """Catches a capture of the other convention opened silently, a warning where all is well, and a
+    check too dull for a real head: the principal point 10 pixels off the center, of 401."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     assert open_capture(root, principal_point="vhap").warnings == ()
     for wrong in ("opencv", "center"):
@@ -217,25 +216,7 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path) -> None:
         assert "with 'vhap'" in warning
     each_split(root, no_masks)
     assert open_capture(root, principal_point="opencv").warnings == ()
-
-
-@pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
-def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str | None) -> None:
-    """Catches a capture in millimeters that trains to nonsense, or renders nothing, silently."""
-    root = factory.write_mesh_capture(tmp_path / "capture")
-    vertices, faces = factory.ball()
-    for path in (root / "meshes").glob("*.obj"):
-        factory.write_mesh(path, factor * vertices, faces)
-    each_split(root, no_masks)
-    warnings = open_capture(root).warnings
-    assert len(warnings) == (says is not None)
-    assert says is None or says in warnings[0]
-
-
-def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) -> None:
-    """Catches a check too dull for a real head: the principal point 10 pixels off the center, of
-    401."""
-    root = tmp_path / "capture"
+    root = tmp_path / "real"
     root.mkdir()
     for entry in (shared_data / "studio_head").iterdir():
         if entry.is_dir():
@@ -250,6 +231,19 @@ def test_principal_point_of_a_real_capture(tmp_path: Path, shared_data: Path) ->
     each_split(root, shift)
     (warning,) = open_capture(root, principal_point="opencv").warnings
     assert "with 'center'" in warning
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
+def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str | None) -> None:
+    """Catches a capture in millimeters that trains to nonsense, or renders nothing, silently."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    vertices, faces = factory.ball()
+    for path in (root / "meshes").glob("*.obj"):
+        factory.write_mesh(path, factor * vertices, faces)
+    each_split(root, no_masks)
+    warnings = open_capture(root).warnings
+    assert len(warnings) == (says is not None)
+    assert says is None or says in warnings[0]
 
 
 def test_studio_head(shared_data: Path) -> None:
@@ -327,6 +321,18 @@ def cut(name: str) -> Callable[[Path], object]:
     return lambda root: (root / name).write_bytes((root / name).read_bytes()[:40])
 
 
+def in_a_point(name: str) -> Callable[[Path], None]:
+    vertices, faces = factory.ball()
+    return lambda root: factory.write_mesh(root / name, np.full_like(vertices, 0.1), faces)
+
+
+def written(name: str, content: Any) -> Callable[[Path], None]:
+    """A file of text, or of an array."""
+    if isinstance(content, str):
+        return lambda root: (root / name).write_text(content) and None
+    return lambda root: np.save(root / name, content)
+
+
 def edited(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], object]:
     return lambda root: factory.edit(
         root / "transforms_val.json", lambda document: change(document["frames"])
@@ -343,6 +349,8 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (cut("meshes/neutral.obj"), r"neutral\.obj: "),
     (cut("regions.json"), r"regions\.json: is not valid JSON"),
     (cut("fg_masks/00000_00.png"), r"fg_masks/00000_00\.png: is not a readable image"),
+    (in_a_point("meshes/neutral.obj"), r"neutral\.obj: all vertices of the mesh lie in one point"),
+    (in_a_point("meshes/00001.obj"), r"00001\.obj: all vertices of the mesh lie in one point"),
     (edited(lambda own: own[1].pop("mesh_path")), r"val\.json: frames\[1\]\.mesh_path: is missing"),
     (
         edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
@@ -354,9 +362,8 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
     def damage(root: Path) -> None:
         arrays: dict[str, Any] = factory.flame_parameters(0) | change
-        np.savez(
-            root / "flame_param/00000.npz", **{k: v for k, v in arrays.items() if v is not None}
-        )
+        given = {name: array for name, array in arrays.items() if array is not None}
+        np.savez(root / "flame_param/00000.npz", **given)
 
     return damage
 
@@ -368,55 +375,77 @@ BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (parameters({"shape": None}), r"00000\.npz: .*shape"),
     (parameters({"static_offset": np.zeros((1, 100, 3))}), r"00000\.npz: .*static_offset"),
     (parameters({"expr": np.array([{}], object)}), r"00000\.npz: "),
+    (parameters({"translation": np.full((1, 3), 9e5)}), "timestep 0: the mesh reaches farther"),
+    (parameters({"expr": np.full((1, 2), 1e300)}), r"00000\.npz: expr holds values"),
 ]
 
 
-def ids(array: np.ndarray) -> Callable[[Path], None]:
-    return lambda root: np.save(root / "training_faces/0000.npy", array)
-
-
-def soup(text: str) -> Callable[[Path], object]:
-    return lambda root: (root / "meshes/mesh_0000.json").write_text(text)
-
-
+IDS, SOUP, NO_SOUP = "training_faces/0000.npy", "meshes/mesh_0000.json", r"0000\.json: triangles: "
 BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
-    (ids(np.array([0, 320])), r"0000\.npy: names triangles 0 to 320, but the mesh has 0 to 319"),
-    (ids(np.array([-1])), r"0000\.npy: names triangles"),
-    (ids(np.array([0.5])), r"0000\.npy: expected a list of triangle numbers"),
-    (ids(np.array([[1]])), r"0000\.npy: expected a list of triangle numbers"),
-    (ids(np.array([{}], object)), r"0000\.npy: is not a readable npy"),
-    (soup("[]"), r"mesh_0000\.json: triangles: "),
-    (soup('{"triangles": []}'), r"mesh_0000\.json: triangles: "),
-    (soup('{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'), r"0000\.json: triangles: "),
-    (soup('{"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]}'), "json: vertex 0"),
+    (written(IDS, np.array([0, 320])), r"0000\.npy: names triangles 0 to 320, but .* 0 to 319"),
+    (written(IDS, np.array([-1])), r"0000\.npy: names triangles"),
+    (written(IDS, np.array([0.5])), r"0000\.npy: expected a list of triangle numbers"),
+    (written(IDS, np.array([[1]])), r"0000\.npy: expected a list of triangle numbers"),
+    (written(IDS, np.array([{}], object)), r"0000\.npy: is not a readable npy"),
+    (written(SOUP, "[]"), NO_SOUP),
+    (written(SOUP, '{"triangles": []}'), NO_SOUP),
+    (written(SOUP, '{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'), NO_SOUP),
+    (written(SOUP, '{"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]}'),
+     "json: vertex 0"),
     (remove("meshes/mesh_0001.json"), r"mesh_0001\.json: cannot be read"),
-]
+]  # fmt: skip
 
 
 BROKEN_CAPTURES = [
-    *((factory.write_mesh_capture, 0, *row) for row in BROKEN_MESH_CAPTURES),
-    *((factory.write_flame_capture, 0, *row) for row in BROKEN_FLAME_CAPTURES),
-    *((factory.write_release, 1, *row) for row in BROKEN_RELEASES),
+    *((factory.write_mesh_capture, *row) for row in BROKEN_MESH_CAPTURES),
+    *((factory.write_flame_capture, *row) for row in BROKEN_FLAME_CAPTURES),
+    *((factory.write_release, *row) for row in BROKEN_RELEASES),
 ]
 
 
-@pytest.mark.parametrize(("write", "timestep", "damage", "message"), BROKEN_CAPTURES)
-def test_broken_captures(tmp_path, write, timestep, damage, message):
-    """Catches a damaged capture that opens, or fails without naming the file and the field."""
-    written = write(tmp_path / "capture")
-    root, model_file = written if isinstance(written, tuple) else (written, None)
+@pytest.mark.parametrize(("write", "damage", "message"), BROKEN_CAPTURES)
+def test_broken_captures(tmp_path, write, damage, message):
+    """Catches a damaged or absurd capture that opens, or fails without naming file and field."""
+    made = write(tmp_path / "capture")
+    root, model_file = made if isinstance(made, tuple) else (made, None)
     if write == factory.write_mesh_capture:
         noise = np.random.default_rng(0).integers(0, 255, (60, 40), np.uint8)
         Image.fromarray(noise).save(root / "fg_masks/00000_00.png")
     damage(root)
     with pytest.raises(StgaError, match=message):
-        open_capture(root, model_file).mesh(timestep)
+        every_mesh(root, model_file)
+
+
+def every_mesh(root: Path, model_file: Path | None) -> None:
+    capture = open_capture(root, model_file)
+    for timestep in capture.timesteps:
+        capture.expression_mesh(timestep, "head")
+        capture.mesh(timestep)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-9, 0.02, 0.1, -1.0])
+@pytest.mark.filterwarnings("error")
+def test_camera_inside_the_head(tmp_path, distance):
+    """Catches divisions by a depth or distance of zero for a camera in the head, or with the head
+    behind it."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+
+    def change(document):
+        for frame in document["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= distance
+
+    each_split(root, change)
+    samples = take_samples(open_capture(root))
+    assert np.isfinite(samples.direction).all()
+    assert np.isnan(samples.pixel_width).all() or distance > 0
 
 
 def test_what_is_no_capture(tmp_path: Path) -> None:
     """Catches a wrong folder, file or option ending in a traceback or in an empty capture."""
-    with pytest.raises(StgaError, match="none: is not a folder"):
-        open_capture(tmp_path / "none")
+    for folder in (tmp_path / "none", Path("a" * 5000), Path("a/" * 3000), Path("nul\0")):
+        with pytest.raises(StgaError, match="is not a folder"):
+            open_capture(folder)
     with pytest.raises(StgaError, match="is not a capture; expected transforms_"):
         open_capture(tmp_path)
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
@@ -464,7 +493,8 @@ def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
 
 
 def test_frame_rate(tmp_path: Path) -> None:
-    """Catches a rate that is lost in one of the layouts, or made up where none is written."""
+    """Catches a rate that is lost in one of the layouts, made up where none is written, or one at
+    which nothing plays, which fails as late as in an export."""
     mesh = factory.write_mesh_capture(tmp_path / "mesh")
     flame, model = factory.write_flame_capture(tmp_path / "flame")
     release = factory.write_release(tmp_path / "release")
@@ -475,3 +505,8 @@ def test_frame_rate(tmp_path: Path) -> None:
         assert open_capture(root, model).fps == 59.94
         summary = dict(summarize_capture(open_capture(root, model)))
         assert summary["frame rate"] == "59.94 frames per second"
+    for value in (0, -25, 1000, float("inf"), float("nan"), True, "60", [60]):
+        factory.edit(mesh / "transforms_val.json", lambda d, value=value: d.update(fps=value))
+        with pytest.raises(StgaError, match=r"transforms_val\.json: (fps: expected|is not valid)"):
+            open_capture(mesh)
+        factory.edit(mesh / "transforms_val.json", lambda document: document.pop("fps"))

@@ -45,8 +45,8 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
 
 
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
-    """Catches exposure of one camera corrected in the images of another that merely has its
-    number."""
+    """Catches exposure of one camera corrected in the images of another that merely has its number,
+    and two that count as one because their takes begin as far apart as their numbers."""
     views = tuple(
         replace(view, camera=turned(view.camera)) if view.camera_index == 1 else view
         for view in toy.views["train"]
@@ -57,11 +57,6 @@ def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> 
     kept = {old.camera_index: view.camera_index for old, view in zip(views, new, strict=True)}
     assert kept[0] == 0
     assert kept[1] not in before
-
-
-def test_cameras_of_different_takes_have_different_indices(toy: Capture) -> None:
-    """Catches two cameras that count as one because their takes begin as far apart as their
-    numbers."""
     start = max(toy.timesteps) + 1
     (view,) = (view for view in toy.views["train"] if (view.timestep, view.camera_index) == (0, 0))
     away = [replace(view, camera=turned(view.camera), camera_index=n) for n in (start, 0)]

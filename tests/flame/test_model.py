@@ -36,19 +36,13 @@ class _Python2Pickler(pickle._Pickler):  # type: ignore[name-defined,misc]
     dispatch[bytes] = dispatch[str] = _save_string
 
     def save_global(self, obj: Any, name: str | None = None) -> None:
-        module = {
-            "numpy._core.multiarray": "numpy.core.multiarray",
-            "copyreg": "copy_reg",
-            "builtins": "__builtin__",
-        }
-        self.write(
-            f"c{module.get(obj.__module__, obj.__module__)}\n{name or obj.__qualname__}\n".encode()
-        )
+        old = {"numpy._core.multiarray": "numpy.core.multiarray"}
+        old |= {"copyreg": "copy_reg", "builtins": "__builtin__"}
+        module = old.get(obj.__module__, obj.__module__)
+        self.write(f"c{module}\n{name or obj.__qualname__}\n".encode())
         self.memoize(obj)
 
-    dispatch[type] = dispatch[types.FunctionType] = dispatch[types.BuiltinFunctionType] = (
-        save_global
-    )
+    dispatch |= dict.fromkeys((type, types.FunctionType, types.BuiltinFunctionType), save_global)
 
 
 def _python2_pickle(value: Any) -> bytes:
@@ -61,14 +55,10 @@ def _python2_pickle(value: Any) -> bytes:
 def chumpy(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
     """Classes that pickle under chumpy's names; the library itself imports on no current Python."""
     made = {}
-    for module, name in (
-        ("chumpy.ch", "Ch"),
-        ("chumpy.reordering", "Select"),
-        ("chumpy.ch_ops", "add"),
-    ):
-        made[name] = type(name, (), {"__module__": module})
-        monkeypatch.setitem(sys.modules, module, types.ModuleType(module))
-        setattr(sys.modules[module], name, made[name])
+    for name, module in {"Ch": "ch", "Select": "reordering", "add": "ch_ops"}.items():
+        made[name] = type(name, (), {"__module__": f"chumpy.{module}"})
+        monkeypatch.setitem(sys.modules, f"chumpy.{module}", types.ModuleType(f"chumpy.{module}"))
+        setattr(sys.modules[f"chumpy.{module}"], name, made[name])
     return made
 
 
@@ -80,12 +70,9 @@ def _with(kind: type, **state: Any) -> Any:
 
 def _assert_model(path: Path, arrays: dict[str, np.ndarray]) -> None:
     model = read_flame(path)
-    np.testing.assert_array_equal(model.v_template, arrays["v_template"])
-    np.testing.assert_array_equal(model.shapedirs, arrays["shapedirs"])
-    np.testing.assert_array_equal(model.posedirs, arrays["posedirs"])
-    np.testing.assert_allclose(model.j_regressor, arrays["J_regressor"], atol=0)
-    np.testing.assert_array_equal(model.weights, arrays["weights"])
-    np.testing.assert_array_equal(model.faces, arrays["f"])
+    named = {"j_regressor": "J_regressor", "faces": "f"}
+    for name in ("v_template", "shapedirs", "posedirs", "j_regressor", "weights", "faces"):
+        np.testing.assert_array_equal(getattr(model, name), arrays[named.get(name, name)])
     assert model.parents.tolist() == [-1, 0, 1, 1, 1]
     assert model.faces.dtype == np.int32
     assert (model.n_identity, model.n_expression) == (9, 3)
@@ -124,30 +111,27 @@ def test_python2_pickle_with_chumpy_and_sparse(
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_every_pickle_protocol(tmp_path: Path, protocol: int) -> None:
-    # Catches a protocol whose way of storing arrays (text, codecs, buffers) is not understood.
-    arrays = random_arrays()
-    stored = dict(
-        arrays, J_regressor=scipy.sparse.csc_matrix(arrays["J_regressor"]), n_identity=np.int64(9)
-    )
-    path = tmp_path / "model.pkl"
+    """Catches a protocol whose way of storing arrays (text, codecs, buffers) is not understood, and
+    a reader that knows only one numpy's private module names."""
+    arrays, path = random_arrays(), tmp_path / "model.pkl"
+    sparse = scipy.sparse.csc_matrix(arrays["J_regressor"])
+    stored = dict(arrays, J_regressor=sparse, n_identity=np.int64(9))
     path.write_bytes(pickle.dumps(stored, protocol=protocol))
     _assert_model(path, arrays)
-
-
-def test_numpy_2_module_names(tmp_path: Path) -> None:
-    # Catches a reader that knows only numpy 1's private module names.
-    arrays = random_arrays()
     data = pickle.dumps(arrays, protocol=0)
-    path = tmp_path / "model.pkl"
     for old, new in ((b"numpy.core.", b"numpy._core."), (b"numpy._core.", b"numpy.core.")):
         path.write_bytes(data.replace(old, new))
         _assert_model(path, arrays)
 
 
 def test_npz_with_masks_and_identity_count(tmp_path: Path) -> None:
-    # Catches npz models whose own masks or identity count are ignored.
+    """Catches npz models whose own masks or identity count are ignored, and a wrong split of
+    FLAME's published layout."""
     arrays = random_arrays()
     path = tmp_path / "model.npz"
+    np.savez(path, **random_arrays(vertices=10, components=400))
+    model = read_flame(path)
+    assert (model.n_identity, model.n_expression) == (300, 100)
     corners = np.unique(arrays["f"][:20])
     np.savez(path, **arrays, n_identity=5, **{"masks/nose": arrays["f"][3], "masks/lips": corners})
     model = read_flame(path)
@@ -174,14 +158,6 @@ def test_mask_file_beside_the_model(tmp_path: Path) -> None:
     assert keys["left_eye"][[0, 1]].all()
     assert keys["right_eye"][2]
     assert "mouth" not in keys
-
-
-def test_400_components_are_300_and_100(tmp_path: Path) -> None:
-    # Catches a wrong split of FLAME's published layout.
-    path = tmp_path / "model.npz"
-    np.savez(path, **random_arrays(vertices=10, components=400))
-    model = read_flame(path)
-    assert (model.n_identity, model.n_expression) == (300, 100)
 
 
 class _Attack:
