@@ -49,46 +49,42 @@ def test_replacing_is_all_or_nothing(tmp_path: Path) -> None:
     assert os.listdir(path.parent) == ["file.txt"]
 
 
-@pytest.mark.parametrize("name", ["file/a.json", "folder", "x" * 250, "y" * 5000, "a\0", "\ud800"])
+UNWRITABLE = (
+    "file/a.json", "file/inner/a.json", "folder", "pipe", ".", "/", "x" * 250, "y" * 5000, "a\0",
+    "\ud800",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNWRITABLE)
 def test_unwritable_paths(tmp_path: Path, name: str) -> None:
     """Catches a traceback where a folder is a file, the file is a folder or no file can have such a
-    name, and temporary files left beside it."""
+    name, a device, such as /dev/null, that is replaced by a file, a path that is refused only after
+    minutes of work, and temporary files left beside it."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder" / "inner").mkdir(parents=True)
+    os.mkfifo(tmp_path / "pipe")
+    path = Path(name) if name in ("/", ".") else tmp_path / name
     with pytest.raises(StgaError, match="cannot be written"):
-        write_json(tmp_path / name, {})
-    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
-
-
-def test_a_path_is_checked_without_a_trace(tmp_path: Path) -> None:
-    """Catches a path that is refused only after minutes of work, and folders or files that the
-    check leaves."""
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "folder").mkdir()
-    for path in (tmp_path / "new/inner/video.mp4", tmp_path / "video.mp4", tmp_path / "file"):
+        write_json(path, {})
+    with pytest.raises(StgaError, match="cannot be written"):
         check_writable(path)
-    for name in ("file/video.mp4", "file/inner/video.mp4", "folder"):
-        path = tmp_path / name
-        with pytest.raises(StgaError, match="cannot be written"):
-            check_writable(path)
-    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+    for writable in (tmp_path / "new/inner/video.mp4", tmp_path / "video.mp4", tmp_path / "file"):
+        check_writable(writable)
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder", "pipe"]
     assert (tmp_path / "file").read_text() == "x"
-
-
-def test_json_round_trip(tmp_path: Path) -> None:
-    """Catches an encoding that depends on the system."""
-    value = {"name": "Grüße", "list": [1, 2.5, None, True], "nested": {"a": "b"}}
-    write_json(tmp_path / "a.json", value)
-    assert read_json(tmp_path / "a.json") == value
-    (tmp_path / "b.json").write_bytes(json.dumps(value, ensure_ascii=False).encode())
-    assert read_json(tmp_path / "b.json") == value
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"hello", b"\xff\xfe{}", b"[" * 200_000, b'{"a": 1']
 )
-def test_malformed_json(tmp_path: Path, content: bytes) -> None:
-    """Catches a traceback, a crash by deep nesting, and a message that does not name the file."""
+def test_json(tmp_path: Path, content: bytes) -> None:
+    """Catches a traceback, a crash by deep nesting, a message that does not name the file, and an
+    encoding that depends on the system."""
+    value = {"name": "Grüße", "list": [1, 2.5, None, True], "nested": {"a": "b"}}
+    write_json(tmp_path / "a.json", value)
+    assert read_json(tmp_path / "a.json") == value
+    (tmp_path / "a.json").write_bytes(json.dumps(value, ensure_ascii=False).encode())
+    assert read_json(tmp_path / "a.json") == value
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(StgaError, match=r"a\.json: is not valid JSON"):
         read_json(tmp_path / "a.json")
@@ -100,11 +96,8 @@ def test_malformed_json(tmp_path: Path, content: bytes) -> None:
 @pytest.mark.parametrize("compressed", [False, True])
 def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
     """Catches a suffix that numpy adds, and arrays that change their type or shape."""
-    arrays = {
-        "a": np.arange(6, dtype=np.int32).reshape(2, 3),
-        "b/c": np.array([True, False]),
-        "d": np.float64(3),
-    }
+    arrays = {"a": np.arange(6, dtype=np.int32).reshape(2, 3), "b/c": np.array([True, False])}
+    arrays["d"] = np.float64(3)
     write_npz(tmp_path / "file.part", arrays, compressed)
     again = read_npz(tmp_path / "file.part")
     assert os.listdir(tmp_path) == ["file.part"]
@@ -180,8 +173,8 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
 def test_temporary_name_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a predictable temporary name, and a link under that name that is followed and
-    overwritten."""
+    """Catches a predictable temporary name, a link under that name that is followed and
+    overwritten, and results that a group cannot read although its umask allows that."""
     names = set()
     for _ in range(2):
         with replacing(tmp_path / "a.json") as partial:
@@ -195,29 +188,13 @@ def test_temporary_name_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(StgaError, match=r"a\.json: cannot be written"):
         write_json(tmp_path / "a.json", {})
     assert (tmp_path / "target").read_text() == "mine"
-
-
-@pytest.mark.skipif(os.name == "nt", reason="modes of POSIX systems")
-def test_mode_follows_the_umask(tmp_path: Path) -> None:
-    """Catches results that a group cannot read although its umask allows that."""
+    monkeypatch.undo()
     before = os.umask(0o027)
     try:
-        write_json(tmp_path / "a.json", {})
+        write_json(tmp_path / "b.json", {})
     finally:
         os.umask(before)
-    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o640
-
-
-@pytest.mark.parametrize("name", [".", "/", "folder", "pipe"])
-def test_only_regular_files_are_replaced(tmp_path, name):
-    """Catches a device, such as /dev/null, that is replaced by a file, and a traceback for a path
-    without a name."""
-    (tmp_path / "folder").mkdir()
-    os.mkfifo(tmp_path / "pipe")
-    path = Path(name) if name in "./" else tmp_path / name
-    with pytest.raises(StgaError, match="is not a regular file"), files.replacing(path):
-        pytest.fail("the block must not run")
-    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["folder", "pipe"]
+    assert stat.S_IMODE((tmp_path / "b.json").stat().st_mode) == 0o640
 
 
 def refused(times: int, winerror: int | None):

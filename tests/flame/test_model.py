@@ -92,12 +92,9 @@ def test_python2_pickle_with_chumpy_and_sparse(
     stored["v_template"] = _with(chumpy["Ch"], x=arrays["v_template"], _dirty_vars={"x"})
     stored["shapedirs"] = _with(chumpy["Ch"], x=np.asfortranarray(arrays["shapedirs"]))
     flat = np.arange(arrays["posedirs"].size)[::-1]
-    stored["posedirs"] = _with(
-        chumpy["Select"],
-        a=_with(chumpy["Ch"], x=arrays["posedirs"].ravel()[::-1].copy()),
-        idxs=flat,
-        preferred_shape=arrays["posedirs"].shape,
-    )
+    leaf, shape = arrays["posedirs"].ravel()[::-1].copy(), arrays["posedirs"].shape
+    leaf = _with(chumpy["Ch"], x=leaf)
+    stored["posedirs"] = _with(chumpy["Select"], a=leaf, idxs=flat, preferred_shape=shape)
     stored["J_regressor"] = layout(arrays["J_regressor"])
     stored["weights"] = arrays["weights"].astype(">f8")
     stored["bs_style"] = "lbs"
@@ -148,11 +145,8 @@ def test_mask_file_beside_the_model(tmp_path: Path) -> None:
     arrays = random_arrays()
     path = tmp_path / "model.pkl"
     path.write_bytes(pickle.dumps(arrays))
-    regions = {
-        "left_eye_region": arrays["f"][0],
-        "left_eyeball": arrays["f"][1],
-        "right_eyeball": arrays["f"][2],
-    }
+    names = "left_eye_region", "left_eyeball", "right_eyeball"
+    regions = dict(zip(names, arrays["f"][:3], strict=True))
     (tmp_path / "FLAME_masks.pkl").write_bytes(_python2_pickle(regions))
     keys = key_regions(read_flame(path))
     assert keys["left_eye"][[0, 1]].all()
@@ -183,13 +177,10 @@ def test_other_classes_are_refused_by_name(
     # Catches a pickle that gets anything executed: the witness file must not appear, and the class
     # must be named.
     witness = tmp_path / "witness"
-    attack.arguments = tuple(
-        a.format(witness) if isinstance(a, str) else a for a in attack.arguments
-    )
-    path = tmp_path / "model.pkl"
-    path.write_bytes(
-        pickle.dumps(dict(random_arrays(), extra=attack), protocol=protocol, fix_imports=False)
-    )
+    texts = (a.format(witness) if isinstance(a, str) else a for a in attack.arguments)
+    attack.arguments, path = tuple(texts), tmp_path / "model.pkl"
+    stored = dict(random_arrays(), extra=attack)
+    path.write_bytes(pickle.dumps(stored, protocol=protocol, fix_imports=False))
     with pytest.raises(StgaError, match=f"model.pkl.*{name.replace('.', '[.]')}"):
         read_flame(path)
     assert not witness.exists()

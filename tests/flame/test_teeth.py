@@ -32,14 +32,12 @@ def toothed(flame_open: FlameModel) -> FlameModel:
     return with_teeth(flame_open)
 
 
-def _rows(model: FlameModel) -> np.ndarray:
-    return model.v_template[5023:].reshape(8, 15, 3)
-
-
 def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) -> None:
     """Catches vertices that are inserted rather than appended: tracked offsets would land
-    elsewhere."""
+    elsewhere; and selection that leaves the teeth out of the mouth region."""
     assert (len(toothed.v_template), len(toothed.faces)) == (5143, 10144)
+    model = with_teeth(replace(flame_open, masks={"lips": np.concatenate(lip_pairs(flame_open))}))
+    assert key_regions(model)["mouth"][9976:].all()
     for name in ("v_template", "shapedirs", "posedirs", "weights"):
         np.testing.assert_array_equal(getattr(toothed, name)[:5023], getattr(flame_open, name))
     np.testing.assert_array_equal(toothed.faces[:9976], flame_open.faces)
@@ -72,19 +70,15 @@ def test_sound_triangles(toothed: FlameModel) -> None:
     assert (double_area / longest**2).min() > 0.15
 
 
-def test_left_mirrors_right(toothed: FlameModel) -> None:
-    """Catches an arch that is shifted, or turned towards one cheek."""
-    rows = _rows(toothed)
+def test_rows_bite(toothed: FlameModel) -> None:
+    """Catches rows that are upside down, far apart or larger than teeth, and an arch that is
+    shifted, or turned towards one cheek."""
+    rows = toothed.v_template[5023:].reshape(8, 15, 3)
     np.testing.assert_allclose(rows[:, ::-1, 1:], rows[:, :, 1:], atol=1e-12)
     plane = (rows[:, ::-1, 0] + rows[:, :, 0]) / 2
     np.testing.assert_allclose(plane, plane[0, 0], atol=1e-12)
     assert abs(plane[0, 0]) < 0.0003
     assert (np.diff(rows[:, :, 0]) < 0).all()
-
-
-def test_rows_bite(toothed: FlameModel) -> None:
-    """Catches rows that are upside down, far apart or larger than teeth."""
-    rows = _rows(toothed)
     assert 0.001 < (rows[LE, :, 1] - rows[UE, :, 1]).mean() < 0.004
     assert 0.002 < rows[UE, 7, 2] - rows[LE, 7, 2] < 0.005
     for root, edge in ((UR, UE), (LR, LE)):
@@ -160,17 +154,10 @@ def test_lips_face_each_other(flame_open: FlameModel, toothed: FlameModel) -> No
     assert np.abs(upper[:, 0] - lower[:, 0]).max() < 0.003
     assert np.ptp(upper[:, 0]) > 0.045
     opened = jaw_opened(toothed, 20)
-    before, after = (
-        np.linalg.norm(np.subtract(*(mesh[ids] for ids in lip_pairs(toothed))), axis=1).max()
-        for mesh in (flame_open.v_template, opened)
-    )
+    upper, lower = lip_pairs(toothed)
+    meshes = flame_open.v_template, opened
+    before, after = (np.linalg.norm(at[upper] - at[lower], axis=1).max() for at in meshes)
     assert after - before > 0.008
-
-
-def test_teeth_belong_to_the_mouth(flame_open: FlameModel) -> None:
-    """Catches selection that leaves the teeth out of the mouth region."""
-    model = with_teeth(replace(flame_open, masks={"lips": np.concatenate(lip_pairs(flame_open))}))
-    assert key_regions(model)["mouth"][9976:].all()
 
 
 def test_a_closed_mouth_is_refused(flame_open: FlameModel) -> None:
