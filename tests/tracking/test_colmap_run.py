@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.capture.camera import look_at
+from stga_addon.capture.mesh_geometry import similarity
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.shots import Lens
 
@@ -59,16 +60,6 @@ def ideal_rays(camera):
     return rays
 
 
-def similarity(source, target):
-    """Scale, rotation and translation that take points (N, 3) to others, by Umeyama's method."""
-    middle_s, middle_t = source.mean(axis=0), target.mean(axis=0)
-    u, s, vt = np.linalg.svd((target - middle_t).T @ (source - middle_s))
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ sign @ vt
-    scale = np.trace(np.diag(s) @ sign) / ((source - middle_s) ** 2).sum()
-    return scale, rotation, middle_t - scale * rotation @ middle_s
-
-
 @pytest.mark.slow
 def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
     """Catches any step from COLMAP's files to pinhole images that is off: pose, lens, principal
@@ -85,9 +76,8 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
         image = rendered(camera, rays, walls).round().astype(np.uint8)
         Image.fromarray(image).convert("RGB").save(tmp_path / f"images/{number}.png")
 
-    database, images, sparse = (
-        str(tmp_path / name) for name in ("database.db", "images", "sparse")
-    )
+    names = ("database.db", "images", "sparse")
+    database, images, sparse = (str(tmp_path / name) for name in names)
     reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
     single = pycolmap.CameraMode.SINGLE
     pycolmap.extract_features(database, images, camera_mode=single, reader_options=reader)
@@ -100,11 +90,11 @@ def test_undistorted_frames_show_what_the_cameras_see(tmp_path):
     assert [camera.name for camera in footage.cameras] == [str(n) for n in range(len(truth))]
     positions = np.array([camera.camera.position for camera in footage.cameras])
     true = np.array([camera.position for camera in truth])
-    scale, rotation, translation = similarity(positions, true)
+    fit = similarity(positions, true)
     for found, expected in zip(footage.cameras, truth, strict=True):
-        aligned = scale * rotation @ found.camera.position + translation
+        aligned = fit.apply(found.camera.position)
         np.testing.assert_allclose(aligned, expected.position, atol=0.02)
-        turned = found.camera.world_to_camera[:3, :3] @ rotation.T
+        turned = found.camera.world_to_camera[:3, :3] @ fit.rotation.T
         np.testing.assert_allclose(turned, expected.world_to_camera[:3, :3], atol=0.01)
         ideal = rendered(expected, pixel_rays(found.camera), walls)
         difference = np.abs(found.image(0)[..., 0].astype(float) - ideal)[4:-4, 4:-4]

@@ -52,20 +52,6 @@ def test_range_step_and_offset(tmp_path):
     assert red(footage) == {"a": [*range(102, 109)], "b": [*range(201, 208)]}
 
 
-@pytest.mark.parametrize(("counts", "frames", "message"), [
-    ((6, 5), FrameRange(), "b has 5 frames and camera a 6; expected recordings of the same length"),
-    ((6, 5), FrameRange(0, 6), "Camera b has 5 frames; expected all up to 6"),
-    ((6, 6), FrameRange(0, 6, 1, {"b": 1}), "b has 6 frames; expected all up to 6 and its offset"),
-    ((6, 6), FrameRange(offsets={"z": 1}), "Offset for camera z: expected one of a, b"),
-    ((6, 6), FrameRange(9), "Frames from 9 on: the cameras have only 6 in common"),
-])  # fmt: skip
-def test_recordings_out_of_step(tmp_path, counts, frames, message):
-    """Catches frames of different moments silently paired."""
-    write_folders(tmp_path, counts)
-    with pytest.raises(StgaError, match=message):
-        open_footage(tmp_path, frames=frames)
-
-
 def without_one_frame(images):
     write_image(images / "a/frame_7.png")
     (images / "a/frame_4.png").unlink()
@@ -81,21 +67,35 @@ def of_other_size(images, numbers=range(1, 7)):
         write_image(images / f"b/frame_{number}.png", size=(20, 15))
 
 
-@pytest.mark.parametrize(("damage", "message"), [
-    (without_one_frame, r"b/frame_4.png: is 3 frames after the first of camera b, where camera a "),
-    (without_a_recording, r"image 'b/frame_1.png': .* has no folder or video of this camera"),
-    (of_other_size, r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"),
-    (lambda images: of_other_size(images, [3]),
+def of_other_length(images):
+    (images / "b/frame_6.png").unlink()
+
+
+@pytest.mark.parametrize(("damage", "frames", "message"), [
+    (of_other_length, FrameRange(),
+     "b has 5 frames and camera a 6; expected recordings of the same length"),
+    (of_other_length, FrameRange(0, 6), "Camera b has 5 frames; expected all up to 6"),
+    (None, FrameRange(0, 6, 1, {"b": 1}), "b has 6 frames; expected all up to 6 and its offset"),
+    (None, FrameRange(offsets={"z": 1}), "Offset for camera z: expected one of a, b"),
+    (None, FrameRange(9), "Frames from 9 on: the cameras have only 6 in common"),
+    (without_one_frame, FrameRange(),
+     r"b/frame_4.png: is 3 frames after the first of camera b, where camera a "),
+    (without_a_recording, FrameRange(),
+     r"image 'b/frame_1.png': .* has no folder or video of this camera"),
+    (of_other_size, FrameRange(),
+     r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"),
+    (lambda images: of_other_size(images, [3]), FrameRange(),
      r"frame_3.png: has 20 x 15 pixels at timestep 2, but camera b has 40 x 30"),
 ])  # fmt: skip
-def test_folders_that_do_not_fit(tmp_path, damage, message):
-    """Catches all later frames of a camera being one too early because one file is missing, a
-    camera that disappears from the footage, and images of another resolution than the
-    calibration's, all of them or from some frame on."""
+def test_recordings_out_of_step(tmp_path, damage, frames, message):
+    """Catches frames of different moments silently paired, all later frames of a camera being one
+    too early because one file is missing, a camera that disappears from the footage, and images of
+    another resolution than the calibration's, all of them or from some frame on."""
     write_folders(tmp_path)
-    damage(tmp_path / "images")
+    if damage is not None:
+        damage(tmp_path / "images")
     with pytest.raises(StgaError, match=message):
-        open_footage(tmp_path)
+        open_footage(tmp_path, frames=frames)
 
 
 def test_masks_beside_the_images(tmp_path):
@@ -169,7 +169,10 @@ def test_one_video_without_calibration(tmp_path):
 
 
 def test_two_cameras_without_calibration(tmp_path):
-    """Catches a rig without poses taken for one camera."""
+    """Catches a rig without poses taken for one camera, a traceback where a folder's name ends as
+    an export's does, and the RuntimeError by which resolving a loop of links ends."""
+    (tmp_path / "old.xml").mkdir()
+    (tmp_path / "old.csv").mkdir()
     write_image(tmp_path / "a/1.png")
     write_image(tmp_path / "b/1.png")
     message = r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model"
@@ -178,14 +181,9 @@ def test_two_cameras_without_calibration(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
         open_footage(tmp_path / "empty")
-
-
-def test_folders_named_as_calibrations(tmp_path):
-    """Catches a traceback where a folder's name ends as an export's does."""
-    write_image(tmp_path / "a/1.png", 90)
-    (tmp_path / "old.xml").mkdir()
-    (tmp_path / "old.csv").mkdir()
-    assert open_footage(tmp_path).focal == "usual"
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with pytest.raises(StgaError, match="is neither a folder nor a video"):
+        open_footage(tmp_path / "loop")
 
 
 def test_distorted_frames_are_undistorted(tmp_path):
@@ -200,11 +198,3 @@ def test_distorted_frames_are_undistorted(tmp_path):
     assert camera.image(0).shape == (HEIGHT, WIDTH, 3)
     assert camera.mask(0).shape == (HEIGHT, WIDTH)
     assert camera.file(0) is None
-
-
-def test_a_loop_of_links_is_no_footage(tmp_path) -> None:
-    """Catches the RuntimeError by which resolving such a path ends."""
-    path = tmp_path / "loop"
-    path.symlink_to(path)
-    with pytest.raises(StgaError, match="is neither a folder nor a video"):
-        open_footage(path)
