@@ -19,7 +19,7 @@ GAMMAS = {4: 2.2, 5: 2.8}
 
 REFERENCE_WHITE_CD_M2 = 203.0
 """Of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; what is brighter is clipped."""
-HLG_PEAK_CD_M2, HLG_SYSTEM_GAMMA = 1000.0, 1.2
+HLG_PEAK, HLG_SYSTEM_GAMMA = 1000.0 / REFERENCE_WHITE_CD_M2, 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 BAND_PIXELS = 1 << 18
 """Converted at a time: wide intermediate numbers of a large image would fill the memory."""
@@ -42,7 +42,10 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     matrix = np.asarray(np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(known), np.float32)
 
     def convert(band: np.ndarray) -> np.ndarray:
-        light = _displayed(table[band]) if transfer == HLG else table[band]
+        light = table[band]
+        if transfer == HLG:  # light of the scene to a display's, where 1 is diffuse white (OOTF)
+            luminance = np.maximum(light @ BT2020_LUMINANCE.astype(light.dtype), 1e-6)
+            light = HLG_PEAK * (luminance ** (HLG_SYSTEM_GAMMA - 1))[..., None] * light
         return 255 * linear_to_srgb(np.clip(light @ matrix.T, 0, 1)) + 0.5
 
     return in_bands(pixels, 3, convert)
@@ -78,7 +81,7 @@ def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _linear(transfer: int, levels: int) -> np.ndarray:
-    """(levels,) light of each signal: 1 is diffuse white. HLG: before `_displayed`."""
+    """(levels,) light of each signal: 1 is diffuse white; of HLG: light of the scene."""
     signal = np.arange(levels) / (levels - 1)
     if transfer == LINEAR:
         light = signal
@@ -94,13 +97,6 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
     else:
         light = srgb_to_linear(signal)
     return np.asarray(light, np.float32)
-
-
-def _displayed(scene: np.ndarray) -> np.ndarray:
-    """HLG's light of the scene (…, 3), BT.2020, as a display's, where 1 is diffuse white (OOTF)."""
-    luminance = np.maximum(scene @ BT2020_LUMINANCE.astype(scene.dtype), 1e-6)
-    gain = HLG_PEAK_CD_M2 / REFERENCE_WHITE_CD_M2 * luminance ** (HLG_SYSTEM_GAMMA - 1)
-    return np.asarray(gain[..., None] * scene)
 
 
 def _to_xyz(primaries: int) -> np.ndarray:

@@ -59,12 +59,8 @@ def find_calibration(root: Path) -> Path | None:
     colmap = find_colmap(root)
     if colmap is not None:
         return colmap
-    found = [
-        path
-        for pattern, is_own in (("*.xml", is_metashape), ("*.csv", is_realitycapture_csv))
-        for path in sorted(root.glob(pattern))
-        if isfile(path) and is_own(path)
-    ]
+    found = [path for path in sorted(root.glob("*.xml")) if isfile(path) and _is_metashape(path)]
+    found += [path for path in sorted(root.glob("*.csv")) if isfile(path) and _is_csv(path)]
     if len(found) > 1:
         raise StgaError(f"{root}: {found[0].name} and {found[1].name} are calibrations; choose one")
     folders = [folder for folder in (root, root / "images") if any(folder.glob("*.xmp"))]
@@ -164,7 +160,7 @@ def _lens(values: dict[str, Any], where: str) -> Lens:
 # Metashape
 
 
-def is_metashape(path: Path) -> bool:
+def _is_metashape(path: Path) -> bool:
     """Whether it begins as Metashape's export; others write XML files beside images, too."""
     with path.open("rb") as stream:
         start = stream.read(1024)
@@ -242,7 +238,7 @@ def _sensor(
 # RealityCapture
 
 
-def is_realitycapture_csv(path: Path) -> bool:
+def _is_csv(path: Path) -> bool:
     """Whether the first line is that of an export of internal and external camera parameters."""
     with path.open("rb") as stream:
         names = stream.readline(4096).decode("utf-8-sig", errors="replace")

@@ -35,12 +35,9 @@ USUAL_VIEW_DEG = 65.0
 
 
 def open_footage(
-    path: Path,
-    cameras: Path | None = None,
-    frames: FrameRange = ALL_FRAMES,
-    focal: float | None = None,
-    mattes: Path | None = None,
-) -> Footage:
+    path: Path, cameras: Path | None = None, frames: FrameRange = ALL_FRAMES,
+    focal: float | None = None, mattes: Path | None = None,
+) -> Footage:  # fmt: skip
     """Open footage: cameras and file names now, frames when they are asked for.
 
     path     folder with an image, a folder of images or a video for each camera; or one video
@@ -133,11 +130,9 @@ def _masked(
 
 
 def _rig(
-    sources: Sources,
-    shots: Mapping[str, Shot],
-    sequences: Mapping[str, Sequence],
+    sources: Sources, shots: Mapping[str, Shot], sequences: Mapping[str, Sequence],
     frames: FrameRange,
-) -> Footage:
+) -> Footage:  # fmt: skip
     videos = [own for own in sequences.values() if isinstance(own, Video)]
     warnings = [warning for video in videos for warning in video.warnings]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
@@ -185,11 +180,8 @@ def usual_focal(width: int, height: int) -> float:
 
 
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
-    """Shots with their image, after which they are named, and which shows the only timestep.
-
-    Raises StgaError for two of the same pose: the images of a camera that stands still are a
-    sequence.
-    """
+    """Shots with their image, after which they are named, and which shows the only timestep; no two
+    of the same pose: the images of a camera that stands still are a sequence."""
     found, poses = [], dict[bytes, Shot]()
     for shot in shots:
         other = poses.setdefault(_pose(shot), shot)

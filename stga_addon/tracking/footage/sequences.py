@@ -67,11 +67,9 @@ def sequence_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def synchronized(
-    sequences: Mapping[str, Sequence],
-    shots: Mapping[str, Shot],
-    sources: Sources,
+    sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], sources: Sources,
     frames: FrameRange,
-) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:
+) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:  # fmt: skip
     """Frames of each camera, those of the videos a second (None where none says a plausible
     number), and a sentence for each clock that was compared.
 
@@ -106,10 +104,9 @@ def synchronized(
         numbers = {t: recorded[name][t] for t in timesteps}
         size, shot, camera = sequence_size(own), shots[name], shots[name].camera
         if size != (camera.width, camera.height):
-            raise StgaError(
-                f"{own.path if isinstance(own, Video) else own[0]}: has {size[0]} x {size[1]} "
-                f"pixels, but {shot.where} has {camera.width} x {camera.height}"
-            )
+            path = own.path if isinstance(own, Video) else own[0]
+            expected = f"but {shot.where} has {camera.width} x {camera.height}"
+            raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {expected}")
         if isinstance(own, Video):
             result[name] = VideoFrames(own, numbers)
             continue
@@ -127,20 +124,16 @@ def _frames_per_second(sequences: Mapping[str, Sequence]) -> float | None:
     first, usual = next(iter(rates.items()), ("", None))
     for name, rate in rates.items():
         if usual is not None and abs(rate - usual) > 0.01 * usual:
-            raise StgaError(
-                f"The video of camera {name} has {rate:g} frames a second, "
-                f"that of camera {first} {usual:g}; expected one rate"
-            )
+            other = f"that of camera {first} {usual:g}; expected one rate"
+            raise StgaError(f"The video of camera {name} has {rate:g} frames a second, {other}")
     return usual
 
 
 def _common_range(
     sequences: Mapping[str, Sequence], frames: FrameRange, offsets: Mapping[str, int]
 ) -> tuple[int, int]:
-    """Timesteps (first, last + 1) that all cameras have.
-
-    Recordings of different length may start at different moments, so they need a `stop` or offsets.
-    """
+    """Timesteps (first, last + 1) that all cameras have. Recordings of different length may start
+    at different moments, so they need a `stop` or offsets."""
     lengths = {
         name: own.timesteps[-1] + 1 if isinstance(own, Video) else len(own)
         for name, own in sequences.items()
@@ -151,10 +144,9 @@ def _common_range(
         if frames.stop is not None and length - offsets[name] < frames.stop:
             raise StgaError(f"{has}; expected all up to {frames.stop} and its offset")
         if frames.stop is None and not frames.offsets and length != lengths[longest]:
-            raise StgaError(
-                f"{has} and camera {longest} {lengths[longest]}; "
-                "expected recordings of the same length, offsets, or the number of the last frame"
-            )
+            has += f" and camera {longest} {lengths[longest]}"
+            same = "recordings of the same length, offsets, or the number of the last frame"
+            raise StgaError(f"{has}; expected {same}")
     first = max(0, *(-offset for offset in offsets.values()))
     return first, min(length - offsets[name] for name, length in lengths.items())
 
@@ -175,11 +167,10 @@ def _require_same_gaps(
         first = next(iter(patterns))
         for path, own, other in zip(paths, patterns[name], patterns[first], strict=True):
             if own != other:
-                raise StgaError(
-                    f"{path}: is {own} frames after the first of camera {name}, "
-                    f"where camera {first} has one {other} after its first; "
-                    "expected no missing frames, or the same ones"
-                )
+                here = f"is {own} frames after the first of camera {name}"
+                there = f"where camera {first} has one {other} after its first"
+                same = "expected no missing frames, or the same ones"
+                raise StgaError(f"{path}: {here}, {there}; {same}")
 
 
 def clock_offsets(

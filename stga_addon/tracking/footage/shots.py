@@ -25,6 +25,7 @@ CACHED_MAPS = 32  # Lenses whose maps are kept: 6 bytes a pixel each
 ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
 MAX_POSITION = 1e12
 """Of a camera, in the calibration's unit: millimeters from the center of the earth are 1e10."""
+Intrinsics = tuple[int, int, float, float, float, float]  # Width, height, fl_x, fl_y, cx, cy
 
 
 @dataclass(frozen=True)
@@ -109,15 +110,12 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
     try:
         import cv2  # noqa: F401
     except ImportError as error:
-        raise StgaError(
-            f"{where}: its lens is distorted; undistorting needs opencv-python-headless"
-        ) from error
+        needed = "undistorting needs opencv-python-headless"
+        raise StgaError(f"{where}: its lens is distorted; {needed}") from error
     low, high = ZOOM_RANGE
     if not _is_inside(recorded, lens, high):
-        raise StgaError(
-            f"{where}: the distortion of its lens folds the image; "
-            "expected coefficients of this camera"
-        )
+        folds = "the distortion of its lens folds the image"
+        raise StgaError(f"{where}: {folds}; expected coefficients of this camera")
     for _ in range(ZOOM_STEPS):
         middle = (low + high) / 2
         low, high = (low, middle) if _is_inside(recorded, lens, middle) else (middle, high)
@@ -141,16 +139,12 @@ def _is_inside(recorded: Camera, lens: Lens, zoom: float) -> bool:
     return bool((np.diff(np.linalg.norm(distorted, axis=-1), axis=0) > 0).all())
 
 
-def _intrinsics(camera: Camera) -> tuple[int, int, float, float, float, float]:
+def _intrinsics(camera: Camera) -> Intrinsics:
     return camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy
 
 
 @lru_cache(CACHED_MAPS)
-def _maps(
-    recorded: tuple[int, int, float, float, float, float],
-    lens: Lens,
-    ideal: tuple[int, int, float, float, float, float],
-) -> tuple[Any, Any]:
+def _maps(recorded: Intrinsics, lens: Lens, ideal: Intrinsics) -> tuple[Any, Any]:
     """OpenCV's fixed-point maps; its pixel centers are whole numbers, ours lie at .5."""
     import cv2
 
@@ -227,13 +221,9 @@ def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[
 
 
 def pinhole(
-    size: tuple[float, float],
-    focal: tuple[float, float],
-    center: tuple[float, float],
-    rotation: np.ndarray,
-    position: np.ndarray,
-    where: str,
-) -> Camera:
+    size: tuple[float, float], focal: tuple[float, float], center: tuple[float, float],
+    rotation: np.ndarray, position: np.ndarray, where: str,
+) -> Camera:  # fmt: skip
     """Camera of a calibration.
 
     size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from

@@ -67,15 +67,13 @@ def read_video(path: Path) -> Video:
     all are.
     """
     size, first = first_frames(path)
-    times: Sequence[int | None] | None
     times, is_cut_off = _packet_times(path)
-    left_out = 0 if times is None or first[0] not in times else times.index(first[0])
-    if times is None or times[left_out : left_out + len(first)] != first:
-        with opened_video(path) as container:
-            container.streams.video[0].thread_type = "AUTO"
-            times, left_out = [frame.pts for frame in _decoded_frames(container)], 0
+    left_out = times.index(first[0]) if first[0] in times else 0
     with opened_video(path) as container:
         stream = container.streams.video[0]
+        if times[left_out : left_out + len(first)] != first:
+            stream.thread_type = "AUTO"
+            times, left_out = [frame.pts for frame in _decoded_frames(container)], 0
         exact = _is_of(container, SEEKABLE_CONTAINERS) or stream.codec_context.codec.intra_only
         seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
@@ -83,7 +81,7 @@ def read_video(path: Path) -> Video:
     if not seekable:
         numbers = tuple(range(len(times)))
         return Video(path, numbers, numbers, next(iter(rates), 0.0), size, seekable=False)
-    shown = tuple(time for time in times[left_out:] if time is not None)
+    shown = tuple(times[left_out:])
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
     if left_out:
         fate = "cannot be decoded; they are left out, and not counted"
@@ -157,10 +155,7 @@ class VideoFrames:
 
     def _frame(self, number: int) -> Any:
         """The frame, decoded on from the last one, from a key frame before it, or from the
-        beginning.
-
-        Raises ValueError where the decoder gives no frame of that time.
-        """
+        beginning. Raises ValueError where the decoder gives no frame of that time."""
         from av.error import InvalidDataError
 
         failure, times = None, self.video.times
@@ -236,18 +231,16 @@ def opened_video(path: Path) -> Iterator[Any]:
         raise StgaError(f"{path}: is not a readable video ({_reason(error)})") from error
 
 
-def _packet_times(path: Path) -> tuple[list[int] | None, bool]:
-    """When packets are shown, ascending; None where they do not say it, so that all frames must be
-    decoded. And whether the file was found to end within a packet, which is left out.
-
-    Packets that an edit list hides are decoded, but not shown.
-    """
+def _packet_times(path: Path) -> tuple[list[int], bool]:
+    """When packets are shown, ascending, without those that an edit list hides; none where they do
+    not say it, so that all frames must be decoded. And whether the file was found to end within a
+    packet, which is left out."""
     with opened_video(path) as container:
         stream = container.streams.video[0]
         timed = stream.codec_context.name not in CODECS_WITH_HIDDEN_PACKETS
         timed = timed and _is_of(container, TIMED_CONTAINERS)
         if not (timed or stream.codec_context.codec.intra_only):
-            return None, False
+            return [], False
         packets, is_cut_off = [], False
         for packet in container.demux(stream):
             is_cut_off = _is_cut_off(container, packet)
@@ -256,7 +249,7 @@ def _packet_times(path: Path) -> tuple[list[int] | None, bool]:
             if packet.size and not packet.is_discard:
                 packets.append(packet.pts)
     times = sorted(time for time in packets if time is not None)
-    return times if len(times) == len(packets) and _ascending(times) else None, is_cut_off
+    return times if len(times) == len(packets) and _ascending(times) else [], is_cut_off
 
 
 def _is_cut_off(container: Any, packet: Any) -> bool:
@@ -284,11 +277,8 @@ def _decoded_frames(container: Any) -> Iterator[Any]:
 
 
 def _from_key_frame(frames: Iterator[Any], time: int) -> Iterator[Any]:
-    """The frames from the first key frame on, because those shown before it may refer to frames
-    before the seek.
-
-    No frames where the key frame is later than `time`.
-    """
+    """The frames from the first key frame on, because those before it may refer to frames before
+    the seek; none where it is later than `time`."""
     for frame in frames:
         if frame.key_frame:
             yield frame
@@ -308,11 +298,9 @@ def _is_of(container: Any, formats: Sequence[str]) -> bool:
 def _timed(
     path: Path, times: Sequence[int], time_base: float, rates: list[float]
 ) -> tuple[tuple[int, ...], float, tuple[str, ...]]:
-    """Timesteps of the frames, frames per second, and a sentence where the rate varies.
-
-    The rate is the first of the stated ones that the frames' times agree with, else the average of
-    the times: what a file states also counts frames that are hidden.
-    """
+    """Timesteps of the frames, frames per second, and a sentence where the rate varies. The rate is
+    the first of the stated ones that the frames' times agree with, else that of the times: what a
+    file states also counts frames that are hidden."""
     if len(times) < 2:
         return tuple(range(len(times))), next(iter(rates), 0.0), ()
     durations = np.diff(times)
@@ -326,10 +314,9 @@ def _timed(
     timesteps = np.round((np.array(times) - times[0]) * time_base * fps).astype(int)
     low, high = (1000 * time_base * float(ticks) for ticks in (durations.min(), durations.max()))
     missing = timesteps[-1] + 1 - len(np.unique(timesteps))
-    warning = (
-        f"{path}: has a variable frame rate (frames last {low:.0f} to {high:.0f} ms); its frames "
-        f"are numbered by their times, {fps:.4g} a second, and {missing} numbers have none"
-    )
+    rate = f"has a variable frame rate (frames last {low:.0f} to {high:.0f} ms)"
+    numbered = f"its frames are numbered by their times, {fps:.4g} a second"
+    warning = f"{path}: {rate}; {numbered}, and {missing} numbers have none"
     return tuple(timesteps.tolist()), fps, (warning,)
 
 
