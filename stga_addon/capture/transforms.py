@@ -30,13 +30,55 @@ MATRIX = "a 4x4 matrix of finite numbers"
 
 
 @dataclass(frozen=True)
+class Record:
+    """A JSON object, its file, that file's resolved folder, and its place in it for messages."""
+
+    path: Path
+    folder: Path
+    place: str
+    values: dict[str, Any]
+
+    def where(self, key: str) -> str:
+        return f"{self.path}: {self.place}{key}"
+
+    def has(self, key: str) -> bool:
+        return self.values.get(key) is not None
+
+    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
+        """A finite number strictly between the bounds."""
+        value = self.values[key]
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not low < value < high or abs(value) > MAX_NUMBER:
+            bounds = (("above", low), ("below", high))
+            limits = [f"{word} {limit:g}" for word, limit in bounds if math.isfinite(limit)]
+            expected = f"a finite number {' and '.join(limits)}".strip()
+            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
+        return float(value)
+
+    def natural(self, key: str) -> int:
+        value = self.values[key]
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
+            expected = "a whole number from 0 up, below 2^31"
+            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
+        return value
+
+    def path_of(self, key: str) -> Path | None:
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, str):
+            raise StgaError(f"{self.where(key)}: expected a relative path, not {shorten(value)}")
+        return inside(self.folder, value, self.where(key))
+
+
+@dataclass(frozen=True)
 class Frame:
     """One entry of a transforms file.
 
     principal  (cx, cy) in pixels as written in the file; the image center where they are missing
     camera_id  name of the camera in the file, or None
     mesh, flame  file of the tracked mesh or FLAME parameters of the frame's timestep, or None
-    where      file and entry, with which messages begin
+    record     the entry, with what the top level says besides
     """
 
     view: View
@@ -44,7 +86,12 @@ class Frame:
     camera_id: str | None
     mesh: Path | None
     flame: Path | None
-    where: str
+    record: Record
+
+    @property
+    def where(self) -> str:
+        """File and entry, with which messages begin."""
+        return self.record.where("").rstrip(".")
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
@@ -111,10 +158,10 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
     for split, name in (names or {"train": WHOLE_FILE}).items():
         path, values = folder / name, read_json(folder / name)
         frames[split] = _read_frames(path, values, principal_point)
-        record = _Record(path, folder.resolve(), "", values)
+        record = Record(path, folder.resolve(), "", values)
         meshes.append(record.path_of("canonical_mesh_path"))
         regions.append(record.path_of("regions_path"))
-        rates.append(frame_rate(path, values))
+        rates.append(record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None)
     numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
     counts = {split: len(frames.get(split, ())) for split in SPLITS}
     splits = {split: tuple(itertools.islice(numbered, n)) for split, n in counts.items()}
@@ -123,12 +170,6 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
         return next((value for value in values if value is not None), None)
 
     return Transforms(splits, first(meshes), first(regions), first(rates))
-
-
-def frame_rate(path: Path, values: dict[str, Any]) -> float | None:
-    """`fps` at the top level of a transforms file; None without. Raises StgaError."""
-    record = _Record(path, path.parent, "", values)
-    return record.number("fps", low=0, high=FPS_LIMIT) if record.has("fps") else None
 
 
 def with_principal_point(camera: Camera, written: tuple[float, float], convention: str) -> Camera:
@@ -179,52 +220,10 @@ def inside(root: Path, relative: str, where: str) -> Path:
     return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
 
 
-@dataclass(frozen=True)
-class _Record:
-    """A JSON object, its file, that file's resolved folder, and its place in it for messages."""
-
-    path: Path
-    folder: Path
-    place: str
-    values: dict[str, Any]
-
-    def where(self, key: str) -> str:
-        return f"{self.path}: {self.place}{key}"
-
-    def has(self, key: str) -> bool:
-        return self.values.get(key) is not None
-
-    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        """A finite number strictly between the bounds."""
-        value = self.values[key]
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not low < value < high or abs(value) > MAX_NUMBER:
-            bounds = (("above", low), ("below", high))
-            limits = [f"{word} {limit:g}" for word, limit in bounds if math.isfinite(limit)]
-            expected = f"a finite number {' and '.join(limits)}".strip()
-            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
-        return float(value)
-
-    def natural(self, key: str) -> int:
-        value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
-            expected = "a whole number from 0 up, below 2^31"
-            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
-        return value
-
-    def path_of(self, key: str) -> Path | None:
-        value = self.values.get(key)
-        if value is None:
-            return None
-        if not isinstance(value, str):
-            raise StgaError(f"{self.where(key)}: expected a relative path, not {shorten(value)}")
-        return inside(self.folder, value, self.where(key))
-
-
 def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
-    shared = _Record(path, path.parent.resolve(), "", values)
+    shared = Record(path, path.parent.resolve(), "", values)
     timed = any(_timestep_key(entry) for entry in values["frames"] if isinstance(entry, dict))
     cameras: dict[tuple[bytes | float, ...], Camera] = {}
     frames = []
@@ -257,7 +256,8 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         view = View(timestep, index, cameras[known], name, image, record.path_of("fg_mask_path"))
         camera_id = str(entry["camera_id"]) if record.has("camera_id") else None
         mesh, flame = record.path_of("mesh_path"), record.path_of("flame_param_path")
-        frames.append(Frame(view, written, camera_id, mesh, flame, where("").rstrip(".")))
+        whole = replace(record, values=values | entry)
+        frames.append(Frame(view, written, camera_id, mesh, flame, whole))
     return frames
 
 
@@ -267,7 +267,7 @@ def _timestep_key(values: dict[str, Any]) -> str | None:
     return next((key for key in keys if values.get(key) is not None), None)
 
 
-def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
+def _principal(record: Record, shared: Record, key: str, size: int) -> float:
     """One coordinate of the principal point as written; the image's center where there is none."""
     source = record if record.has(key) else shared
     if not source.has(key):
@@ -275,7 +275,7 @@ def _principal(record: _Record, shared: _Record, key: str, size: int) -> float:
     return source.number(key, low=-MAX_FOCAL_PIXELS, high=MAX_FOCAL_PIXELS)
 
 
-def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int]:
+def _image_size(record: Record, shared: Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
         if not isfile(image):
@@ -291,7 +291,7 @@ def _image_size(record: _Record, shared: _Record, image: Path) -> tuple[int, int
     return int(width), int(height)
 
 
-def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[float, float]:
+def _focal(record: Record, shared: Record, width: int, height: int) -> tuple[float, float]:
     source = next((s for s in (record, shared) if s.has("fl_x") or s.has("camera_angle_x")), None)
     if source is None:
         where = record.where("fl_x")
@@ -313,7 +313,7 @@ def _focal(record: _Record, shared: _Record, width: int, height: int) -> tuple[f
     return fl_x, fl_y
 
 
-def _pose(record: _Record, matrix: np.ndarray) -> np.ndarray:
+def _pose(record: Record, matrix: np.ndarray) -> np.ndarray:
     where = record.where("transform_matrix")
     finite = matrix.shape == (4, 4) and np.isfinite(matrix).all()
     if not finite or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):

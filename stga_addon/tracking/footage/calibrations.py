@@ -8,22 +8,20 @@ import io
 from collections.abc import Callable, Iterable
 from os.path import isdir, isfile
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from ...capture.camera import GL_TO_CV, MAX_FOCAL_PIXELS
+from ...capture.model import FPS_LIMIT
 from ...capture.transforms import (
-    MAX_NUMBER,
     WHOLE_FILE,
-    frame_rate,
-    inside,
+    Record,
     read_transforms,
     transforms_files,
+    with_principal_point,
 )
 from ...errors import StgaError, shorten
-from ...files import read_json
 from ...flame.forward import axis_angle_matrices
 from .colmap import find_colmap, read_colmap
 from .shots import Lens, Shot, numbers, pinhole, read_text, read_xml
@@ -113,43 +111,35 @@ def read_nerfstudio(path: Path) -> list[Shot]:
     Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does
     (`read_transforms`).
     """
-    top = read_json(path)
-    found = top.get("frames") if isinstance(top, dict) else None
-    entries = [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
-    timed = any("timestep_index" in entry for entry in entries)
-    frames = read_transforms(path, "vhap" if timed else "opencv")
-    timed = timed or any("keyframe" in entry for entry in entries)
-    folder, fps, shots = path.parent.resolve(), frame_rate(path, top), []
-    for frame, entry in zip(frames, entries, strict=True):
-        values, view, where = {**top, **entry}, frame.view, frame.where
-        lens, mask, mask_path = _lens(values, where), view.mask, values.get("mask_path")
-        if mask is None and isinstance(mask_path, str):  # nerfstudio's
-            mask = inside(folder, mask_path, f"{where}.mask_path")
-        number = f"{view.camera_index:02d}" if "camera_index" in values else None
-        timestep, name = view.timestep if timed else None, frame.camera_id or number
-        keeps = top.get("world") == "keep"
-        shots.append(
-            Shot(view.name, view.camera, lens, where, view.image, timestep, mask, name, fps, keeps)
-        )
+    frames, shots = read_transforms(path, "opencv"), []
+    is_vhap = any(frame.record.has("timestep_index") for frame in frames)
+    is_timed = is_vhap or any(frame.record.has("keyframe") for frame in frames)
+    for frame in frames:
+        view, record, name = frame.view, frame.record, frame.camera_id
+        camera = with_principal_point(view.camera, frame.principal, "vhap" if is_vhap else "opencv")
+        if name is None and record.has("camera_index"):
+            name = f"{view.camera_index:02d}"
+        timestep, mask = view.timestep if is_timed else None, view.mask
+        mask = mask or record.path_of("mask_path")  # nerfstudio's
+        fps = record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None
+        seen = _lens(record), frame.where, view.image, timestep, mask, name, fps
+        shots.append(Shot(view.name, camera, *seen, record.values.get("world") == "keep"))
     return shots
 
 
-def _lens(values: dict[str, Any], where: str) -> Lens:
-    """The lens of a frame, whose fields come before those at the top level."""
-    usual = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"
-    model, known = values.get("camera_model") or usual, PERSPECTIVE_MODELS + FISHEYE_MODELS
+def _lens(record: Record) -> Lens:
+    """The lens of a frame."""
+    usual = "OPENCV_FISHEYE" if record.values.get("is_fisheye") else "OPENCV"
+    model, known = record.values.get("camera_model") or usual, PERSPECTIVE_MODELS + FISHEYE_MODELS
     if model not in known:
-        raise StgaError(f"{where}.camera_model: {shorten(model)} is not one of {', '.join(known)}")
+        one = f"{shorten(model)} is not one of {', '.join(known)}"
+        raise StgaError(f"{record.where('camera_model')}: {one}")
     if model in PINHOLE_MODELS:
         return Lens()
-    coefficients = []
-    for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"):
-        value = values.get(key) or 0.0
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not abs(value) <= MAX_NUMBER:
-            raise StgaError(f"{where}.{key}: expected a finite number, not {shorten(value)}")
-        coefficients.append(float(value))
-    k1, k2, k3, k4, k5, k6, p1, p2 = coefficients
+    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    k1, k2, k3, k4, k5, k6, p1, p2 = (
+        record.number(name) if record.has(name) else 0.0 for name in names
+    )
     if model in FISHEYE_MODELS:
         return Lens("fisheye", radial=(k1, k2, k3, k4))
     if model == "FULL_OPENCV":

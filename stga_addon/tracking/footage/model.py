@@ -10,7 +10,6 @@ import numpy as np
 from ...capture.camera import Camera
 from ...capture.images import image_size, is_plain, read_image, read_mask
 from ...capture.model import View
-from ...errors import StgaError
 from ...files import replacing
 from .shots import Undistortion
 from .video import VideoFrames
@@ -29,15 +28,9 @@ class ImageFrames:
     def timesteps(self) -> tuple[int, ...]:
         return tuple(self.views)
 
-    def require_sizes(self, name: str) -> None:
-        """Read all headers. Raises StgaError for an image of another size than the camera's."""
-        for timestep, view in self.views.items():
-            width, height = image_size(view.image)
-            expected = view.camera.width, view.camera.height
-            if (width, height) != expected:
-                has = f"{width} x {height} pixels at timestep {timestep}"
-                needed = f"camera {name} has {expected[0]} x {expected[1]}"
-                raise StgaError(f"{view.image}: has {has}, but {needed}")
+    def sizes(self) -> Iterator[tuple[Path, tuple[int, int]]]:
+        """Width and height of each file, from its header."""
+        return ((path, image_size(path)) for path in self.files)
 
     def image(self, timestep: int) -> np.ndarray:
         return read_image(self.views[timestep])

@@ -141,8 +141,11 @@ def _rig(
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
-    if isinstance(frames, ImageFrames):
-        frames.require_sizes(name)
+    width, height = shot.camera.width, shot.camera.height
+    for path, size in frames.sizes():
+        if size != (width, height):
+            expected = f"but {shot.where} has {width} x {height}"
+            raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {expected}")
     found = undistortion(shot.camera, shot.lens, shot.where)
     return FootageCamera(name, shot.camera if found is None else found.camera, frames, found)
 

@@ -102,19 +102,14 @@ def synchronized(
     result: dict[str, Frames] = {}
     for name, own in sequences.items():
         numbers = {t: recorded[name][t] for t in timesteps}
-        size, shot, camera = sequence_size(own), shots[name], shots[name].camera
-        if size != (camera.width, camera.height):
-            path = own.path if isinstance(own, Video) else own[0]
-            expected = f"but {shot.where} has {camera.width} x {camera.height}"
-            raise StgaError(f"{path}: has {size[0]} x {size[1]} pixels, {expected}")
         if isinstance(own, Video):
             result[name] = VideoFrames(own, numbers)
             continue
-        files = {t: own[number] for t, number in numbers.items()}
-        masks = {t: sources.mask_of(file) for t, file in files.items()}
-        result[name] = ImageFrames(
-            {t: View(t, 0, camera, shot.label, files[t], masks[t]) for t in timesteps}
-        )
+        views, shot = {}, shots[name]
+        for t, number in numbers.items():
+            mask = sources.mask_of(own[number])
+            views[t] = View(t, 0, shot.camera, shot.label, own[number], mask)
+        result[name] = ImageFrames(views)
     return result, fps, sentences
 
 

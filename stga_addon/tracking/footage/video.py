@@ -143,6 +143,10 @@ class VideoFrames:
         """What the frames are read from."""
         return (self.video.path,)
 
+    def sizes(self) -> Iterator[tuple[Path, tuple[int, int]]]:
+        """Width and height of each of the files."""
+        yield self.video.path, self.video.size
+
     def file(self, timestep: int) -> Path | None:
         """The image file whose stored pixels are the frame; None where they are converted."""
         return None
