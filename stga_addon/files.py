@@ -55,11 +55,8 @@ def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Pat
 @contextmanager
 def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFile]:
     """Yield a function like `replacing` whose files are renamed together when this block succeeds,
-    else all deleted.
-
-    A failure also removes the folders that were made for the files. Raises StgaError as `replacing`
-    does.
-    """
+    else all deleted. A failure also removes the folders that were made for the files. Raises
+    StgaError as `replacing` does."""
     partials: dict[Path, Path] = {}
     made_folders: list[Path] = []
 
@@ -101,11 +98,8 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
 
 class NumberedFiles:
     """The numbered files of a folder, which replace those of an earlier sequence there, and nobody
-    else's.
-
-    SEQUENCE_FILE in the folder lists what was written: name, bytes and time of modification in
-    nanoseconds, a line each; files with such a name that are not listed so are not touched.
-    """
+    else's. SEQUENCE_FILE in the folder lists what was written: name, bytes and time of modification
+    in nanoseconds, a line each; files with such a name that are not listed so are not touched."""
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
         """Raises StgaError where the folder holds one of these names that is not listed."""

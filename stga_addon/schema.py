@@ -50,11 +50,8 @@ def setting(
 
 def validate(value: Any, prefix: str = "") -> None:
     """Raise StgaError naming the first field of a dataclass, nested ones included, that is not
-    allowed.
-
-    A field is allowed by its type hint and the limits of `setting`; what fields must have in
-    common, a dataclass says in a method `check()` that raises StgaError.
-    """
+    allowed. A field is allowed by its type hint and the limits of `setting`; what fields must have
+    in common, a dataclass says in a method `check()` that raises StgaError."""
     hints = type_hints(type(value))  # type: ignore[arg-type]
     for spec in dataclasses.fields(value):
         found, hint = getattr(value, spec.name), hints[spec.name]
@@ -147,12 +144,10 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
 
 
 def to_json(value: Any, arrays: Arrays | None = None, kinds: Any = None, name: str = "") -> Any:
-    """A dataclass as plain values of JSON, which `from_json` reads back.
-
-    Paths become texts, tuples lists, and a dataclass where a field allows several an object with
-    its `kind`. Arrays are put into `arrays`, which must then be kept beside the JSON. kinds: type
-    hint of `value`; default: its type. name: its place in the whole, of which arrays are named.
-    """
+    """A dataclass as plain values of JSON, which `from_json` reads back. Paths become texts, tuples
+    lists, and a dataclass where a field allows several an object with its `kind`. Arrays are put
+    into `arrays`, which must then be kept beside the JSON. kinds: type hint of `value`; default:
+    its type. name: its place in the whole, of which arrays are named."""
     kinds = alternatives(kinds or type(value))
 
     def plain(key: Any, item: Any, hint: Any) -> Any:
@@ -187,11 +182,8 @@ def from_json(
     kind: Any, values: Any, where: str = "", arrays: Mapping[str, np.ndarray] | None = None
 ) -> Any:
     """A dataclass (or one of several: a union) from plain values of JSON and the arrays beside
-    them.
-
-    Raises StgaError naming the field, after `where`, unless each object has exactly the fields of
-    its dataclass and `validate` allows them.
-    """
+    them. Raises StgaError naming the field, after `where`, unless each object has exactly the
+    fields of its dataclass and `validate` allows them."""
     value = _parsed(kind, values, where, arrays or {})
     validate(value)
     return value

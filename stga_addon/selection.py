@@ -36,12 +36,10 @@ def select_faces(
     mesh: np.ndarray, neutral: np.ndarray, faces: np.ndarray, regions: Mapping[str, np.ndarray],
     threshold: float,
 ) -> np.ndarray:  # fmt: skip
-    """(F,) bool: the triangles whose splats this frame trains.
-
-    mesh, neutral (V, 3) meters without rigid head motion; faces (F, 3); regions name -> (F,) bool.
-    A region whose mean offset of triangle centers exceeds the threshold is selected as a whole; a
-    triangle outside of the regions is selected by its own offset (STGA, selective training).
-    """
+    """(F,) bool: the triangles whose splats this frame trains. mesh, neutral (V, 3) meters without
+    rigid head motion; faces (F, 3); regions name -> (F,) bool. A region whose mean offset of
+    triangle centers exceeds the threshold is selected as a whole; a triangle outside of the regions
+    is selected by its own offset (STGA, selective training)."""
     offset = np.linalg.norm((mesh[faces] - neutral[faces]).mean(1), axis=-1)
     in_region = np.zeros(len(faces), bool)
     selected = np.zeros(len(faces), bool)

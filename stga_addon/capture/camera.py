@@ -62,12 +62,10 @@ class Camera:
         return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) meters.
-
-        Positions count from the top-left corner of the image, pixel centers lie at .5. Depth is the
-        distance along the viewing axis, negative behind the camera; positions of such points mean
-        nothing.
-        """
+        """Pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) meters. Positions
+        count from the top-left corner of the image, pixel centers lie at .5. Depth is the distance
+        along the viewing axis, negative behind the camera; positions of such points mean
+        nothing."""
         local = points @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         depth = local[:, 2]
         flat = local[:, :2] / np.maximum(depth, MIN_PROJECTION_DEPTH)[:, None]
@@ -125,11 +123,8 @@ def look_at(
     up: Sequence[float] = UP,
 ) -> Camera:  # fmt: skip
     """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the
-    image's center.
-
-    width, height, focal_length in pixels. up: the world direction that points up in the image.
-    Raises ValueError where it is parallel to the viewing direction, or that is none.
-    """
+    image's center. width, height, focal_length in pixels. up: the world direction that points up in
+    the image. Raises ValueError where it is parallel to the viewing direction, or that is none."""
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     right = np.cross(forward, np.asarray(up, np.float64))
     if not np.linalg.norm(right):
@@ -146,10 +141,8 @@ def turntable(
     up: Sequence[float] = UP,
 ) -> list[Camera]:  # fmt: skip
     """`count` cameras that orbit the vertical axis through `center` (3,), from where `start` is.
-
     angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings
-    to both sides.
-    """
+    to both sides."""
     low, high = angles
     shares = np.arange(count) / count
     if high - low >= 2 * np.pi:
@@ -163,11 +156,8 @@ def covered_angles(
     cameras: Sequence[Camera], start: Camera, center: np.ndarray, up: Sequence[float] = UP
 ) -> tuple[float, float]:
     """The angles about the vertical axis through `center` (3,), in radians from `start`, that the
-    cameras cover.
-
-    Of what no camera saw, training has nothing to show. A full turn where they leave no gap of
-    MAX_GAP_RAD.
-    """
+    cameras cover. Of what no camera saw, training has nothing to show. A full turn where they leave
+    no gap of MAX_GAP_RAD."""
     axis = np.asarray(up, np.float64) / np.linalg.norm(up)
     arms = np.array([camera.position for camera in (start, *cameras)]) - center
     first = arms[0] - arms[0] @ axis * axis

@@ -31,10 +31,8 @@ def is_srgb(primaries: int, transfer: int) -> bool:
 
 
 def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
-    """Colors (H, W, 3), uint8 or uint16 full range, as uint8 sRGB.
-
-    primaries, transfer: codes of ITU-T H.273. What sRGB cannot hold is clipped.
-    """
+    """Colors (H, W, 3), uint8 or uint16 full range, as uint8 sRGB. primaries, transfer: codes of
+    ITU-T H.273. What sRGB cannot hold is clipped."""
     if is_srgb(primaries, transfer):
         return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
     table = _linear(transfer, np.iinfo(pixels.dtype).max + 1)

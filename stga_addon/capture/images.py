@@ -80,10 +80,7 @@ def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarr
 
 def read_mask(view: View) -> np.ndarray | None:
     """The view's foreground mask (H, W) uint8, 255 inside; an image's transparency where it has no
-    mask file.
-
-    None where there is neither. Raises StgaError as `read_image` does.
-    """
+    mask file. None where there is neither. Raises StgaError as `read_image` does."""
     if view.mask is None:
         return _transparency(_decode(view.image, view, "image"))
     pixels = _decode(view.mask, view, "mask")
@@ -96,11 +93,8 @@ def read_view(
     view: View, scale: float = 1.0, background: tuple[int, int, int] = WHITE
 ) -> tuple[View, np.ndarray, np.ndarray | None]:
     """Image and mask at `scale` in (0, 1]: the view with its camera scaled alike, image and mask as
-    above.
-
-    Every small pixel is the mean over the area it covers, to avoid aliasing.
-    Raises StgaError as `read_image` does.
-    """
+    above. Every small pixel is the mean over the area it covers, to avoid aliasing. Raises
+    StgaError as `read_image` does."""
     if not 0 < scale <= 1:
         raise ValueError(f"scale {scale} is not in (0, 1]")
     pixels = _decode(view.image, view, "image")

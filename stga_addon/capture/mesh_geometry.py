@@ -91,10 +91,7 @@ def weighted_procrustes(
 
 def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> Similarity:
     """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not
-    coincide (Umeyama).
-
-    metric: of those with a scale of 1.
-    """
+    coincide (Umeyama). metric: of those with a scale of 1."""
     rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
     a, b = source - source.mean(0), target - target.mean(0)
     scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
@@ -141,11 +138,8 @@ def rasterize(
     vertices: np.ndarray, faces: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a camera sees of a mesh: triangle (H, W) int32, -1 for none, and barycentric coordinates
-    (H, W, 3).
-
-    Both sides of a triangle are visible. Triangles that reach behind the camera are left out;
-    barycentric coordinates are those in the image, without perspective.
-    """
+    (H, W, 3). Both sides of a triangle are visible. Triangles that reach behind the camera are left
+    out; barycentric coordinates are those in the image, without perspective."""
     flat, depth = camera.project(vertices)
     inverse_depth = 1 / np.where(depth > 0, depth, np.nan)[faces]
     rows = np.flatnonzero(np.isfinite(inverse_depth).all(1) & np.isfinite(flat[faces]).all((1, 2)))
@@ -212,11 +206,8 @@ def _crossings(
     corners: np.ndarray, face: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y
-    (R,).
-
-    An edge's ends are taken in the order of y, so that two triangles with a common edge agree where
-    it lies to the last bit and leave no pixel between them.
-    """
+    (R,). An edge's ends are taken in the order of y, so that two triangles with a common edge agree
+    where it lies to the last bit and leave no pixel between them."""
     left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         first, second = corners[:, a], corners[:, b]
@@ -234,10 +225,7 @@ def _crossings(
 
 def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
     """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y +
-    [k, 2].
-
-    Zero for triangles that are seen edge-on.
-    """
+    [k, 2]. Zero for triangles that are seen edge-on."""
     x, y = corners[..., 0] - 0.5, corners[..., 1] - 0.5
     along_x, along_y = np.roll(y, -1, 1) - np.roll(y, 1, 1), np.roll(x, 1, 1) - np.roll(x, -1, 1)
     constant = -(along_x * np.roll(x, -1, 1) + along_y * np.roll(y, -1, 1))

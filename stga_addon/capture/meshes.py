@@ -30,9 +30,7 @@ SELECTED_WEIGHT = 0.5
 
 def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     """The document and the binary chunk of a .glb file; the chunk is empty where there is none.
-
-    Raises ValueError where it is not binary glTF 2.0. Source: Khronos, glTF 2.0, section 4.4.
-    """
+    Raises ValueError where it is not binary glTF 2.0. Source: Khronos, glTF 2.0, section 4.4."""
     if len(data) < HEADER_BYTES:
         raise ValueError("ends within its header")
     magic, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
@@ -50,12 +48,9 @@ def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 meters and triangles (F, 3) int32, in the file's order; polygons
-    become fans.
-
-    STL stores no shared vertices, so V is 3F there. A GLB's nodes are placed and joined.
-    Raises StgaError naming the file where it is missing, malformed, not finite or without
-    triangles, collapsed to a point or far outside of any scene.
-    """
+    become fans. STL stores no shared vertices, so V is 3F there. A GLB's nodes are placed and
+    joined. Raises StgaError naming the file where it is missing, malformed, not finite or without
+    triangles, collapsed to a point or far outside of any scene."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise StgaError(f"{path}: is not a mesh; expected one of {', '.join(MESH_SUFFIXES)}")
@@ -97,11 +92,8 @@ def tracked_meshes(
     files: Mapping[int, Path], count: int, faces: np.ndarray, canonical: Path,
     read: Callable[[Path], tuple[np.ndarray, np.ndarray]],
 ) -> Callable[[int], np.ndarray]:  # fmt: skip
-    """timestep -> its vertices (V, 3), parsed when called and cached.
-
-    Raises StgaError where a file has not exactly the `count` vertices and the `faces` of the file
-    `canonical`.
-    """
+    """timestep -> its vertices (V, 3), parsed when called and cached. Raises StgaError where a file
+    has not exactly the `count` vertices and the `faces` of the file `canonical`."""
 
     def mesh(timestep: int) -> np.ndarray:
         path = file_of(files, timestep)
@@ -143,10 +135,7 @@ def file_of(files: Mapping[int, Path], timestep: int) -> Path:
 
 def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.ndarray]:
     """Region name -> (F,) bool from a JSON file of vertex indices: a triangle belongs when its
-    three corners do.
-
-    Raises StgaError naming the file and the region.
-    """
+    three corners do. Raises StgaError naming the file and the region."""
     values = read_json(path)
     if not isinstance(values, dict):
         raise StgaError(f"{path}: expected an object: region name -> list of vertex indices")
@@ -247,10 +236,7 @@ def is_region_file(name: str) -> bool:
 
 def find_region(capture: Capture, name: str) -> np.ndarray:
     """(F,) bool: a region of the capture, a vertex mask of FLAME, or the triangles of a region
-    file.
-
-    Raises StgaError where there is none, or it holds no triangle.
-    """
+    file. Raises StgaError where there is none, or it holds no triangle."""
     masks = {} if capture.flame is None else capture.flame.model.masks
     path, shape = Path(name), (len(capture.faces),)
     if name in capture.regions:

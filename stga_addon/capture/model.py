@@ -208,11 +208,8 @@ def require_same_head(first: Capture, other: Capture) -> None:
 
 def require_same_scale(first: Capture, other: Capture) -> None:
     """Raise StgaError where `other`, a take of the same head, has meshes or cameras in another unit
-    of length.
-
-    Its tracked meshes must be as large as the neutral one, and the head must take a similar share
-    of the images.
-    """
+    of length. Its tracked meshes must be as large as the neutral one, and the head must take a
+    similar share of the images."""
     posed = [_extent(other.mesh(timestep)) for timestep in evenly_spread(other.timesteps, COMPARED)]
     factor = float(np.median(posed)) / _extent(other.neutral)
     if not 1 / MAX_SCALE_FACTOR <= factor <= MAX_SCALE_FACTOR:

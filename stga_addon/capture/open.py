@@ -164,12 +164,9 @@ def _principal_point_warning(
 
 
 def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
-    """Capture of layout "mesh" without views: a folder of meshes, one a timestep.
-
-    Timesteps are the numbers at the end of the names, or the alphabetical order where a name has
-    none. A mesh called `neutral` or `canonical` is the canonical one, and `regions.json` the
-    regions file.
-    """
+    """Capture of layout "mesh" without views: a folder of meshes, one a timestep. Timesteps are the
+    numbers at the end of the names, or the alphabetical order where a name has none. A mesh called
+    `neutral` or `canonical` is the canonical one, and `regions.json` the regions file."""
     names, regions = ("neutral", "canonical"), root / "regions.json"
     canonical = next((path for path in listed if path.stem.lower() in names), None)
     tracked = [path for path in listed if path != canonical]
@@ -234,10 +231,7 @@ def _open_release(root: Path, transforms: Transforms) -> Capture:
 
 def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]},
-    meters.
-
-    The layout has no shared vertices. Raises StgaError naming the file and the field.
-    """
+    meters. The layout has no shared vertices. Raises StgaError naming the file and the field."""
     document = read_json(path)
     try:
         corners = np.array([triangle["Vertices"] for triangle in document["triangles"]], np.float64)

@@ -149,10 +149,8 @@ def read_transforms(
 
 def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Transforms:
     """Read every split of a capture folder, as `read_transforms` does; `transforms.json` alone is
-    all training.
-
-    Cameras without `camera_index` are numbered alike in all splits. Raises StgaError.
-    """
+    all training. Cameras without `camera_index` are numbered alike in all splits. Raises
+    StgaError."""
     names = {split: name for split, name in SPLIT_FILES.items() if (folder / name).is_file()}
     frames, meshes, regions, rates = dict[str, list[Frame]](), [], [], []
     for split, name in (names or {"train": WHOLE_FILE}).items():
@@ -181,10 +179,8 @@ def with_principal_point(camera: Camera, written: tuple[float, float], conventio
 
 
 def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
-    """timestep -> its tracked file, ascending; `field` is "mesh" or "flame".
-
-    Raises StgaError where a frame has none, or where two frames of a timestep name different ones.
-    """
+    """timestep -> its tracked file, ascending; `field` is "mesh" or "flame". Raises StgaError where
+    a frame has none, or where two frames of a timestep name different ones."""
     files: dict[int, Path] = {}
     key = "mesh_path" if field == "mesh" else "flame_param_path"
     for frame in frames:
@@ -199,12 +195,9 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
 
 
 def inside(root: Path, relative: str, where: str) -> Path:
-    """Resolve a path of a capture's file against the folder `root` of that file.
-
-    `..` may lead to a sibling of `root`, not further; symbolic links inside the capture are
-    followed. Raises StgaError, beginning with `where`, for absolute paths and for those that lead
-    outside.
-    """
+    """Resolve a path of a capture's file against the folder `root` of that file. `..` may lead to a
+    sibling of `root`, not further; symbolic links inside the capture are followed. Raises
+    StgaError, beginning with `where`, for absolute paths and for those that lead outside."""
     text = relative.replace("\\", "/")
     parts = posixpath.normpath(text).split("/")
     drives = [PureWindowsPath(part).drive for part in parts if ":" in part]

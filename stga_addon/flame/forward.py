@@ -96,11 +96,8 @@ def flame_forward(
     model: FlameModel, shape: np.ndarray, frame: FlameFrame, static_offset: np.ndarray | None = None
 ) -> np.ndarray:
     """Vertices (V, 3) in meters of one frame: blend shapes, pose correctives, linear blend
-    skinning, translation.
-
-    shape (I,); static_offset (V, 3) or None. FLAME (Li et al. 2017) with the vertex offsets of
-    VHAP.
-    """
+    skinning, translation. shape (I,); static_offset (V, 3) or None. FLAME (Li et al. 2017) with the
+    vertex offsets of VHAP."""
     offsets = [offset for offset in (static_offset, frame.dynamic_offset) if offset is not None]
     shaped = shaped_vertices(model, shape, frame.expr, np.sum(offsets, axis=0) if offsets else None)
     posed = _posed(model, shaped, frame)
@@ -113,8 +110,7 @@ def parameters_gradient(
 ) -> np.ndarray:
     """(E + 18,) gradient of a scalar with respect to the frame's `parameters`, from that with
     respect to its vertices (V, 3): the reverse of `flame_forward`, of a model whose template has
-    the identity and the static offset.
-    """
+    the identity and the static offset."""
     expressions = model.shapedirs[:, :, model.n_identity :]
     shaped = model.v_template + expressions @ frame.expr
     shaped = shaped if frame.dynamic_offset is None else shaped + frame.dynamic_offset

@@ -39,10 +39,7 @@ def continuous(quaternions: np.ndarray) -> np.ndarray:
 
 def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
     """(..., 4) on the shortest arc from `first` (share 0) to `second` (share 1), and beyond; share
-    (...,).
-
-    Spherical linear interpolation (Shoemake 1985).
-    """
+    (...,). Spherical linear interpolation (Shoemake 1985)."""
     cosine = (first * second).sum(-1, keepdims=True)
     second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine)
     angle = np.arctan2(np.linalg.norm(second - cosine * first, axis=-1, keepdims=True), cosine)
@@ -76,11 +73,9 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def from_matrices(matrices: np.ndarray) -> np.ndarray:
-    """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3).
-
-    Builds the outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations
-    by 180° (trace −1) lose no precision.
-    """
+    """Unit quaternion wxyz (..., 4), w ≥ 0, of proper rotation matrices (..., 3, 3). Builds the
+    outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
+    (trace −1) lose no precision."""
     m = np.asarray(matrices, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     outer = np.empty((*m.shape[:-2], 4, 4))

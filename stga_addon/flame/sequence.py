@@ -68,11 +68,9 @@ def sequence_mesh(sequence: FlameSequence, timestep: int) -> np.ndarray:
 
 
 def expression_mesh(sequence: FlameSequence, timestep: int, zero_pose: str) -> np.ndarray:
-    """The mesh (V, 3) with the head's motion removed (STGA, selective training).
-
-    zero_pose "head" zeroes rotation, translation and neck, so that jaw and eyes count as
-    expression; "all" zeroes jaw and eyes too. Raises StgaError for any other value.
-    """
+    """The mesh (V, 3) with the head's motion removed (STGA, selective training). zero_pose "head"
+    zeroes rotation, translation and neck, so that jaw and eyes count as expression; "all" zeroes
+    jaw and eyes too. Raises StgaError for any other value."""
     if zero_pose not in ZERO_POSES:
         raise StgaError(f"zero_pose is {zero_pose!r}, expected one of {', '.join(ZERO_POSES)}")
     zero = np.zeros(3)
@@ -89,11 +87,8 @@ def neutral_mesh(sequence: FlameSequence) -> np.ndarray:
 
 def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np.ndarray:
     """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck,
-    seen by the torso.
-
-    The joint is that of the model without offsets, which may draw the torso over clothes, and the
-    joint with it.
-    """
+    seen by the torso. The joint is that of the model without offsets, which may draw the torso over
+    clothes, and the joint with it."""
     model, frame = sequence.model, sequence.frame(timestep)
     shaped = shaped_vertices(model, sequence.shape, frame.expr)
     root = joint_positions(model, shaped)[JOINTS.index("root")] + frame.translation
@@ -120,12 +115,9 @@ def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
 
 def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without
-    a leading 1.
-
-    Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression coefficients than the
-    model has, and offsets without the teeth's vertices, are filled up with zeros. Raises StgaError
-    naming the file and the field.
-    """
+    a leading 1. Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression
+    coefficients than the model has, and offsets without the teeth's vertices, are filled up with
+    zeros. Raises StgaError naming the file and the field."""
     arrays = read_npz(path)
     for name in ("expr", "rotation", "translation"):
         if name not in arrays:
@@ -212,12 +204,9 @@ def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -
 
 def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dict[str, np.ndarray]:
     """The motion as arrays that `motion_of` takes, and as flame_param.npz of a GaussianAvatars
-    avatar holds in float32.
-
-    shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation (T, 3), eyes_pose (T, 6),
-    static_offset (V, 3), dynamic_offset (T, V, 3), zero where the sequence has none; 300 and 100
-    for I and E with a published FLAME.
-    """
+    avatar holds in float32. shape (I,), expr (T, E), rotation, neck_pose, jaw_pose and translation
+    (T, 3), eyes_pose (T, 6), static_offset (V, 3), dynamic_offset (T, V, 3), zero where the
+    sequence has none; 300 and 100 for I and E with a published FLAME."""
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     none, static = np.zeros_like(sequence.model.v_template), sequence.static_offset
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
@@ -303,10 +292,8 @@ TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 
 def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     """The frames at the first timestep and every `step` timesteps after it, up to the last.
-
     Coefficients and translation are interpolated linearly, rotations on the shortest arc (slerp).
-    Dynamic offsets, which belong to the tracked person, are left out.
-    """
+    Dynamic offsets, which belong to the tracked person, are left out."""
     times = np.asarray(sequence.timesteps, np.float64)
     wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
     row = np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1
@@ -328,10 +315,7 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
 
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
     """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the
-    neutral face.
-
-    Rotation and translation of the head are scaled about the first frame's.
-    """
+    neutral face. Rotation and translation of the head are scaled about the first frame's."""
     first, here, changed = frames[0], np.array([strength]), []
     for frame in frames:
         turns = {}
@@ -345,12 +329,10 @@ def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFra
 
 
 def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
-    """The motion on the person whose neutral mesh is `neutral` (V, 3), of the same model.
-
-    FLAME adds shape and static offset to the template before posing, so the difference between
-    neutral mesh and template replaces both. Dynamic offsets, which belong to the tracked person,
-    are left out.
-    """
+    """The motion on the person whose neutral mesh is `neutral` (V, 3), of the same model. FLAME
+    adds shape and static offset to the template before posing, so the difference between neutral
+    mesh and template replaces both. Dynamic offsets, which belong to the tracked person, are left
+    out."""
     return replace(
         motion,
         shape=np.zeros_like(motion.shape),

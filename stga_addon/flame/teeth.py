@@ -65,12 +65,10 @@ def _remembered(path: Path, *state: int) -> FlameModel:
 
 
 def with_teeth(model: FlameModel) -> FlameModel:
-    """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles.
-
-    The upper row follows the neck joint, which turns the head, and the lower row the jaw; both
-    follow identity as the inside of the mouth does, neither expression nor pose correctives. Adds
-    the mask "teeth". Raises StgaError for a mesh without an open mouth.
-    """
+    """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles. The
+    upper row follows the neck joint, which turns the head, and the lower row the jaw; both follow
+    identity as the inside of the mouth does, neither expression nor pose correctives. Adds the mask
+    "teeth". Raises StgaError for a mesh without an open mouth."""
     rings, lips = _mouth(model)
     inside = np.concatenate(rings)
     teeth = _positions(model.v_template, rings, lips)
@@ -96,11 +94,8 @@ def with_teeth(model: FlameModel) -> FlameModel:
 
 def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
     """Vertex ids (n,) along the upper and the lower lip between the corners of the mouth, opposite
-    each other.
-
-    They are found on FLAME's mesh with or without teeth, and where expressions have ARKit's names.
-    Raises StgaError for another mesh without an open mouth.
-    """
+    each other. They are found on FLAME's mesh with or without teeth, and where expressions have
+    ARKit's names. Raises StgaError for another mesh without an open mouth."""
     if "jawOpen" in model.expression_names:  # which moves one lip and leaves the other
         column = model.n_identity + model.expression_names.index("jawOpen")
         lips, at = model.masks["lips"], model.v_template

@@ -47,10 +47,8 @@ ImageSize = Callable[[str], tuple[int, int]]
 
 def find_calibration(root: Path) -> Path | None:
     """The calibration of a folder, the first of: transforms files, COLMAP, Metashape,
-    RealityCapture's CSV and XMP.
-
-    A folder stands for transforms_train.json and its like, for a COLMAP model or for XMP files.
-    """
+    RealityCapture's CSV and XMP. A folder stands for transforms_train.json and its like, for a
+    COLMAP model or for XMP files."""
     listed = transforms_files(root)
     if listed:
         return listed[0] if listed[0].name == WHOLE_FILE else root
@@ -67,11 +65,8 @@ def find_calibration(root: Path) -> Path | None:
 
 def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tuple[str, ...]]:
     """Shots of a calibration file or folder, and a sentence about cameras that it lists without a
-    pose.
-
-    image_size: size of the images of a label, which RealityCapture does not write. Raises StgaError
-    that names file and field.
-    """
+    pose. image_size: size of the images of a label, which RealityCapture does not write. Raises
+    StgaError that names file and field."""
     suffix, without_pose = path.suffix.lower(), list[str]()
     splits = transforms_files(path)
     colmap = find_colmap(path if isdir(path) else path.parent)
@@ -106,11 +101,9 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
 
 
 def read_nerfstudio(path: Path) -> list[Shot]:
-    """Entries of a transforms file; `file_path` is the label. Raises StgaError.
-
-    Their `cy` means what VHAP's does where frames have `timestep_index`, else what OpenCV's does
-    (`read_transforms`).
-    """
+    """Entries of a transforms file; `file_path` is the label. Raises StgaError. Their `cy` means
+    what VHAP's does where frames have `timestep_index`, else what OpenCV's does
+    (`read_transforms`)."""
     frames, shots = read_transforms(path, "opencv"), []
     is_vhap = any(frame.record.has("timestep_index") for frame in frames)
     is_timed = is_vhap or any(frame.record.has("keyframe") for frame in frames)
@@ -159,11 +152,8 @@ def _is_metashape(path: Path) -> bool:
 
 def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
     """One shot an aligned camera, labelled as in Metashape; and the labels of those that are not
-    aligned.
-
-    World and unit are the chunk's, without its transform. Raises StgaError that names file, sensor
-    or camera.
-    """
+    aligned. World and unit are the chunk's, without its transform. Raises StgaError that names
+    file, sensor or camera."""
     root = read_xml(path)
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
     cameras, shots = list(root.iter("camera")), []
@@ -236,12 +226,9 @@ def _is_csv(path: Path) -> bool:
 
 
 def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
-    """One shot a line, labelled with the image's name.
-
-    Columns: name, x, y, alt, heading, pitch, roll (degrees), f (35 mm film), and, where they are
-    there, px, py (shares of the longer side), k1 to k4, t1, t2. Raises StgaError that names file
-    and line.
-    """
+    """One shot a line, labelled with the image's name. Columns: name, x, y, alt, heading, pitch,
+    roll (degrees), f (35 mm film), and, where they are there, px, py (shares of the longer side),
+    k1 to k4, t1, t2. Raises StgaError that names file and line."""
     lines, rows = csv.reader(io.StringIO(read_text(path))), []
     try:
         rows = [(lines.line_num, line) for line in lines if line]
@@ -281,9 +268,7 @@ def read_realitycapture_xmp(
     paths: Iterable[Path], image_size: ImageSize
 ) -> tuple[list[Shot], list[str]]:
     """One shot an XMP file with a pose, labelled with its name; and the names of those without.
-
-    Raises StgaError that names file and field.
-    """
+    Raises StgaError that names file and field."""
     shots, without_pose = [], []
     for path in sorted(paths):
         fields: dict[str, str] = {}  # as attributes or as elements, by the version

@@ -54,10 +54,8 @@ def find_colmap(folder: Path) -> Path | None:
 
 def read_colmap(folder: Path) -> list[Shot]:
     """One shot an image, in natural order of their names, which are the labels; COLMAP's numbers
-    vary from run to run.
-
-    World and unit are the model's. Raises StgaError that names file, camera and image.
-    """
+    vary from run to run. World and unit are the model's. Raises StgaError that names file, camera
+    and image."""
     suffix = _suffix(folder)
     if suffix is None:
         expected = "expected cameras.bin and images.bin, or .txt"

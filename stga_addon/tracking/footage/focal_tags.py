@@ -48,9 +48,7 @@ def photo_focal(path: Path, width: int, height: int) -> float | None:
 
 def video_focal(path: Path, width: int, height: int) -> float | None:
     """Focal length in pixels of a video of that size, as its metadata says; None where it does not.
-
-    Phones write it into the video's track, where FFmpeg does not look.
-    """
+    Phones write it into the video's track, where FFmpeg does not look."""
     try:
         with (
             path.open("rb") as stream,

@@ -83,11 +83,8 @@ class FootageCamera:
 
     def image(self, timestep: int) -> np.ndarray:
         """The undistorted frame (H, W, 3) uint8 sRGB; transparent pixels are laid over white.
-
-        Reading a video in order is fast; going back decodes again from the last key frame.
-        Raises StgaError that names the file; KeyError where the camera has no frame at the
-        timestep.
-        """
+        Reading a video in order is fast; going back decodes again from the last key frame. Raises
+        StgaError that names the file; KeyError where the camera has no frame at the timestep."""
         kept = self.kept.get(timestep)
         if kept is not None and kept.exists():
             return read_image(View(timestep, 0, self.camera, self.name, kept))

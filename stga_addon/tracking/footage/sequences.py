@@ -172,11 +172,9 @@ def clock_offsets(
     videos: Mapping[str, Video], fps: float, by: str
 ) -> tuple[dict[str, int], tuple[str, ...]]:
     """Camera -> frames by which its recording shows a moment later than the first camera's, and a
-    sentence for each.
-
-    by: "sound"; "motion": how much changes from frame to frame; "auto": sound where all have it.
-    Raises StgaError where a video has no sound, or where the recordings do not agree on one offset.
-    """
+    sentence for each. by: "sound"; "motion": how much changes from frame to frame; "auto": sound
+    where all have it. Raises StgaError where a video has no sound, or where the recordings do not
+    agree on one offset."""
     if by == "auto":
         by = "sound"
         for video in videos.values():

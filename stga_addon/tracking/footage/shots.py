@@ -97,12 +97,10 @@ class Undistortion:
 
 
 def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | None:
-    """The undistortion of a camera's frames; None for an ideal lens.
-
-    The pinhole keeps size, pose, principal point and aspect; its focal length is the shortest with
-    which every pixel was recorded. Raises StgaError, beginning with `where`, without OpenCV, and
-    for a lens that folds the image.
-    """
+    """The undistortion of a camera's frames; None for an ideal lens. The pinhole keeps size, pose,
+    principal point and aspect; its focal length is the shortest with which every pixel was
+    recorded. Raises StgaError, beginning with `where`, without OpenCV, and for a lens that folds
+    the image."""
     if lens.projection == "perspective" and not any(
         (*lens.radial, *lens.rational, *lens.tangential, *lens.prism, *lens.affine)
     ):
@@ -224,13 +222,10 @@ def pinhole(
     size: tuple[float, float], focal: tuple[float, float], center: tuple[float, float],
     rotation: np.ndarray, position: np.ndarray, where: str,
 ) -> Camera:  # fmt: skip
-    """Camera of a calibration.
-
-    size, focal, center: (x, y) in pixels, the center from the top-left corner. rotation (3, 3) from
-    world to OpenCV's camera axes; position (3,) of the camera in the calibration's world, whose
-    unit is free. Raises StgaError, beginning with `where`, for a size, focal length, principal
-    point or pose that no camera has.
-    """
+    """Camera of a calibration. size, focal, center: (x, y) in pixels, the center from the top-left
+    corner. rotation (3, 3) from world to OpenCV's camera axes; position (3,) of the camera in the
+    calibration's world, whose unit is free. Raises StgaError, beginning with `where`, for a size,
+    focal length, principal point or pose that no camera has."""
     (width, height), (fl_x, fl_y), (cx, cy), limit = size, focal, center, MAX_FOCAL_PIXELS
     bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE  # else, products overflow
     skewed = np.abs(rotation @ rotation.T - np.eye(3)).max() if bounded else np.inf

@@ -81,11 +81,9 @@ def find_sources(root: Path) -> Sources:
 
 
 def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
-    """For each label, the name of its camera's folder or video; None where it has neither.
-
-    The name is the label, with or without suffix and leading folders; or the folder of the image
-    that the camera was calibrated with, where no other camera's lies there.
-    """
+    """For each label, the name of its camera's folder or video; None where it has neither. The name
+    is the label, with or without suffix and leading folders; or the folder of the image that the
+    camera was calibrated with, where no other camera's lies there."""
     labels = list(labels)
     parents = [_stem(label).rpartition("/")[0] for label in labels]
     found = []

@@ -61,11 +61,8 @@ class Video:
 
 
 def read_video(path: Path) -> Video:
-    """Index a video. Raises StgaError where it cannot be read, or without PyAV.
-
-    Where the container says when packets are shown, only the first frames are decoded; otherwise,
-    all are.
-    """
+    """Index a video. Raises StgaError where it cannot be read, or without PyAV. Where the container
+    says when packets are shown, only the first frames are decoded; otherwise, all are."""
     size, first = first_frames(path)
     times, is_cut_off = _packet_times(path)
     left_out = times.index(first[0]) if first[0] in times else 0
