@@ -18,14 +18,12 @@ from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .model import View
 
 WHITE = (255, 255, 255)
-WHITE_LEVEL = 247
-"""Of all channels, from which a pixel without a mask counts as a white background."""
+WHITE_LEVEL = 247  # Of all channels, from which a pixel without a mask counts as a white background
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
-SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02
-"""PNG's gAMA of what is shown as sRGB."""
+SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02  # PNG's gAMA of what is shown as sRGB
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what

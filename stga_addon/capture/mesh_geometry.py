@@ -30,8 +30,7 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
 
 
 MAX_ITERATIONS = 100
-MIN_RESIDUAL = 1e-7
-"""Share of the mesh's size below which residuals are rounding."""
+MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
 
 
 @dataclass(frozen=True)
@@ -128,10 +127,8 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(np.take_along_axis(options, nearest, axis=0)[0])
 
 
-CHUNK_PIXELS = 1 << 21
-"""Candidate pixels that are tested at a time, to bound the memory."""
-MIN_DEPTH_M = 0.01
-"""Triangles nearer to the camera's plane, or behind it, are not drawn."""
+CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
+MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
 def rasterize(

@@ -24,8 +24,7 @@ CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
-SELECTED_WEIGHT = 0.5
-"""Least weight of a triangle that belongs to the region."""
+SELECTED_WEIGHT = 0.5  # Least weight of a triangle that belongs to the region
 
 
 def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:

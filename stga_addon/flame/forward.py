@@ -10,8 +10,7 @@ from .quaternions import from_axis_angle, to_matrices
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
 """At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
-SMALL_ANGLE = 1e-4
-"""Radians, below which a quotient by the squared angle is its limit."""
+SMALL_ANGLE = 1e-4  # Radians, below which a quotient by the squared angle is its limit
 
 
 @dataclass(frozen=True)

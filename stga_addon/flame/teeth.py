@@ -35,14 +35,12 @@ TEETH_STRIPS = {
 }
 # Sizes as shares of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
-CLEARANCE = 0.03
-"""Between the lips' inner surface and the teeth."""
+CLEARANCE = 0.03  # Between the lips' inner surface and the teeth
 OVERBITE, OVERJET = 0.06, 0.02
 """How far the upper edge reaches below the lower one, and stands in front of it."""
 EDGE_THICKNESS, ROOT_THICKNESS = 0.05, 0.1
 MAX_MOUTH_RINGS = 12
-MAX_LIP_DISTANCE_M = 0.002
-"""Between opposite vertices of closed lips."""
+MAX_LIP_DISTANCE_M = 0.002  # Between opposite vertices of closed lips
 
 
 def flame_model(path: Path | None) -> FlameModel:

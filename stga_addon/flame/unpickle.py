@@ -23,8 +23,7 @@ from ..errors import StgaError
 from ..files import read_bytes
 
 MAX_FILE_BYTES = 2 << 30
-MAX_DENSE_ELEMENTS = 1 << 22
-"""In a sparse matrix; FLAME's joint regressor has 25,115."""
+MAX_DENSE_ELEMENTS = 1 << 22  # In a sparse matrix; FLAME's joint regressor has 25,115
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
 )
