@@ -42,9 +42,8 @@ def exit_code(work: Callable[[], object]) -> int:
 
 def one_line(message: str) -> str:
     """The message in bounded length, with control characters and lone surrogates escaped."""
-    return _UNPRINTABLE.sub(
-        lambda found: ascii(found[0])[1:-1], _cut(message, MAX_MESSAGE_CHARACTERS)
-    )
+    message = _cut(message, MAX_MESSAGE_CHARACTERS)
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], message)
 
 
 def shorten(value: object) -> str:

@@ -108,10 +108,9 @@ class NumberedFiles:
         text = self._list.read_text(errors="replace") if self._list.is_file() else ""
         listed = set(text.splitlines())
         with naming(folder):
-            self._earlier = [
-                path for path in self._found() if self._line(path.name, path) in listed
-            ]
-            other = next((path.name for path in self._found() if path not in self._earlier), None)
+            found = self._found()
+            self._earlier = [path for path in found if self._line(path.name, path) in listed]
+            other = next((path.name for path in found if path not in self._earlier), None)
         if other is not None:
             problem = f"holds {other}, which was not written here; choose another folder"
             raise StgaError(f"{folder}: {problem}")

@@ -74,9 +74,8 @@ def complaint(name: str, expected: str, value: Any) -> str:
 
 @cache
 def type_hints(kind: Any) -> dict[str, Any]:
-    return {
-        name: hint for name, hint in get_type_hints(kind).items() if hint is not dataclasses.KW_ONLY
-    }
+    hints = get_type_hints(kind)
+    return {name: hint for name, hint in hints.items() if hint is not dataclasses.KW_ONLY}
 
 
 def alternatives(hint: Any) -> tuple[Any, ...]:
@@ -109,10 +108,8 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
         if not isinstance(value, Mapping):
             return "an object of Mapping"
         names, values = get_args(kind)
-        if all(
-            isinstance(key, names) and expectation(item, values, limits) is None
-            for key, item in value.items()
-        ):
+        wrong = (expectation(item, values, limits) for item in value.values())
+        if all(isinstance(key, names) for key in value) and not any(wrong):
             return None
         return "texts by name" if (names, values) == (str, str) else "values by name"
     if kind in (int, float):

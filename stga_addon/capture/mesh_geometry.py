@@ -6,6 +6,8 @@ import numpy as np
 
 from .camera import Camera
 
+ArrayPair = tuple[np.ndarray, np.ndarray]
+
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
@@ -76,9 +78,7 @@ def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     return np.asarray(fitted)
 
 
-def weighted_procrustes(
-    source: np.ndarray, target: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> ArrayPair:
     """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points
     (N, 3)."""
     share = (weights / weights.sum())[:, None]
@@ -131,9 +131,7 @@ CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound t
 MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
-def rasterize(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
+def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayPair:
     """What a camera sees of a mesh: triangle (H, W) int32, -1 for none, and barycentric coordinates
     (H, W, 3). Both sides of a triangle are visible. Triangles that reach behind the camera are left
     out; barycentric coordinates are those in the image, without perspective."""
@@ -184,24 +182,20 @@ def silhouette(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.nd
     return np.asarray(picture)
 
 
-def _whole(low: np.ndarray, high: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _whole(low: np.ndarray, high: np.ndarray, size: int) -> ArrayPair:
     """The first pixel with its center from `low` to `high` in an image of this size; how many."""
     first = np.ceil(np.clip(low, 0, size + 1) - 0.5).astype(np.int64)
     last = np.floor(np.clip(high, -1, size) - 0.5).astype(np.int64)
     return first, np.maximum(np.minimum(last, size - 1) - first + 1, 0)
 
 
-def _counted(
-    values: np.ndarray, first: np.ndarray, count: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _counted(values: np.ndarray, first: np.ndarray, count: np.ndarray) -> ArrayPair:
     """Each value `count` times, and numbers that count from its `first`."""
     begin = np.cumsum(count) - count
     return np.repeat(values, count), np.arange(count.sum()) + np.repeat(first - begin, count)
 
 
-def _crossings(
-    corners: np.ndarray, face: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> ArrayPair:
     """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y
     (R,). An edge's ends are taken in the order of y, so that two triangles with a common edge agree
     where it lies to the last bit and leave no pixel between them."""

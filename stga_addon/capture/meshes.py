@@ -16,6 +16,7 @@ from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
 from .model import Capture
 
+Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
 MAGIC, VERSION, JSON_KIND = b"glTF", 2, b"JSON"
 HEADER_BYTES, CHUNK_HEADER_BYTES = 20, 8
 """The file's header and that of its first chunk; and that of any later chunk."""
@@ -45,7 +46,7 @@ def glb_chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return document, rest[CHUNK_HEADER_BYTES : CHUNK_HEADER_BYTES + size]
 
 
-def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_mesh(path: Path) -> Mesh:
     """Vertices (V, 3) float64 meters and triangles (F, 3) int32, in the file's order; polygons
     become fans. STL stores no shared vertices, so V is 3F there. A GLB's nodes are placed and
     joined. Raises StgaError naming the file where it is missing, malformed, not finite or without
@@ -59,9 +60,7 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return checked_mesh(path, *_parse_with_trimesh(path, data, suffix[1:]))
 
 
-def checked_mesh(
-    path: Path, vertices: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def checked_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """The arrays as float64 and int32. Raises StgaError where they are no mesh (`read_mesh`)."""
     triples = all(own.ndim == 2 and own.shape[1] == 3 for own in (vertices, faces))
     if not triples or not len(faces):
@@ -89,7 +88,7 @@ def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
 
 def tracked_meshes(
     files: Mapping[int, Path], count: int, faces: np.ndarray, canonical: Path,
-    read: Callable[[Path], tuple[np.ndarray, np.ndarray]],
+    read: Callable[[Path], Mesh],
 ) -> Callable[[int], np.ndarray]:  # fmt: skip
     """timestep -> its vertices (V, 3), parsed when called and cached. Raises StgaError where a file
     has not exactly the `count` vertices and the `faces` of the file `canonical`."""
@@ -146,7 +145,7 @@ def read_regions(path: Path, faces: np.ndarray, vertices: int) -> dict[str, np.n
     return {name: faces_within(faces, np.array(value, np.int64)) for name, value in values.items()}
 
 
-def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> tuple[np.ndarray, np.ndarray]:
+def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> Mesh:
     try:
         import trimesh
     except ImportError as error:
@@ -190,7 +189,7 @@ def _check_glb(data: bytes) -> None:
         raise ValueError("its nodes form a cycle")
 
 
-def _parse_obj(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _parse_obj(path: Path, data: bytes) -> Mesh:
     """An own parser: trimesh regroups the vertices of an OBJ with several materials or objects."""
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     points = [n for n, line in enumerate(lines) if line.startswith((b"v ", b"v\t"))]

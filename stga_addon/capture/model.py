@@ -36,6 +36,7 @@ class View:
     mask: Path | None = None
 
 
+Views = Mapping[str, tuple[View, ...]]  # By their split, "train", "val" or "test"
 ViewExposure = Callable[[View], np.ndarray | None]
 """View -> gain and offset (2, 3), in levels, of red, green and blue; None where not known."""
 
@@ -46,7 +47,7 @@ class Capture:
 
     faces      (F, 3) int32, shared by all timesteps
     neutral    (V, 3) float64 meters: the canonical mesh (expression and pose zero)
-    views      split name ("train", "val", "test") -> its views; empty for a bare mesh sequence
+    views      by their split; empty for a bare mesh sequence
     timesteps  all timesteps that have a mesh, ascending
     regions    key region name -> (F,) bool
     mesh       timestep -> (V, 3) float64, the tracked mesh in world space, read on demand
@@ -64,7 +65,7 @@ class Capture:
     layout: str
     faces: np.ndarray
     neutral: np.ndarray
-    views: Mapping[str, tuple[View, ...]]
+    views: Views
     timesteps: tuple[int, ...]
     regions: Mapping[str, np.ndarray]
     mesh: Callable[[int], np.ndarray]
@@ -158,11 +159,13 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
     for other in takes[1:]:
         require_same_head(first, other)
     starts, views = first_timesteps(takes), dict[str, tuple[View, ...]]()
+    selected: dict[int, np.ndarray] = {}
     numbered = list(zip(takes, starts, strict=True))
     for take, start in numbered:
         taken = {view.camera_index for members in views.values() for view in members}
         for split, members in _renumbered(take, start, first, taken).items():
             views[split] = (*views.get(split, ()), *members)
+        selected |= {start + timestep: faces for timestep, faces in take.given_selection.items()}
     timesteps = tuple(start + timestep for take, start in numbered for timestep in take.timesteps)
     flame = [take.flame for take in takes if take.flame is not None]
     frame = _dispatch([each.frame for each in flame], starts)
@@ -175,11 +178,7 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
         mesh=_dispatch([take.mesh for take in takes], starts),
         expression_mesh=_dispatch([take.expression_mesh for take in takes], starts),
         flame=whole if len(flame) == len(takes) else None,
-        given_selection={
-            start + timestep: faces
-            for take, start in numbered
-            for timestep, faces in take.given_selection.items()
-        },
+        given_selection=selected,
         warnings=tuple(dict.fromkeys(warning for take in takes for warning in take.warnings)),
         fps=rates[0] if rates and max(rates) <= (1 + RATE_TOLERANCE) * min(rates) else None,
     )
@@ -235,14 +234,12 @@ def _share_of_images(take: Capture) -> float:
     return float(np.median(shares))
 
 
-def _renumbered(
-    take: Capture, start: int, first: Capture, taken: set[int]
-) -> dict[str, tuple[View, ...]]:
+def _renumbered(take: Capture, start: int, first: Capture, taken: set[int]) -> Views:
     """The views at the joined timesteps. Their cameras keep an index under which the first take has
     the same; others are counted from the take's start, as the identities of runs hold them, or
     above all that are `taken`."""
     if start == 0:
-        return dict(take.views)
+        return take.views
     known = [view for members in first.views.values() for view in members]
     poses = {view.camera_index: view.camera.world_to_camera for view in known}
     own = {view.camera_index for members in take.views.values() for view in members}

@@ -1,7 +1,7 @@
 """Opening a capture folder of any layout."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
@@ -27,7 +27,7 @@ from ..flame.sequence import (
 from ..flame.teeth import flame_model
 from . import meshes
 from .mesh_geometry import without_head_motion
-from .model import Capture, View, evenly_spread
+from .model import Capture, Views, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
     PRINCIPAL_POINTS,
@@ -96,10 +96,8 @@ def open_capture(
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
     size = float(np.ptp(capture.neutral, axis=0).max()) if len(capture.neutral) else 0.0
     if not MIN_HEAD_EXTENT_M <= size <= MAX_HEAD_EXTENT_M:
-        warnings.append(
-            f"{root}: the neutral mesh measures {size:.3g} m; "
-            f"expected a head of {TYPICAL_HEAD_EXTENT_M} m"
-        )
+        expected = f"expected a head of {TYPICAL_HEAD_EXTENT_M} m"
+        warnings.append(f"{root}: the neutral mesh measures {size:.3g} m; {expected}")
     return replace(capture, fps=transforms.fps, warnings=tuple(warnings))
 
 
@@ -156,11 +154,9 @@ def _principal_point_warning(
     best = min(share, key=lambda convention: share[convention])
     if share[chosen] < 2 * share[best] + MIN_SHARE_DIFFERENCE:
         return None
-    return (
-        f"{share[chosen]:.1%} of the mesh falls outside the masks with the principal point read "
-        f"as {chosen!r}, but {share[best]:.1%} with {best!r}: "
-        "the capture was probably written that way"
-    )
+    outside_masks = f"{share[chosen]:.1%} of the mesh falls outside the masks"
+    read_so = f"with the principal point read as {chosen!r}, but {share[best]:.1%} with {best!r}"
+    return f"{outside_masks} {read_so}: the capture was probably written that way"
 
 
 def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
@@ -183,7 +179,7 @@ def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
 
 def _mesh_capture(
     root: Path, layout: str, files: dict[int, Path], transforms: Transforms,
-    read: Callable[[Path], tuple[np.ndarray, np.ndarray]] = meshes.read_mesh,
+    read: Callable[[Path], meshes.Mesh] = meshes.read_mesh,
 ) -> Capture:  # fmt: skip
     warnings, canonical, regions_file = [], transforms.canonical_mesh, transforms.regions
     if canonical is None:
@@ -229,7 +225,7 @@ def _open_release(root: Path, transforms: Transforms) -> Capture:
     return replace(capture, given_selection=selection)
 
 
-def read_soup(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_soup(path: Path) -> meshes.Mesh:
     """Vertices (3F, 3) and triangles (F, 3) from {"triangles": [{"Vertices": [[x, y, z], …]}, …]},
     meters. The layout has no shared vertices. Raises StgaError naming the file and the field."""
     document = read_json(path)
@@ -291,9 +287,8 @@ def with_sequence(capture: Capture, sequence: FlameSequence) -> Capture:
 
 
 def sequence_capture(
-    root: Path, sequence: FlameSequence, model_file: Path | None,
-    views: Mapping[str, tuple[View, ...]],
-) -> Capture:  # fmt: skip
+    root: Path, sequence: FlameSequence, model_file: Path | None, views: Views
+) -> Capture:
     """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
     model, regions = sequence.model, key_regions(sequence.model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it)"
@@ -333,9 +328,8 @@ def _model_file(root: Path, given: Path | None) -> Path:
     beside = (root / name for name in OWN_MODELS)
     found = given or next((path for path in beside if path.is_file()), None)
     if found is None:
-        raise StgaError(
-            f"{root}: is tracked with FLAME; give the FLAME model file (.pkl or .npz) with --flame "
-            "or in the preferences of the add-on, or put it into the folder as "
-            f"{OWN_MODELS[0]}"
-        )
+        given_by = "with --flame or in the preferences of the add-on"
+        advice = f"{given_by}, or put it into the folder as {OWN_MODELS[0]}"
+        model = "give the FLAME model file (.pkl or .npz)"
+        raise StgaError(f"{root}: is tracked with FLAME; {model} {advice}")
     return found

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import read_json
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
-from .model import FPS_LIMIT, Item, View
+from .model import FPS_LIMIT, Item, View, Views
 
 SPLITS = ("train", "val", "test")
 WHOLE_FILE, SPLIT_FILES = "transforms.json", {s: f"transforms_{s}.json" for s in SPLITS}
@@ -121,7 +121,7 @@ class Transforms:
         return tuple(frame for split in self.splits.values() for frame in split)
 
     @property
-    def views(self) -> dict[str, tuple[View, ...]]:
+    def views(self) -> Views:
         return {split: tuple(frame.view for frame in own) for split, own in self.splits.items()}
 
 

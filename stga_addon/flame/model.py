@@ -10,6 +10,8 @@ from ..errors import StgaError
 from ..files import read_npz
 from .unpickle import read_pickled_arrays
 
+Arrays = Mapping[str, np.ndarray]
+Shape = tuple[int | None, ...]  # None: any number of them
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
 POSE_FEATURES = 9 * (len(JOINTS) - 1)
 # FLAME 2020 and 2023: 300 identity then 100 expression components
@@ -138,18 +140,16 @@ def read_flame(path: Path) -> FlameModel:
     )
 
 
-def _check_shape(path: Path, key: str, array: np.ndarray, expected: tuple[int | None, ...]) -> None:
-    fits = array.ndim == len(expected) and all(
-        want is None or size == want for size, want in zip(array.shape, expected, strict=True)
-    )
-    if not fits or 0 in array.shape:
+def _check_shape(path: Path, key: str, array: np.ndarray, expected: Shape) -> None:
+    found = array.shape
+    sizes = zip(found, expected, strict=False)
+    fits = len(found) == len(expected) and all(want in (None, size) for size, want in sizes)
+    if not fits or 0 in found:
         wanted = ", ".join("any" if size is None else str(size) for size in expected)
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
 
 
-def _floats(
-    path: Path, arrays: Mapping[str, np.ndarray], key: str, expected: tuple[int | None, ...]
-) -> np.ndarray:
+def _floats(path: Path, arrays: Arrays, key: str, expected: Shape) -> np.ndarray:
     array = arrays[key]
     _check_shape(path, key, array, expected)
     if array.dtype.kind not in "iuf":
@@ -167,7 +167,7 @@ def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _masks(path: Path, arrays: Mapping[str, np.ndarray], vertices: int) -> dict[str, np.ndarray]:
+def _masks(path: Path, arrays: Arrays, vertices: int) -> dict[str, np.ndarray]:
     own = {key: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
     found = {key.removeprefix(MASK_PREFIX): value for key, value in own.items()}
     source, beside = path, path.with_name(MASK_FILE)

@@ -1,6 +1,6 @@
 """Tracked FLAME sequences: files, meshes; retargeting to another person, speed or strength."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,10 +17,11 @@ from .forward import (
     neutral_frame,
     shaped_vertices,
 )
-from .model import JOINTS, MIN_TORSO_WEIGHT, FlameModel
+from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
 from .quaternions import from_axis_angle, slerp, to_axis_angle
 from .teeth import TEETH_VERTICES
 
+Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
 ZERO_POSES = {
     "head": "head rotation, translation and neck; jaw and eyes count as expression",
     "all": "head motion, jaw and eyes",
@@ -125,7 +126,7 @@ def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     return _frame(path, arrays, model)
 
 
-def read_identity(path: Path, model: FlameModel) -> tuple[np.ndarray, np.ndarray | None]:
+def read_identity(path: Path, model: FlameModel) -> Identity:
     """Shape (I,) and static offset (V, 3) or None of a file. Errors as in `read_frame`."""
     return _identity(path, read_npz(path), model)
 
@@ -156,7 +157,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
     return motion_of(path, read_npz(path), model)
 
 
-def motion_of(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameSequence:
+def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     """The motion in the arrays of a file, as `read_motion` reads it; errors name `path`."""
     spelled = {FIELD_ALIASES[name]: own for name, own in arrays.items() if name in FIELD_ALIASES}
     arrays = spelled | dict(arrays)
@@ -219,16 +220,14 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
     }
 
 
-def _frame(path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel) -> FlameFrame:
+def _frame(path: Path, arrays: Arrays, model: FlameModel) -> FlameFrame:
     sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
     values = {name: _vector(path, arrays, name, size) for name, size in sizes.items()}
     offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))
     return FlameFrame(**values, dynamic_offset=offset)
 
 
-def _identity(
-    path: Path, arrays: Mapping[str, np.ndarray], model: FlameModel
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _identity(path: Path, arrays: Arrays, model: FlameModel) -> Identity:
     if "shape" not in arrays:
         raise StgaError(f"{path}: has no shape, the person's identity coefficients")
     shape = _vector(path, arrays, "shape", model.n_identity)
@@ -245,7 +244,7 @@ def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) -> np.ndarray:
+def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:
     """(size,) float64 from (size,) or (1, size); absent fields are zero, short ones padded."""
     vector = np.zeros(size)
     if name not in arrays:
@@ -260,9 +259,7 @@ def _vector(path: Path, arrays: Mapping[str, np.ndarray], name: str, size: int) 
     return vector
 
 
-def _offset(
-    path: Path, arrays: Mapping[str, np.ndarray], name: str, vertices: int
-) -> np.ndarray | None:
+def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray | None:
     """(V, 3) float64, None where absent or all zero; the teeth's rows are added or dropped."""
     if name not in arrays:
         return None

@@ -41,6 +41,8 @@ REQUIRED_COLUMNS = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 NAMESPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 XMP_MODELS = ("perspective", "brown3", "brown4", "brown3t2", "brown4t2")
 
+Pair = tuple[float, float]
+Found = tuple[list[Shot], list[str]]  # Cameras with a pose, and labels of those without
 ImageSize = Callable[[str], tuple[int, int]]
 """Label of a camera -> (width, height), not in RealityCapture's files. Raises StgaError."""
 
@@ -130,14 +132,12 @@ def _lens(record: Record) -> Lens:
     if model in PINHOLE_MODELS:
         return Lens()
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-    k1, k2, k3, k4, k5, k6, p1, p2 = (
-        record.number(name) if record.has(name) else 0.0 for name in names
-    )
+    *k, p1, p2 = (record.number(name) if record.has(name) else 0.0 for name in names)
     if model in FISHEYE_MODELS:
-        return Lens("fisheye", radial=(k1, k2, k3, k4))
+        return Lens("fisheye", radial=tuple(k[:4]))
     if model == "FULL_OPENCV":
-        return Lens(radial=(k1, k2, k3), rational=(k4, k5, k6), tangential=(p1, p2))
-    return Lens(radial=(k1, k2, k3, k4), tangential=(p1, p2))  # nerfstudio's k4 is that of r⁸
+        return Lens(radial=tuple(k[:3]), rational=tuple(k[3:]), tangential=(p1, p2))
+    return Lens(radial=tuple(k[:4]), tangential=(p1, p2))  # nerfstudio's k4 is that of r⁸
 
 
 # Metashape
@@ -150,7 +150,7 @@ def _is_metashape(path: Path) -> bool:
     return b"<document" in start and b"<chunk" in start
 
 
-def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
+def read_metashape(path: Path) -> Found:
     """One shot an aligned camera, labelled as in Metashape; and the labels of those that are not
     aligned. World and unit are the chunk's, without its transform. Raises StgaError that names
     file, sensor or camera."""
@@ -177,9 +177,7 @@ def read_metashape(path: Path) -> tuple[list[Shot], list[str]]:
     return shots, [camera.get("label", "") for camera in left_out]
 
 
-def _sensor(
-    sensor: Element, where: str
-) -> tuple[tuple[float, float], float, tuple[float, float], Lens]:
+def _sensor(sensor: Element, where: str) -> tuple[Pair, float, Pair, Lens]:
     """Image size, focal length, principal point and lens, adjusted by the alignment or not."""
     found = sensor.findall("calibration")
     adjusted = (c for c in found if c.get("class") == "adjusted")
@@ -264,9 +262,7 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     return shots
 
 
-def read_realitycapture_xmp(
-    paths: Iterable[Path], image_size: ImageSize
-) -> tuple[list[Shot], list[str]]:
+def read_realitycapture_xmp(paths: Iterable[Path], image_size: ImageSize) -> Found:
     """One shot an XMP file with a pose, labelled with its name; and the names of those without.
     Raises StgaError that names file and field."""
     shots, without_pose = [], []
@@ -295,10 +291,9 @@ def _xmp_shot(path: Path, fields: dict[str, str], size: tuple[int, int]) -> Shot
     coefficients += [0.0] * (6 - len(coefficients))
     model = fields.get("DistortionModel", "perspective")
     if model not in XMP_MODELS and any(coefficients):
-        raise StgaError(
-            f"{path}: xcr:DistortionModel {shorten(model)} is not one of {', '.join(XMP_MODELS)}; "
-            "choose one of these in RealityCapture's alignment settings and export again"
-        )
+        unknown = f"xcr:DistortionModel {shorten(model)} is not one of {', '.join(XMP_MODELS)}"
+        advice = "choose one of these in RealityCapture's alignment settings and export again"
+        raise StgaError(f"{path}: {unknown}; {advice}")
     if "FocalLength35mm" not in fields:
         raise StgaError(f"{path}: xcr:FocalLength35mm is missing")
     scale, share = max(size), values("FocalLength35mm", "")[0] / FILM_WIDTH_MM
