@@ -53,20 +53,11 @@ def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
 def frame(timestep: int, camera: int, **more: Any) -> dict[str, Any]:
     name = f"{timestep:05d}_{camera:02d}.png"
     return {
-        "timestep_index": timestep,
-        "camera_index": camera,
-        "camera_id": f"cam{camera}",
-        "file_path": f"images/{name}",
-        "fg_mask_path": f"fg_masks/{name}",
-        "transform_matrix": pose(camera).tolist(),
-        "fl_x": FOCAL,
-        "fl_y": FOCAL,
-        "cx": CX,
-        "cy": HEIGHT - CY,
-        "w": WIDTH,
-        "h": HEIGHT,
-        **more,
-    }
+        "timestep_index": timestep, "camera_index": camera, "camera_id": f"cam{camera}",
+        "file_path": f"images/{name}", "fg_mask_path": f"fg_masks/{name}",
+        "transform_matrix": pose(camera).tolist(), "fl_x": FOCAL, "fl_y": FOCAL, "cx": CX,
+        "cy": HEIGHT - CY, "w": WIDTH, "h": HEIGHT, **more,
+    }  # fmt: skip
 
 
 def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -> None:
@@ -125,6 +116,8 @@ def write_flame_model(path: Path, seed: int = 0) -> Path:
     vertices, faces = ball()
     weights = random.random((len(vertices), 5))
     regressor = random.random((5, len(vertices)))
+    masks = {"masks/nose": np.flatnonzero(vertices[:, 2] > 0.07)}
+    masks["masks/lips"] = np.flatnonzero(vertices[:, 1] < -0.06)
     np.savez(
         path,
         v_template=vertices,
@@ -135,10 +128,7 @@ def write_flame_model(path: Path, seed: int = 0) -> Path:
         kintree_table=np.array([[-1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
         weights=weights / weights.sum(1, keepdims=True),
         f=faces,
-        **{
-            "masks/nose": np.flatnonzero(vertices[:, 2] > 0.07),
-            "masks/lips": np.flatnonzero(vertices[:, 1] < -0.06),
-        },
+        **masks,
     )
     return path
 

@@ -46,9 +46,7 @@ def saved(path: Path, pixels: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
-def test_transparency_is_laid_over_the_background(
-    tmp_path: Path, background: tuple[int, int, int]
-) -> None:
+def test_transparency_is_laid_over_the_background(tmp_path, background):
     """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha
     is the mask."""
     view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
@@ -219,6 +217,7 @@ def profile(colorants, gamma, name):
 
 
 P3 = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 DISPLAY_P3 = profile(P3, 2.2, "P3")
 """Colorants as published with Apple's profile."""
 
@@ -238,28 +237,19 @@ def png(path, color, *chunks, mode="RGB"):
 # In Display P3 sRGB's red is (0.9175, 0.2003, 0.1386) by CSS Color 4; it is near that with an
 # exponent of 2.2 as well.
 RED_IN_P3 = (234, 51, 35)
+LINEAR = chunk(b"gAMA", struct.pack(">I", 100000))
 STORED = {
     "profile": (RED_IN_P3, [icc(DISPLAY_P3)], (255, 0, 0)),
-    "sRGB's profile": (
-        RED_IN_P3,
-        [icc(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())],
-        RED_IN_P3
-    ),
+    "sRGB's profile": (RED_IN_P3, [icc(SRGB)], RED_IN_P3),
     "damaged profile": (RED_IN_P3, [icc(DISPLAY_P3[:140])], RED_IN_P3),
     "cICP of Display P3": (RED_IN_P3, [chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
     "cICP of sRGB before a profile": (
-        RED_IN_P3,
-        [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)],
-        RED_IN_P3
+        RED_IN_P3, [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)], RED_IN_P3,
     ),
     "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
-    "linear gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 100000))], (128, 128, 128)),
+    "linear gAMA": ((55, 55, 55), [LINEAR], (128, 128, 128)),
     "usual gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
-    "gAMA beside sRGB": (
-        (55, 55, 55),
-        [chunk(b"gAMA", struct.pack(">I", 100000)), chunk(b"sRGB", b"\0")],
-        (55, 55, 55)
-    ),
+    "gAMA beside sRGB": ((55, 55, 55), [LINEAR, chunk(b"sRGB", b"\0")], (55, 55, 55)),
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stga_addon.capture.camera import Camera, look_at
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes, without_head_motion
 from stga_addon.capture.meshes import (
     CACHE_BYTES,
@@ -194,9 +194,7 @@ def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
             find_region(toy, str(path))
 
 
-def by_equations(
-    vertices: np.ndarray, faces: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
+def by_equations(vertices, faces, camera):
     """Like `rasterize`: the barycentric coordinates of each pixel center in each triangle, solved
     for."""
     flat, depth = camera.project(vertices)
@@ -220,9 +218,11 @@ def test_every_pixel_shows_the_nearest_triangle():
     rng = np.random.default_rng(0)
     camera = replace(look_at((0.2, 0.1, 2.0), (0, 0, 0), 37, 29, 40.0), cx=17.0, cy=15.5)
     sizes = np.repeat([0.005, 0.05, 0.3, 3.0], [150, 60, 30, 8])
-    corners = rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)) + sizes[:, None, None] * rng.normal(
-        size=(len(sizes), 3, 3)
+    centers, shapes = (
+        rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)),
+        rng.normal(size=(len(sizes), 3, 3)),
     )
+    corners = centers + sizes[:, None, None] * shapes
     vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(sizes)).reshape(-1, 3)
     in_front = (camera.project(vertices)[1][faces] > 0.05).all(1)
     triangle, weights = rasterize(vertices, faces[in_front], camera)

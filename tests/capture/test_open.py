@@ -334,9 +334,8 @@ def written(name: str, content: Any) -> Callable[[Path], None]:
 
 
 def edited(change: Callable[[list[dict[str, Any]]], object]) -> Callable[[Path], object]:
-    return lambda root: factory.edit(
-        root / "transforms_val.json", lambda document: change(document["frames"])
-    )
+    path = "transforms_val.json"
+    return lambda root: factory.edit(root / path, lambda document: change(document["frames"]))
 
 
 BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
@@ -352,10 +351,8 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (in_a_point("meshes/neutral.obj"), r"neutral\.obj: all vertices of the mesh lie in one point"),
     (in_a_point("meshes/00001.obj"), r"00001\.obj: all vertices of the mesh lie in one point"),
     (edited(lambda own: own[1].pop("mesh_path")), r"val\.json: frames\[1\]\.mesh_path: is missing"),
-    (
-        edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
-        r"val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already"
-    ),
+    (edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
+     r"val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already"),
 ]  # fmt: skip
 
 

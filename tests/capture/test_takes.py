@@ -33,9 +33,8 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
     for timestep in toy.timesteps:
         np.testing.assert_array_equal(joined.mesh(timestep), toy.mesh(timestep))
         np.testing.assert_array_equal(joined.mesh(start + timestep), toy.mesh(timestep) + 0.1)
-        np.testing.assert_array_equal(
-            joined.expression_mesh(start + timestep, "head"), toy.expression_mesh(timestep, "head")
-        )
+        found = joined.expression_mesh(start + timestep, "head")
+        np.testing.assert_array_equal(found, toy.expression_mesh(timestep, "head"))
     for split, views in toy.views.items():
         both = joined.views[split]
         assert both[: len(views)] == views
@@ -47,10 +46,10 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
     """Catches exposure of one camera corrected in the images of another that merely has its number,
     and two that count as one because their takes begin as far apart as their numbers."""
-    views = tuple(
-        replace(view, camera=turned(view.camera)) if view.camera_index == 1 else view
-        for view in toy.views["train"]
-    )
+    views, train = [], toy.views["train"]
+    for view in train:
+        camera = turned(view.camera) if view.camera_index == 1 else view.camera
+        views.append(replace(view, camera=camera))
     joined = join_takes([toy, replace(toy, views={"train": views})])
     new = joined.views["train"][len(views) :]
     before = {view.camera_index for members in toy.views.values() for view in members}

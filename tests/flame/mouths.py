@@ -42,17 +42,15 @@ def jaw_weights(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     x, y, z = vertices.T
     inner = np.isin(np.arange(len(vertices)), np.unique(open_edges(faces)))
     fixed = (y > -0.036) | (z < 0) | (y < -0.11)
-    moved = ((y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)) | (
-        inner & (z > 0.03) & (y < -0.053)
-    )
+    moved = (y < -0.05) & (z > 0.045) & (np.abs(x) < 0.025) & (y > -0.09)
+    moved |= inner & (z > 0.03) & (y < -0.053)
     edges = np.concatenate([edges_of(faces), edges_of(faces)[:, ::-1]])
     adjacency = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices),) * 2).tocsr()
     laplacian = diags(np.asarray(adjacency.sum(1)).ravel()) - adjacency
     free = ~(fixed | moved)
     weights = np.where(moved & ~fixed, 1.0, 0.0)
-    weights[free] = spsolve(
-        laplacian[free][:, free].tocsc(), -(laplacian[free][:, ~free] @ weights[~free])
-    )
+    from_fixed = laplacian[free][:, ~free] @ weights[~free]
+    weights[free] = spsolve(laplacian[free][:, free].tocsc(), -from_fixed)
     return np.clip(weights, 0, 1)
 
 

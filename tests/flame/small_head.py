@@ -26,9 +26,8 @@ def small_head(person: int) -> FlameModel:
     """The model whose template is a person's, one for each number."""
     model = read_flame(FILE)
     own = 0.6 * np.random.default_rng(person).normal(size=model.n_identity)
-    return replace(
-        model, v_template=model.v_template + model.shapedirs[:, :, : model.n_identity] @ own
-    )
+    moved = model.shapedirs[:, :, : model.n_identity] @ own
+    return replace(model, v_template=model.v_template + moved)
 
 
 def small_head_colors() -> np.ndarray:
@@ -73,8 +72,5 @@ def write_flame(model: FlameModel, path: Path) -> None:
         "weights": model.weights, "f": model.faces.astype(np.uint32),
         "n_identity": np.array(model.n_identity),
     }  # fmt: skip
-    write_npz(
-        path,
-        arrays | {MASK_PREFIX + name: ids for name, ids in model.masks.items()},
-        compressed=True,
-    )
+    masks = {MASK_PREFIX + name: ids for name, ids in model.masks.items()}
+    write_npz(path, arrays | masks, compressed=True)

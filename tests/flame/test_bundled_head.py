@@ -62,10 +62,8 @@ def test_vertices_and_shapes_are_ict_facekits(head, shared_data):
         distance, of = neutral.query(head.v_template + [0, 0, SETBACK_M] * is_ball[:, None])
         assert distance.max() < 1e-7
         row = {str(name): number for number, name in enumerate(source["expression_names"])}
-        expressions = [
-            sum(source["expression"][row[part]] for part in ict_names(n))
-            for n in head.expression_names
-        ]
+        parts = (ict_names(name) for name in head.expression_names)
+        expressions = [sum(source["expression"][row[part]] for part in own) for own in parts]
         wanted = np.concatenate([source["identity"], expressions])[:, of].astype(np.float64)
     missed = np.abs(np.moveaxis(head.shapedirs, 2, 0) - METERS_PER_UNIT * wanted)
     missed[:, is_ball] = 0  # pushed back by lids

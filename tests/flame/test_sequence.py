@@ -234,11 +234,8 @@ def test_strength(tiny_flame: FlameModel) -> None:
     for whole, same in zip(frames, strengthened(frames, 1.0), strict=True):
         _assert_same(whole, same)
     still = strengthened(frames, 0.0)[3]
-    zero = np.zeros(3)
-    calm = replace(
-        frames[0], expr=np.zeros(4), neck_pose=zero, jaw_pose=zero, eyes_pose=np.zeros(6)
-    )
-    _assert_same(still, calm)
+    calm = {"expr": np.zeros(4), "neck_pose": np.zeros(3), "jaw_pose": np.zeros(3)}
+    _assert_same(still, replace(frames[0], **calm, eyes_pose=np.zeros(6)))
     half = strengthened(frames, 0.5)[3]
     np.testing.assert_allclose(half.expr, frames[3].expr / 2)
     np.testing.assert_allclose(half.jaw_pose, frames[3].jaw_pose / 2, atol=1e-12)

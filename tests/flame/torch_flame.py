@@ -46,24 +46,15 @@ def axis_angle_matrices(axis_angle: torch.Tensor) -> torch.Tensor:
 
 
 def flame_forward(
-    flame: FlameTensors,
-    shape: torch.Tensor,
-    expr: torch.Tensor,
-    pose: torch.Tensor,
-    translation: torch.Tensor,
-    offset: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Vertices (T, V, 3) in meters of T frames.
-
-    shape (I,) or (T, I); expr (T, E); pose (T, 5, 3) axis-angle of root, neck, jaw, left eye, right
-    eye;
-    translation (T, 3); offset (V, 3) or (T, V, 3): static plus dynamic offset, or None.
-    """
+    flame: FlameTensors, shape: torch.Tensor, expr: torch.Tensor, pose: torch.Tensor,
+    translation: torch.Tensor, offset: torch.Tensor,
+) -> torch.Tensor:  # fmt: skip
+    """Vertices (T, V, 3) in meters of T frames: shape (I,); expr (T, E); pose (T, 5, 3) axis-angle
+    of root, neck, jaw, left eye, right eye; translation (T, 3); offset (V, 3), static plus
+    dynamic."""
     frames = len(expr)
     coefficients = torch.cat([shape.expand(frames, -1), expr], 1)
-    shaped = flame.v_template + torch.einsum("vck,tk->tvc", flame.shapedirs, coefficients)
-    if offset is not None:
-        shaped = shaped + offset
+    shaped = flame.v_template + torch.einsum("vck,tk->tvc", flame.shapedirs, coefficients) + offset
     joints = flame.j_regressor @ shaped
     rotations = axis_angle_matrices(pose)
     identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
