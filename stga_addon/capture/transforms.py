@@ -56,11 +56,10 @@ class Record:
         return float(value)
 
     def natural(self, key: str) -> int:
-        value = self.values[key]
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INDEX_LIMIT:
-            expected = "a whole number from 0 up, below 2^31"
-            raise StgaError(f"{self.where(key)}: expected {expected}, not {shorten(value)}")
-        return value
+        value = self.number(key, -1, INDEX_LIMIT)
+        if value % 1:
+            raise StgaError(f"{self.where(key)}: expected a whole number, not {value:g}")
+        return int(value)
 
     def path_of(self, key: str) -> Path | None:
         value = self.values.get(key)

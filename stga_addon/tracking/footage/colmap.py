@@ -158,14 +158,10 @@ class _Cursor:
         self.offset += size
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.offset)
-        if end < 0:
-            raise StgaError(f"{self.path}: ends within a name; expected a COLMAP model")
-        name, self.offset = self.data[self.offset : end], end + 1
-        try:
-            return name.decode("utf-8")
-        except ValueError as error:
-            raise StgaError(f"{self.path}: image name {name!r} is not UTF-8") from error
+        start, end = self.offset, self.data.find(b"\0", self.offset)
+        self.advance((end if end >= 0 else len(self.data)) + 1 - start)
+        name = self.data[start:end]
+        return name.decode("utf-8", errors="replace")  # where it is not, no image has that name
 
 
 def _binary_cameras(path: Path) -> Iterator[_Camera]:
