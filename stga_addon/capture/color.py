@@ -14,6 +14,7 @@ CHROMATICITIES = {
 D65 = (0.3127, 0.3290)
 SRGB = 1
 LINEAR, PQ, HLG = 8, 16, 18
+Conversion = Callable[[np.ndarray], np.ndarray]  # Of pixels
 GAMMAS = {4: 2.2, 5: 2.8}
 """Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
 
@@ -49,9 +50,7 @@ def to_srgb(pixels: np.ndarray, primaries: int, transfer: int) -> np.ndarray:
     return in_bands(pixels, 3, convert)
 
 
-def in_bands(
-    pixels: np.ndarray, channels: int, convert: Callable[[np.ndarray], np.ndarray]
-) -> np.ndarray:
+def in_bands(pixels: np.ndarray, channels: int, convert: Conversion) -> np.ndarray:
     """(H, W, channels) uint8 of `convert` applied to the rows of an image, some at a time."""
     converted = np.empty((*pixels.shape[:2], channels), np.uint8)
     step = max(1, BAND_PIXELS // max(1, pixels.shape[1]))

@@ -49,15 +49,11 @@ class ViewLoader:
     """
 
     def __init__(
-        self,
-        views: Iterable[View],
-        scale: Callable[[int], float] = lambda position: 1.0,
-        background: tuple[int, int, int] = WHITE,
-        queue_bytes: int = 16 << 20,
-        cache_bytes: int = 224 << 20,
-        prepare: Preparation | None = None,
+        self, views: Iterable[View], scale: Callable[[int], float] = lambda position: 1.0,
+        background: tuple[int, int, int] = WHITE, queue_bytes: int = 16 << 20,
+        cache_bytes: int = 224 << 20, prepare: Preparation | None = None,
         mesh: Callable[[int], np.ndarray] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.waited_s = 0.0
         self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh
         self._queue_bytes = queue_bytes
@@ -71,8 +67,8 @@ class ViewLoader:
         self._error: BaseException | None = None
         self._finished = self._closed = False
         self._changed = Condition()
-        work = (iter(views),)
-        self._thread = Thread(target=self._work, args=work, name="view loader", daemon=True)
+        work = partial(self._work, iter(views))
+        self._thread = Thread(target=work, name="view loader", daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[LoadedView]:

@@ -7,6 +7,10 @@ import numpy as np
 from .camera import Camera
 
 ArrayPair = tuple[np.ndarray, np.ndarray]
+MAX_ITERATIONS = 100
+MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
+CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
+MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -29,10 +33,6 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
         part = part[part]
         if np.array_equal(part, before):
             return np.asarray(part)
-
-
-MAX_ITERATIONS = 100
-MIN_RESIDUAL = 1e-7  # Share of the mesh's size below which residuals are rounding
 
 
 @dataclass(frozen=True)
@@ -125,10 +125,6 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     distance[0] = np.where(inside, distance[0], np.inf)
     nearest = distance.argmin(axis=0)[None, ..., None]
     return np.asarray(np.take_along_axis(options, nearest, axis=0)[0])
-
-
-CHUNK_PIXELS = 1 << 21  # Candidate pixels that are tested at a time, to bound the memory
-MIN_DEPTH_M = 0.01  # Triangles nearer to the camera's plane, or behind it, are not drawn
 
 
 def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayPair:

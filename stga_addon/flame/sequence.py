@@ -277,12 +277,9 @@ def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray 
 
 # Part of a motion that can be transferred -> fields of a frame.
 PARTS = {
-    "expression": ("expr",),
-    "jaw": ("jaw_pose",),
-    "eyes": ("eyes_pose",),
-    "neck": ("neck_pose",),
+    "expression": ("expr",), "jaw": ("jaw_pose",), "eyes": ("eyes_pose",), "neck": ("neck_pose",),
     "head": ("rotation", "translation"),
-}
+}  # fmt: skip
 ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 

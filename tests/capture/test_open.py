@@ -184,27 +184,6 @@ def test_bare_folder(tmp_path: Path) -> None:
     assert open_capture(tmp_path).timesteps == (0, 1, 2, 3)
 
 
-def test_union_set(tmp_path: Path) -> None:
-    """Catches union sets, whose frames all lie in sibling folders."""
-    root, model_file = factory.write_flame_capture(tmp_path / "seq_01")
-    union = tmp_path / "union"
-    union.mkdir()
-    shutil.copy(root / "canonical_flame_param.npz", union)
-
-    def prefix(document: dict[str, Any]) -> None:
-        for entry in document["frames"]:
-            for key in ("file_path", "fg_mask_path", "flame_param_path"):
-                entry[key] = f"../seq_01/{entry[key]}"
-
-    for split in factory.SPLITS:
-        shutil.copy(root / f"transforms_{split}.json", union)
-    each_split(union, prefix)
-    capture = open_capture(union, model_file)
-    view = capture.views["train"][0]
-    assert view.name == "../seq_01/images/00000_00.png"
-    np.testing.assert_array_equal(read_image(view), factory.picture(0, 0))
-
-
 def test_principal_point_is_checked_against_the_masks(tmp_path: Path, shared_data: Path) -> None:
     """Catches a capture of the other convention opened silently, a warning where all is well, and a
     check too dull for a real head: the principal point 10 pixels off the center, of 401."""

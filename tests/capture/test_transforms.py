@@ -128,8 +128,8 @@ def test_static_capture_without_timesteps(tmp_path: Path) -> None:
 
 
 def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
-    """Catches union sets (`../<sequence>/images`) being refused, or resolved from the working
-    directory."""
+    """Catches union sets of VHAP, whose frames all lie in sibling folders (`../<sequence>/images`),
+    being refused, or resolved from the working directory."""
     root = tmp_path / "union"
     assert inside(root, "../seq_01/images/1.png", "x") == tmp_path / "seq_01/images/1.png"
     assert inside(root, "images/../../seq_01\\1.png", "x") == tmp_path / "seq_01/1.png"

@@ -16,7 +16,7 @@ from avatar.conftest import random_mesh, random_splats
 from capture import factory
 from flame.conftest import model_of, random_arrays
 from PIL import Image
-from tracking import scenes, test_head_model, test_metashape, test_nerfstudio, test_realitycapture
+from tracking import scenes, test_calibrations, test_head_model
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -165,7 +165,9 @@ def size_of(label: str) -> tuple[int, int]:
 
 def nerfstudio(path: Path) -> None:
     frames = [
-        test_nerfstudio.entry(camera, f"images/{name}", k1=0.1, p2=0.001, mask_path=f"masks/{name}")
+        test_calibrations.entry(
+            camera, f"images/{name}", k1=0.1, p2=0.001, mask_path=f"masks/{name}"
+        )
         for camera, name in zip(RIG, NAMES, strict=True)
     ]
     path.write_text(json.dumps({"frames": frames, "camera_model": "OPENCV"}))
@@ -190,16 +192,16 @@ COLMAP = ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
 TARGETS = {name: Target(*row) for name, row in {
     "metashape": (
         "cameras.xml",
-        lambda p: test_metashape.write_export(p, RIG, NAMES, intrinsics=test_metashape.INTRINSICS),
+        lambda p: test_calibrations.write_export(p, RIG, NAMES),
         lambda p: undistorted(read_metashape(p)[0])
     ),
     "realitycapture csv": (
         "cameras.csv",
-        lambda p: p.write_text("\n".join([test_realitycapture.HEADER, *map(ROW.format, NAMES)])),
+        lambda p: p.write_text("\n".join([test_calibrations.HEADER, *map(ROW.format, NAMES)])),
         lambda p: undistorted(read_realitycapture_csv(p, size_of))
     ),
     "realitycapture xmp": (
-        "a.xmp", lambda p: test_realitycapture.write_xmp(p, RIG[0]),
+        "a.xmp", lambda p: test_calibrations.write_xmp(p, RIG[0]),
         lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0])
     ),
     "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p))),

@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 from capture import factory
 from flame.conftest import random_arrays
-from tracking import test_metashape, test_realitycapture
+from tracking import test_calibrations
 from tracking.test_head_model import glb as head_glb
 from tracking.test_head_model import simple
 from training.test_folder import make_checkpoint
@@ -502,7 +502,7 @@ def full(value: Any, *shape: int) -> np.ndarray:
 
 
 DIGITS = "9" * 5000
-XMP = test_realitycapture.COEFFICIENTS
+XMP = test_calibrations.XMP_COEFFICIENTS
 CSV = "cam0.png,1,2,3,10,20,30,24.3"
 ZEROS = ",0,0,0,0,0,0,0,0"
 LANDMARK_ROWS = [
@@ -581,7 +581,7 @@ MODEL_ROWS = [
 ]  # fmt: skip
 FOLDS, WIDE = "the distortion of its lens folds the image", "expected a focal length of 1 to 1e7"
 COUNT = "expected a whole number, not '999"
-FOCAL = f"<f>{test_metashape.INTRINSICS['f']}</f>"
+FOCAL = f"<f>{test_calibrations.INTRINSICS['f']}</f>"
 WRONG: dict[str, list[tuple[Any, str]]] = {
     "colmap cameras.txt": [
         (("PINHOLE", "EQUIRECTANGULAR"), "camera 1: model 'EQUIRECTANGULAR' is not one of"),
