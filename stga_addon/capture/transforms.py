@@ -127,7 +127,7 @@ class Transforms:
 def transforms_files(folder: Path) -> list[Path]:
     """The folder's transforms files: the whole one, and those of splits."""
     files = (folder / name for name in (WHOLE_FILE, *SPLIT_FILES.values()))
-    return [path for path in files if path.is_file()]
+    return [path for path in files if isfile(path)]
 
 
 def read_transforms(

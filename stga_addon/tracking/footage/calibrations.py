@@ -6,6 +6,7 @@ which `colmap` reads."""
 import csv
 import io
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from os.path import isdir, isfile
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -70,16 +71,16 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
     pose. image_size: size of the images of a label, which RealityCapture does not write. Raises
     StgaError that names file and field."""
     suffix, without_pose = path.suffix.lower(), list[str]()
-    splits = transforms_files(path)
-    colmap = find_colmap(path if isdir(path) else path.parent)
-    if splits:
+    if isdir(path) and (splits := transforms_files(path)):
         shots = [shot for name in splits for shot in read_nerfstudio(name)]
-    elif colmap and (isdir(path) or (suffix in (".bin", ".txt") and colmap == path.parent)):
+    elif isdir(path) and (colmap := find_colmap(path)):
         shots = read_colmap(colmap)
     elif isdir(path):
         shots, without_pose = read_realitycapture_xmp(path.glob("*.xmp"), image_size)
     elif not isfile(path):
         raise StgaError(f"{path}: does not exist; expected {EXPECTED}")
+    elif suffix in (".bin", ".txt") and find_colmap(path.parent) == path.parent:
+        shots = read_colmap(path.parent)
     elif suffix == ".json":
         shots = read_nerfstudio(path)
     elif suffix == ".xml":
@@ -117,8 +118,9 @@ def read_nerfstudio(path: Path) -> list[Shot]:
         timestep, mask = view.timestep if is_timed else None, view.mask
         mask = mask or record.path_of("mask_path")  # nerfstudio's
         fps = record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None
-        seen = _lens(record), frame.where, view.image, timestep, mask, name, fps
-        shots.append(Shot(view.name, camera, *seen, record.values.get("world") == "keep"))
+        keeps_world = record.values.get("world") == "keep"
+        shot = Shot(view.name, camera, _lens(record), frame.where, view.image, timestep, mask, name)
+        shots.append(replace(shot, fps=fps, keeps_world=keeps_world))
     return shots
 
 
