@@ -104,7 +104,8 @@ def read_flame(path: Path) -> FlameModel:
         given = _integers(path, "n_identity", arrays["n_identity"]).ravel().tolist()
         if len(given) != 1 or not 0 <= given[0] <= components:
             expected = f"one number from 0 to {components}"
-            raise StgaError(f"{path}: n_identity is {given}, expected {expected}")
+            found = arrays["n_identity"].tolist()
+            raise StgaError(f"{path}: n_identity is {found}, expected {expected}")
         n_identity = given[0]
     posedirs = _floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES))
     regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), vertices))

@@ -176,8 +176,9 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     count = next((len(array) for array in moving.values() if array.ndim), 0)
     for name, array in moving.items():
         if array.ndim < 2 or len(array) != count or not count:
-            expected = f"expected ({count or 'timesteps'}, coefficients)"
-            raise StgaError(f"{path}: {name} has shape {array.shape}, {expected}")
+            other = array.ndim > 1 and count
+            expected = f"{count} timesteps first" if other else "(timesteps, coefficients)"
+            raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     if "shape" in arrays and arrays["shape"].ndim == 2:
         arrays["shape"] = arrays["shape"][0]  # one per timestep, all of the same person
     shape, static_offset = _identity(path, {"shape": np.zeros(0), **arrays}, model)
