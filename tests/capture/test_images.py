@@ -214,8 +214,7 @@ def profile(colorants, gamma, name):
 
 P3 = (0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407)
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-DISPLAY_P3 = profile(P3, 2.2, "P3")
-"""Colorants as published with Apple's profile."""
+DISPLAY_P3 = profile(P3, 2.2, "P3")  # Colorants as published with Apple's profile
 
 
 def icc(data):

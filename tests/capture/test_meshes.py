@@ -54,8 +54,7 @@ def test_obj_dialects(tmp_path: Path) -> None:
     """Catches what exporters really write: colors, texture corners, several materials and objects,
     quads, negative indices, Windows line ends, continued lines. trimesh would regroup the triangles
     by material. And kept triangles that ignore how many vertices stand before a line that counts
-    backwards.
-    """
+    backwards."""
     points = [f"v {i} {i * i} 0 1 0 0" for i in range(5)]
     lines = ["mtllib x.mtl", "o a", *points, "vt 0 0", "vn 0 0 1", "usemtl b", "f 4/1 2/1 1/1"]
     lines += ["usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]

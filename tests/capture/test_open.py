@@ -125,10 +125,8 @@ def test_flame_capture_without_paths_or_masks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rows", [5023, 5143])
 def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: int) -> None:
     """Catches a mesh of 9976 triangles where VHAP tracked 10144, whichever size its offsets have.
-
     The real template and triangles; skinning and expressions are filled in, for they are not
-    published openly.
-    """
+    published openly."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, faces = data["v_template"].astype(float), data["faces"]
     count = len(template)
@@ -264,10 +262,7 @@ def test_summary(tmp_path: Path) -> None:
 
 def test_numpy_alone_is_enough(tmp_path: Path) -> None:
     """Catches an import that needs more than numpy: Blender must open a capture without Pillow,
-    trimesh or torch.
-
-    What does need them says so.
-    """
+    trimesh or torch. What does need them says so."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     ply = factory.write_mesh_capture(tmp_path / "ply", suffix=".ply")
     only = tmp_path / "packages"

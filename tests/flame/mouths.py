@@ -18,10 +18,8 @@ JOINT_POSITIONS_M = np.array(
 
 
 def open_flame(shared_data: Path) -> FlameModel:
-    """FLAME 2023 Open's template and identity, with a skeleton and a jaw made here.
-
-    Expressions and correctives stay random: they are not published openly.
-    """
+    """FLAME 2023 Open's template and identity, with a skeleton and a jaw made here. Expressions and
+    correctives stay random: they are not published openly."""
     with np.load(shared_data / "flame_open" / "flame2023_open_basis.npz") as data:
         arrays = random_arrays(vertices=5023, components=80)
         arrays["shapedirs"][:, :, :60] = data["shapedirs"]

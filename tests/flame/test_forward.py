@@ -50,11 +50,9 @@ def test_same_as_four_by_four_matrices_vertex_by_vertex(tiny_flame: FlameModel) 
 
 def test_equals_smplx(tmp_path: Path) -> None:
     """Catches disagreement with the reference FLAME of smplx: component layout, pose order, joints,
-    correctives.
-
-    smplx_vertices.npy holds the vertices (50, 3) that `smplx.FLAME` of smplx 0.1.28 returned in
-    float64 for the same random model, shape and frame (num_betas=300, num_expression_coeffs=100).
-    """
+    correctives. smplx_vertices.npy holds the vertices (50, 3) that `smplx.FLAME` of smplx 0.1.28
+    returned in float64 for the same random model, shape and frame (num_betas=300,
+    num_expression_coeffs=100)."""
     arrays = random_arrays(seed=11, vertices=50, components=400)
     arrays["shapedirs"] *= 0.2
     (tmp_path / "FLAME_NEUTRAL.pkl").write_bytes(pickle.dumps(arrays, protocol=2))

@@ -39,10 +39,7 @@ def record(
     folder, head, picture=lambda mesh, camera: np.zeros((SIZE, SIZE, 3), np.uint8), timesteps=5
 ):
     """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2;
-    returns its meshes.
-
-    picture(mesh, camera) gives the pixels.
-    """
+    returns its meshes. picture(mesh, camera) gives the pixels."""
     cameras, places = rig(), places_on(head, LANDMARKS)
     shape = np.zeros(head.model.n_identity)
     frames = [frame_at(head, timestep) for timestep in range(timesteps)]
