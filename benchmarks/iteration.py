@@ -33,7 +33,6 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.teeth import flame_model
-from stga_addon.raster.cpu import kernel_jit
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.layout import PROJECTED, Parameters
 from stga_addon.raster.cpu.project import project_backward, project_forward
@@ -46,7 +45,7 @@ from stga_addon.raster.cpu.rasterize import (
     tile_grid,
     with_strain_color,
 )
-from stga_addon.raster.cpu.threads import next_piece, parallel, threads
+from stga_addon.raster.cpu.threads import parallel, pieces, threads
 from stga_addon.raster.cpu.tiles import (
     SORT_PARTS,
     arrange_tiles,
@@ -147,11 +146,9 @@ MULTIPLY_ADDS = 16
 
 
 @parallel(lambda rows: len(rows), piece=16)
-@kernel_jit
 def multiply_add_rows(work, rows):
     """Sixteen multiply-adds of each value of rows (R, 256) float32, 100 times over."""
-    first, past = next_piece(work)
-    while first < past:
+    for first, past in pieces(work):
         for n in range(first, past):
             row = rows[n]
             for _ in range(100):
@@ -161,7 +158,6 @@ def multiply_add_rows(work, rows):
                     for _ in range(MULTIPLY_ADDS):
                         value = value * x - x
                     row[p] = value
-        first, past = next_piece(work)
 
 
 def arithmetic_rate(clock: Callable[[], float]) -> float:

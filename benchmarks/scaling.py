@@ -12,10 +12,9 @@ tile) pairs of the view, and draws them.
 is cut into are timed one after the other (time of the thread, median of repeats; many short ones a
 few at a time) and given to N threads as `threads.py` does: the calling thread unpacks the arguments
 and begins, each of the others joins later by as much as two threads measurably need to meet in a
-kernel, one after the other, and each takes the next piece when it is free. Where the pause before a
-kernel is longer than threads look for work, they are woken: the caller wakes two, and each of these
-two more, each time as late as measured. Added is what lies between the kernels. Cores are taken to
-be alike and memory to keep up: the last column is the bandwidth that this needs.
+kernel, one after the other, and each takes the next piece when it is free. Added is what lies
+between the kernels. Cores are taken to be alike and memory to keep up: the last column is the
+bandwidth that this needs.
 """
 
 import argparse
@@ -25,7 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import perf_counter, sleep, thread_time
+from time import perf_counter, thread_time
 from typing import Any
 from unittest.mock import patch
 
@@ -34,12 +33,11 @@ import numpy as np
 from iteration import bundled_head, front_camera, global_step, median_ms, two_regions
 
 from stga_addon.avatar.embedding import face_frames
-from stga_addon.raster.cpu import kernel_jit
 from stga_addon.raster.cpu import threads as kernel_threads
-from stga_addon.raster.cpu.elementary import fetch_add, load
+from stga_addon.raster.cpu.elementary import fetch_add
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
-from stga_addon.raster.cpu.threads import next_piece, parallel, set_threads, threads
+from stga_addon.raster.cpu.threads import parallel, pieces, set_threads, threads
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -132,12 +130,9 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
     in order, and what lies between them, in milliseconds of this thread.
     """
     found: list[Kernel] = []
-    words = np.zeros(kernel_threads.FIRST_HELPER, np.int64)
     last = aside = 0.0
 
-    def one_by_one(
-        kernel: kernel_threads.TeamKernel, units: int, piece: int, arguments: tuple[Any, ...]
-    ) -> None:
+    def one_by_one(kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> None:
         nonlocal aside, last
         begin = thread_time()
         together = piece * -(-units // (piece * TIMED_PIECES))
@@ -145,19 +140,19 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
         times = []
         for first, past in spans:
             before = thread_time()
-            kernel.call(words, 0, (np.array([first, past, piece]), *arguments))
+            kernel(np.array([first, past, piece]), *arguments)
             times.append(1e3 * (thread_time() - before))
         before = thread_time()
         for _ in range(3):
-            kernel.call(words, 0, (np.array([0, 0, piece]), *arguments))
+            kernel(np.array([0, 0, piece]), *arguments)
         call = 1e3 * (thread_time() - before) / 3
-        pieces = [-(-(past - first) // piece) for first, past in spans]
+        taken = [-(-(past - first) // piece) for first, past in spans]
         each = [
             max(0.0, ms - call) / count
-            for ms, count in zip(times, pieces, strict=True)
+            for ms, count in zip(times, taken, strict=True)
             for _ in range(count)
         ]
-        found.append(Kernel(kernel.kernel.__name__, each, call, 1e3 * (begin - last)))
+        found.append(Kernel(kernel.__name__, each, call, 1e3 * (begin - last)))
         last = thread_time()
         aside += 1e3 * (last - begin)
 
@@ -170,76 +165,61 @@ def kernels_of(step: Callable[[], object]) -> tuple[list[Kernel], float]:
 
 @dataclass(frozen=True)
 class Latency:
-    """Milliseconds that a thread joins a kernel later than its caller begins it: if it looks for
-    work, what every further one takes on top, and if it sleeps and is woken by a thread that joins
-    then.
-    """
+    """Milliseconds that a thread joins a kernel later than its caller begins it, and what every
+    further one takes on top."""
 
-    awake: float
+    first: float
     further: float
-    asleep: float
 
-    def of(self, helpers: int, asleep: bool) -> list[float]:
-        if asleep:
-            return [self.asleep * int(np.log2(n + 2)) for n in range(helpers)]
-        return [self.awake + n * self.further for n in range(helpers)]
+    def of(self, helpers: int) -> list[float]:
+        return [self.first + n * self.further for n in range(helpers)]
 
 
 def spans_ms(kernels: list[Kernel], count: int, latency: Latency) -> list[float]:
     """How long each kernel of an iteration takes `count` threads, of which each takes the next
-    piece when it is free; who has waited longer than SPIN_S since its last piece sleeps.
-    """
-    spans, waited = [], np.inf
+    piece when it is free."""
+    spans = []
     for kernel in kernels:
-        helpers, waited = min(count, len(kernel.pieces)) - 1, waited + kernel.pause
-        late = latency.of(helpers, waited > 1e3 * kernel_threads.SPIN_S)
+        late = latency.of(min(count, len(kernel.pieces)) - 1)
         free = [kernel.call, *(kernel.call + ms for ms in late)]
         heapq.heapify(free)
         end = kernel.call
         for ms in kernel.pieces:
             end = max(end, free[0] + ms)
             heapq.heapreplace(free, free[0] + ms)
-        waited = end - min(end, free[0])
         spans.append(end)
     return spans
 
 
 @parallel(lambda met, *_: len(met) - 1)
-@kernel_jit
 def meet(work, met, patience):
     """Each thread takes one unit and waits until met[0], how many have, is all of them: together,
     if that many came."""
-    begin, end = next_piece(work)
-    while begin < end:
+    for _ in pieces(work):
         fetch_add(met, 0, 1)
         for _ in range(patience):
-            if load(met, 0) == len(met) - 1:
+            if fetch_add(met, 0, 0) == len(met) - 1:
                 break
-        begin, end = next_piece(work)
 
 
 @parallel(lambda count: count)
-@kernel_jit
 def take(work, count):
     """Takes all pieces and does nothing with them."""
-    begin, end = next_piece(work)
-    while begin < end:
-        begin, end = next_piece(work)
+    for _ in pieces(work):
+        pass
 
 
 def measure_latency(repeats: int) -> Latency:
     """Measured on two threads, of the repeats the fastest tenth: on a loaded machine a thread may
     lack a core."""
-    pieces = 100_000
+    units = 100_000
 
-    def meet_ms(awake: bool) -> float:
-        """A whole kernel in which the two meet, right after another one or after a rest."""
+    def meet_ms() -> float:
+        """A whole kernel in which the two meet."""
         times = []
         for _ in range(repeats):
-            take(10 * pieces)  # long enough for the system to give each thread a core
+            take(10 * units)  # long enough for the system to give each thread a core
             met = np.zeros(3, np.int64)
-            if not awake:
-                sleep(10 * kernel_threads.SPIN_S)
             begin = perf_counter()
             meet(met, 1_000_000)
             times.append(1e3 * (perf_counter() - begin))
@@ -248,11 +228,11 @@ def measure_latency(repeats: int) -> Latency:
     before = threads()
     set_threads(2)
     try:
-        awake, asleep = meet_ms(True), meet_ms(False)
-        further = median_ms(lambda: take(pieces), 5) / pieces
+        first = meet_ms()
+        further = median_ms(lambda: take(units), 5) / units
     finally:
         set_threads(before)
-    return Latency(awake, further, asleep)
+    return Latency(first, further)
 
 
 def model(splats: int, repeats: int) -> None:
@@ -272,8 +252,8 @@ def model(splats: int, repeats: int) -> None:
     moved = splats * BYTES_PER_SPLAT + pairs * BYTES_PER_PAIR + WIDTH * HEIGHT * BYTES_PER_PIXEL
     latency = measure_latency(20 * repeats)
     print(
-        f"a thread joins after {1e3 * latency.awake:.1f} µs, each further one "
-        f"{1e3 * latency.further:.2f} µs later, one that sleeps after {1e3 * latency.asleep:.0f} µs"
+        f"a thread joins after {1e3 * latency.first:.1f} µs, each further one "
+        f"{1e3 * latency.further:.2f} µs later"
     )
     runs: dict[int, list[tuple[list[Kernel], float]]] = {count: [] for count in MODELLED_THREADS}
     for _ in range(repeats + 2):

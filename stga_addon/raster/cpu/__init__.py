@@ -46,9 +46,6 @@ def _cached(**options: Any) -> Any:
 
 
 jit = _cached(nogil=True, no_cfunc_wrapper=True)
-# For kernels that `threads.parallel` calls by their address, never Python: what would unpack
-# Python's arguments is not compiled.
-kernel_jit = _cached(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)
 # For functions that kernels call. Unless LLVM inlines them, a process that compiles the kernel
 # calls the function as compiled alone, and one that loads it from the cache calls the copy in
 # there, whose last bits differ.

@@ -16,7 +16,7 @@ computed, and every pixel is stored.
 
 import numpy as np
 
-from . import inline_jit, kernel_jit, part_jit
+from . import inline_jit, part_jit
 from .elementary import prefetch
 from .layout import (
     BLUE,
@@ -33,7 +33,7 @@ from .layout import (
     TILE,
 )  # fmt: skip
 from .outline import outline, rows_within
-from .threads import next_piece, parallel
+from .threads import parallel, pieces
 
 MAX_ALPHA = np.float32(0.999)
 MIN_ALPHA = np.float32(1 / 255)
@@ -288,7 +288,6 @@ def _store_tile(s, left, top, background, blended):
 
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
-@kernel_jit
 def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
@@ -302,8 +301,7 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
     s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
-    first_tile, past_tile = next_piece(work)
-    while first_tile < past_tile:
+    for first_tile, past_tile in pieces(work):
         for k in range(first_tile, past_tile):
             tile = tiles[k]
             left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -339,7 +337,6 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
                     _falloff(blocks, listed, batch, False, s)
                     _blend(blocks, listed, batch_begin - begin, batch, s)
             _store_tile(s, left, top, background, blended)
-        first_tile, past_tile = next_piece(work)
 
 
 @part_jit
@@ -447,7 +444,6 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
 
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
-@kernel_jit
 def blend_backward(
     work, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
     pair_gradients,
@@ -465,8 +461,7 @@ def blend_backward(
     sums, places = np.empty(PROJECTED, np.float32), np.empty(PAIRS_PER_GROUP + 1, np.uint64)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
-    first_tile, past_tile = next_piece(work)
-    while first_tile < past_tile:
+    for first_tile, past_tile in pieces(work):
         for k in range(first_tile, past_tile):
             tile = tiles[k]
             left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -507,4 +502,3 @@ def blend_backward(
                         if wanted[pair_splat[j]]:
                             _sum_gradient(places[n], places[n + 1], s, sums)
                             _store_pair(pair_gradients, j, q, batch, sums)
-        first_tile, past_tile = next_piece(work)

@@ -1,6 +1,5 @@
 """Exponential and logarithm for loops that LLVM vectorizes: the C library's are calls, one value at
-a time. And instructions that Python has no name for: prefetching, and what threads read and write
-at the same time."""
+a time. And instructions that Python has no name for: prefetching, and atomic addition."""
 
 from typing import Any
 
@@ -69,71 +68,14 @@ def prefetch(typing: Any, array: Any, index: Any) -> Any:
     return types.void(array, index), generate
 
 
-def _atomic(generate_of: Any, *kinds: Any) -> Any:
-    """(signature, code) of an operation on an element of an int64 array; generate_of(builder, its
-    pointer, *values)."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        return generate_of(builder, builder.gep(data, [arguments[1]]), *arguments[2:])
-
-    return types.int64(*kinds), generate
-
-
 @intrinsic
 def fetch_add(typing: Any, array: Any, index: Any, step: Any) -> Any:
     """Add `step` to an element of an int64 array, undivided by other threads; returns what it was
     before."""
-    return _atomic(
-        lambda builder, at, by: builder.atomic_rmw("add", at, by, "seq_cst"),
-        array,
-        types.int64,
-        types.int64,
-    )
-
-
-@intrinsic
-def exchange(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write an element of an int64 array; returns what it was before."""
-    return _atomic(
-        lambda builder, at, to: builder.atomic_rmw("xchg", at, to, "seq_cst"),
-        array,
-        types.int64,
-        types.int64,
-    )
-
-
-@intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """An element of an int64 array, as other threads left it; what they wrote before it is seen as
-    well."""
-    return _atomic(lambda builder, at: builder.load_atomic(at, "seq_cst", 8), array, types.int64)
-
-
-@intrinsic
-def compare_exchange(typing: Any, array: Any, index: Any, expected: Any, value: Any) -> Any:
-    """Write an element of an int64 array if it is as expected; returns 1 if it was, else 0."""
-
-    def generate(builder: Any, at: Any, old: Any, new: Any) -> Any:
-        done = builder.extract_value(builder.cmpxchg(at, old, new, "seq_cst", "seq_cst"), 1)
-        return builder.zext(done, ir.IntType(64))
-
-    return _atomic(generate, array, types.int64, types.int64, types.int64)
-
-
-@intrinsic
-def pause(typing: Any) -> Any:
-    """Tell the processor that this thread waits in a loop; nothing where LLVM has no name for
-    that."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        machine, kind = builder.module.triple.split("-")[0], ir.FunctionType(ir.VoidType(), [])
-        if machine == "x86_64":
-            builder.call(builder.module.declare_intrinsic("llvm.x86.sse2.pause", (), kind), [])
-        elif machine in ("aarch64", "arm64"):
-            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(32)])
-            hint = builder.module.declare_intrinsic("llvm.aarch64.hint", (), kind)
-            builder.call(hint, [ir.IntType(32)(1)])  # yield
-        return context.get_dummy_value()
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.gep(data, [arguments[1]])
+        return builder.atomic_rmw("add", address, arguments[2], "seq_cst")
 
-    return types.void(), generate
+    return types.int64(array, types.int64, types.int64), generate

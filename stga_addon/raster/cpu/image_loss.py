@@ -8,8 +8,8 @@ eleven, so the intermediate maps never reach main memory.
 
 import numpy as np
 
-from . import inline_jit, jit, kernel_jit, part_jit
-from .threads import next_piece, parallel
+from . import inline_jit, jit, part_jit
+from .threads import parallel, pieces
 
 WINDOW_RADIUS_PX = 5
 LOSS_REACH_PX = 2 * WINDOW_RADIUS_PX
@@ -145,7 +145,6 @@ def _gradient_row(
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
-@kernel_jit
 def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, sums):
     """Gradient of the loss with respect to the image, within each rectangle (x0, y0, x1, y1) of
     pixels.
@@ -157,8 +156,7 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
     an image is cut into bands.
     """
     height, width = image.shape[1], image.shape[2]
-    first_job, past_job = next_piece(work)
-    while first_job < past_job:
+    for first_job, past_job in pieces(work):
         # one channel of one rectangle: row by row, the gradient ten rows behind
         for job in range(first_job, past_job):
             r, c = job // 3, job % 3
@@ -236,7 +234,6 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                     ssim_weight, scale, gradient[c, out], differences,
                 )  # fmt: skip
                 sums[0, c, first_sum + out] = _sum_row(differences, x0 - left, x1 - left)
-        first_job, past_job = next_piece(work)
 
 
 @jit
@@ -256,7 +253,6 @@ def _total(sums):
 
 
 @parallel(lambda image, *_: len(image), piece=16)
-@kernel_jit
 def change_background(work, image, mask, before, after, out):
     """Write image (H, W, 3) uint8, composited over the color `before`, as it looks over `after`.
 
@@ -264,8 +260,7 @@ def change_background(work, image, mask, before, after, out):
     image = coverage · foreground + (1 − coverage) · before, so only the second term has to be
     exchanged.
     """
-    first_row, past_row = next_piece(work)
-    while first_row < past_row:
+    for first_row, past_row in pieces(work):
         for y in range(first_row, past_row):
             for x in range(image.shape[1]):
                 clear = np.float32(255 - mask[y, x]) * np.float32(1 / 255)
@@ -274,4 +269,3 @@ def change_background(work, image, mask, before, after, out):
                     out[y, x, c] = np.uint8(
                         min(np.float32(255.0), max(ZERO, value)) + np.float32(0.5)
                     )
-        first_row, past_row = next_piece(work)

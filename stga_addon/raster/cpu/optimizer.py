@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from . import jit, kernel_jit, part_jit
+from . import jit, part_jit
 from .elementary import exponential
-from .threads import next_piece, parallel
+from .threads import parallel, pieces
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 ROWS_PER_BLOCK = 256
@@ -55,7 +55,6 @@ class AdamOptions(NamedTuple):
 
 
 @parallel(lambda rows, *_: len(rows), piece=ROWS_PER_BLOCK)
-@kernel_jit
 def adam_rows(work, rows, steps, parameters, options):
     """One Adam step on the listed rows (M,) of several parameters, with each row's own step count.
 
@@ -69,8 +68,7 @@ def adam_rows(work, rows, steps, parameters, options):
     correct1, correct2 = np.empty(ROWS_PER_BLOCK, np.float32), np.empty(ROWS_PER_BLOCK, np.float32)
     ema_shares = np.empty(ROWS_PER_BLOCK, np.float32)
     latest, first, second, share = np.int32(-1), ZERO, ZERO, ZERO
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for n in range(begin, end):
             steps[rows[n]] += 1
             if steps[rows[n]] != latest:  # neighbors are mostly trained equally often
@@ -82,7 +80,6 @@ def adam_rows(work, rows, steps, parameters, options):
             correct1[n - begin], correct2[n - begin], ema_shares[n - begin] = first, second, share
         for p in range(len(parameters)):
             _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
-        begin, end = next_piece(work)
 
 
 @part_jit
@@ -113,16 +110,13 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
-@kernel_jit
 def add_screen_gradients(work, rows, screen_gradient, total, count):
     """Add screen_gradient (N,) of the listed rows (M,) to total (N,), and 1 to their count (N,)."""
-    first_row, past_row = next_piece(work)
-    while first_row < past_row:
+    for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = np.uint64(rows[n])
             total[i] += screen_gradient[i]
             count[i] += ONE
-        first_row, past_row = next_piece(work)
 
 
 @jit
@@ -180,13 +174,11 @@ def scale_limit(
 
 
 @parallel(lambda sums, *_: len(sums), piece=4)
-@kernel_jit
 def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
     """Write to each of the sums Σ ReLU(scale − limit)² over its ROWS_PER_SUM rows; see
     `scale_limit`."""
     scales = np.empty(3 * ROWS_PER_SUM, np.float32)
-    first_sum, past_sum = next_piece(work)
-    while first_sum < past_sum:
+    for first_sum, past_sum in pieces(work):
         for k in range(first_sum, past_sum):
             begin, count = k * ROWS_PER_SUM, min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
             for n in range(np.uint64(count)):
@@ -203,40 +195,33 @@ def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
                     excess = max(ZERO, scales[np.uint64(3) * n + c] - limit)
                     total += excess * excess
             sums[k] = total
-        first_sum, past_sum = next_piece(work)
 
 
 @parallel(lambda rows, *_: len(rows), piece=1024)
-@kernel_jit
 def add_excess_scale(work, rows, log_scale, face, unbound, limits, factor, gradient):
     """Add factor · ReLU(scale − limit) · scale to gradient (N, 3); see `scale_limit`."""
-    first_row, past_row = next_piece(work)
-    while first_row < past_row:
+    for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = rows[n]
             limit = limits[1 if unbound[i] else 0, face[i]]
             for c in range(3):
                 scale = math.exp(log_scale[i, c])
                 gradient[i, c] += factor * max(ZERO, scale - limit) * scale
-        first_row, past_row = next_piece(work)
 
 
 @parallel(lambda rows, *_: len(rows), piece=16_384)
-@kernel_jit
 def opacity_weight(work, rows, opacity, share, weight, gradient):
     """weight · Σ share · sigmoid(opacity) over the listed rows; its gradient is added to gradient
     (N,).
 
     share (N,) float32.
     """
-    first_row, past_row = next_piece(work)
-    while first_row < past_row:
+    for first_row, past_row in pieces(work):
         for n in range(first_row, past_row):
             i = rows[n]
             if share[i] != ZERO:  # bound splats have none
                 value = ONE / (ONE + math.exp(-opacity[i]))
                 gradient[i] += np.float32(weight) * share[i] * value * (ONE - value)
-        first_row, past_row = next_piece(work)
 
 
 @jit

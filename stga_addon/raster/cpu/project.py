@@ -8,11 +8,11 @@ back.
 
 import numpy as np
 
-from . import kernel_jit, part_jit
+from . import part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
-from .threads import next_piece, parallel
+from .threads import parallel, pieces
 
 COLUMN = np.uint64(BLOCK_SPLATS)
 SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
@@ -20,7 +20,6 @@ SPLATS_PER_PIECE = 4 * BLOCK_SPLATS
 
 
 @parallel(lambda origin, *_: len(origin), piece=4096)
-@kernel_jit
 def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, camera_matrix):
     """Face frames as a camera sees them: camera_matrix = turn @ rotation · scale, camera_origin =
     turn @ origin + shift.
@@ -29,8 +28,7 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
     distance from the origin costs no precision. Writes camera_origin (F, 3) and camera_matrix (F,
     3, 3) float32.
     """
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for f in range(begin, end):
             for r in range(3):
                 t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
@@ -40,7 +38,6 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
                 for c in range(3):
                     along = t0 * rotation[f, 0, c] + t1 * rotation[f, 1, c] + t2 * rotation[f, 2, c]
                     camera_matrix[f, r, c] = scale[f] * along
-        begin, end = next_piece(work)
 
 
 @part_jit
@@ -141,7 +138,6 @@ def _list_seen(rows, covered, rect, b, seen):
 
 
 @parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
-@kernel_jit
 def project_forward(
     work, rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
 ):  # fmt: skip
@@ -164,8 +160,7 @@ def project_forward(
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
     b, seen = np.zeros(block.FORWARD_SIZE, np.float32), np.empty(BLOCK_SPLATS, np.uint64)
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for first in range(begin, end, BLOCK_SPLATS):
             some = rows[first : min(end, first + BLOCK_SPLATS)]
             _load(some, splats, face, frames, b)
@@ -204,7 +199,6 @@ def project_forward(
                 projected[i, PRECISION_Y] = b[block.PRECISION_Y + q]
                 projected[i, OPACITY] = b[block.OPACITY + q]
                 projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
-        begin, end = next_piece(work)
 
 
 @part_jit
@@ -271,7 +265,6 @@ def _store_gradient(rows, b, gradients, screen_gradient):
 
 
 @parallel(lambda visible, *_: len(visible), piece=SPLATS_PER_PIECE)
-@kernel_jit
 def project_backward(
     work, visible, splats, face, frames, degree, depth_as_color, antialiased,
     projected, lists, pair_gradients, gradients, screen_gradient,
@@ -296,8 +289,7 @@ def project_backward(
     coefficients = np.uint64((degree + 1) * (degree + 1))
     compensated = ONE if antialiased else ZERO
     b = np.zeros(block.BACKWARD_SIZE, np.float32)
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for first in range(begin, end, BLOCK_SPLATS):
             some = visible[first : min(end, first + BLOCK_SPLATS)]
             _load(some, splats, face, frames, b)
@@ -319,4 +311,3 @@ def project_backward(
                     v_strain_color[i, k, 2] = weight * b[block.G_BLUE + q]
             block.differentiate_position(b, frames.to_world)
             _store_gradient(some, b, gradients, screen_gradient)
-        begin, end = next_piece(work)

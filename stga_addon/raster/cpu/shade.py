@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from . import kernel_jit, part_jit
-from .threads import next_piece, parallel
+from . import part_jit
+from .threads import parallel, pieces
 
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (
     np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi)
@@ -40,7 +40,6 @@ def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
 
 
 @parallel(lambda points, *_: len(points), piece=256)
-@kernel_jit
 def add_lights(
     work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight
 ):
@@ -50,8 +49,7 @@ def add_lights(
     eye (3,). roughness, reflectance (N,): of the highlight; a roughness of 0 has none. lit (maps,
     N): see MAP.
     """
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for n in range(begin, end):
             px, py, pz = points[n, 0], points[n, 1], points[n, 2]
             nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
@@ -94,4 +92,3 @@ def add_lights(
                     arriving = light[COLOR + k] * strength * facing
                     irradiance[n, k] += arriving * light[DIFFUSE]
                     highlight[n, k] += arriving * light[SPECULAR] * gloss
-        begin, end = next_piece(work)

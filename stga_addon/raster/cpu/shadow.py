@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from . import jit, kernel_jit
-from .threads import next_piece, parallel
+from . import jit
+from .threads import parallel, pieces
 
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
@@ -46,7 +46,6 @@ def add_depths(points, faces, depth):
 
 
 @parallel(lambda depth, points, *_: len(points), piece=256)
-@kernel_jit
 def lit_shares(work, depth, points, bias, step, lit):
     """Write lit (N,) float32: share 0…1 of the depth map's texels around each point that do not
     block it.
@@ -56,8 +55,7 @@ def lit_shares(work, depth, points, bias, step, lit):
     place.
     """
     size, reach = len(depth), 1 if step > 0 else 0
-    begin, end = next_piece(work)
-    while begin < end:
+    for begin, end in pieces(work):
         for n in range(begin, end):
             found, z = ZERO, points[n, 2] - bias[n]
             for across in range(-reach, reach + 1):
@@ -73,4 +71,3 @@ def lit_shares(work, depth, points, bias, step, lit):
                             weight = right_share if k & 1 else ONE - right_share
                             found += weight * (lower_share if k >> 1 else ONE - lower_share)
             lit[n] = found / np.float32((2 * reach + 1) ** 2)
-        begin, end = next_piece(work)

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from . import inline_jit, jit, kernel_jit, part_jit
+from . import inline_jit, jit, part_jit
 from .blend import RUN_TILES
 from .elementary import prefetch
 from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
-from .threads import next_piece, parallel
+from .threads import parallel, pieces
 
 RADIX_BITS = 11
 DIGITS = 1 << RADIX_BITS
@@ -29,7 +29,6 @@ def _digit(key, least, shift):
 
 
 @parallel(lambda rect, *_: parts_of(len(rect)))
-@kernel_jit
 def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, counts):
     """List the splats with tiles in their bounds, rect (N, 4), by parts of SPLATS_PER_SORT splats.
 
@@ -38,8 +37,7 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
     each splat has, and how many in its part come before. parts (parts + 1, 4) int64: see SPLATS.
     counts (parts, DIGITS) int32: of the keys' lowest digits.
     """
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row, count, before = counts[k], np.uint64(0), np.int32(0)
             row[:] = 0
@@ -57,7 +55,6 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
                 greatest = max(greatest, key if seen else greatest)
             parts[k, SPLATS], parts[k, PAIRS] = count, before
             parts[k, LEAST], parts[k, GREATEST] = least, greatest
-        part, past_part = next_piece(work)
 
 
 def parts_of(splats: int) -> int:
@@ -116,7 +113,6 @@ def sum_digits(counts):
 
 
 @parallel(lambda parts, *_: len(parts) - 1)
-@kernel_jit
 def move_visible(work, parts, found, keys, place, first_pair, visible, moved_keys, moved):
     """Write the splats of `list_visible`, M in all, to visible (M,), and with their keys sorted by
     the lowest digit to moved (M,) and moved_keys (M,).
@@ -124,8 +120,7 @@ def move_visible(work, parts, found, keys, place, first_pair, visible, moved_key
     parts and `place`, the places of digits, as of `sum_parts`; `place` is advanced. first_pair
     (N,): from now on counts the pairs of the parts before as well.
     """
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row, begin = place[k], np.uint64(k * SPLATS_PER_SORT)
             first = np.uint64(parts[k, SPLATS])
@@ -138,11 +133,9 @@ def move_visible(work, parts, found, keys, place, first_pair, visible, moved_key
                 at = np.uint64(row[digit])
                 moved_keys[at], moved[at] = key, i
                 row[digit] += 1
-        part, past_part = next_piece(work)
 
 
 @parallel(lambda counts, *_: len(counts))
-@kernel_jit
 def count_digits(work, counts, keys, least, shift):
     """Count in each part of the keys (M,) uint32, SPLATS_PER_SORT long, how often each digit
     occurs.
@@ -150,24 +143,20 @@ def count_digits(work, counts, keys, least, shift):
     The digit is that of the key minus `least`, from bit `shift` on, both uint32. counts (parts,
     DIGITS) int32.
     """
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row = counts[k]
             row[:] = 0
             past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
             for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
                 row[_digit(keys[n], least, shift)] += 1
-        part, past_part = next_piece(work)
 
 
 @parallel(lambda counts, *_: len(counts))
-@kernel_jit
 def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
     """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is
     advanced."""
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row = place[k]
             past = min(len(keys), (k + 1) * SPLATS_PER_SORT)
@@ -176,7 +165,6 @@ def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
                 at = np.uint64(row[digit])
                 moved_keys[at], moved[at] = keys[n], values[n]
                 row[digit] += 1
-        part, past_part = next_piece(work)
 
 
 SPLATS_AHEAD = 16
@@ -209,14 +197,12 @@ def _next_tile(tile, column, width, tiles_x):
 
 
 @parallel(lambda *_: SORT_PARTS)
-@kernel_jit
 def count_pairs(work, rect, order, tiles_x, counts):
     """Count the (splat, tile) pairs of each part of order (M,) int32: the splats, near to far.
 
     rect (N, 4) int32 tile bounds. Writes counts (SORT_PARTS, tiles) int32.
     """
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row = counts[k]
             row[:] = 0
@@ -229,7 +215,6 @@ def count_pairs(work, rect, order, tiles_x, counts):
                 for _ in range(total):
                     row[tile] += 1
                     tile, column = _next_tile(tile, column, width, tiles_x)
-        part, past_part = next_piece(work)
 
 
 @jit
@@ -274,7 +259,6 @@ def heaviest_first(tiles, start):
 
 
 @parallel(lambda *_: SORT_PARTS)
-@kernel_jit
 def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_splat):
     """Write every tile's pairs front to back; `place` holds the offsets of `arrange_tiles` and is
     advanced.
@@ -282,8 +266,7 @@ def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_
     pair_splat (P,) int32: whose pair it is. splat_pairs (P,) int32: where the pairs of a splat
     stand, its first at first_pair[i].
     """
-    part, past_part = next_piece(work)
-    while part < past_part:
+    for part, past_part in pieces(work):
         for k in range(part, past_part):
             row = place[k]
             past = np.uint64((k + 1) * len(order) // SORT_PARTS)
@@ -298,7 +281,6 @@ def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_
                     pair_splat[np.uint64(at)] = i
                     splat_pairs[found] = at
                     tile, column = _next_tile(tile, column, width, tiles_x)
-        part, past_part = next_piece(work)
 
 
 def whole_tiles(count: int) -> np.ndarray:

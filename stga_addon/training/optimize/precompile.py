@@ -20,7 +20,6 @@ from ...raster.cpu.optimizer import (
 )
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
-from ...raster.cpu.threads import start_threads
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
@@ -55,7 +54,6 @@ def precompile_kernels(device: str = "cpu") -> None:
 def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
-    start_threads()
     compile_gradients()
     _step()
     if helper is not None:
