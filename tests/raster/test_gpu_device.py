@@ -13,7 +13,7 @@ pytestmark = pytest.mark.needs("adapter")
 
 NUMBERS = """
 override STEP: u32 = 1u;
-@group(0) @binding(0) var<storage, read_write> numbers: array<u32>;
+var<storage> numbers: array<u32>;
 @compute @workgroup_size(WORKGROUP)
 fn main(thread: Thread) {
   let n = thread_number(thread);

@@ -10,7 +10,7 @@ from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import AdamOptions
 from stga_addon.raster.gpu.device import Device
-from stga_addon.raster.gpu.layout import VIEW, split_rows
+from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
 from stga_addon.training.optimize.adam import PLAIN
 
@@ -74,8 +74,7 @@ def on_device(
 ) -> State:  # fmt: skip
     """The state after a step; weights: of scale, distance, opacity."""
     n, upload = len(state.steps), device.upload
-    view = np.zeros(1, VIEW)
-    view["splats"], view["coefficients"], view["strain_colors"] = n, COEFFICIENTS, STRAINS
+    view = device.uniform("View", splats=n, coefficients=COEFFICIENTS, strain_colors=STRAINS)
     history = np.concatenate([state.steps[:, None], state.statistics.view(np.int32)], 1)
     tables = OptimizerTables(
         *(upload(f"test {name}", getattr(state, name)) for name in ("first", "second", "average")),
@@ -87,7 +86,7 @@ def on_device(
     upload_step(device, RATES, options, weights, statistics)
     with device.record() as work:
         optimize(
-            work, n, STRIDE, any(weights[:2]), tables, view=upload("view", view, "uniform"),
+            work, n, STRIDE, any(weights[:2]), tables, view=view,
             splats=splats,
             gradients=gradients, face=upload("test face", state.face),
             wanted=upload("test wanted", state.wanted.astype(np.uint32)),

@@ -129,9 +129,9 @@ def test_a_broken_splat_is_dropped(field: str, value: float) -> None:
     raw = Raw(scene, Rasterizer(gpu_device.device()))
 
     def projected() -> tuple[np.ndarray, np.ndarray]:
-        tables = raw.forward()
-        return raw.read(tables["rect"], raw.count, 4, dtype=np.int32), raw.read(
-            tables["projected"], raw.count, PROJECTED
+        raw.forward()
+        return raw.read(raw.device.buffer("rect", 0), raw.count, 4, dtype=np.int32), raw.read(
+            raw.device.buffer("projected", 0), raw.count, PROJECTED
         )
 
     bounds, expected = projected()

@@ -15,7 +15,7 @@ from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.rasterize import frames_in_camera, tile_grid
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.frames import Embedding
-from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, VIEW, WORKGROUP
+from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, WORKGROUP
 from stga_addon.raster.gpu.optimizer import image_loss, upload_target
 from stga_addon.raster.gpu.rasterize import counts_buffer, sort_keys
 from stga_addon.training.optimize.losses import image_gradient, whole_image
@@ -29,9 +29,7 @@ def device() -> Device:
 
 
 def view_of(device: Device, splats: int) -> Any:
-    view = np.zeros((), VIEW)
-    view["splats"], view["capacity"] = splats, 1 << 16
-    return device.upload("view", view, "uniform")
+    return device.uniform("View", splats=splats, capacity=1 << 16)
 
 
 @pytest.mark.parametrize("count", [1, 255, 257, 2048, 2049, 10_000])
@@ -81,17 +79,13 @@ def on_device(
 ) -> tuple[np.ndarray, float]:
     """Gradient (3, H, W), filled with 77 before, and loss; touched (rows, columns) of tiles."""
     _, height, width = image.shape
-    view = np.zeros(1, VIEW)
-    view["width"], view["height"], (view["tiles_x"], view["tiles_y"]) = (
-        width,
-        height,
-        tile_grid(width, height),
-    )
+    columns, rows = tile_grid(width, height)
+    view = device.uniform("View", width=width, height=height, tiles_x=columns, tiles_y=rows)
     upload_target(device, target, SSIM_WEIGHT, **options)
     device.upload("v_image", np.full_like(image, 77))
     with device.record() as work:
         v_image, loss = image_loss(
-            work, width, height, view=device.upload("view", view, "uniform"),
+            work, width, height, view=view,
             image=device.upload("image", image),
             touched=device.upload("touched", touched.astype(np.uint32)), whole=bool(touched.all()),
         )  # fmt: skip

@@ -81,7 +81,8 @@ def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
     from .test_gpu_rasterize import Raw
 
     raw = Raw(scene(), antialiased=antialiased)
-    return raw.read(raw.forward()["projected"], 24, PROJECTED)
+    raw.forward()
+    return raw.read(raw.device.buffer("projected", 0), 24, PROJECTED)
 
 
 def scene():

@@ -1,17 +1,9 @@
 // Alpha blending of the splats of each tile, forward and backward; see `cpu/blend.py`. A workgroup is a tile.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> touched: array<u32>;
-@group(0) @binding(2) var<storage, read> rendered: array<u32>;
-@group(0) @binding(3) var<storage, read> tile_range: array<vec2u>;
-@group(0) @binding(4) var<storage, read> pair_slot: array<u32>;
-@group(0) @binding(5) var<storage, read> slot_splat: array<u32>;
-@group(0) @binding(6) var<storage, read> projected: array<f32>;
-@group(0) @binding(7) var<storage, read_write> image: array<f32>; // (3, H, W)
-@group(0) @binding(8) var<storage, read_write> pixels: array<vec2u>; // (H, W)
-@group(0) @binding(9) var<storage, read> v_image: array<f32>; // (3, H, W)
-@group(0) @binding(10) var<storage, read> v_transmittance: array<f32>; // (H, W), if HAS_V_TRANSMITTANCE
-@group(0) @binding(11) var<storage, read_write> pair_gradients: array<f32>;
+var<storage> touched: array<u32>;
+var<storage> pair_slot: array<u32>; // (P,) a pair's slot; by tile, near to far
+var<storage> pixels: array<vec2u>; // (H, W) transmittance f32, and one past the last contributing pair
+var<storage> v_transmittance: array<f32>; // (H, W), if HAS_V_TRANSMITTANCE
 
 struct Splat {
   mean: vec2f, // from the tile's corner
@@ -107,7 +99,7 @@ fn forward(thread: Thread) {
   if !is_inside(pixel) {
     return;
   }
-  color += t * vec3f(view.background_r, view.background_g, view.background_b);
+  color += t * view.background.rgb;
   let n = pixel.y * view.width + pixel.x;
   let area = view.width * view.height;
   image[n] = color.x;
@@ -173,7 +165,7 @@ fn backward(thread: Thread) {
     v = vec3f(v_image[n], v_image[area + n], v_image[2u * area + n]);
     t = bitcast<f32>(pixels[n].x);
     last = pixels[n].y;
-    behind = dot(vec3f(view.background_r, view.background_g, view.background_b), v);
+    behind = dot(view.background.rgb, v);
     if HAS_V_TRANSMITTANCE {
       behind += v_transmittance[n];
     }

@@ -17,7 +17,7 @@ from .rasterize import (
     Tables,
     ViewOptions,
     blend,
-    projected_tables,
+    make_projected,
     upload_frames,
     upload_splats,
 )
@@ -57,23 +57,25 @@ def _compose(
         given.append((layer, table, frames, tables))
     count = sum(table.count for _, table, _, _ in given)
 
-    def project(work: Recording, depth_as_color: bool = False) -> Tables:
-        first, seen = 0, projected_tables(device, count)
+    make_projected(device, count)
+
+    def project(work: Recording, depth_as_color: bool = False) -> None:
+        first = 0
         for n, (layer, table, frames, tables) in enumerate(given):
             options = ViewOptions(
                 camera, layer.splats.sh_degree, strains=frames.strain.shape[1],
                 depth_as_color=depth_as_color, antialiased=layer.antialiased,
             )  # fmt: skip
             view = rasterizer.upload_view(table, options, frames.to_world, first, f"view {n}")
-            work.dispatch("project.forward", table.count, {**tables, **seen, "view": view})
+            work.dispatch("project.forward", table.count, tables | {"view": view})
             first += table.count
-        return seen
 
     def render() -> Tables:
         """The colors, of all layers together; submitted."""
         view = rasterizer.upload_view(SplatTable(None, None, count, 0, 0), ViewOptions(camera, 0))
         with device.record() as work:
-            return rasterizer.draw(work, {**project(work), "view": view}, count, camera)
+            project(work)
+            return rasterizer.draw(work, view, count, camera)
 
     rendering = render()
     while not rasterizer.pairs_fit():
@@ -83,6 +85,7 @@ def _compose(
     if not with_depth:
         return ComposedImage(rgb, alpha, None)
     with device.record() as work:
-        blend(work, camera, rendering | project(work, depth_as_color=True))
+        project(work, depth_as_color=True)
+        blend(work, camera, rendering)
     depth = device.read(rendering["image"], (camera.height, camera.width))
     return ComposedImage(rgb, alpha, depth / np.maximum(alpha, np.finfo(np.float32).tiny))

@@ -20,34 +20,27 @@ import wgpu
 
 from ...errors import DeviceError, StgaError
 from .adapters import adapters, is_software
-from .layout import MAX_GROUPS, VIEW, WORKGROUP, constants_wgsl, struct_wgsl
+from .layout import MAX_GROUPS, UNIFORMS, WORKGROUP, prelude_wgsl
 
 POLL_INTERVAL_S = 2e-4
 LOST_CHECK_S = 0.5
 
-_BINDING = re.compile(
-    r"^@group\(0\) @binding\((\d+)\) var<(uniform|storage, read_write|storage, read)> (\w+)(.*)$",
-    re.M,
-)
+_TABLE = re.compile(r"^var<(uniform|storage)> (\w+)(.*)$", re.M)
 _FUNCTION = re.compile(r"(?:^@compute[^\n]*\n)?^fn (\w+)(.*?)^\}", re.M | re.S)
 _WRITTEN = re.compile(r"^\s*(\w+)\[[^=;\n]*\][.\w]* [-+*|]?=\s|&(\w+)", re.M)
-_LAYOUT_TYPE = {
-    "uniform": "uniform", "storage, read": "read-only-storage", "storage, read_write": "storage",
-}  # fmt: skip
-
+NONE: Mapping[str, Any] = {}
 Groups = tuple[int, int, int] | tuple[Any, int]
 """Workgroups of a dispatch; or the buffer that holds them as three u32, and the offset in bytes."""
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """An entry point of a WGSL file, ready to be dispatched; bindings: index of each table that it
-    uses by name."""
+    """An entry point of a WGSL file, ready to be dispatched; tables: those that it uses, in the
+    order of their bindings."""
 
-    name: str
     pipeline: Any
     layout: Any
-    bindings: dict[str, int]
+    tables: tuple[str, ...]
 
 
 class Device:
@@ -128,6 +121,14 @@ class Device:
                 self.gpu.queue.write_buffer(buffer, whole, rest)
         return buffer
 
+    def uniform(self, struct: str, name: str = "", **fields: Any) -> Any:
+        """Send a struct of `UNIFORMS`, whose other fields are zero, before the next submit; name:
+        of the buffer, where it is not the struct's in lower case."""
+        record = np.zeros((), UNIFORMS[struct])
+        for field, value in fields.items():
+            record[field] = value
+        return self.upload(name or struct.lower(), record, "uniform")
+
     def read(self, buffer: Any, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
         """Wait for all submitted work and copy the beginning of a buffer to host memory."""
         count = int(np.prod(shape))
@@ -154,7 +155,7 @@ class Device:
         code, tables = _linked(file, entry)
         entries = [
             {"binding": n, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
-            for n, kind in tables.values()
+            for n, kind in enumerate(tables.values())
         ]
         with self.errors():
             layout = self.gpu.create_bind_group_layout(entries=entries)
@@ -164,18 +165,19 @@ class Device:
                 layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
                 compute={"module": module, "entry_point": entry, "constants": constants},
             )
-        return Kernel(name, pipeline, layout, {table: n for table, (n, _) in tables.items()})
+        return Kernel(pipeline, layout, tuple(tables))
 
     def bind(self, kernel: Kernel, tables: Mapping[str, Any]) -> Any:
-        """The bind group of a kernel with those of the tables that it uses; made once for the same
-        buffers."""
-        buffers = [tables[name] for name in kernel.bindings]
+        """The bind group of a kernel with the tables that it uses, which are the buffers of these
+        names where they are not given; made once for the same buffers."""
+        buffers = [
+            tables[name] if name in tables else self._buffers[name] for name in kernel.tables
+        ]
         key = id(kernel), *map(id, buffers)
         found = self._groups.get(key)
         if found is None:
             entries = [
-                {"binding": index, "resource": {"buffer": buffer}}
-                for index, buffer in zip(kernel.bindings.values(), buffers, strict=True)
+                {"binding": n, "resource": {"buffer": buffer}} for n, buffer in enumerate(buffers)
             ]
             group = self.gpu.create_bind_group(layout=kernel.layout, entries=entries)
             # Kept with its buffers, so that no identity in the key is given to another one.
@@ -226,10 +228,10 @@ class Recording:
         self._pass: Any = None
 
     def dispatch(
-        self, name: str, threads: int | Groups, tables: Mapping[str, Any], **constants: float
+        self, name: str, threads: int | Groups, tables: Mapping[str, Any] = NONE, **constants: float
     ) -> None:
-        """Run `Device.kernel` with those of the tables that it uses, by at least so many threads or
-        workgroups."""
+        """Run `Device.kernel` by at least so many threads or workgroups; tables: as in
+        `Device.bind`."""
         kernel, groups = self.device.kernel(name, **constants), threads
         if isinstance(groups, int):
             # `thread_number` in WGSL numbers the threads
@@ -363,16 +365,14 @@ def _source(name: str) -> str:
 
 
 @cache
-def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
-    """The text of an entry point with the functions that it calls, and index and kind of each table
-    that they use.
+def _linked(file: str, entry: str) -> tuple[str, dict[str, str]]:
+    """The text of an entry point with the functions that it calls, and the kind of each table that
+    they use, in the order of their bindings.
 
     A table is bound for reading where none of them assigns to it: what only reads needs no barrier
     between dispatches.
     """
-    sources = _source("common"), _source(file)
-    text = "\n".join([constants_wgsl(), struct_wgsl("View", VIEW), *sources])
-    code = re.sub("//.*", "", text)
+    code = re.sub("//.*", "", "\n".join([prelude_wgsl(), _source("common"), _source(file)]))
     bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}
     while left:
         reached |= left
@@ -381,16 +381,20 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, tuple[int, str]]]:
     body = "".join(bodies[name] for name in sorted(reached))
     used = set(re.findall(r"(?<![.\w])\w+", body))
     assigned = {name for pair in _WRITTEN.findall(body) for name in pair}
-    tables: dict[str, tuple[int, str]] = {}
+    tables: dict[str, str] = {}
 
     def declare(found: re.Match[str]) -> str:
-        index, kind, name, rest = found.groups()
+        kind, name, rest = found.groups()
         if name not in used:
             return ""
-        if kind == "storage, read_write" and name not in assigned:
-            kind = "storage, read"
-        tables[name] = int(index), _LAYOUT_TYPE[kind]
-        return f"@group(0) @binding({index}) var<{kind}> {name}{rest}"
+        binding = f"@group(0) @binding({len(tables)})"
+        if kind == "uniform":
+            access, tables[name] = "uniform", "uniform"
+        elif name in assigned:
+            access, tables[name] = "storage, read_write", "storage"
+        else:
+            access, tables[name] = "storage, read", "read-only-storage"
+        return f"{binding} var<{access}> {name}{rest}"
 
-    code = _BINDING.sub(declare, code)
+    code = _TABLE.sub(declare, code)
     return _FUNCTION.sub(lambda found: found[0] if found[1] in reached else "", code), tables

@@ -13,12 +13,6 @@ from ...capture.camera import Camera
 from .device import Device, Recording
 from .layout import FRAME_STRAIN, list_words
 
-POSE = np.dtype(
-    [("rows", np.float32, (3, 4))]
-    + [(name, np.uint32) for name in ("triangles", "strains", "area_scales", "padding")]
-)
-"""The uniform of frames.wgsl."""
-
 
 class SmoothedStrain:
     """Computes the signal of a driven offset of one mesh, whose neighborhood is uploaded once;
@@ -33,14 +27,14 @@ class SmoothedStrain:
             device.buffer(f"smoothed strain {n}", self._count * STRAIN_COMPONENTS) for n in range(2)
         ]
 
-    def record(self, work: Recording, pose: Any, strain_from_rest: Any) -> Any:
-        """Record the signal of the pose whose strain (F, 3), less that at rest, is given; returns
-        its table (F, 3)."""
-        tables, averaged = {"pose": pose, "neighbors": self._neighbors}, strain_from_rest
+    def record(self, work: Recording, strain_from_rest: Any) -> Any:
+        """Record the signal of the uploaded pose, whose strain (F, 3), less that at rest, is given;
+        returns its table (F, 3)."""
+        averaged = strain_from_rest
         for n in range(AVERAGING_ROUNDS):
             smoothed, averaged = averaged, self._rounds[n % 2]
-            own = {**tables, "smoothed": smoothed, "averaged": averaged}
-            work.dispatch(self.kernels[0], self._count, own)
+            tables = {"neighbors": self._neighbors, "smoothed": smoothed, "averaged": averaged}
+            work.dispatch(self.kernels[0], self._count, tables)
         return averaged
 
 
@@ -78,11 +72,11 @@ class Embedding:
             touching = list_words(basis.vertex_faces)
         self._tables = {
             "faces": device.upload("faces", faces.astype(np.uint32)),
-            "neutral_area": device.upload("neutral area", area.astype(np.float32)),
-            "basis": device.upload("strain basis", rows),
-            "vertex_faces": device.upload("vertex faces", touching),
-            "tensors": device.buffer("strain tensors", 6 * len(faces) if self.strains else 0),
-            "strain_from_rest": device.buffer("strain from rest", len(faces) * self.strains),
+            "neutral_area": device.upload("neutral_area", area.astype(np.float32)),
+            "basis": device.upload("basis", rows),
+            "vertex_faces": device.upload("vertex_faces", touching),
+            "tensors": device.buffer("tensors", 6 * len(faces) if self.strains else 0),
+            "strain_from_rest": device.buffer("strain_from_rest", len(faces) * self.strains),
         }
         assert basis is not None or not offsets
         self._signals = {
@@ -103,11 +97,10 @@ class Embedding:
         parts[:, 3:] = local - parts[:, :3]
         self._device.upload("vertices", parts)
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
-        pose = np.zeros(1, POSE)
-        pose["rows"] = np.c_[turn, turn @ center + shift]
-        pose["triangles"], pose["strains"] = self._count, self.strains
-        pose["area_scales"] = self._area_scales
-        self._device.upload("pose", pose, "uniform")
+        self._device.uniform(
+            "Pose", rows=np.c_[turn, turn @ center + shift], triangles=self._count,
+            strains=self.strains, area_scales=self._area_scales,
+        )  # fmt: skip
 
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:
         """Record the frames of the mesh that was uploaded last; returns their table.
@@ -115,18 +108,14 @@ class Embedding:
         coefficients: driven offset -> table (F, S, 3): the frames are moved by them as in
         `Avatar.frames`.
         """
-        buffer, tables = self._device.buffer, self._tables
-        pose = tables["pose"] = buffer("pose", POSE.itemsize // 4, "uniform")
-        tables["vertices"] = buffer("vertices", 0)
-        tables["frames"] = buffer("frames", self._count * (FRAME_STRAIN + self.strains))
+        tables, words = self._tables, self._count * (FRAME_STRAIN + self.strains)
+        frames = tables["frames"] = self._device.buffer("frames", words)
         work.dispatch("frames.compose", self._count, tables)
         if self.strains:
             work.dispatch("frames.average_strain", self._count, tables)
         strain = tables["strain_from_rest"]
-        self.signals = {
-            name: signal.record(work, pose, strain) for name, signal in self._signals.items()
-        }
+        self.signals = {name: signal.record(work, strain) for name, signal in self._signals.items()}
         for name, table in coefficients.items():
             moving = {**tables, "coefficients": table, "driving": self.signals[name]}
             work.dispatch("frames.shift", self._count, moving, SIGNALS=OFFSETS[name].signals)
-        return tables["frames"]
+        return frames

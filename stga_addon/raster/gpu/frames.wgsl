@@ -4,39 +4,23 @@
 // Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
 // which only differences and means are formed: an edge is as exact as float32 can hold it.
 
-@group(0) @binding(0) var<uniform> pose: Pose;
-@group(0) @binding(1) var<storage, read> vertices: array<f32>; // (V, 6): a position's float32 and what is left of it
-@group(0) @binding(2) var<storage, read> faces: array<u32>; // (F, 3)
+var<uniform> pose: Pose;
+var<storage> vertices: array<f32>; // (V, 6): a position's float32 and what is left of it
+var<storage> faces: array<u32>; // (F, 3)
 // (F,) area in the neutral mesh, 0 where a triangle counts as a line.
-@group(0) @binding(3) var<storage, read> neutral_area: array<f32>;
+var<storage> neutral_area: array<f32>;
 // (F, 21 + 8·S): `gram`, `to_tensor`, `to_plane` and `range` of the `StrainBasis`.
-@group(0) @binding(4) var<storage, read> basis: array<f32>;
+var<storage> basis: array<f32>;
 // (V + 1 + 3·F): where the triangles that touch a vertex begin in this array, then those triangles.
-@group(0) @binding(5) var<storage, read> vertex_faces: array<u32>;
+var<storage> vertex_faces: array<u32>;
 // (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
-@group(0) @binding(6) var<storage, read_write> tensors: array<f32>;
-@group(0) @binding(7) var<storage, read_write> frames: array<f32>;
+var<storage> tensors: array<f32>;
 // (F, S): strain less that at rest, which positions follow where it is averaged.
-@group(0) @binding(8) var<storage, read_write> strain_from_rest: array<f32>;
+var<storage> strain_from_rest: array<f32>;
 // (F + 1 + N): where the triangles that share an edge with a triangle begin in this array, then those triangles.
-@group(0) @binding(9) var<storage, read> neighbors: array<u32>;
-@group(0) @binding(10) var<storage, read> smoothed: array<f32>; // (F, S): as averaged in the rounds so far
-@group(0) @binding(11) var<storage, read_write> averaged: array<f32>; // (F, S): once more
-@group(0) @binding(12) var<storage, read> coefficients: array<f32>; // (F, S, 3): `Avatar.driven_offsets`
-@group(0) @binding(13) var<storage, read> driving: array<f32>; // (F, S): their signal
-
-override SIGNALS: u32 = 1u; // S of a driven offset
-
-struct Pose {
-  // The matrix from the mesh, relative to its first vertex, to the camera.
-  row_x: vec4f,
-  row_y: vec4f,
-  row_z: vec4f,
-  triangles: u32,
-  strains: u32, // components of strain, 0 where neither colors nor positions follow it
-  area_scales: u32, // 1: the convention "stga", 0: "gaussian_avatars"
-  padding: u32,
-}
+var<storage> neighbors: array<u32>;
+var<storage> smoothed: array<f32>; // (F, S): as averaged in the rounds so far
+var<storage> averaged: array<f32>; // (F, S): once more
 
 const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
@@ -54,24 +38,20 @@ struct Edges {
   center: vec3f,
 }
 
-fn position(vertex: u32) -> vec3f {
-  return vec3f(vertices[6u * vertex], vertices[6u * vertex + 1u], vertices[6u * vertex + 2u]);
+fn vertex_vec3(at: u32) -> vec3f {
+  return vec3f(vertices[at], vertices[at + 1u], vertices[at + 2u]);
 }
 
-fn remainder(vertex: u32) -> vec3f {
-  return vec3f(vertices[6u * vertex + 3u], vertices[6u * vertex + 4u], vertices[6u * vertex + 5u]);
+fn edge_between(a: u32, b: u32) -> vec3f {
+  return (vertex_vec3(b) - vertex_vec3(a)) + (vertex_vec3(b + 3u) - vertex_vec3(a + 3u));
 }
 
 fn edges_of(f: u32) -> Edges {
-  let a = faces[3u * f];
-  let b = faces[3u * f + 1u];
-  let c = faces[3u * f + 2u];
-  return Edges(
-    (position(b) - position(a)) + (remainder(b) - remainder(a)),
-    (position(c) - position(a)) + (remainder(c) - remainder(a)),
-    (position(c) - position(b)) + (remainder(c) - remainder(b)),
-    (position(a) + position(b) + position(c)) / 3.0,
-  );
+  let a = 6u * faces[3u * f];
+  let b = 6u * faces[3u * f + 1u];
+  let c = 6u * faces[3u * f + 2u];
+  let center = (vertex_vec3(a) + vertex_vec3(b) + vertex_vec3(c)) / 3.0;
+  return Edges(edge_between(a, b), edge_between(a, c), edge_between(b, c), center);
 }
 
 // The unit normal beside a unit axis; any perpendicular where the triangle is a line.
@@ -121,21 +101,16 @@ fn compose(thread: Thread) {
   }
   let at = f * (FRAME_STRAIN + pose.strains);
   let center = vec4f(e.center, 1.0);
-  frames[at + FRAME_ORIGIN] = dot(pose.row_x, center);
-  frames[at + FRAME_ORIGIN + 1u] = dot(pose.row_y, center);
-  frames[at + FRAME_ORIGIN + 2u] = dot(pose.row_z, center);
-  write_row(at + FRAME_MATRIX, scale * (pose.row_x.xyz * axes));
-  write_row(at + FRAME_MATRIX + 3u, scale * (pose.row_y.xyz * axes));
-  write_row(at + FRAME_MATRIX + 6u, scale * (pose.row_z.xyz * axes));
+  for (var axis = 0u; axis < 3u; axis++) {
+    frames[at + FRAME_ORIGIN + axis] = dot(pose.rows[axis], center);
+    let row = scale * (pose.rows[axis].xyz * axes);
+    for (var c = 0u; c < 3u; c++) {
+      frames[at + FRAME_MATRIX + 3u * axis + c] = row[c];
+    }
+  }
   if pose.strains > 0u {
     write_tensor(f, e);
   }
-}
-
-fn write_row(at: u32, row: vec3f) {
-  frames[at] = row.x;
-  frames[at + 1u] = row.y;
-  frames[at + 2u] = row.z;
 }
 
 // Green's strain of a triangle: the change of its edges' squared lengths and product, as a tensor.

@@ -3,25 +3,14 @@
 // A workgroup computes one channel of one tile, from its pixels and those up to REACH around it, in its own memory:
 // what SSIM's windows need twice is computed again instead of being stored, so that no map of the image's size exists.
 
-struct Loss {
-  ssim_weight: f32,
-  masked: u32, // 1: the target's background is exchanged where the mask leaves it free
-  change_r: f32, // the background's new color less the old one, in 0…255
-  change_g: f32,
-  change_b: f32,
-}
-
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> loss: Loss;
-@group(0) @binding(2) var<storage, read> image: array<f32>; // (3, H, W)
+var<uniform> loss: Loss;
 // (H, W, 3) and (H, W) bytes, four to a word.
-@group(0) @binding(3) var<storage, read> image_target: array<u32>;
-@group(0) @binding(4) var<storage, read> mask: array<u32>;
+var<storage> image_target: array<u32>;
+var<storage> mask: array<u32>;
 // (tiles,) 1 where the gradient is wanted; the image must be rendered REACH pixels around these tiles.
-@group(0) @binding(5) var<storage, read> touched: array<u32>;
-@group(0) @binding(6) var<storage, read_write> v_image: array<f32>; // (3, H, W)
-@group(0) @binding(7) var<storage, read_write> sums: array<vec2f>; // (3, tiles): Σ |difference| and Σ SSIM
-@group(0) @binding(8) var<storage, read_write> result: array<f32>; // (1,) the loss
+var<storage> touched: array<u32>;
+var<storage> tile_sums: array<vec2f>; // (3, tiles): Σ |difference| and Σ SSIM
+var<storage> result: array<f32>; // (1,) the loss
 
 const RADIUS: i32 = i32(WINDOW_RADIUS_PX);
 const REACH: i32 = 2 * RADIUS;
@@ -50,9 +39,8 @@ fn target_value(x: i32, y: i32, channel: u32) -> f32 {
   let at = 3u * pixel + channel;
   var value = byte_of(image_target[at / 4u], at);
   if loss.masked == 1u {
-    let change = vec3f(loss.change_r, loss.change_g, loss.change_b)[channel];
     let clear = (255.0 - byte_of(mask[pixel / 4u], pixel)) * (1.0 / 255.0);
-    value = floor(clamp(value + clear * change, 0.0, 255.0) + 0.5);
+    value = floor(clamp(value + clear * loss.change[channel], 0.0, 255.0) + 0.5);
   }
   return value * (1.0 / 255.0);
 }
@@ -208,7 +196,7 @@ fn gradient(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index
   }
   total = sum_of_workgroup(total, index);
   if index == 0u {
-    sums[group.z * view.tiles_x * view.tiles_y + tile] = total;
+    tile_sums[group.z * view.tiles_x * view.tiles_y + tile] = total;
   }
 }
 
@@ -218,7 +206,7 @@ fn total(@builtin(local_invocation_index) index: u32) {
   let count = 3u * view.tiles_x * view.tiles_y;
   var total = vec2f(0.0);
   for (var n = index; n < count; n += WORKGROUP) {
-    total += sums[n];
+    total += tile_sums[n];
   }
   total = sum_of_workgroup(total, index) / f32(3u * view.width * view.height);
   if index == 0u {

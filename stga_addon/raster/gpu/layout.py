@@ -1,34 +1,12 @@
-"""Memory layout of the GPU's arrays, in Python and as the WGSL prelude that every kernel begins
-with.
-
-A table is a flat array of 32-bit words, row by row, without padding: word c of row i is table[i *
-stride + c]. N splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image
-H × W.
-
-splats          11 + 3K + 3S f32  the fields of `cpu.layout.Parameters` in order; also gradients
-                and moments
-frames          12 + columns f32  a triangle's origin (3), matrix (3, 3) by rows, strain, in camera
-                space
-projected       PROJECTED f32     a splat on the screen: the columns of `cpu.layout`
-rect            4 i32             tile bounds x0, y0, x1, y1 of a splat, as in `Projection`
-depth_key       1 u32             bits of a splat's depth; HIDDEN where it is not visible
-slots           2 u32             a splat's first slot and how many it has: one a pair
-slot_splat      1 u32             the splat of a slot, with WANTED
-pair_gradients  PROJECTED f32     by slot: the pair's gradient of the projected columns
-wanted          1 u32             1 for visible splats in focus: only their gradients are written
-touched         1 u32             1 for the tiles that a splat in focus reaches
-rendered        1 u32             1 for those and the tiles that their gradient depends on
-tile_range      2 u32             a tile's first pair and one past its last
-pair_slot       1 u32             a pair's slot; by tile, near to far
-pixels          2 words           transmittance f32, and one past the last contributing pair
-"""
+"""Memory layout of the GPU's arrays, and the WGSL prelude that every kernel begins with: constants
+and structs; the tables are in common.wgsl."""
 
 import math
 
 import numpy as np
 
 from ...avatar import embedding, strain
-from ..cpu import blend, image_loss, layout, optimizer, splat_block
+from ..cpu import blend, harmonics, image_loss, layout, optimizer, splat_block
 from ..cpu.layout import Parameters
 
 WORKGROUP = 256
@@ -48,30 +26,62 @@ XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
 """Columns of a splat; its strain colors begin after the SH coefficients."""
 FRAME_ORIGIN, FRAME_MATRIX, FRAME_STRAIN = 0, 3, 12
 
-VIEW = np.dtype(
-    [(name, np.float32) for name in ("fl_x", "fl_y", "cx", "cy")]
-    + [(name, np.uint32) for name in ("width", "height", "tiles_x", "tiles_y")]
-    + [(f"to_world_{row}{column}", np.float32) for row in range(3) for column in range(3)]
-    + [(f"background_{channel}", np.float32) for channel in "rgb"]
-    + [
-        (name, np.uint32)
-        for name in (
-            "splats",  # N
-            "coefficients",  # K, stored
-            "strain_colors",  # S, stored
-            "degree",  # of the spherical harmonics in use
-            "strains",  # strain colors in use
-            "frame_strains",  # columns of strain in `frames`
-            "depth_as_color",
-            "antialiased",
-            "focused",  # 0 where every splat is in focus
-            "ring",  # tiles that are rendered around those which the focus touches
-            "capacity",  # pairs that the buffers hold
-            "first",  # row of the first of these splats in the tables of projected ones
-        )
-    ]
-)
-"""The uniform `view` of an iteration: camera, sizes and rendering options."""
+UNIFORMS = {
+    "View": np.dtype(
+        [
+            ("to_world", "f4", (3, 4)),  # rotation, by rows
+            ("background", "f4", 4),
+            *((name, "f4") for name in ("fl_x", "fl_y", "cx", "cy")),
+            *((name, "u4") for name in ("width", "height", "tiles_x", "tiles_y")),
+            ("splats", "u4"),  # N
+            ("coefficients", "u4"),  # K, stored
+            ("strain_colors", "u4"),  # S, stored
+            ("degree", "u4"),  # of the spherical harmonics in use
+            ("strains", "u4"),  # strain colors in use
+            ("frame_strains", "u4"),  # columns of strain in `frames`
+            ("depth_as_color", "u4"),
+            ("antialiased", "u4"),
+            ("focused", "u4"),  # 0 where every splat is in focus
+            ("ring", "u4"),  # tiles that are rendered around those which the focus touches
+            ("capacity", "u4"),  # pairs that the buffers hold
+            ("first", "u4"),  # row of the first of these splats in the tables of projected ones
+        ]
+    ),
+    "Pose": np.dtype(
+        [
+            ("rows", "f4", (3, 4)),  # from the mesh, relative to its first vertex, to the camera
+            ("triangles", "u4"),
+            ("strains", "u4"),  # components; 0 where neither colors nor positions follow strain
+            ("area_scales", "u4"),  # 1: the convention "stga", 0: "gaussian_avatars"
+            ("padding", "u4"),
+        ]
+    ),
+    "Loss": np.dtype(
+        [
+            ("change", "f4", 4),  # the background's new color less the old one, in 0…255
+            ("ssim_weight", "f4"),
+            ("masked", "u4"),  # 1: the background is exchanged where the mask leaves it free
+            ("padding", "u4", 2),
+        ]
+    ),
+    "Step": np.dtype(
+        [
+            (
+                "rates",
+                "f4",
+                (2, 4),
+            ),  # by field, see `field_of`; the last: harmonics above the first
+            *((name, "f4") for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon")),
+            ("ahead", "f4"),  # by how much of the way from the first moment to the gradient it goes
+            ("ema_share", "f4"),  # least share of a step in the exponential moving average
+            *((name, "f4") for name in ("scale_weight", "distance_weight")),
+            ("opacity_weight", "f4"),  # already divided by the number of splats
+            ("statistics", "u4"),  # 1: collect what density control asks for
+            ("triangles", "u4"),  # whose splats driven offsets move
+        ]
+    ),
+}
+"""Structs of the kernels: of an image (camera, sizes, options), a mesh, a target and a step."""
 
 _OWN = (
     "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED"
@@ -85,6 +95,7 @@ _CPU = {
     embedding: "MIN_AREA_RATIO UPRIGHT_COSINE",
     strain: "STRAIN_GAIN STRAIN_COMPONENTS",
     image_loss: "WINDOW_RADIUS_PX",
+    harmonics: "C0 C1 C2 C3 C4 C5 C6 C7 C8 C9",
     optimizer: "MAX_GRADIENT",
 }
 CONSTANTS: dict[str, int | float] = {
@@ -122,17 +133,18 @@ def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
     )
 
 
-def struct_wgsl(name: str, fields: np.dtype) -> str:
-    """A WGSL struct with the memory layout of a numpy record of 32-bit scalars."""
-    kinds = {"f": "f32", "u": "u32", "i": "i32"}
-    lines = [f"  {field}: {kinds[fields[field].kind]}," for field in fields.names or ()]
-    return "\n".join([f"struct {name} {{", *lines, "}", ""])
-
-
-def constants_wgsl() -> str:
-    """Every constant that Python and WGSL share."""
-    return "".join(
-        f"const {name}: {'u32' if isinstance(value, int) else 'f32'} = "
-        f"{f'{value}u' if isinstance(value, int) else float(np.float32(value)).hex() + 'f'};\n"
-        for name, value in CONSTANTS.items()
-    )
+def prelude_wgsl() -> str:
+    """The structs and every constant that Python and WGSL share."""
+    kinds, lines = {"f": "f32", "u": "u32"}, list[str]()
+    for struct, record in UNIFORMS.items():
+        lines.append(f"struct {struct} {{")
+        for name in record.names or ():
+            item, shape = record[name].subdtype or (record[name], ())
+            kind = f"vec{shape[-1]}{item.kind}" if shape else kinds[item.kind]
+            lines.append(f"  {name}: {f'array<{kind}, {shape[0]}>' if len(shape) > 1 else kind},")
+        lines.append("}")
+    for name, value in CONSTANTS.items():
+        is_count = isinstance(value, int)
+        text = f"{value}u" if is_count else f"{float(np.float32(value)).hex()}f"
+        lines.append(f"const {name}: {'u32' if is_count else 'f32'} = {text};")
+    return "\n".join(lines)

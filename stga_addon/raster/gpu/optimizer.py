@@ -16,37 +16,16 @@ from .frames import SIGNALS
 from .layout import WORKGROUP
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
-KERNELS = {
-    "frames": ("compose", "average_strain"),
-    "project": ("mark_focus", "forward", "backward"),
-    "tiles": (
-        "mark_touched",
-        "choose_rendered",
-        "count_pairs",
-        "add_pairs",
-        "fill_pairs",
-        "find_ranges",
-    ),
-    "blend": ("forward", "backward"),
-    "image_loss": ("gradient", "total"),
-    "optimizer": ("measure_excess", "join_excess", "prepare", "adam"),
-}
-"""What any iteration may dispatch, by file, beside sorting and driven offsets."""
+KERNELS = (
+    "frames.compose frames.average_strain project.mark_focus project.forward project.backward"
+    " tiles.mark_touched tiles.choose_rendered tiles.count_pairs tiles.add_pairs tiles.fill_pairs"
+    " tiles.find_ranges blend.forward blend.backward image_loss.gradient image_loss.total"
+    " optimizer.measure_excess optimizer.join_excess optimizer.prepare optimizer.adam"
+)
+"""What any iteration may dispatch beside sorting and driven offsets."""
 RATES = (*Parameters._fields, "sh_rest")
 """Learning rates in the order of the kernels; the last is that of the harmonics above the constant
 one."""
-_NUMBERS = "beta1 beta2 log_beta1 log_beta2 epsilon ahead ema_share scale_weight distance_weight"
-STEP = np.dtype(
-    [("rates", np.float32, 8)]
-    + [(name, np.float32) for name in (*_NUMBERS.split(), "opacity_weight")]
-    + [(name, np.uint32) for name in ("statistics", "triangles")]
-)
-"""The uniform `step` of optimizer.wgsl."""
-LOSS = np.dtype(
-    [("ssim_weight", np.float32), ("masked", np.uint32)]
-    + [(f"change_{channel}", np.float32) for channel in "rgb"]
-)
-"""The uniform `loss` of image_loss.wgsl."""
 
 
 def upload_target(
@@ -61,40 +40,31 @@ def upload_target(
     mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's
     color is changed by `change` (3,) in 0…255.
     """
-    loss = np.zeros(1, LOSS)
-    loss["ssim_weight"], loss["masked"] = ssim_weight, mask is not None
-    loss["change_r"], loss["change_g"], loss["change_b"] = change
-    device.upload("loss", loss, "uniform")
+    device.uniform(
+        "Loss", change=(*change, 0), ssim_weight=ssim_weight, masked=mask is not None
+    )  # fmt: skip
     device.upload("image_target", target)
     if mask is not None:
         device.upload("mask", mask)
 
 
 def image_loss(
-    work: Recording, width: int, height: int, *, view: Any, image: Any, touched: Any, whole: bool
+    work: Recording, width: int, height: int, *, whole: bool, **given: Any
 ) -> tuple[Any, Any]:
     """Record the gradient of the loss of an image (3, H, W) against the uploaded target.
 
-    touched (tiles,): in which tiles the gradient is wanted; the image must be rendered
-    LOSS_REACH_PX around them. Returns the gradient (3, H, W), undefined in other tiles, and the
-    loss (1,), which is computed if `whole`: every tile is touched.
+    given: view, image, and touched (tiles,), in which tiles the gradient is wanted; the image must
+    be rendered LOSS_REACH_PX around them. Returns the gradient (3, H, W), undefined in other tiles,
+    and the loss (1,), which is computed if `whole`: every tile is touched.
     """
     buffer, (columns, rows) = work.device.buffer, tile_grid(width, height)
-    tables = {
-        "view": view,
-        "loss": buffer("loss", LOSS.itemsize // 4, "uniform"),
-        "image": image,
-        "image_target": buffer("image_target", 0),
-        "mask": buffer("mask", 0),
-        "touched": touched,
-        "v_image": buffer("v_image", 3 * width * height),
-        "sums": buffer("loss sums", 6 * columns * rows),
-        "result": buffer("loss result", 1),
-    }
-    work.dispatch("image_loss.gradient", (columns, rows, 3), tables)
+    v_image, result = buffer("v_image", 3 * width * height), buffer("result", 1)
+    buffer("mask", 0)
+    buffer("tile_sums", 6 * columns * rows)
+    work.dispatch("image_loss.gradient", (columns, rows, 3), given)
     if whole:
-        work.dispatch("image_loss.total", (1, 1, 1), tables)
-    return tables["v_image"], tables["result"]
+        work.dispatch("image_loss.total", (1, 1, 1), given)
+    return v_image, result
 
 
 class OptimizerTables(NamedTuple):
@@ -129,14 +99,14 @@ def upload_step(
     splats, opacity; statistics: collect the screen gradients; triangles: whose splats driven
     offsets move.
     """
-    step = np.zeros(1, STEP)
-    step["rates"][0, : len(RATES)] = [rates[name] for name in RATES]
-    for name, value in options._asdict().items():
-        step[name] = value
-    step["log_beta1"], step["log_beta2"] = map(math.log, options[:2])
-    step["statistics"], step["triangles"] = statistics, triangles
-    step["scale_weight"], step["distance_weight"], step["opacity_weight"] = weights
-    device.upload("step", step, "uniform")
+    scale_weight, distance_weight, opacity_weight = weights
+    device.uniform(
+        "Step", rates=np.reshape([*(rates[name] for name in RATES), 0], (2, 4)),
+        **options._asdict(), log_beta1=math.log(options.beta1), log_beta2=math.log(options.beta2),
+        scale_weight=scale_weight,
+        distance_weight=distance_weight, opacity_weight=opacity_weight, statistics=statistics,
+        triangles=triangles,
+    )  # fmt: skip
 
 
 def optimize(
@@ -148,15 +118,10 @@ def optimize(
     limited: whether a limit of scale or distance has a weight. given: view, splats, face, wanted,
     gradients, which are changed by those of the limits, and screen, of `Rasterizer.backward`.
     """
-    buffer = work.device.buffer
-    all_tables = {
-        **given,
-        **tables._asdict(),
-        "step": buffer("step", STEP.itemsize // 4, "uniform"),
-        "corrections": buffer("corrections", 4 * count),
-        "norms": buffer("norms", 2),
-        "excess": buffer("excess", 4 * -(-count // WORKGROUP) if limited else 0),
-    }
+    buffer, all_tables = work.device.buffer, given | tables._asdict()
+    buffer("corrections", 4 * count)
+    buffer("norms", 2)
+    buffer("excess", 4 * -(-count // WORKGROUP) if limited else 0)
     if limited:
         work.dispatch("optimizer.measure_excess", count, all_tables)
         work.dispatch("optimizer.join_excess", (1, 1, 1), all_tables)
@@ -204,9 +169,8 @@ def step_offsets(
     signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the
     limits.
     """
-    uniform = work.device.buffer("step", STEP.itemsize // 4, "uniform")
     for name, tables in offsets.items():
-        all_tables = {**given, **tables._asdict(), "step": uniform, "driving": signals[name]}
+        all_tables = {**given, **tables._asdict(), "driving": signals[name]}
         work.dispatch("optimizer.step_offset", triangles, all_tables, **offset_constants(name))
 
 
@@ -218,9 +182,8 @@ def offset_constants(name: str) -> dict[str, float]:
 def compile_kernels(device: Device) -> None:
     """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to
     training."""
-    for file, entries in KERNELS.items():
-        for entry in entries:
-            device.kernel(f"{file}.{entry}")
+    for kernel in KERNELS.split():
+        device.kernel(kernel)
     for constants in (*sort_passes(DEPTH_BITS, False), *sort_passes(MAX_TILE_BITS, True)):
         for entry in ("count", "place", "scatter"):
             device.kernel(f"sort.{entry}", **constants)

@@ -1,73 +1,37 @@
 // Adam on the splats and on the coefficients of driven offsets, with the gradients of the limits. Rows that are not
 // wanted, and triangles without a wanted splat, keep every bit.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> step: Step;
-@group(0) @binding(2) var<storage, read_write> splats: array<f32>;
-@group(0) @binding(3) var<storage, read> face: array<u32>;
-@group(0) @binding(4) var<storage, read> wanted: array<u32>;
-@group(0) @binding(5) var<storage, read> traits: array<vec2f>; // (N,) 1 if unbound, else 0; share of unseen cameras
-@group(0) @binding(6) var<storage, read> limits: array<f32>; // (F, 3) scale of bound and of unbound splats, distance
+var<uniform> step: Step;
+var<storage> traits: array<vec2f>; // (N,) 1 if unbound, else 0; share of unseen cameras
+var<storage> limits: array<f32>; // (F, 3) scale of bound and of unbound splats, distance
 // A workgroup's excess of scale (xy) and of distance (zw).
-@group(0) @binding(7) var<storage, read_write> excess: array<vec4f>;
-@group(0) @binding(8) var<storage, read_write> norms: array<f32>; // (2,) of scale and of distance
-@group(0) @binding(9) var<storage, read> screen: array<f32>;
-@group(0) @binding(10) var<storage, read_write> gradients: array<f32>; // of the splats
+var<storage> excess: array<vec4f>;
+var<storage> norms: array<f32>; // (2,) of scale and of distance
 // (N, 3): steps, sum of the screen gradients and number of summands; the latter two are bits of float32.
-@group(0) @binding(11) var<storage, read_write> history: array<u32>;
+var<storage> history: array<u32>;
 // (N, 4): what corrects the first and second moment's bias, the step's share in the average, all three bits of
 // float32; and a bit for each field that keeps its value because its gradient is broken.
-@group(0) @binding(12) var<storage, read_write> corrections: array<vec4u>;
+var<storage> corrections: array<vec4u>;
 // Moments and moving average, of the splats or of an offset's coefficients.
-@group(0) @binding(13) var<storage, read_write> first: array<f32>;
-@group(0) @binding(14) var<storage, read_write> second: array<f32>;
-@group(0) @binding(15) var<storage, read_write> average: array<f32>;
-@group(0) @binding(16) var<storage, read_write> coefficients: array<f32>; // (F, S, 3) of a driven offset
-@group(0) @binding(17) var<storage, read_write> steps: array<u32>; // (F,) of its triangles
-@group(0) @binding(18) var<storage, read> driving: array<f32>; // (F, S): its signal
+var<storage> first: array<f32>;
+var<storage> second: array<f32>;
+var<storage> average: array<f32>;
+var<storage> steps: array<u32>; // (F,) of its triangles
 // (F + 1 + N): where each triangle's splats begin in this array, then those splats.
-@group(0) @binding(19) var<storage, read> splats_of: array<u32>;
+var<storage> splats_of: array<u32>;
 
-override SIGNALS: u32 = 1u; // S of a driven offset
 override RATE_SHARE: f32 = 1.0; // its learning rate, as a share of that of the splats' positions
 
 const REST_RATE: u32 = 6u; // of the harmonics above the constant one
 
-struct Step {
-  rates: array<vec4f, 2>, // by field, see field_of(); the last is that of the harmonics above the constant one
-  beta1: f32,
-  beta2: f32,
-  log_beta1: f32,
-  log_beta2: f32,
-  epsilon: f32,
-  ahead: f32, // by how much of the way from the first moment to the gradient a step goes
-  ema_share: f32, // least share of a step in the exponential moving average
-  scale_weight: f32,
-  distance_weight: f32,
-  opacity_weight: f32, // already divided by the number of splats
-  statistics: u32, // 1: collect what density control asks for
-  triangles: u32, // whose splats driven offsets move
-}
-
 // Number of the parameter that a column of a row belongs to: in the order of `cpu.layout.Parameters`.
-fn field_of(view: View, column: u32) -> u32 {
-  if column < ROTATION {
-    return 0u;
-  }
-  if column < LOG_SCALE {
-    return 1u;
-  }
-  if column < OPACITY_LOGIT {
-    return 2u;
-  }
-  if column < SH {
-    return 3u;
-  }
-  return select(5u, 4u, column < SH + 3u * view.coefficients);
+fn field_of(column: u32) -> u32 {
+  return u32(column >= ROTATION) + u32(column >= LOG_SCALE) + u32(column >= OPACITY_LOGIT) + u32(column >= SH)
+    + u32(column >= SH + 3u * view.coefficients);
 }
 
 // For the given step of a row: what corrects the first and the second moment's bias, and its share in the average.
-fn corrections_at(step: Step, count: u32) -> vec3f {
+fn corrections_at(count: u32) -> vec3f {
   let n = f32(count);
   return vec3f(
     1.0 / one_minus_exp(n * step.log_beta1 + log(1.0 - step.ahead)),
@@ -101,6 +65,14 @@ fn is_too_large(gradient: f32) -> bool {
 
 var<workgroup> parts: array<vec4f, WORKGROUP>;
 
+fn is_unbound(i: u32) -> bool {
+  return traits[i].x > 0.0;
+}
+
+fn scale_limit(i: u32) -> f32 {
+  return limits[3u * face[i] + u32(is_unbound(i))];
+}
+
 fn join(a: vec2f, b: vec2f) -> vec2f {
   let largest = max(a.x, b.x);
   if largest == 0.0 {
@@ -124,33 +96,24 @@ fn join_workgroup(value: vec4f, index: u32) {
   }
 }
 
-fn excess_of(i: u32) -> vec4f {
-  let at = i * splat_stride(view);
-  let unbound = traits[i].x > 0.0;
-  let limit = limits[3u * face[i] + select(0u, 1u, unbound)];
-  var found = vec4f(0.0);
-  for (var c = 0u; c < 3u; c++) {
-    let over = max(0.0, bounded_exp(splats[at + LOG_SCALE + c]) - limit);
-    found = vec4f(join(found.xy, vec2f(over, 1.0)), found.zw);
-  }
-  if !unbound {
-    let away = length(vec3f(splats[at + XYZ], splats[at + XYZ + 1u], splats[at + XYZ + 2u]));
-    found.z = max(0.0, away - limits[3u * face[i] + 2u]);
-    found.w = 1.0;
-  }
-  return found;
-}
-
 @compute @workgroup_size(WORKGROUP)
 fn measure_excess(thread: Thread) {
-  let local = thread.local;
   let i = thread_number(thread);
-  var value = vec4f(0.0);
+  var found = vec4f(0.0);
   if i < view.splats && wanted[i] != 0u {
-    value = excess_of(i);
+    let at = i * splat_stride();
+    let limit = scale_limit(i);
+    for (var c = 0u; c < 3u; c++) {
+      let over = max(0.0, bounded_exp(splats[at + LOG_SCALE + c]) - limit);
+      found = vec4f(join(found.xy, vec2f(over, 1.0)), found.zw);
+    }
+    if !is_unbound(i) {
+      found.z = max(0.0, length(splat_vec3(at + XYZ)) - limits[3u * face[i] + 2u]);
+      found.w = 1.0;
+    }
   }
-  join_workgroup(value, local);
-  if local == 0u {
+  join_workgroup(found, thread.local);
+  if thread.local == 0u {
     excess[i / WORKGROUP] = parts[0];
   }
 }
@@ -177,58 +140,39 @@ fn prepare(thread: Thread) {
   if i >= view.splats || wanted[i] == 0u {
     return;
   }
-  limit_scale(i);
-  limit_distance(i);
-  let at = i * splat_stride(view);
+  let at = i * splat_stride();
+  // scale_weight · ‖ReLU(scale − limit)‖₂
+  if step.scale_weight > 0.0 && norms[0] > 0.0 {
+    let limit = scale_limit(i);
+    for (var c = at + LOG_SCALE; c < at + LOG_SCALE + 3u; c++) {
+      let scale = bounded_exp(splats[c]);
+      gradients[c] += step.scale_weight / norms[0] * max(0.0, scale - limit) * scale;
+    }
+  }
+  // distance_weight · ‖ReLU(|xyz| − limit)‖₂ over the bound splats
+  if step.distance_weight > 0.0 && norms[1] > 0.0 && !is_unbound(i) {
+    let away = length(splat_vec3(at + XYZ));
+    let over = max(0.0, away - limits[3u * face[i] + 2u]);
+    for (var c = at + XYZ; over > 0.0 && c < at + XYZ + 3u; c++) {
+      gradients[c] += step.distance_weight / norms[1] * (over / away) * splats[c];
+    }
+  }
   let visible = sigmoid(splats[at + OPACITY_LOGIT]);
   gradients[at + OPACITY_LOGIT] += step.opacity_weight * traits[i].y * visible * (1.0 - visible);
-  count_step(i);
+  history[3u * i] += 1u;
+  corrections[i] = vec4u(bitcast<vec3u>(corrections_at(history[3u * i])), broken_fields(i));
   if step.statistics == 1u {
     history[3u * i + 1u] = bitcast<u32>(bitcast<f32>(history[3u * i + 1u]) + screen[i]);
     history[3u * i + 2u] = bitcast<u32>(bitcast<f32>(history[3u * i + 2u]) + 1.0);
   }
 }
 
-// The gradient of scale_weight · ‖ReLU(scale − limit)‖₂.
-fn limit_scale(i: u32) {
-  if !(step.scale_weight > 0.0 && norms[0] > 0.0) {
-    return;
-  }
-  let at = i * splat_stride(view) + LOG_SCALE;
-  let limit = limits[3u * face[i] + select(0u, 1u, traits[i].x > 0.0)];
-  for (var c = 0u; c < 3u; c++) {
-    let scale = bounded_exp(splats[at + c]);
-    gradients[at + c] += step.scale_weight / norms[0] * max(0.0, scale - limit) * scale;
-  }
-}
-
-// The gradient of distance_weight · ‖ReLU(|xyz| − limit)‖₂ over the bound splats.
-fn limit_distance(i: u32) {
-  if !(step.distance_weight > 0.0 && norms[1] > 0.0) || traits[i].x > 0.0 {
-    return;
-  }
-  let at = i * splat_stride(view) + XYZ;
-  let away = length(vec3f(splats[at], splats[at + 1u], splats[at + 2u]));
-  let over = away - limits[3u * face[i] + 2u];
-  if over > 0.0 {
-    for (var c = 0u; c < 3u; c++) {
-      gradients[at + c] += step.distance_weight / norms[1] * (over / away) * splats[at + c];
-    }
-  }
-}
-
-fn count_step(i: u32) {
-  let count = history[3u * i] + 1u;
-  history[3u * i] = count;
-  corrections[i] = vec4u(bitcast<vec3u>(corrections_at(step, count)), broken_fields(i));
-}
-
 // Bit f is set where a gradient of field f is not finite, or so large that Adam cannot square it.
 fn broken_fields(i: u32) -> u32 {
-  let stride = splat_stride(view);
+  let stride = splat_stride();
   var broken = 0u;
   for (var c = 0u; c < stride; c++) {
-    broken |= select(0u, 1u << field_of(view, c), is_too_large(gradients[i * stride + c]));
+    broken |= select(0u, 1u << field_of(c), is_too_large(gradients[i * stride + c]));
   }
   return broken;
 }
@@ -247,13 +191,13 @@ fn adam_step(n: u32, gradient: f32, rate: f32, correct: vec3f) -> f32 {
 @compute @workgroup_size(WORKGROUP)
 fn adam(thread: Thread) {
   let n = thread_number(thread);
-  let stride = splat_stride(view);
+  let stride = splat_stride();
   let i = n / stride;
   if i >= view.splats || wanted[i] == 0u {
     return;
   }
   let column = n % stride;
-  let field = field_of(view, column);
+  let field = field_of(column);
   if ((corrections[i].w >> field) & 1u) == 1u {
     return;
   }
@@ -278,7 +222,7 @@ fn step_offset(thread: Thread) {
   for (var n = splats_of[f]; n < splats_of[f + 1u]; n++) {
     let i = splats_of[n];
     if wanted[i] != 0u {
-      let at = i * splat_stride(view) + XYZ;
+      let at = i * splat_stride() + XYZ;
       moved += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
       is_wanted = true;
     }
@@ -287,17 +231,14 @@ fn step_offset(thread: Thread) {
     return;
   }
   steps[f] += 1u;
-  if !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z)) {
-    return;
-  }
-  var broken = false;
+  var broken = !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z));
   for (var c = 0u; c < 3u * SIGNALS; c++) {
     broken = broken || is_too_large(driving[f * SIGNALS + c / 3u] * moved[c % 3u]);
   }
   if broken {
     return;
   }
-  let correct = corrections_at(step, steps[f]);
+  let correct = corrections_at(steps[f]);
   for (var c = 0u; c < 3u * SIGNALS; c++) {
     let n = 3u * SIGNALS * f + c;
     let gradient = driving[f * SIGNALS + c / 3u] * moved[c % 3u];

@@ -1,26 +1,9 @@
 // Embedding, projection and color of every splat, a thread each, and the gradient back to it. The formulas, and what
 // has to be taken together because it cancels, are in `cpu/project.py`.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> splats: array<f32>;
-@group(0) @binding(2) var<storage, read> face: array<u32>;
-@group(0) @binding(3) var<storage, read> frames: array<f32>;
-@group(0) @binding(4) var<storage, read_write> projected: array<f32>;
-@group(0) @binding(5) var<storage, read_write> depth_key: array<u32>;
-@group(0) @binding(6) var<storage, read_write> rect: array<vec4i>;
-@group(0) @binding(7) var<storage, read> wanted: array<u32>;
-@group(0) @binding(8) var<storage, read> slots: array<vec2u>;
-@group(0) @binding(9) var<storage, read> pair_gradients: array<f32>;
-@group(0) @binding(10) var<storage, read_write> gradients: array<f32>;
-// (N,) length of the gradient with respect to the projected center in units of half the image, for density control.
-@group(0) @binding(11) var<storage, read_write> screen: array<f32>;
-@group(0) @binding(12) var<storage, read> selected: array<u32>; // (F,) bytes, four to a word
-@group(0) @binding(13) var<storage, read_write> focus: array<u32>; // (N,) 0 or 1
+var<storage> depth_key: array<u32>; // (N,) bits of a splat's depth; HIDDEN where it is not visible
+var<storage> selected: array<u32>; // (F,) bytes, four to a word
 
-const SH_WEIGHTS = array<f32, 10>(
-  0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396,
-  0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277,
-);
 const MAX_COEFFICIENTS: u32 = 16u;
 
 struct Frame {
@@ -45,16 +28,12 @@ struct CameraSplat {
   minors: vec3f, // a0 × a1
 }
 
-fn splat_vec3(at: u32) -> vec3f {
-  return vec3f(splats[at], splats[at + 1u], splats[at + 2u]);
-}
-
 fn frame_vec3(at: u32) -> vec3f {
   return vec3f(frames[at], frames[at + 1u], frames[at + 2u]);
 }
 
 fn read_frame(triangle: u32) -> Frame {
-  let at = triangle * frame_stride(view);
+  let at = triangle * frame_stride();
   return Frame(
     frame_vec3(at + FRAME_ORIGIN),
     frame_vec3(at + FRAME_MATRIX),
@@ -132,46 +111,28 @@ fn place(at: u32, frame: Frame, position: vec3f) -> CameraSplat {
 
 // Rotation from the camera to the world, in which the harmonics' directions are.
 fn to_world() -> mat3x3f {
-  return mat3x3f(
-    view.to_world_00, view.to_world_10, view.to_world_20,
-    view.to_world_01, view.to_world_11, view.to_world_21,
-    view.to_world_02, view.to_world_12, view.to_world_22,
-  );
+  return transpose(mat3x3f(view.to_world[0].xyz, view.to_world[1].xyz, view.to_world[2].xyz));
 }
 
 fn used_coefficients() -> u32 {
   return (view.degree + 1u) * (view.degree + 1u);
 }
 
-// Real spherical harmonics of a unit direction; those above the degree in use are zero.
+// Real spherical harmonics of a unit direction; formulas and constants are those of `cpu/harmonics.py`.
 fn harmonics(d: vec3f) -> array<f32, MAX_COEFFICIENTS> {
-  var b: array<f32, MAX_COEFFICIENTS>;
-  let xx = d.x * d.x;
-  let yy = d.y * d.y;
-  let zz = d.z * d.z;
-  b[0] = SH_WEIGHTS[0];
-  if view.degree > 0u {
-    b[1] = -SH_WEIGHTS[1] * d.y;
-    b[2] = SH_WEIGHTS[1] * d.z;
-    b[3] = -SH_WEIGHTS[1] * d.x;
-  }
-  if view.degree > 1u {
-    b[4] = SH_WEIGHTS[2] * d.x * d.y;
-    b[5] = -SH_WEIGHTS[2] * d.y * d.z;
-    b[6] = SH_WEIGHTS[3] * (2.0 * zz - xx - yy);
-    b[7] = -SH_WEIGHTS[2] * d.x * d.z;
-    b[8] = SH_WEIGHTS[4] * (xx - yy);
-  }
-  if view.degree > 2u {
-    b[9] = -SH_WEIGHTS[5] * d.y * (3.0 * xx - yy);
-    b[10] = SH_WEIGHTS[6] * d.x * d.y * d.z;
-    b[11] = -SH_WEIGHTS[7] * d.y * (4.0 * zz - xx - yy);
-    b[12] = SH_WEIGHTS[8] * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy);
-    b[13] = -SH_WEIGHTS[7] * d.x * (4.0 * zz - xx - yy);
-    b[14] = SH_WEIGHTS[9] * d.z * (xx - yy);
-    b[15] = -SH_WEIGHTS[5] * d.x * (xx - 3.0 * yy);
-  }
-  return b;
+  let x = d.x;
+  let y = d.y;
+  let z = d.z;
+  let xx = x * x;
+  let yy = y * y;
+  let zz = z * z;
+  return array<f32, MAX_COEFFICIENTS>(
+    C0, -C1 * y, C1 * z, -C1 * x,
+    C2 * x * y, -C2 * y * z, C3 * (2.0 * zz - xx - yy), -C2 * x * z, C4 * (xx - yy),
+    -C5 * y * (3.0 * xx - yy), C6 * x * y * z, -C7 * y * (4.0 * zz - xx - yy),
+    C8 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -C7 * x * (4.0 * zz - xx - yy),
+    C9 * z * (xx - yy), -C5 * x * (xx - 3.0 * yy),
+  );
 }
 
 // Which splats ride on a selected triangle, a thread each.
@@ -198,7 +159,7 @@ fn forward(thread: Thread) {
 
 // Write a visible splat's columns and depth; returns its tile bounds.
 fn project(i: u32) -> vec4i {
-  let at = i * splat_stride(view);
+  let at = i * splat_stride();
   let frame = read_frame(face[i]);
   let position = to_camera(frame, splat_vec3(at + XYZ));
   // The near plane first: nothing below may divide by a depth of zero.
@@ -269,7 +230,7 @@ fn color_of(at: u32, triangle: u32, direction: vec3f) -> vec3f {
   }
   let by_strain = at + SH + 3u * view.coefficients;
   for (var k = 0u; k < view.strains; k++) {
-    color += frames[triangle * frame_stride(view) + FRAME_STRAIN + k] * splat_vec3(by_strain + 3u * k);
+    color += frames[triangle * frame_stride() + FRAME_STRAIN + k] * splat_vec3(by_strain + 3u * k);
   }
   return color;
 }
@@ -283,7 +244,7 @@ fn backward(thread: Thread) {
   }
   var g = sum_of_pairs(i);
   screen[i] = length(0.5 * vec2f(f32(view.width), f32(view.height)) * vec2f(g[MEAN_X], g[MEAN_Y]));
-  let at = i * splat_stride(view);
+  let at = i * splat_stride();
   let frame = read_frame(face[i]);
   let s = place(at, frame, to_camera(frame, splat_vec3(at + XYZ)));
   let p = i * PROJECTED;
@@ -384,18 +345,18 @@ fn write_color(at: u32, triangle: u32, position: vec3f, v_color: vec3f) -> vec3f
   var weights: array<f32, MAX_COEFFICIENTS>;
   for (var k = 0u; k < MAX_COEFFICIENTS; k++) {
     let column = at + SH + 3u * k;
-    if k < view.coefficients {
-      write_vec3(column, b[k] * v_color); // zero above the degree in use
-      if k < used_coefficients() {
-        weights[k] = dot(v_color, splat_vec3(column));
-      }
+    if k < used_coefficients() {
+      write_vec3(column, b[k] * v_color);
+      weights[k] = dot(v_color, splat_vec3(column));
+    } else if k < view.coefficients {
+      write_vec3(column, vec3f(0.0));
     }
   }
   let by_strain = at + SH + 3u * view.coefficients;
   for (var k = 0u; k < view.strain_colors; k++) {
     var strain = 0.0;
     if k < view.strains {
-      strain = frames[triangle * frame_stride(view) + FRAME_STRAIN + k];
+      strain = frames[triangle * frame_stride() + FRAME_STRAIN + k];
     }
     write_vec3(by_strain + 3u * k, strain * v_color);
   }
@@ -404,34 +365,22 @@ fn write_color(at: u32, triangle: u32, position: vec3f, v_color: vec3f) -> vec3f
 }
 
 // Gradient with respect to the direction of Σ w[k]·harmonics[k].
-fn harmonics_gradient(d: vec3f, weights: array<f32, MAX_COEFFICIENTS>) -> vec3f {
-  var w = weights;
-  var g = vec3f(0.0);
-  if view.degree > 0u {
-    g = SH_WEIGHTS[1] * vec3f(-w[3], -w[1], w[2]);
-  }
-  if view.degree > 1u {
-    g.x += SH_WEIGHTS[2] * (d.y * w[4] - d.z * w[7]) - 2.0 * SH_WEIGHTS[3] * d.x * w[6]
-      + 2.0 * SH_WEIGHTS[4] * d.x * w[8];
-    g.y += SH_WEIGHTS[2] * (d.x * w[4] - d.z * w[5]) - 2.0 * SH_WEIGHTS[3] * d.y * w[6]
-      - 2.0 * SH_WEIGHTS[4] * d.y * w[8];
-    g.z += -SH_WEIGHTS[2] * (d.y * w[5] + d.x * w[7]) + 4.0 * SH_WEIGHTS[3] * d.z * w[6];
-  }
-  if view.degree > 2u {
-    let xx = d.x * d.x;
-    let yy = d.y * d.y;
-    let zz = d.z * d.z;
-    g.x += -SH_WEIGHTS[5] * 6.0 * d.x * d.y * w[9] + SH_WEIGHTS[6] * d.y * d.z * w[10]
-      + SH_WEIGHTS[7] * 2.0 * d.x * d.y * w[11] - SH_WEIGHTS[8] * 6.0 * d.x * d.z * w[12]
-      - SH_WEIGHTS[7] * (4.0 * zz - 3.0 * xx - yy) * w[13] + SH_WEIGHTS[9] * 2.0 * d.x * d.z * w[14]
-      - SH_WEIGHTS[5] * 3.0 * (xx - yy) * w[15];
-    g.y += -SH_WEIGHTS[5] * 3.0 * (xx - yy) * w[9] + SH_WEIGHTS[6] * d.x * d.z * w[10]
-      - SH_WEIGHTS[7] * (4.0 * zz - xx - 3.0 * yy) * w[11] - SH_WEIGHTS[8] * 6.0 * d.y * d.z * w[12]
-      + SH_WEIGHTS[7] * 2.0 * d.x * d.y * w[13] - SH_WEIGHTS[9] * 2.0 * d.y * d.z * w[14]
-      + SH_WEIGHTS[5] * 6.0 * d.x * d.y * w[15];
-    g.z += SH_WEIGHTS[6] * d.x * d.y * w[10] - SH_WEIGHTS[7] * 8.0 * d.y * d.z * w[11]
-      + SH_WEIGHTS[8] * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w[12] - SH_WEIGHTS[7] * 8.0 * d.x * d.z * w[13]
-      + SH_WEIGHTS[9] * (xx - yy) * w[14];
-  }
-  return g;
+fn harmonics_gradient(d: vec3f, w: array<f32, MAX_COEFFICIENTS>) -> vec3f {
+  let x = d.x;
+  let y = d.y;
+  let z = d.z;
+  let xx = x * x;
+  let yy = y * y;
+  let zz = z * z;
+  return vec3f(
+    -C1 * w[3] + C2 * (y * w[4] - z * w[7]) - 2.0 * C3 * x * w[6] + 2.0 * C4 * x * w[8]
+      - 6.0 * C5 * x * y * w[9] + C6 * y * z * w[10] + 2.0 * C7 * x * y * w[11] - 6.0 * C8 * x * z * w[12]
+      - C7 * (4.0 * zz - 3.0 * xx - yy) * w[13] + 2.0 * C9 * x * z * w[14] - 3.0 * C5 * (xx - yy) * w[15],
+    -C1 * w[1] + C2 * (x * w[4] - z * w[5]) - 2.0 * C3 * y * w[6] - 2.0 * C4 * y * w[8]
+      - 3.0 * C5 * (xx - yy) * w[9] + C6 * x * z * w[10] - C7 * (4.0 * zz - xx - 3.0 * yy) * w[11]
+      - 6.0 * C8 * y * z * w[12] + 2.0 * C7 * x * y * w[13] - 2.0 * C9 * y * z * w[14] + 6.0 * C5 * x * y * w[15],
+    C1 * w[2] - C2 * (y * w[5] + x * w[7]) + 4.0 * C3 * z * w[6] + C6 * x * y * w[10]
+      - 8.0 * C7 * y * z * w[11] + C8 * (6.0 * zz - 3.0 * xx - 3.0 * yy) * w[12]
+      - 8.0 * C7 * x * z * w[13] + C9 * (xx - yy) * w[14],
+  );
 }

@@ -2,8 +2,7 @@
 splats.
 
 Three stages, a WGSL file each: `project` places and colors splats, `tiles` lists those of a tile,
-`blend` draws them. They share tables, by the names of `layout.py`; a function that records a stage
-adds its own to those given.
+`blend` draws them. They share tables, which are the device's buffers of the same names.
 """
 
 from collections.abc import Sequence
@@ -15,20 +14,9 @@ import numpy as np
 from ...capture.camera import Camera
 from ..cpu.layout import PROJECTED, TILE, CameraFrames, Parameters
 from ..cpu.rasterize import tile_grid
+from . import layout
 from .device import Device, Groups, Recording
-from .layout import (
-    COUNTS,
-    DIGIT_BITS,
-    NEEDED,
-    OVERFLOWED,
-    PAIR_GROUPS,
-    SH,
-    SORT_BLOCK,
-    SORT_GROUPS,
-    VIEW,
-    WORKGROUP,
-    splat_rows,
-)  # fmt: skip
+from .layout import COUNTS, DIGIT_BITS, SORT_BLOCK, WORKGROUP
 
 INITIAL_PAIR_CAPACITY = 1 << 18
 """Pairs that a rasterizer has room for at first: 14 MB."""
@@ -53,7 +41,7 @@ class SplatTable:
     @property
     def stride(self) -> int:
         """Words per row."""
-        return SH + 3 * (self.coefficients + self.strain_colors)
+        return layout.SH + 3 * (self.coefficients + self.strain_colors)
 
 
 @dataclass(frozen=True)
@@ -92,17 +80,17 @@ class Rasterizer:
         `options.focused`.
 
         Returns its tables, valid until the device's next rendering: the image (3, H, W) over the
-        background and those of `layout.py`.
+        background and what `backward` needs.
         """
-        tables = projected_tables(self.device, splats.count)
-        tables |= {"view": view, "splats": splats.rows, "face": splats.face, "frames": frames}
+        tables = {"view": view, "splats": splats.rows, "face": splats.face, "frames": frames}
+        make_projected(self.device, splats.count)
         work.dispatch("project.forward", splats.count, tables)
-        return self.draw(work, tables, splats.count, options.camera, focus)
+        return tables | self.draw(work, view, splats.count, options.camera, focus)
 
     def draw(
-        self, work: Recording, tables: Tables, count: int, camera: Camera, focus: Any = None
+        self, work: Recording, view: Any, count: int, camera: Camera, focus: Any = None
     ) -> Tables:
-        """Record the rendering of `count` projected splats, with the view in `tables`.
+        """Record the rendering of `count` projected splats.
 
         Splats are sorted by depth and write their (tile, splat) pairs in that order, which a stable
         sort by tile keeps. A splat has a pair with each rendered tile that its outline reaches; its
@@ -111,28 +99,26 @@ class Rasterizer:
         """
         columns, rows = tile_grid(camera.width, camera.height)
         tiles, room, buffer = columns * rows, self.capacity, self.device.buffer
+        counts = counts_buffer(self.device)
         words = {"touched": tiles, "rendered": tiles, "wanted": count, "slots": 2 * count}
-        words |= dict.fromkeys(("slot_tile", "slot_splat"), room)
+        words |= {"tile_range": 2 * tiles, "slot_tile": room, "slot_splat": room}
         words["pairs_until"] = count + -(-count // WORKGROUP)
-        tables |= {name: buffer(name, each) for name, each in words.items()}
-        tables["tile_range"] = buffer("ranges", 2 * tiles)
-        tables["counts"] = counts_buffer(self.device)
-        tables["focus"] = tables["rect"] if focus is None else focus
+        tables = {name: buffer(name, each) for name, each in words.items()}
+        tables |= {"view": view, "focus": buffer("rect", 0) if focus is None else focus}
         if focus is not None:
             work.clear(tables["touched"], tiles)
             work.dispatch("tiles.mark_touched", count, tables)
         work.dispatch("tiles.choose_rendered", tiles, tables)
-        view = tables["view"]
-        _, tables["order"] = sort_keys(work, tables["depth_key"], count, DEPTH_BITS, view)
+        keys = buffer("depth_key", 0)
+        _, tables["order"] = sort_keys(work, keys, count, DEPTH_BITS, view)
         work.dispatch("tiles.count_pairs", count, tables)
         work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
         work.dispatch("tiles.fill_pairs", count, tables)
         keys, bits = tables["slot_tile"], tiles.bit_length()
         by_tile = sort_keys(work, keys, room, bits, view, of_pairs=True)
         tables["pair_tile"], tables["pair_slot"] = by_tile
-        work.dispatch("tiles.find_ranges", (tables["counts"], 4 * PAIR_GROUPS), tables)
-        blend(work, camera, tables)
-        return tables
+        work.dispatch("tiles.find_ranges", (counts, 4 * layout.PAIR_GROUPS), tables)
+        return blend(work, camera, tables)
 
     def backward(
         self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any,
@@ -146,25 +132,21 @@ class Rasterizer:
         to the projected center in units of half the image.
         """
         columns, rows = tile_grid(camera.width, camera.height)
-        tables = {
-            **rendering,
-            "v_image": v_image,
-            "v_transmittance": v_image if v_transmittance is None else v_transmittance,
-            "pair_gradients": self.device.buffer("pair_gradients", PROJECTED * self.capacity),
-            "gradients": gradients,
-            "screen": self.device.buffer("screen", splats.count),
-        }
-        constants = {"HAS_V_TRANSMITTANCE": True} if v_transmittance is not None else {}
+        given = {"v_image": v_image, "v_transmittance": v_transmittance or v_image}
+        given |= {"gradients": gradients, "screen": self.device.buffer("screen", splats.count)}
+        self.device.buffer("pair_gradients", PROJECTED * self.capacity)
+        constants = {} if v_transmittance is None else {"HAS_V_TRANSMITTANCE": True}
+        tables = rendering | given
         work.dispatch("blend.backward", Device.groups_of(columns * rows), tables, **constants)
         work.dispatch("project.backward", splats.count, tables)
-        return tables["screen"]
+        return given["screen"]
 
     def pairs_fit(self) -> bool:
         """Wait for the submitted work; whether its pairs fitted. If not, room for them is made."""
         counts = self.device.read(counts_buffer(self.device), (COUNTS,), np.uint32)
-        if counts[OVERFLOWED]:
-            self.make_room(int(counts[NEEDED]))
-        return not counts[OVERFLOWED]
+        if counts[layout.OVERFLOWED]:
+            self.make_room(int(counts[layout.NEEDED]))
+        return not counts[layout.OVERFLOWED]
 
     def make_room(self, needed: int) -> None:
         """Hold at least so many pairs from now on, and an eighth to spare, and let renderings begin
@@ -181,17 +163,20 @@ class Rasterizer:
         to_world (3, 3): from the camera to the space of the harmonics' directions, where that is
         not the world; first: row of the splats in the tables of projected ones.
         """
-        camera, view = options.camera, np.zeros((), VIEW)
+        camera = options.camera
         to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
-        view[...] = (
-            camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.width, camera.height, columns,
-            rows, *to_world.ravel(), *options.background, splats.count, splats.coefficients,
-            splats.strain_colors, options.degree, min(options.strains, splats.strain_colors),
-            options.strains, options.depth_as_color, options.antialiased, options.focused,
-            -(-options.reach // TILE), self.capacity, first,
+        return self.device.uniform(
+            "View", name, to_world=np.c_[to_world, np.zeros(3)],
+            background=(*options.background, 0), fl_x=camera.fl_x, fl_y=camera.fl_y, cx=camera.cx,
+            cy=camera.cy, width=camera.width, height=camera.height, tiles_x=columns, tiles_y=rows,
+            splats=splats.count, coefficients=splats.coefficients,
+            strain_colors=splats.strain_colors, degree=options.degree,
+            strains=min(options.strains, splats.strain_colors), frame_strains=options.strains,
+            depth_as_color=options.depth_as_color, antialiased=options.antialiased,
+            focused=options.focused, ring=-(-options.reach // TILE), capacity=self.capacity,
+            first=first,
         )  # fmt: skip
-        return self.device.upload(name, view, "uniform")
 
 
 def upload_splats(
@@ -199,7 +184,7 @@ def upload_splats(
 ) -> SplatTable:
     """Numpy arrays of splats as a table on the device; layer: part of its name where there are
     several."""
-    rows = splat_rows(splats)
+    rows = layout.splat_rows(splats)
     strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
     table = device.upload(f"splats{layer}", rows)
     faces = device.upload(f"face{layer}", face.astype(np.uint32))
@@ -228,10 +213,10 @@ def mark_focus(work: Recording, splats: SplatTable, view: Any, selected: Any) ->
     return focus
 
 
-def projected_tables(device: Device, count: int) -> Tables:
-    """Room for `count` projected splats."""
-    words = {"projected": PROJECTED, "depth_key": 1, "rect": 4}
-    return {name: device.buffer(name, count * each) for name, each in words.items()}
+def make_projected(device: Device, count: int) -> None:
+    """Make room for `count` projected splats."""
+    for name, words in {"projected": PROJECTED, "depth_key": 1, "rect": 4}.items():
+        device.buffer(name, count * words)
 
 
 def sort_keys(
@@ -243,7 +228,9 @@ def sort_keys(
     sorted keys and of their numbers before; `keys` may be overwritten.
     """
     counts, buffer, blocks = counts_buffer(work.device), work.device.buffer, -(-room // SORT_BLOCK)
-    groups: Groups = (counts, 4 * SORT_GROUPS) if of_pairs else (blocks, 1, 1)
+    groups: Groups = (counts, 4 * layout.SORT_GROUPS) if of_pairs else (blocks, 1, 1)
+    buffer("block_digits", blocks << DIGIT_BITS)
+    buffer("digit_totals", 1 << DIGIT_BITS)
     name, values = "pair" if of_pairs else "splat", counts  # the first pass reads no values
     # The gradients of the pairs are written when the sorted tiles have been read.
     first = "pair_gradients" if of_pairs else "splat_keys"
@@ -252,10 +239,8 @@ def sort_keys(
         targets.append((keys, buffer(f"{name}_numbers 2", room)))
     for n, constants in enumerate(sort_passes(bits, of_pairs)):
         tables = {
-            "view": view, "counts": counts, "keys": keys, "values": values,
+            "view": view, "keys": keys, "values": values,
             "sorted_keys": targets[n % 2][0], "sorted_values": targets[n % 2][1],
-            "block_digits": buffer("block_digits", blocks << DIGIT_BITS),
-            "digit_totals": buffer("digit_totals", 1 << DIGIT_BITS),
         }  # fmt: skip
         work.dispatch("sort.count", groups, tables, **constants)
         work.dispatch("sort.place", 1 << DIGIT_BITS, tables, **constants)
@@ -270,9 +255,11 @@ def sort_passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
     return [{"SHIFT": shift, "FIRST": shift == 0, "OF_PAIRS": of_pairs} for shift in shifts]
 
 
-def blend(work: Recording, camera: Camera, tables: Tables) -> None:
-    """Record the blending of the rendered tiles; image and pixels are undefined in others."""
+def blend(work: Recording, camera: Camera, tables: Tables) -> Tables:
+    """Record the blending of the rendered tiles; image and pixels, which are added to the tables,
+    are undefined in others."""
     area, (columns, rows) = camera.width * camera.height, tile_grid(camera.width, camera.height)
     buffer = work.device.buffer
     tables |= {"image": buffer("image", 3 * area), "pixels": buffer("pixels", 2 * area)}
     work.dispatch("blend.forward", Device.groups_of(columns * rows), tables)
+    return tables

@@ -8,15 +8,13 @@ override SHIFT: u32 = 0u; // of the digit
 override FIRST: bool = true; // the values are the keys' own numbers
 override OF_PAIRS: bool = false; // sort as many keys as there are pairs, instead of splats
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> counts: array<u32>;
-@group(0) @binding(2) var<storage, read> keys: array<u32>;
-@group(0) @binding(3) var<storage, read> values: array<u32>;
-@group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
-@group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
+var<storage> keys: array<u32>;
+var<storage> values: array<u32>;
+var<storage> sorted_keys: array<u32>;
+var<storage> sorted_values: array<u32>;
 // (blocks, DIGITS): how often, then how often in the blocks before.
-@group(0) @binding(6) var<storage, read_write> block_digits: array<u32>;
-@group(0) @binding(7) var<storage, read_write> digit_totals: array<u32>;
+var<storage> block_digits: array<u32>;
+var<storage> digit_totals: array<u32>;
 
 const ROUNDS: u32 = SORT_BLOCK / WORKGROUP;
 const DIGITS_PER_THREAD: u32 = DIGITS / WORKGROUP;
@@ -115,17 +113,7 @@ fn find_places(block: u32, local: u32) {
   for (var k = 0u; k < DIGITS_PER_THREAD; k++) {
     own += digit_totals[first + k];
   }
-  round_digits[local] = own;
-  for (var step = 1u; step < WORKGROUP; step *= 2u) {
-    workgroupBarrier();
-    var earlier = 0u;
-    if local >= step {
-      earlier = round_digits[local - step];
-    }
-    workgroupBarrier();
-    round_digits[local] += earlier;
-  }
-  var smaller = round_digits[local] - own;
+  var smaller = sum_until(own, local) - own;
   for (var k = 0u; k < DIGITS_PER_THREAD; k++) {
     let digit = first + k;
     next_place[digit] = smaller + block_digits[block * DIGITS + digit];

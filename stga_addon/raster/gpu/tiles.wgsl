@@ -3,23 +3,13 @@
 // Where the pairs exceed the capacity, or did so in an earlier submit, the device goes on with none at all: no splat is
 // wanted then and no parameter changes, until the host has made room and clears OVERFLOWED.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> rect: array<vec4i>;
-@group(0) @binding(2) var<storage, read> focus: array<u32>;
-@group(0) @binding(3) var<storage, read_write> touched: array<atomic<u32>>; // (tiles,) a splat in focus reaches it
-@group(0) @binding(4) var<storage, read_write> rendered: array<u32>; // (tiles,)
-@group(0) @binding(5) var<storage, read_write> tile_range: array<vec2u>; // (tiles,) first pair, one past the last
-@group(0) @binding(6) var<storage, read> order: array<u32>; // (N,) splats, near to far
-@group(0) @binding(7) var<storage, read_write> counts: array<u32>;
+var<storage> touched: array<atomic<u32>>; // (tiles,) 1 for those that a splat in focus reaches
+var<storage> order: array<u32>; // (N,) splats, near to far
 // (N + workgroups,) by place in `order`: pairs within the workgroup up to this splat; then the pairs of each workgroup,
 // and in the end those before it.
-@group(0) @binding(8) var<storage, read_write> pairs_until: array<u32>;
-@group(0) @binding(9) var<storage, read> projected: array<f32>;
-@group(0) @binding(10) var<storage, read_write> wanted: array<u32>;
-@group(0) @binding(11) var<storage, read_write> slots: array<vec2u>;
-@group(0) @binding(12) var<storage, read_write> slot_tile: array<u32>; // (P,)
-@group(0) @binding(13) var<storage, read_write> slot_splat: array<u32>; // (P,) with WANTED
-@group(0) @binding(14) var<storage, read> pair_tile: array<u32>; // (P,) sorted
+var<storage> pairs_until: array<u32>;
+var<storage> slot_tile: array<u32>; // (P,)
+var<storage> pair_tile: array<u32>; // (P,) sorted
 
 // A thread a splat; `touched` is zero before.
 @compute @workgroup_size(WORKGROUP)
@@ -116,10 +106,6 @@ fn is_listed(o: Outline, tile: vec2u) -> bool {
   return rendered[tile.y * view.tiles_x + tile.x] == 1u && touches(o, tile);
 }
 
-const TOO_MANY: u32 = 0x7fffffffu; // sums end here instead of overflowing
-
-var<workgroup> sums: array<u32, WORKGROUP>;
-
 // How many tiles to be rendered a visible splat reaches.
 fn pairs_of(i: u32, r: vec4u) -> u32 {
   let outline = outline_of(i);
@@ -130,22 +116,6 @@ fn pairs_of(i: u32, r: vec4u) -> u32 {
     }
   }
   return found;
-}
-
-// The sum of `value` over this thread and those before it.
-fn sum_until(value: u32, local: u32) -> u32 {
-  sums[local] = value;
-  for (var step = 1u; step < WORKGROUP; step *= 2u) {
-    workgroupBarrier();
-    var earlier = 0u;
-    if local >= step {
-      earlier = sums[local - step];
-    }
-    workgroupBarrier();
-    sums[local] = min(sums[local] + earlier, TOO_MANY);
-  }
-  workgroupBarrier();
-  return sums[local];
 }
 
 // How many pairs each splat has, a thread each in order of depth.
