@@ -15,8 +15,8 @@ from ..errors import StgaError
 from ..export.playback import check_rate
 from ..files import NumberedFiles, check_writable, naming, replacing
 from ..raster.posed_splats import ComposedImage, PosedSplats
+from .client import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
 from .device import Composer
-from .server import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
 
 CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
 """H.264 with halved color resolution: what browsers, phones and editors play."""
@@ -41,13 +41,30 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     check_rate(path, fps)
     import av
 
+    rate, is_empty = Fraction(fps).limit_denominator(1001), True
     with replacing(path) as partial:
-        options = {"movflags": "faststart"}
         try:
-            with av.open(str(partial), "w", format="mp4", options=options) as container:
-                append, finish = _encoder(container, Fraction(fps).limit_denominator(1001))
+            with av.open(
+                str(partial), "w", format="mp4", options={"movflags": "faststart"}
+            ) as container:
+                stream: Any = container.add_stream(CODEC, rate=rate, options=QUALITY)
+                stream.pix_fmt = PIXEL_FORMAT
+                context = stream.codec_context
+                context.colorspace = context.color_primaries = context.color_trc = BT709
+                context.color_range = LIMITED_RANGE
+
+                def append(image: np.ndarray) -> None:
+                    nonlocal is_empty
+                    odd = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
+                    pixels = np.ascontiguousarray(np.pad(image, odd, mode="edge"))
+                    frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+                    if is_empty:
+                        stream.width, stream.height, is_empty = frame.width, frame.height, False
+                    colors = {"dst_colorspace": BT709, "dst_color_range": LIMITED_RANGE}
+                    container.mux(stream.encode(frame.reformat(format=PIXEL_FORMAT, **colors)))
+
                 yield append
-                finish()
+                container.mux(stream.encode())  # what the encoder still holds
         except av.error.FFmpegError as error:
             reason = error.strerror or error
             raise StgaError(f"{path}: the video cannot be written ({reason})") from error
@@ -80,34 +97,6 @@ def sequence_writer(folder: Path) -> Iterator[WriteImage]:
         files.finish()
 
 
-def _encoder(container: Any, rate: Fraction) -> tuple[WriteImage, Callable[[], None]]:
-    """Functions that append an image to the container, and write what the encoder still holds."""
-    from av import VideoFrame
-
-    stream = container.add_stream(CODEC, rate=rate, options=QUALITY)
-    stream.pix_fmt = PIXEL_FORMAT
-    context = stream.codec_context
-    context.colorspace = context.color_primaries = context.color_trc = BT709
-    context.color_range = LIMITED_RANGE
-    is_empty = True
-
-    def append(image: np.ndarray) -> None:
-        nonlocal is_empty
-        odd = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
-        pixels = np.ascontiguousarray(np.pad(image, odd, mode="edge"))
-        frame = VideoFrame.from_ndarray(pixels, format="rgb24")
-        if is_empty:
-            stream.width, stream.height, is_empty = frame.width, frame.height, False
-        colors = {"dst_colorspace": BT709, "dst_color_range": LIMITED_RANGE}
-        container.mux(stream.encode(frame.reformat(format=PIXEL_FORMAT, **colors)))
-
-    return append, lambda: container.mux(stream.encode())
-
-
-FIRST_IMAGE = "0001.png"
-"""Of a sequence, as `video.sequence_writer` names it."""
-
-
 def is_video(output: Path) -> bool:
     """Whether images are written as one video; else as PNGs in a folder."""
     return output.suffix.lower() == ".mp4"
@@ -115,7 +104,7 @@ def is_video(output: Path) -> bool:
 
 def check_output(output: Path) -> None:
     """Raise StgaError where the output cannot be written, or others' images are there."""
-    check_writable(output if is_video(output) else output / FIRST_IMAGE)
+    check_writable(output if is_video(output) else output / "0001.png")
     if not is_video(output):
         NumberedFiles(output, IMAGE_NAME)
 

@@ -16,9 +16,8 @@ from stga_addon.errors import StgaError
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.render import client as render_client
-from stga_addon.render.client import RenderClient
+from stga_addon.render.client import RenderClient, pack_layers, receive, unpack_layers
 from stga_addon.render.render import render
-from stga_addon.render.server import pack_layers, receive, unpack_layers
 
 HERE = np.eye(4)
 AHEAD = np.array([0, 0, 1.2])

@@ -15,7 +15,7 @@ from stga_addon.jobs.blender import RenderRecording
 from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
-from stga_addon.render.server import pack_layers, unpack_layers
+from stga_addon.render.client import pack_layers, unpack_layers
 from stga_addon.render.video import Recorder, finished
 from stga_addon.worker.status import inspect_worker, request_cancel
 
