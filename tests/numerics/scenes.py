@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 from raster import reference
-from raster.test_kernels import NAMES, Scene, cloud, kernel_gradients, random_cotangents
+from raster.test_kernels import (
+    NAMES,
+    Scene,
+    kernel_gradients,
+    random_cotangents,
+    reference_gradients,
+)
 
 from stga_addon.capture.camera import Camera
 
@@ -39,19 +45,6 @@ def facing(
 
 def rows(scene: Scene, keep: np.ndarray) -> Scene:
     return replace(scene, splats={name: value[keep] for name, value in scene.splats.items()})
-
-
-def reference_gradients(
-    scene: Scene, cotangents: list[torch.Tensor], near: float = 0.01
-) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    """Images and gradients of the float64 reference for the very numbers that the kernels get."""
-    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
-    images = reference.render(*tensors, scene.camera, sh_degree=scene.degree, near=near)
-    loss = sum((image * v).sum() for image, v in zip(images, cotangents, strict=True))
-    gradients = torch.autograd.grad(loss, tensors)
-    return [image.detach().numpy() for image in images], {
-        n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)
-    }
 
 
 def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
@@ -106,9 +99,9 @@ def compare(
     cotangents = [v * torch.from_numpy(steady) for v in random_cotangents(scene.camera)]
     images, gradients = kernel_gradients(scene, cotangents)
     got = _named(images, gradients, steady)
-    want = _named(*reference_gradients(scene, cotangents, near), steady)
+    want = _named(*reference_gradients(scene, cotangents, near=near), steady)
     moved = [
-        _named(*reference_gradients(rounded(scene, seed), cotangents, near), steady)
+        _named(*reference_gradients(rounded(scene, seed), cotangents, near=near), steady)
         for seed in range(roundings)
     ]
     scales = {
@@ -131,41 +124,31 @@ def _named(
     images: list[np.ndarray], gradients: dict[str, np.ndarray], steady: np.ndarray
 ) -> dict[str, np.ndarray]:
     """The images, black where they are not steady, and the gradients."""
-    return (
-        dict(zip(IMAGES, (np.where(steady, image, image * 0) for image in images), strict=True))
-        | gradients
-    )
+    shown = (np.where(steady, image, image * 0) for image in images)
+    return dict(zip(IMAGES, shown, strict=True)) | gradients
 
 
 def rounded(scene: Scene, seed: int) -> Scene:
     """The scene with every other number one unit in the last place farther from zero."""
     rng = np.random.default_rng(seed)
-    return replace(
-        scene,
-        splats={
-            name: np.where(
-                rng.random(value.shape) < 0.5,
-                value,
-                np.nextafter(value, np.copysign(np.inf, value)),
-            )
-            for name, value in scene.splats.items()
-        },
-    )
+    moved = {
+        name: np.where(
+            rng.random(value.shape) < 0.5, value, np.nextafter(value, np.copysign(np.inf, value))
+        )
+        for name, value in scene.splats.items()
+    }
+    return replace(scene, splats=moved)
 
 
 def assert_close(errors: dict[str, float], image: float, gradient: float) -> None:
     """Every error below its tolerance; the message names those that are not."""
     limits = dict.fromkeys(IMAGES, image)
-    bad = {
-        name: f"{value:.1e}"
-        for name, value in errors.items()
-        if not value < limits.get(name, gradient)
-    }
+    bad = {name: f"{e:.1e}" for name, e in errors.items() if not e < limits.get(name, gradient)}
     assert not bad, bad
 
 
 __all__ = [
-    "NAMES", "Scene", "assert_close", "cloud", "compare", "facing", "kernel_gradients",
+    "NAMES", "Scene", "assert_close", "compare", "facing", "kernel_gradients",
     "random_cotangents",
     "reference_gradients", "rows", "steady_pixels",
 ]  # fmt: skip

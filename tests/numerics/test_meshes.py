@@ -5,19 +5,15 @@ import numpy as np
 import pytest
 import torch
 from flame.torch_flame import axis_angle_matrices
-from raster import reference
-from raster.test_kernels import embed
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames, to_local, to_world
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.camera import Camera
 from stga_addon.flame.quaternions import from_matrices
-from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.layout import Parameters
 
 from .meshes import DEGENERATE, WHOLE, mesh_of
-from .scenes import NAMES, random_cotangents
+from .scenes import NAMES, Scene, kernel_gradients, random_cotangents, reference_gradients
 
 FACES = np.array([[0, 1, 2]])
 
@@ -99,29 +95,17 @@ def test_collapsed_triangles_render_and_train_in_float32() -> None:
         frames = face_frames(posed, faces, neutral, convention)
         pose = np.eye(4)
         pose[:3, 3] = [-0.09, -0.09, 0.5]
-        camera = Camera(40, 40, 80.0, 80.0, 20.0, 20.0, pose)
-        cotangents = random_cotangents(camera)
-
-        tensors = [torch.from_numpy(values[name]).clone().requires_grad_() for name in NAMES]
-        images = render_differentiable(Parameters(*tensors), camera, frames, splats.face, degree=1)
-        gradients = torch.autograd.grad(
-            sum((i * v.float()).sum() for i, v in zip(images, cotangents, strict=True)), tensors
-        )
+        scene = Scene(values, Camera(40, 40, 80.0, 80.0, 20.0, 20.0, pose), 1)
+        cotangents = random_cotangents(scene.camera)
+        images, gradients = kernel_gradients(scene, cotangents, frames, splats.face)
         frames.scale[:] = np.maximum(frames.scale, 1e-30)  # the reference wants its logarithm
-        tensors = [torch.from_numpy(values[name]).double().requires_grad_() for name in NAMES]
-        expected_images = reference.render(
-            *embed(tensors, frames, splats.face), camera, sh_degree=1
-        )
-        expected = torch.autograd.grad(
-            sum((i * v).sum() for i, v in zip(expected_images, cotangents, strict=True)), tensors
-        )
+        expected_images, expected = reference_gradients(scene, cotangents, frames, splats.face)
         assert expected_images[1].max() > 0.3
         for image, want in zip(images, expected_images, strict=True):
-            np.testing.assert_allclose(image.detach(), want.detach(), atol=5e-6)
-        for name, gradient, want in zip(NAMES, gradients, expected, strict=True):
-            np.testing.assert_allclose(
-                gradient, want, atol=2e-5 * float(want.abs().max()), err_msg=name
-            )
+            np.testing.assert_allclose(image, want, atol=5e-6)
+        for name, want in expected.items():
+            largest = np.abs(want).max()
+            np.testing.assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
 
 
 def test_a_triangle_that_flips_between_frames() -> None:

@@ -6,13 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from raster import reference
-from raster.test_kernels import embed
 
-from stga_addon.avatar.embedding import FaceFrames, face_frames
+from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.camera import Camera
-from stga_addon.raster.cpu.autograd import render_differentiable
-from stga_addon.raster.cpu.layout import Parameters
 
 from .scenes import (
     NAMES,
@@ -224,26 +220,11 @@ def triangles(seed: int = 3, count: int = 12) -> tuple[np.ndarray, np.ndarray, n
     return neutral + rng.normal(0, 0.003, neutral.shape), neutral, faces
 
 
-def embedded(count: int = 60, faces: int = 12) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Splats in the frames of the triangles: parameters and face (N,) int32."""
+def embedded(camera: Camera) -> tuple[Scene, np.ndarray]:
+    """Splats in the frames of the triangles, and face (N,) int32."""
     rng = np.random.default_rng(4)
-    scene = facing(
-        count, 4, xyz=rng.normal(0, 0.005, (count, 3)), log_scale=log_normal(count, 0.008)
-    )
-    return scene.splats, rng.integers(0, faces, count).astype(np.int32)
-
-
-def draw(
-    splats: dict[str, np.ndarray], face: np.ndarray, frames: FaceFrames, camera: Camera
-) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    tensors = [torch.from_numpy(splats[name]).clone().requires_grad_() for name in NAMES]
-    images = render_differentiable(Parameters(*tensors), camera, frames, face, degree=1)
-    cotangents = random_cotangents(camera)
-    loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
-    gradients = torch.autograd.grad(loss, tensors)
-    return [i.detach().numpy() for i in images], {
-        n: g.numpy() for n, g in zip(NAMES, gradients, strict=True)
-    }
+    scene = facing(60, 4, xyz=rng.normal(0, 0.005, (60, 3)), log_scale=log_normal(60, 0.008))
+    return replace(scene, camera=camera), rng.integers(0, 12, 60).astype(np.int32)
 
 
 def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
@@ -257,15 +238,16 @@ def test_a_head_far_from_the_origin_is_the_same_head(back_end: str, shift: list[
     """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a
     millimeter."""
     posed, neutral, faces = triangles()
-    splats, face = embedded()
-    camera = head_camera()
-    images, gradients = draw(splats, face, face_frames(posed, faces, neutral), camera)
+    camera, cotangents = head_camera(), random_cotangents(head_camera())
+    scene, face = embedded(camera)
+    images, gradients = kernel_gradients(
+        scene, cotangents, face_frames(posed, faces, neutral), face
+    )
     moved = camera.world_to_camera.copy()
     moved[:3, 3] -= moved[:3, :3] @ shift
-    far = replace(camera, world_to_camera=moved)
-    far_images, far_gradients = draw(
-        splats, face, face_frames(posed + shift, faces, neutral + shift), far
-    )
+    far = replace(scene, camera=replace(camera, world_to_camera=moved))
+    frames = face_frames(posed + shift, faces, neutral + shift)
+    far_images, far_gradients = kernel_gradients(far, cotangents, frames, face)
     assert images[1].max() > 0.5
     for image, other in zip(images, far_images, strict=True):
         np.testing.assert_allclose(other, image, atol=2e-6)
@@ -291,25 +273,16 @@ def test_a_mesh_a_thousand_times_too_large_or_small(
     before the near plane.
     """
     posed, neutral, faces = triangles()
-    splats, face = embedded()
     camera = head_camera(distance, focal)
     camera.world_to_camera[:2, 3] *= size
+    scene, face = embedded(camera)
     # the splats stay in meters of the neutral mesh
-    frames = face_frames(posed * size, faces, neutral)
-    images, gradients = draw(splats, face, frames, camera)
-    tensors = [torch.from_numpy(splats[name]).double().requires_grad_() for name in NAMES]
-    expected_images = reference.render(*embed(tensors, frames, face), camera, sh_degree=1)
-    loss = sum(
-        (image * v).sum()
-        for image, v in zip(expected_images, random_cotangents(camera), strict=True)
-    )
-    expected = torch.autograd.grad(loss, tensors)
+    given = scene, random_cotangents(camera), face_frames(posed * size, faces, neutral), face
+    images, gradients = kernel_gradients(*given)
+    expected_images, expected = reference_gradients(*given)
     assert images[1].max() > 0.5
     for image, want in zip(images, expected_images, strict=True):
-        np.testing.assert_allclose(
-            image, want.detach(), atol=5e-6 * max(1, float(want.detach().max()))
-        )
-    for name, want in zip(NAMES, expected, strict=True):
-        np.testing.assert_allclose(
-            gradients[name], want, atol=2e-5 * float(want.abs().max()), err_msg=name
-        )
+        np.testing.assert_allclose(image, want, atol=5e-6 * max(1, want.max()))
+    for name, want in expected.items():
+        largest = np.abs(want).max()
+        np.testing.assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)

@@ -41,7 +41,8 @@ def render_differentiable(
 
 
 @cache
-def _rasterizer() -> Rasterizer:
+def shared_rasterizer() -> Rasterizer:
+    """One for all tests, whose kernels stay compiled."""
     return Rasterizer(Device())
 
 
@@ -56,29 +57,24 @@ class _Blend(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         ctx.saved = options, camera_frames, face, splats
-        image, transmittance, _ = _render(options, camera_frames, face, splats, None)
+        image, transmittance, _ = render(options, camera_frames, face, splats)
         return torch.from_numpy(image), torch.from_numpy(transmittance)
 
     @staticmethod
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
         cotangents = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
         options, camera_frames, face, splats = ctx.saved
-        _, _, gradients = _render(options, camera_frames, face, splats, cotangents)
-        given = [gradient for gradient in gradients if gradient is not None]
-        return (
-            None,
-            None,
-            None,
-            *(torch.from_numpy(g) for g in given[: len(ctx.needs_input_grad) - 3]),
-        )
+        _, _, gradients = render(options, camera_frames, face, splats, cotangents)
+        given = [torch.from_numpy(gradient) for gradient in gradients]
+        return None, None, None, *given[: len(ctx.needs_input_grad) - 3]
 
 
-def _render(
+def render(
     options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, splats: Parameters,
-    cotangents: tuple[np.ndarray, np.ndarray] | None,
+    cotangents: tuple[np.ndarray, np.ndarray] | None = None, rasterizer: Rasterizer | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Parameters]:  # fmt: skip
     """Image and transmittance, and the gradients where there are cotangents of these two."""
-    rasterizer = _rasterizer()
+    rasterizer = rasterizer or shared_rasterizer()
     device, (height, width) = rasterizer.device, (options.camera.height, options.camera.width)
     while True:
         table, frames = upload_splats(device, splats, face), upload_frames(device, camera_frames)

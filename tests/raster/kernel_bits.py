@@ -1,4 +1,4 @@
-"""Hashes of a forward and a backward pass of the CPU's kernels; run by test_cache.py in processes
+"""Hashes of a forward and a backward pass of the CPU's kernels; run by test_bundled.py in processes
 of its own."""
 
 import hashlib

@@ -46,12 +46,9 @@ MASKED_X86 = r"\svp?maskmov|\sv\w*(gather|scatter)|\sv\w*mov\w*\s.*\(.*\{%k"
 AVX2 = Processor(X86, "%ymm", PACKED_X86, SCALAR_X86, MASKED_X86)
 AVX512 = Processor(X86, "%zmm", PACKED_X86, SCALAR_X86, MASKED_X86)
 NEON = Processor(
-    ARM,
-    r"\.4s",
-    r"\sf\w+\s+v.*\.4s",
-    r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d",
+    ARM, r"\.4s", r"\sf\w+\s+v.*\.4s", r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d",
     r"\s(ld|st)\d\s",
-)
+)  # fmt: skip
 PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m1": NEON}
 """LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
 
@@ -69,12 +66,7 @@ def unoptimized_ir(function: Callable, signature: object, monkeypatch: pytest.Mo
     )(python)
     ir = next(iter(compiled.inspect_llvm().values()))
     # Reference counting is in the form for this processor where this process has used it before.
-    return re.sub(
-        r"^define linkonce_odr (\w+ @NRT_\w+)\(.*?^\}",
-        r"declare \1(ptr)",
-        ir,
-        flags=re.MULTILINE | re.DOTALL,
-    )
+    return re.sub(r"(?ms)^define linkonce_odr (\w+ @NRT_\w+)\(.*?^\}", r"declare \1(ptr)", ir)
 
 
 def assemblies(ir: str) -> dict[str, str]:
@@ -127,11 +119,8 @@ def faults(text: str, cpu: str, loops: int, spills: int) -> str:
                 return f"{cpu}: scalar arithmetic in a vectorized loop\n" + "\n".join(loop)
             if (found := count("Spill|Reload", loop)) > spills:
                 return f"{cpu}: {found} values in memory for want of registers\n" + "\n".join(loop)
-    return (
-        ""
-        if len(full) >= loops
-        else f"{cpu}: {len(full)} of {loops} loops are vectorized at full width"
-    )
+    wrong = f"{cpu}: {len(full)} of {loops} loops are vectorized at full width"
+    return "" if len(full) >= loops else wrong
 
 
 STATE = "f4[::1]"
@@ -155,9 +144,7 @@ LOOPS = {
     "SSIM": (image_loss._similarity_row, f"void({STATE}, i8, i8, {STATE}, {STATE})", 1, 8),
     "gradient of the loss": (
         image_loss._gradient_row,
-        f"void({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE}, {STATE})",
-        1,
-        4,
+        f"void({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE}, {STATE})", 1, 4,
     ),
     "Adam": (optimizer._adam_block, ADAM, 2, 1),
     "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 80),
@@ -165,17 +152,12 @@ LOOPS = {
     "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),
     "gradient of the projection": (
         splat_block.differentiate_geometry,
-        f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)",
-        1,
-        230,
+        f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)", 1, 230,
     ),
     "gradient of the harmonics": (
-        splat_block.differentiate_position,
-        f"void({STATE}, f4[:, ::1])",
-        1,
-        52,
+        splat_block.differentiate_position, f"void({STATE}, f4[:, ::1])", 1, 52,
     ),
-}
+}  # fmt: skip
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 
 
@@ -189,41 +171,14 @@ def test_inner_loops_are_vectorized_on_every_processor(name, monkeypatch):
     assert not found, f"{name}\n" + "\n".join(found)
 
 
-def test_the_image_loss_needs_the_arithmetic_that_its_floor_is_made_of(monkeypatch):
-    """Catches a floor of `benchmarks/iteration.py` that the kernel could not reach, or a kernel
-    that computes more."""
-    benchmark = Path(__file__).resolve().parents[2] / "benchmarks" / "iteration.py"
-    terms = re.search(
-        r"LOSS_OPERATIONS = 3 \* \(14 \* (\d+) \+ (\d+) \+ (\d+)\)", benchmark.read_text("utf-8")
-    )
-    blur, similarity, rest = (int(term) for term in terms.groups())
-    found, store = {}, r"\svmovups\s+%ymm\d+, [-\d]*\(%r"
-    for name in ("horizontal blur", "vertical blur", "SSIM", "gradient of the loss"):
-        function, signature, _, _ = LOOPS[name]
-        loops = inner_loops(assemblies(unoptimized_ir(function, signature, monkeypatch))["znver3"])
-        found[name] = max(
-            count(AVX2.packed, loop) / count(store, loop) for loop in loops if count(store, loop)
-        )
-    assert found["horizontal blur"] == found["vertical blur"] == blur
-    assert 4 * found["SSIM"] == similarity  # it stores four values
-    # It stores two values. And their sum, x² + y², x·y and the scale of the target.
-    assert 2 * found["gradient of the loss"] + 5 == rest
-
-
 def with_conditional_store(s, order, limit):
     for p in range(np.uint64(256)):
         t = s[p] * order
         s[p + np.uint64(256)] = order if t > limit else s[p + np.uint64(256)]
 
 
-def with_call(s, order, limit):
-    for p in range(np.uint64(256)):
-        s[p] = np.exp(s[p] * order)
-
-
-@pytest.mark.parametrize("function", [with_conditional_store, with_call])
-def test_the_check_finds_what_it_looks_for(function, monkeypatch):
-    """Catches a check that passes whatever the assembly holds: these loops had the faults that it
-    is there for."""
-    compiled = assemblies(unoptimized_ir(function, f"void({STATE}, f4, f4)", monkeypatch))
+def test_the_check_finds_what_it_looks_for(monkeypatch):
+    """Catches a check that passes whatever the assembly holds."""
+    signature = f"void({STATE}, f4, f4)"
+    compiled = assemblies(unoptimized_ir(with_conditional_store, signature, monkeypatch))
     assert all(faults(compiled[cpu], cpu, 1, 0) for cpu in ("znver3", "apple-m1"))

@@ -72,23 +72,16 @@ def test_reference_image_is_gsplats(antialiased: bool) -> None:
 
 def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
     """(N, PROJECTED) of the scene, by the kernels of one back end."""
+    parameters, face = Parameters(*(DATA[name] for name in NAMES)), np.zeros(24, np.int32)
+    frames = frames_in_camera(WORLD, CAMERA)
     if back_end == "cpu":
-        parameters, face = Parameters(*(DATA[name] for name in NAMES)), np.zeros(24, np.int32)
-        output = render_forward(
-            parameters, face, frames_in_camera(WORLD, CAMERA), 3, antialiased=antialiased
-        )
-        return output.projection.columns
-    from .test_gpu_rasterize import Raw
+        return render_forward(parameters, face, frames, 3, antialiased=antialiased).projection[0]
+    from raster.gpu_autograd import render, shared_rasterizer
+    from stga_addon.raster.gpu.rasterize import ViewOptions
 
-    raw = Raw(scene(), antialiased=antialiased)
-    raw.forward()
-    return raw.read(raw.device.buffer("projected", 0), 24, PROJECTED)
-
-
-def scene():
-    from .test_kernels import Scene
-
-    return Scene({name: DATA[name] for name in NAMES}, CAMERA)
+    render(ViewOptions(CAMERA, 3, antialiased=antialiased), frames, face, parameters)
+    device = shared_rasterizer().device
+    return device.read(device.buffer("projected", 0), (24, PROJECTED))
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from raster import reference
-from stga_addon.avatar.embedding import WORLD, face_frames
+from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
@@ -30,6 +30,7 @@ DEPTH_TOLERANCE = 4e-5
 # Color is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the
 # inverse 2D covariance, whose float32 conditioning worsens with the splats' anisotropy.
 GRADIENT_TOLERANCE = {"sh": 1e-5, "opacity": 2e-5, "xyz": 2e-5, "rotation": 2e-5, "log_scale": 5e-5}
+GRADIENT_TOLERANCE["strain_color"] = 2e-5
 
 
 @dataclass(frozen=True)
@@ -72,15 +73,8 @@ def cloud(
         "opacity": rng.normal(size=count) * 1.5 + logit,
         "sh": rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4,
     }
-    camera = Camera(
-        width,
-        height,
-        focal,
-        focal * 1.1,
-        width / 2 + shift[0],
-        height / 2 + shift[1],
-        random_pose(rng),
-    )
+    center = width / 2 + shift[0], height / 2 + shift[1]
+    camera = Camera(width, height, focal, focal * 1.1, *center, random_pose(rng))
     return Scene({name: value.astype(np.float32) for name, value in splats.items()}, camera, degree)
 
 
@@ -112,30 +106,49 @@ SCENES = {
 }
 
 
+Images = list[np.ndarray]
+Gradients = dict[str, np.ndarray]
+
+
 def reference_gradients(
-    scene: Scene, cotangents: list[torch.Tensor]
-) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
-    images = reference.render(*tensors, scene.camera, sh_degree=scene.degree)
+    scene: Scene, cotangents: list[torch.Tensor], frames: FaceFrames | None = None,
+    face: np.ndarray | None = None, antialiased: bool = False, near: float = reference.NEAR_M,
+) -> tuple[Images, Gradients]:  # fmt: skip
+    """Images and gradients of the float64 reference for the very numbers that the kernels get; of
+    world-space splats, or in the frames of the triangles face (N,)."""
+    tensors = {n: torch.from_numpy(a).double().requires_grad_() for n, a in scene.splats.items()}
+    placed = [tensors[name] for name in NAMES]
+    if frames is not None:
+        placed[:3] = reference.embed(*placed[:3], frames, torch.from_numpy(face).long())
+    if "strain_color" in tensors:
+        strain = torch.from_numpy(frames.strain[face]).double()
+        shift = torch.einsum("ns,nsc->nc", strain, tensors["strain_color"]) / SH_C0
+        placed[4] = placed[4] + torch.nn.functional.pad(
+            shift[:, None], (0, 0, 0, placed[4].shape[1] - 1)
+        )
+    images = reference.render(*placed, scene.camera, scene.degree, near, antialiased)
     return finish(images, cotangents, tensors)
 
 
 def kernel_gradients(
-    scene: Scene, cotangents: list[torch.Tensor]
-) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
-    tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
-    images = render_differentiable(Parameters(*tensors), scene.camera, degree=scene.degree)
+    scene: Scene, cotangents: list[torch.Tensor], frames: FaceFrames = WORLD,
+    face: np.ndarray | None = None, antialiased: bool = False,
+) -> tuple[Images, Gradients]:  # fmt: skip
+    """The same of the kernels."""
+    tensors = {n: torch.from_numpy(a).clone().requires_grad_() for n, a in scene.splats.items()}
+    images = render_differentiable(
+        Parameters(**tensors), scene.camera, frames, face, scene.degree, antialiased
+    )
     return finish(images, cotangents, tensors)
 
 
-def finish(images, cotangents, tensors) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+def finish(images, cotangents, tensors) -> tuple[Images, Gradients]:
     loss = sum(
         (image * v.to(image.dtype)).sum() for image, v in zip(images, cotangents, strict=True)
     )
-    gradients = torch.autograd.grad(loss, tensors)
-    return [image.detach().numpy() for image in images], dict(
-        zip(NAMES, (g.numpy() for g in gradients), strict=True)
-    )
+    gradients = torch.autograd.grad(loss, list(tensors.values()))
+    found = dict(zip(tensors, (g.numpy() for g in gradients), strict=True))
+    return [image.detach().numpy() for image in images], found
 
 
 def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
@@ -147,18 +160,13 @@ def random_cotangents(camera: Camera, seed: int = 0) -> list[torch.Tensor]:
     ]
 
 
-def assert_images_agree(images: list[np.ndarray], expected: list[np.ndarray]) -> None:
-    tolerances = (IMAGE_TOLERANCE, IMAGE_TOLERANCE, DEPTH_TOLERANCE)
-    for name, image, want, tolerance in zip(
-        ("rgb", "alpha", "depth"), images, expected, tolerances, strict=True
-    ):
-        assert image.shape == want.shape, name
-        assert np.abs(image - want).max() < tolerance, f"{name}: {np.abs(image - want).max():.2e}"
+def assert_images_agree(images: Images, expected: Images) -> None:
+    tolerances = {"rgb": IMAGE_TOLERANCE, "alpha": IMAGE_TOLERANCE, "depth": DEPTH_TOLERANCE}
+    for (name, tolerance), image, want in zip(tolerances.items(), images, expected, strict=True):
+        np.testing.assert_allclose(image, want, rtol=0, atol=tolerance, err_msg=name)
 
 
-def assert_gradients_agree(
-    gradients: dict[str, np.ndarray], expected: dict[str, np.ndarray]
-) -> None:
+def assert_gradients_agree(gradients: Gradients, expected: Gradients) -> None:
     for name, want in expected.items():
         largest = np.abs(want).max()
         error = np.abs(gradients[name] - want).max() / max(largest, 1e-6)
@@ -178,33 +186,20 @@ def test_image_and_gradients_are_the_references(back_end, name):
     assert_gradients_agree(gradients, expected_gradients)
 
 
-def embed(local: list[torch.Tensor], frames, face: np.ndarray) -> list[torch.Tensor]:
-    """World-space splats in torch, so that autograd carries the reference's gradient to the local
-    parameters."""
-    return [*reference.embed(*local[:3], frames, torch.from_numpy(face).long()), *local[3:]]
-
-
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on
     triangles."""
-    scene = SCENES["plain"]
-    rng = np.random.default_rng(30)
+    scene, rng = cloud(1), np.random.default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
     frames = face_frames(vertices, faces, neutral, convention)
     face = rng.integers(0, len(faces), len(scene.splats["xyz"])).astype(np.int32)
     scene.splats["xyz"] *= 0.3
-    cotangents = random_cotangents(scene.camera, 2)
-
-    tensors = [torch.from_numpy(scene.splats[name]).clone().requires_grad_() for name in NAMES]
-    images, gradients = finish(
-        render_differentiable(Parameters(*tensors), scene.camera, frames, face), cotangents, tensors
-    )
-    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
-    expected_images = reference.render(*embed(tensors, frames, face), scene.camera)
-    expected_images, expected = finish(expected_images, cotangents, tensors)
+    given = scene, random_cotangents(scene.camera, 2), frames, face
+    images, gradients = kernel_gradients(*given)
+    expected_images, expected = reference_gradients(*given)
     assert_images_agree(images, expected_images)
     assert_gradients_agree(gradients, expected)
 
@@ -233,16 +228,14 @@ def test_background_shows_through_and_pulls_on_the_splats():
     """Catches a background left out of the image, of its gradient, or counted twice."""
     scene, background = SCENES["plain"], np.float32([0.9, 0.2, 0.6])
     rendering, gradients, _, _ = raw_gradients(scene, background=background)
-    tensors = [torch.from_numpy(scene.splats[name]).double().requires_grad_() for name in NAMES]
-    rgb, alpha, _ = reference.render(*tensors, scene.camera)
-    image = rgb + torch.from_numpy(background)[:, None, None] * (1 - alpha)
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
-    expected = torch.autograd.grad((image * v_image).sum() + (alpha * v_alpha).sum(), tensors)
-    assert np.abs(rendering.image - image.detach().numpy()).max() < IMAGE_TOLERANCE
-    assert np.abs(1 - rendering.transmittance - alpha.detach().numpy()).max() < IMAGE_TOLERANCE
-    assert_gradients_agree(
-        gradients._asdict(), dict(zip(NAMES, (g.numpy() for g in expected), strict=True))
-    )
+    behind = torch.from_numpy(background)[:, None, None]
+    cotangents = [v_image, v_alpha - (behind * v_image).sum(0), 0 * v_alpha]
+    (rgb, alpha, _), expected = reference_gradients(scene, cotangents)
+    image = rgb + background[:, None, None] * (1 - alpha)
+    assert np.abs(rendering.image - image).max() < IMAGE_TOLERANCE
+    assert np.abs(1 - rendering.transmittance - alpha).max() < IMAGE_TOLERANCE
+    assert_gradients_agree(gradients._asdict(), expected)
 
 
 def test_screen_gradient_is_that_of_the_projected_center():
@@ -279,37 +272,17 @@ def test_color_follows_strain_with_the_right_gradient(back_end):
     scene, rng = SCENES["dark"], np.random.default_rng(31)
     count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
     faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
-    basis = strain_basis(neutral, faces)
-    frames = face_frames(
-        neutral + 0.1 * rng.normal(size=neutral.shape), faces, neutral, strain=basis
-    )
+    posed = neutral + 0.1 * rng.normal(size=neutral.shape)
+    frames = face_frames(posed, faces, neutral, strain=strain_basis(neutral, faces))
     face = rng.integers(0, len(faces), count).astype(np.int32)
-    color = rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)
+    color = {"strain_color": rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)}
     assert len(np.unique(frames.strain[face], axis=0)) > 5
-    cotangents = random_cotangents(scene.camera, 5)
-
-    tensors = [
-        torch.from_numpy(a).clone().requires_grad_() for a in (*map(scene.splats.get, NAMES), color)
-    ]
-    images = render_differentiable(Parameters(*tensors), scene.camera, frames, face)
-    loss = sum((image * v.float()).sum() for image, v in zip(images, cotangents, strict=True))
-    gradient = torch.autograd.grad(loss, tensors)[-1].numpy()
-    local = [torch.from_numpy(scene.splats[name]).double() for name in NAMES]
-    coefficients = torch.from_numpy(color).double().requires_grad_()
-    placed = embed(local, frames, face)
-    shift = (
-        torch.einsum("ns,nsc->nc", torch.from_numpy(frames.strain[face]).double(), coefficients)
-        / SH_C0
-    )
-    sh = placed[4].clone()
-    sh[:, 0] += shift
-    expected_images = reference.render(*placed[:4], sh, scene.camera)
-    loss = sum((image * v).sum() for image, v in zip(expected_images, cotangents, strict=True))
-    expected = torch.autograd.grad(loss, coefficients)[0].numpy()
-    assert_images_agree(
-        [i.detach().numpy() for i in images], [i.detach().numpy() for i in expected_images]
-    )
-    assert np.abs(gradient - expected).max() < 2 * GRADIENT_TOLERANCE["sh"] * np.abs(expected).max()
+    scene = replace(scene, splats=scene.splats | color)
+    given = scene, random_cotangents(scene.camera, 5), frames, face
+    images, gradients = kernel_gradients(*given)
+    expected_images, expected = reference_gradients(*given)
+    assert_images_agree(images, expected_images)
+    assert_gradients_agree(gradients, {name: expected[name] for name in color})
 
 
 @pytest.mark.parametrize(
@@ -318,18 +291,9 @@ def test_color_follows_strain_with_the_right_gradient(back_end):
 def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
     """Catches a compensation of the wrong determinant, and gradients that leave it out: scale,
     rotation, position."""
-    scene = SCENES[name]
-    cotangents = random_cotangents(scene.camera, 6)
-    tensors = [torch.from_numpy(scene.splats[n]).clone().requires_grad_() for n in NAMES]
-    images = render_differentiable(
-        Parameters(*tensors), scene.camera, degree=scene.degree, antialiased=True
-    )
-    images, gradients = finish(images, cotangents, tensors)
-    tensors = [torch.from_numpy(scene.splats[n]).double().requires_grad_() for n in NAMES]
-    expected_images = reference.render(
-        *tensors, scene.camera, sh_degree=scene.degree, antialiased=True
-    )
-    expected_images, expected = finish(expected_images, cotangents, tensors)
+    scene, cotangents = SCENES[name], random_cotangents(SCENES[name].camera, 6)
+    images, gradients = kernel_gradients(scene, cotangents, antialiased=True)
+    expected_images, expected = reference_gradients(scene, cotangents, antialiased=True)
     plain, _ = kernel_gradients(scene, cotangents)
     assert np.abs(plain[1] - images[1]).max() > 0.01, "antialiasing changes nothing"
     assert_images_agree(images, expected_images)
@@ -338,8 +302,9 @@ def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
 
 @pytest.mark.parametrize("count", [80, 900])
 def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
-    """Catches a local iteration whose restricted tiles change the gradient of a selected splat, and
-    frozen splats in front of it or behind that are left out where it reaches."""
+    """Catches a local iteration whose restricted tiles change the gradient of a selected splat,
+    frozen splats in front of it or behind that are left out where it reaches, and a backward pass
+    that touches, or zeroes, the gradient rows of frozen splats."""
     scene = cloud(21, count=count, size=(100, 70), log_scale=-3.0)
     xyz = scene.splats["xyz"]
     focus = (
@@ -347,26 +312,16 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
         if count == 80
         else np.linalg.norm(xyz - xyz[3], axis=1) < 0.3
     )
-    full, expected, _, _ = raw_gradients(scene)
-    part, gradients, rows, _ = raw_gradients(scene, focus=focus, reach=10)
+    full, expected, _, _ = raw_gradients(scene, fill=123.0)
+    part, gradients, rows, _ = raw_gradients(scene, fill=123.0, focus=focus, reach=10)
     assert 0 < len(part.tiles) < len(full.tiles)
-    assert len(rows)
+    assert 0 < len(rows) <= focus.sum()
     assert focus[rows].all()
     for name in NAMES:
-        np.testing.assert_array_equal(
-            getattr(gradients, name)[focus], getattr(expected, name)[focus], err_msg=name
-        )
-
-
-def test_rows_out_of_focus_are_not_written():
-    """Catches a backward pass that touches, or zeroes, the gradient rows of frozen splats."""
-    scene = cloud(21, count=80, size=(100, 70), log_scale=-3.0)
-    focus = np.arange(80) % 7 == 0
-    _, gradients, rows, _ = raw_gradients(scene, fill=123.0, focus=focus)
-    assert 0 < len(rows) <= focus.sum()
-    for name in NAMES:
-        assert (getattr(gradients, name)[~focus] == 123).all(), name
-        assert (getattr(gradients, name)[rows] != 123).any(), name
+        found, want = getattr(gradients, name), getattr(expected, name)
+        np.testing.assert_array_equal(found[focus], want[focus], err_msg=name)
+        assert (found[~focus] == 123).all(), name
+        assert (found[rows] != 123).any(), name
 
 
 def test_results_do_not_depend_on_threads():
@@ -386,21 +341,15 @@ def test_results_do_not_depend_on_threads():
             np.testing.assert_array_equal(gradients[name], single[1][name], err_msg=name)
 
 
-@pytest.mark.parametrize(("count", "behind"), [(0, False), (5, True)])
-def test_nothing_in_view_is_black_and_has_no_gradient(back_end, count, behind):
-    """Catches empty pair lists, and splats mirrored through the camera."""
-    scene = cloud(22, count=count, spread=0.2)
-    if behind:
+@pytest.mark.parametrize("case", ["no splats", "behind the camera", "below 1/255"])
+def test_nothing_in_view_is_black_and_has_no_gradient(back_end, case):
+    """Catches empty pair lists, splats mirrored through the camera, and a cut that differs from the
+    reference's where the whole splat lies under it."""
+    scene = cloud(22, count=0 if case == "no splats" else 60, spread=0.2)
+    if case == "behind the camera":
         scene.camera.world_to_camera[2, 3] = -4
-    images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
-    for array in (*images, *gradients.values()):
-        assert not array.any()
-
-
-def test_splats_below_one_255th_are_invisible(back_end):
-    """Catches a cut that differs from the reference's where the whole splat lies under it."""
-    scene = cloud(23)
-    scene.splats["opacity"][:] = np.log(0.0039 / (1 - 0.0039))
+    if case == "below 1/255":
+        scene.splats["opacity"][:] = np.log(0.0039 / (1 - 0.0039))
     images, gradients = kernel_gradients(scene, random_cotangents(scene.camera))
     for array in (*images, *gradients.values()):
         assert not array.any()

@@ -16,7 +16,7 @@ from stga_addon.errors import StgaError
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.render import client as render_client
-from stga_addon.render.client import RenderClient, pack_layers, receive, unpack_layers
+from stga_addon.render.client import RenderClient, receive
 from stga_addon.render.render import render
 
 HERE = np.eye(4)
@@ -96,18 +96,6 @@ def test_depth_is_the_mean_of_what_a_pixel_shows():
     assert depth is not None
     np.testing.assert_allclose(depth[depth > 0], 3, rtol=1e-5)
     assert compose([], CAMERA, True).alpha.max() == 0
-
-
-def test_layers_survive_the_protocol():
-    """Catches a field that is not sent to the server."""
-    layers = [embedded(), world(cloud())]
-    for layer, back in zip(layers, unpack_layers(pack_layers(layers)), strict=True):
-        for name, value in vars(layer.splats).items():
-            np.testing.assert_array_equal(getattr(back.splats, name), value)
-        for name in ("origin", "rotation", "scale", "strain"):
-            np.testing.assert_array_equal(getattr(back.frames, name), getattr(layer.frames, name))
-        assert back.antialiased == layer.antialiased
-        np.testing.assert_array_equal(back.to_world, layer.to_world)
 
 
 @pytest.mark.slow

@@ -19,6 +19,8 @@ from stga_addon.render.client import pack_layers, unpack_layers
 from stga_addon.render.video import Recorder, finished
 from stga_addon.worker.status import inspect_worker, request_cancel
 
+from .test_client import embedded
+
 IMAGES = "recording.bin"
 CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
 
@@ -54,18 +56,19 @@ def moved(x: float) -> np.ndarray:
 
 
 def test_layers_without_what_the_reader_has() -> None:
-    """Catches splats that are sent again with each image, and others that are taken for those sent
-    before."""
+    """Catches splats that are sent again with each image, others that are taken for those sent
+    before, and a field that is not sent."""
     before = [layer(0), layer(1)]
-    after = [replace(layer(0), to_world=moved(1)), layer(2), layer(3)]
+    after = [replace(layer(0), to_world=moved(1)), layer(2), embedded()]
     packed = pack_layers(after, before)
     assert "0 splats xyz" not in packed
     assert {"1 splats xyz", "2 splats xyz"} <= set(packed)
-    read = unpack_layers(packed, before)
-    assert len(read) == 3
-    for given, again in zip(after, read, strict=True):
-        np.testing.assert_array_equal(again.splats.xyz, given.splats.xyz)
+    for given, again in zip(after, unpack_layers(packed, before), strict=True):
+        for one, other in ((given.splats, again.splats), (given.frames, again.frames)):
+            for name, value in vars(one).items():
+                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
         np.testing.assert_array_equal(again.to_world, given.to_world)
+        assert again.antialiased == given.antialiased
 
 
 def test_images_are_those_recorded(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 pytest.importorskip("numba")
 
 from stga_addon.avatar.splats import SH_C0, Splats
-from stga_addon.capture.camera import look_at
+from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.ply import write_ply
 from stga_addon.render import render as render_module
 from stga_addon.render.render import render
@@ -52,20 +52,12 @@ def test_look_at_gives_the_pose_worked_out_by_hand() -> None:
     From (3, 2, 0) towards (1, 2, 0) with +y up: forward is -x, right is -z, down is -y.
     """
     camera = look_at((3, 2, 0), (1, 2, 0), width=40, height=30, focal_length=50)
-    np.testing.assert_allclose(
-        camera.world_to_camera,
-        [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]],
-        atol=1e-15,
-    )
+    pose = [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-15)
     np.testing.assert_allclose(camera.position, [3, 2, 0], atol=1e-15)
-    assert (camera.width, camera.height, camera.fl_x, camera.fl_y, camera.cx, camera.cy) == (
-        40,
-        30,
-        50,
-        50,
-        20,
-        15,
-    )
+    assert vars(camera) | {"world_to_camera": None} == vars(
+        Camera(40, 30, 50, 50, 20, 15, None)
+    )  # fmt: skip
     with pytest.raises(ValueError, match="parallel to up"):
         look_at((0, 1, 0), (0, 0, 0), 40, 30, 50)
 

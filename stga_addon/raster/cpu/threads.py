@@ -12,6 +12,7 @@ from functools import wraps
 from typing import Any
 
 import numpy as np
+from numba import njit
 
 from . import jit
 from .elementary import fetch_add
@@ -76,7 +77,7 @@ def _run(kernel: Any, units: int, piece: int, arguments: tuple[Any, ...]) -> Non
             raise error
 
 
-@jit
+@njit  # not cached, because Numba cannot compile a call of a generator that is
 def pieces(work):
     """First and past-the-last unit of each piece that no other thread takes."""
     begin = fetch_add(work, 0, work[PIECE])
