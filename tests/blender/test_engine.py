@@ -21,7 +21,7 @@ from stga_addon.light.harmonics import uniform  # noqa: E402
 from stga_addon.light.relight import Relighter  # noqa: E402
 from stga_addon.light.surface import transfer_of  # noqa: E402
 from stga_addon.light.values import Light, Lighting  # noqa: E402
-from stga_addon.raster.cpu.harmonics import basis as harmonics  # noqa: E402
+from stga_addon.raster.cpu.splat_block import basis as harmonics  # noqa: E402
 from stga_addon.render.render import render as render_splats  # noqa: E402
 from stga_addon.render.render import render_avatar  # noqa: E402
 from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402

@@ -184,7 +184,7 @@ def test_constant_colors_are_scene_linear():
 def test_colors_follow_the_active_camera(degree):
     """Catches harmonics of another order, sign or space, and colors that stay while the camera
     moves."""
-    harmonics = pytest.importorskip("stga_addon.raster.cpu.harmonics")
+    harmonics = pytest.importorskip("stga_addon.raster.cpu.splat_block")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))

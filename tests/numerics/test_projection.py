@@ -100,13 +100,6 @@ SCENES = {
         )
     ),
 }
-for width, height in ((1, 1), (1, 40), (40, 1), (17, 33)):
-    SCENES[f"{width} x {height} px"] = facing(
-        60,
-        size=(width, height),
-        log_scale=RNG.uniform(-12, 3, (60, 3)),
-        opacity=RNG.normal(-1, 1, 60),
-    )
 
 
 @pytest.mark.parametrize("name", SCENES)

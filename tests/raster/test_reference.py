@@ -37,14 +37,6 @@ def test_pixel_ends_before_the_splat_that_would_close_it():
     assert depth.item() == pytest.approx(0.999 * 2 + 0.001 * 0.8 * 3, abs=1e-6)
 
 
-def test_splats_nearer_than_near_are_dropped():
-    """Catches splats behind the camera that mirror into the image."""
-    splats = stacked(one_splat(-1.0, 3.0, -1.0), one_splat(0.005, 3.0, -1.0))
-    rgb, alpha, depth = reference.render(*splats, camera_on_axis(5, 4, 5.0), sh_degree=0)
-    for image in (rgb, alpha, depth):
-        assert not image.any()
-
-
 def test_centered_frustum_limit_is_1_3_half_fields_of_view():
     """Catches a limit that is not symmetric on a centered camera, or ignores an off-center
     principal point."""

@@ -14,27 +14,16 @@ for either, so LLVM would emit masked stores or no vectors at all. Both sides of
 computed, and every pixel is stored.
 """
 
+import math
+
 import numpy as np
 
-from . import inline_jit, part_jit
+from . import inline_jit, layout, part_jit
 from .elementary import prefetch
-from .layout import (
-    BLUE,
-    GREEN,
-    MEAN_X,
-    MEAN_Y,
-    OPACITY,
-    PIXELS,
-    PRECISION_X,
-    PRECISION_Y,
-    PROJECTED,
-    RED,
-    SHEAR,
-    TILE,
-)  # fmt: skip
-from .outline import outline, rows_within
+from .layout import PIXELS, PROJECTED, TILE
 from .threads import parallel, pieces
 
+ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 MAX_ALPHA = np.float32(0.999)
 MIN_ALPHA = np.float32(1 / 255)
 MIN_TRANSMITTANCE = np.float32(1e-4)
@@ -110,16 +99,55 @@ def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
     corner (x0, y0)."""
     for q in range(np.uint64(count)):
         i = np.uint64(pair_splat[np.uint64(first) + q])
-        batch[AT_MEAN_X + q] = projected[i, MEAN_X] - x0
-        batch[AT_MEAN_Y + q] = projected[i, MEAN_Y] - y0
-        batch[AT_PRECISION_X + q] = projected[i, PRECISION_X]
-        batch[AT_SHEAR + q] = projected[i, SHEAR]
-        batch[AT_PRECISION_Y + q] = projected[i, PRECISION_Y]
-        batch[AT_OPACITY + q] = projected[i, OPACITY]
-        batch[AT_RED + q], batch[AT_GREEN + q] = projected[i, RED], projected[i, GREEN]
-        batch[AT_BLUE + q] = projected[i, BLUE]
-        batch[AT_RATE_X + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_X]
-        batch[AT_RATE_Y + q] = np.float32(-0.5) * LOG2E * projected[i, PRECISION_Y]
+        batch[AT_MEAN_X + q] = projected[i, layout.MEAN_X] - x0
+        batch[AT_MEAN_Y + q] = projected[i, layout.MEAN_Y] - y0
+        batch[AT_PRECISION_X + q] = projected[i, layout.PRECISION_X]
+        batch[AT_SHEAR + q] = projected[i, layout.SHEAR]
+        batch[AT_PRECISION_Y + q] = projected[i, layout.PRECISION_Y]
+        batch[AT_OPACITY + q] = projected[i, layout.OPACITY]
+        batch[AT_RED + q] = projected[i, layout.RED]
+        batch[AT_GREEN + q] = projected[i, layout.GREEN]
+        batch[AT_BLUE + q] = projected[i, layout.BLUE]
+        batch[AT_RATE_X + q] = np.float32(-0.5) * LOG2E * projected[i, layout.PRECISION_X]
+        batch[AT_RATE_Y + q] = np.float32(-0.5) * LOG2E * projected[i, layout.PRECISION_Y]
+
+
+@part_jit
+def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
+    """Coefficients of a projected splat's outline for `rows_within`; the arguments are its columns
+    (see `layout.py`).
+
+    On its outline the squares that make the exponent add up to precision_y·extent_y².
+    """
+    shrink = ONE / (precision_x * shear * shear + precision_y)
+    chord = precision_y * extent_y * extent_y * shrink
+    # Slack, so that rounding (of differences of squares above all) does not lose a pixel.
+    slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * extent_y
+    lean, rate = shear * extent_y, precision_x * shear * shrink
+    cut = precision_x * precision_y * shrink * shrink
+    return mean_x - HALF, mean_y - HALF, extent_y, lean, rate, chord, cut, slack
+
+
+@part_jit
+def rows_within(outline, left, width, rows):
+    """First and past-the-last of rows 0 to `rows` in which a pixel of the `width` columns from
+    `left` on has its center in an outline; the first is not before the other where there are none.
+    All float32.
+
+    Between the outermost centers the ellipse is highest where it is highest altogether, or else at
+    the nearer edge, and likewise lowest.
+    """
+    mean_x, mean_y, extent_y, lean, rate, chord, cut, slack = outline
+    low = left - mean_x
+    high = low + width - ONE
+    nearest = min(max(ZERO, low), high)
+    top, bottom = min(max(-lean, low), high), min(max(lean, low), high)
+    up = rate * top - math.sqrt(max(ZERO, chord - cut * top * top)) - slack
+    down = rate * bottom + math.sqrt(max(ZERO, chord - cut * bottom * bottom)) + slack
+    first = np.ceil(max(ZERO, mean_y + max(up, -extent_y)))
+    past = np.floor(min(rows - ONE, mean_y + min(down, extent_y))) + ONE
+    reached = cut * nearest * nearest <= np.float32(1.00001) * chord
+    return min(first, rows) if reached else rows, max(past, ZERO) if reached else ZERO
 
 
 @part_jit
@@ -403,13 +431,13 @@ def _store_pair(grads, j, q, batch, sums):
     """Write the gradient of pair j, splat q of a batch, from the sums of `_sum_gradient`."""
     precision_x, precision_y = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q]
     shear = batch[AT_SHEAR + q]
-    grads[j, MEAN_X] = precision_x * sums[1]
-    grads[j, MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
-    grads[j, PRECISION_X] = np.float32(-0.5) * sums[3]
-    grads[j, SHEAR] = precision_x * sums[4]
-    grads[j, PRECISION_Y] = np.float32(-0.5) * sums[5]
-    grads[j, OPACITY] = sums[0] / batch[AT_OPACITY + q]
-    grads[j, RED], grads[j, GREEN], grads[j, BLUE] = sums[6], sums[7], sums[8]
+    grads[j, layout.MEAN_X] = precision_x * sums[1]
+    grads[j, layout.MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
+    grads[j, layout.PRECISION_X] = np.float32(-0.5) * sums[3]
+    grads[j, layout.SHEAR] = precision_x * sums[4]
+    grads[j, layout.PRECISION_Y] = np.float32(-0.5) * sums[5]
+    grads[j, layout.OPACITY] = sums[0] / batch[AT_OPACITY + q]
+    grads[j, layout.RED], grads[j, layout.GREEN], grads[j, layout.BLUE] = sums[6], sums[7], sums[8]
 
 
 @part_jit

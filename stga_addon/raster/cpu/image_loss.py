@@ -24,6 +24,7 @@ C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 _window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
 W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_window / _window.sum())[: WINDOW_RADIUS_PX + 1])
 ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+N1, N2, N3, N4, N5, N6, N7, N8, N9, N10 = (np.uint64(n) for n in range(1, 11))
 
 
 @inline_jit
@@ -40,18 +41,10 @@ def _blur_row(source, offset, out, at, count):
     padded by PADDING_PX."""
     for x in range(np.uint64(count)):
         i = np.uint64(offset + PADDING_PX - WINDOW_RADIUS_PX) + x
-        one = np.uint64(1)
-        i1 = i + one
-        i2 = i1 + one
-        i3 = i2 + one
-        i4 = i3 + one
-        i5 = i4 + one
-        i6 = i5 + one
-        i7 = i6 + one
-        i8 = i7 + one
-        i9 = i8 + one
-        i10 = i9 + one
-        out[np.uint64(at) + x] = _blur(source, i, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10)
+        out[np.uint64(at) + x] = _blur(
+            source, i, i + N1, i + N2, i + N3, i + N4, i + N5, i + N6, i + N7, i + N8, i + N9,
+            i + N10,
+        )  # fmt: skip
 
 
 @part_jit

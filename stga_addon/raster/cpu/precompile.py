@@ -17,19 +17,9 @@ from ...avatar.embedding import WORLD
 from ...capture.camera import Camera
 from ...worker.launch import end_with_this_process, is_preparing, same_interpreter_environment
 from ..kernel_cache import has_kernels
-from . import KERNEL_CACHE_FOLDER
+from . import KERNEL_CACHE_FOLDER, rasterize
 from .bundled import PACKAGE
 from .layout import CameraFrames, Parameters, TileLists
-from .rasterize import (
-    BLACK_BACKGROUND,
-    BufferPool,
-    RenderOutput,
-    frames_in_camera,
-    new_image,
-    new_projection,
-    render_backward,
-    render_forward,
-)  # fmt: skip
 
 SIZE = 16
 """Width and height of the image, in pixels: one tile."""
@@ -64,7 +54,7 @@ def rasterizer_helper() -> "subprocess.Popen[bytes] | None":
 
 def compile_rendering() -> None:
     """Compile `render_forward` with the types of real training."""
-    render_forward(*_two_splats(), 3, focus=np.ones(2, bool))
+    rasterize.render_forward(*_two_splats(), 3, focus=np.ones(2, bool))
 
 
 def compile_gradients() -> None:
@@ -74,13 +64,15 @@ def compile_gradients() -> None:
     lists = TileLists(
         np.arange(2, dtype=np.int32), by_splat, by_splat, none, np.zeros(2, np.int64), none
     )
-    buffers, (splats, face, frames) = BufferPool(), _two_splats()
-    output = RenderOutput(
-        new_image(SIZE, SIZE, lists, buffers), new_projection(2, buffers), lists, tile,
-        tile_rows=np.zeros((1, 4), np.uint8), focus=np.ones(2, bool), touched=np.ones((1, 1), bool),
-        background=BLACK_BACKGROUND, degree=3, depth_as_color=False, antialiased=False,
+    buffers, (splats, face, frames) = rasterize.BufferPool(), _two_splats()
+    output = rasterize.RenderOutput(
+        rasterize.new_image(SIZE, SIZE, lists, buffers), rasterize.new_projection(2, buffers),
+        lists, tile, tile_rows=np.zeros((1, 4), np.uint8), focus=np.ones(2, bool),
+        touched=np.ones((1, 1), bool), background=rasterize.BLACK_BACKGROUND, degree=3,
+        depth_as_color=False, antialiased=False,
     )  # fmt: skip
-    render_backward(output, splats, face, frames, np.zeros((3, SIZE, SIZE), np.float32), splats)
+    v_image = np.zeros((3, SIZE, SIZE), np.float32)
+    rasterize.render_backward(output, splats, face, frames, v_image, splats)
 
 
 def _two_splats() -> tuple[Parameters, np.ndarray, CameraFrames]:
@@ -89,5 +81,5 @@ def _two_splats() -> tuple[Parameters, np.ndarray, CameraFrames]:
     shapes = (2, 3), (2, 4), (2, 3), (2,), (2, 16, 3)
     splats = Parameters(*(np.zeros(shape, np.float32) for shape in shapes))
     splats.xyz[:, 2], splats.rotation[:, 0], splats.log_scale[:] = (1, 2), 1, -3
-    frames = frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
+    frames = rasterize.frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
     return splats, np.zeros(2, np.int32), frames

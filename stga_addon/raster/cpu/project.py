@@ -277,12 +277,8 @@ def project_backward(
     pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with
     respect to the projected center in units of half the image, for density control.
     """
-    sh, strain, v_sh, v_strain_color = (
-        splats.sh,
-        frames.strain,
-        gradients.sh,
-        gradients.strain_color,
-    )
+    sh, strain = splats.sh, frames.strain
+    v_sh, v_strain_color = gradients.sh, gradients.strain_color
     strains = np.uint64(min(strain.shape[1], splats.strain_color.shape[1]))
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
     limits = _tan_limits(frames.intrinsics, frames.size)

@@ -11,31 +11,10 @@ import numpy as np
 from ...avatar.embedding import FaceFrames
 from ...avatar.splats import no_strain_color
 from ...capture.camera import Camera
+from . import tiles as tiling
 from .blend import blend_backward, blend_forward
 from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
-from .tiles import (
-    DIGITS,
-    PAIRS,
-    RADIX_BITS,
-    SORT_PARTS,
-    SPLATS,
-    arrange_tiles,
-    count_digits,
-    count_pairs,
-    fill_pairs,
-    find_needed_rows,
-    list_visible,
-    listed_rows,
-    move_by_digit,
-    move_visible,
-    parts_of,
-    split_splats,
-    sum_digits,
-    sum_parts,
-    sum_tiles,
-    whole_tiles,
-)  # fmt: skip
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
 
@@ -151,15 +130,15 @@ def render_forward(
 
     touched = buffers.kept("all_tiles", (tiles_y, tiles_x), lambda *shape: np.ones(shape, bool))
     everywhere = buffers.kept(
-        "everywhere", (tiles_y, tiles_x), lambda *shape: sum_tiles(np.ones(shape, bool))
+        "everywhere", (tiles_y, tiles_x), lambda *shape: tiling.sum_tiles(np.ones(shape, bool))
     )
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
-        tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), whole_tiles)
+        tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), tiling.whole_tiles)
     else:
-        focused, others = split_splats(focus)
+        focused, others = tiling.split_splats(focus)
         project(focused, everywhere)
-        touched, covered, tile_rows = find_needed_rows(
+        touched, covered, tile_rows = tiling.find_needed_rows(
             projection, focused, np.float32(reach), tiles_x, tiles_y
         )
         project(others, covered)
@@ -193,16 +172,12 @@ def render_backward(
     """
     n, buffers = len(splats.xyz), buffers or BufferPool()
     tiles_x, _ = tile_grid(*frames.size)
-    lists, columns, tiles, rows = (
-        output.lists,
-        output.projection.columns,
-        output.tiles,
-        output.lists.visible,
-    )
+    lists, columns = output.lists, output.projection.columns
+    tiles, rows = output.tiles, lists.visible
     wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
     if output.focus is not None:
         wanted = output.focus
-        tiles, rows = tiles[output.touched.ravel()[tiles]], listed_rows(rows, wanted)
+        tiles, rows = tiles[output.touched.ravel()[tiles]], tiling.listed_rows(rows, wanted)
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
@@ -253,13 +228,13 @@ def sort_into_tiles(
     """
     rect = projection.rect
     visible, order, first_pair, pairs, total = sort_by_depth(projection, buffers)
-    counts = buffers.get("counts", (SORT_PARTS, len(tile_rows)), np.int32)
+    counts = buffers.get("counts", (tiling.SORT_PARTS, len(tile_rows)), np.int32)
     splat_pairs, pair_splat = (
         buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat")
     )
-    count_pairs(rect, order, tiles_x, counts)
-    start, tiles = arrange_tiles(counts, tile_rows)
-    fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
+    tiling.count_pairs(rect, order, tiles_x, counts)
+    start, tiles = tiling.arrange_tiles(counts, tile_rows)
+    tiling.fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
     return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat), tiles
 
 
@@ -280,26 +255,22 @@ def sort_by_depth(
         for name in ("found", "visible", "order", "moved", "first_pair", "pairs")
     )
     keys, moved_keys = (buffers.get(name, (n,), np.uint32) for name in ("keys", "moved_keys"))
-    parts = buffers.get("parts", (parts_of(n) + 1, 4), np.int64)
-    counts = buffers.get("digits", (parts_of(n), DIGITS), np.int32)
+    parts = buffers.get("parts", (tiling.parts_of(n) + 1, 4), np.int64)
+    counts = buffers.get("digits", (tiling.parts_of(n), tiling.DIGITS), np.int32)
     depth_bits = projection.depth.view(np.uint32)
-    list_visible(projection.rect, depth_bits, found, keys, pairs, first_pair, parts, counts)
-    least, greatest = sum_parts(parts, counts)
-    splats, total = int(parts[-1, SPLATS]), int(parts[-1, PAIRS])
+    tiling.list_visible(projection.rect, depth_bits, found, keys, pairs, first_pair, parts, counts)
+    least, greatest = tiling.sum_parts(parts, counts)
+    splats, total = int(parts[-1, tiling.SPLATS]), int(parts[-1, tiling.PAIRS])
     visible = visible[:splats]
-    move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
-    keys, moved_keys, order, moved = (
-        moved_keys[:splats],
-        keys[:splats],
-        order[:splats],
-        moved[:splats],
-    )
-    counts = counts[: parts_of(splats)]
-    for shift in range(RADIX_BITS, greatest.bit_length(), RADIX_BITS):
+    tiling.move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
+    keys, moved_keys = moved_keys[:splats], keys[:splats]
+    order, moved = order[:splats], moved[:splats]
+    counts = counts[: tiling.parts_of(splats)]
+    for shift in range(tiling.RADIX_BITS, greatest.bit_length(), tiling.RADIX_BITS):
         digit = np.uint32(least), np.uint32(shift)
-        count_digits(counts, keys, *digit)
-        sum_digits(counts)
-        move_by_digit(counts, keys, order, *digit, moved_keys, moved)
+        tiling.count_digits(counts, keys, *digit)
+        tiling.sum_digits(counts)
+        tiling.move_by_digit(counts, keys, order, *digit, moved_keys, moved)
         keys, moved_keys, order, moved = moved_keys, keys, moved, order
     return visible, order, first_pair, pairs, total
 

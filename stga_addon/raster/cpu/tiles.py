@@ -388,58 +388,20 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
     return touched, covered, tile_rows
 
 
-@part_jit
-def _number_group(tiles, numbers, tile, number):
-    """Give all marked tiles that are connected to `tile`, by sides or corners, a number; returns
-    their first row and past-the-last."""
-    rows, columns = tiles.shape
-    waiting, count = np.empty(tiles.size, np.int64), 1
-    waiting[0], numbers[tile // columns, tile % columns] = tile, number
-    first, past = rows, 0
-    while count > 0:
-        count -= 1
-        y, x = waiting[count] // columns, waiting[count] % columns
-        first, past = min(first, y), max(past, y + 1)
-        for v in range(max(0, y - 1), min(rows, y + 2)):
-            for u in range(max(0, x - 1), min(columns, x + 2)):
-                if tiles[v, u] and numbers[v, u] == 0:
-                    numbers[v, u] = number
-                    waiting[count] = v * columns + u
-                    count += 1
-    return first, past
-
-
-@jit
-def box_groups(tiles, most_rows):
+def box_groups(tiles: np.ndarray, most_rows: int) -> np.ndarray:
     """Boxes (B, 4) int64 x0, y0, x1, y1 around each connected group of marked tiles (rows, columns)
     bool, the largest first; a group of more than `most_rows` rows is cut into bands of about as
     many rows each."""
-    columns, numbers = tiles.shape[1], np.zeros(tiles.shape, np.int64)
-    boxes, count, number = np.empty((tiles.size, 4), np.int64), 0, 0
-    for tile in range(tiles.size):
-        y, x = tile // columns, tile % columns
-        if not tiles[y, x] or numbers[y, x] > 0:
-            continue
-        number += 1
-        first, past = _number_group(tiles, numbers, tile, number)
-        bands = (past - first + most_rows - 1) // most_rows
+    from scipy import ndimage  # which rendering does not need
+
+    numbers, _ = ndimage.label(tiles, np.ones((3, 3)))
+    boxes = []
+    for number, (rows, _) in enumerate(ndimage.find_objects(numbers), 1):
+        first, count = rows.start, rows.stop - rows.start
+        bands = -(-count // most_rows)
         for band in range(bands):
-            y0 = first + (past - first) * band // bands
-            y1 = first + (past - first) * (band + 1) // bands
-            x0, x1 = columns, 0
-            for y in range(y0, y1):
-                for x in range(columns):
-                    if numbers[y, x] == number:
-                        x0, x1 = min(x0, x), max(x1, x + 1)
-            at = count
-            while at > 0 and _size(boxes[at - 1]) < (x1 - x0) * (y1 - y0):
-                boxes[at] = boxes[at - 1]
-                at -= 1
-            boxes[at, 0], boxes[at, 1], boxes[at, 2], boxes[at, 3] = x0, y0, x1, y1
-            count += 1
-    return boxes[:count]
-
-
-@part_jit
-def _size(box):
-    return (box[2] - box[0]) * (box[3] - box[1])
+            y0, y1 = first + count * band // bands, first + count * (band + 1) // bands
+            columns = np.flatnonzero((numbers[y0:y1] == number).any(0))
+            boxes.append((columns[0], y0, columns[-1] + 1, y1))
+    boxes.sort(key=lambda box: (box[0] - box[2]) * (box[3] - box[1]))
+    return np.array(boxes, np.int64).reshape(-1, 4)

@@ -147,25 +147,22 @@ class Device:
         `override` declarations."""
         key = name, *sorted(constants.items())
         if key not in self._kernels:
-            self._kernels[key] = self._compile(name, constants)
+            file, entry = name.split(".")
+            code, tables = _linked(file, entry)
+            entries = [
+                {"binding": n, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
+                for n, kind in enumerate(tables.values())
+            ]
+            with self.errors():
+                layout = self.gpu.create_bind_group_layout(entries=entries)
+                module = self.gpu.create_shader_module(label=file, code=code)
+                pipeline = self.gpu.create_compute_pipeline(
+                    label=name,
+                    layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
+                    compute={"module": module, "entry_point": entry, "constants": constants},
+                )
+            self._kernels[key] = Kernel(pipeline, layout, tuple(tables))
         return self._kernels[key]
-
-    def _compile(self, name: str, constants: dict[str, float]) -> Kernel:
-        file, entry = name.split(".")
-        code, tables = _linked(file, entry)
-        entries = [
-            {"binding": n, "visibility": wgpu.ShaderStage.COMPUTE, "buffer": {"type": kind}}
-            for n, kind in enumerate(tables.values())
-        ]
-        with self.errors():
-            layout = self.gpu.create_bind_group_layout(entries=entries)
-            module = self.gpu.create_shader_module(label=file, code=code)
-            pipeline = self.gpu.create_compute_pipeline(
-                label=name,
-                layout=self.gpu.create_pipeline_layout(bind_group_layouts=[layout]),
-                compute={"module": module, "entry_point": entry, "constants": constants},
-            )
-        return Kernel(pipeline, layout, tuple(tables))
 
     def bind(self, kernel: Kernel, tables: Mapping[str, Any]) -> Any:
         """The bind group of a kernel with the tables that it uses, which are the buffers of these

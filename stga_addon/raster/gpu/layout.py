@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from ...avatar import embedding, strain
-from ..cpu import blend, harmonics, image_loss, layout, optimizer, splat_block
+from ..cpu import blend, image_loss, layout, optimizer, splat_block
 from ..cpu.layout import Parameters
 
 WORKGROUP = 256
@@ -91,11 +91,10 @@ _COLUMNS = "MEAN_X MEAN_Y PRECISION_X SHEAR PRECISION_Y OPACITY RED GREEN BLUE"
 _CPU = {
     layout: f"TILE PIXELS PROJECTED {_COLUMNS}",
     blend: "MAX_ALPHA MIN_ALPHA MIN_TRANSMITTANCE",
-    splat_block: "LOW_PASS_PX2 NEAR_M QUATERNION_LIFT",
+    splat_block: "LOW_PASS_PX2 NEAR_M QUATERNION_LIFT C0 C1 C2 C3 C4 C5 C6 C7 C8 C9",
     embedding: "MIN_AREA_RATIO UPRIGHT_COSINE",
     strain: "STRAIN_GAIN STRAIN_COMPONENTS",
     image_loss: "WINDOW_RADIUS_PX",
-    harmonics: "C0 C1 C2 C3 C4 C5 C6 C7 C8 C9",
     optimizer: "MAX_GRADIENT",
 }
 CONSTANTS: dict[str, int | float] = {

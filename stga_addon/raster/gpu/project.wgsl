@@ -118,7 +118,7 @@ fn used_coefficients() -> u32 {
   return (view.degree + 1u) * (view.degree + 1u);
 }
 
-// Real spherical harmonics of a unit direction; formulas and constants are those of `cpu/harmonics.py`.
+// Real spherical harmonics of a unit direction; formulas and constants are those of `cpu/splat_block.py`.
 fn harmonics(d: vec3f) -> array<f32, MAX_COEFFICIENTS> {
   let x = d.x;
   let y = d.y;

@@ -51,7 +51,7 @@ fn choose_rendered(thread: Thread) {
 }
 
 // Which tiles a splat reaches: of those within its bounds the rendered ones whose pixels its outline, the ellipse on
-// which alpha = MIN_ALPHA, may touch. See `cpu/outline.py`.
+// which alpha = MIN_ALPHA, may touch. See `cpu/blend.py`.
 
 struct Outline {
   mean: vec2f,
