@@ -17,13 +17,9 @@ from stga_addon.raster.gpu.rasterize import Rasterizer, ViewOptions, upload_fram
 
 
 def render_differentiable(
-    splats: Parameters,
-    camera: Camera,
-    frames: FaceFrames = WORLD,
-    face: np.ndarray | None = None,
-    degree: int = 3,
-    antialiased: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    splats: Parameters, camera: Camera, frames: FaceFrames = WORLD, face: np.ndarray | None = None,
+    degree: int = 3, antialiased: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Differentiable rendering on the first adapter; everything as in
     `cpu.autograd.render_differentiable`."""
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
@@ -49,12 +45,9 @@ def shared_rasterizer() -> Rasterizer:
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        options: ViewOptions,
-        camera_frames: CameraFrames,
-        face: np.ndarray,
+        ctx: Any, options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray,
         *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         ctx.saved = options, camera_frames, face, splats
         image, transmittance, _ = render(options, camera_frames, face, splats)

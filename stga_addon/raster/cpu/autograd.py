@@ -12,13 +12,9 @@ from .rasterize import frames_in_camera, render_backward, render_forward
 
 
 def render_differentiable(
-    splats: Parameters,
-    camera: Camera,
-    frames: FaceFrames = WORLD,
-    face: np.ndarray | None = None,
-    degree: int = 3,
-    antialiased: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    splats: Parameters, camera: Camera, frames: FaceFrames = WORLD, face: np.ndarray | None = None,
+    degree: int = 3, antialiased: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Differentiable rendering of float32 torch tensors.
 
     Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on
@@ -35,14 +31,9 @@ def render_differentiable(
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        camera_frames: CameraFrames,
-        face: np.ndarray,
-        degree: int,
-        depth_as_color: bool,
-        antialiased: bool,
-        *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+        ctx: Any, camera_frames: CameraFrames, face: np.ndarray, degree: int, depth_as_color: bool,
+        antialiased: bool, *tensors: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         rendering = render_forward(
             splats, face, camera_frames, degree, depth_as_color=depth_as_color,

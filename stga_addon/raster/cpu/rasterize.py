@@ -97,17 +97,10 @@ def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
 
 
 def render_forward(
-    splats: Parameters,
-    face: np.ndarray,
-    frames: CameraFrames,
-    degree: int,
-    background: np.ndarray = BLACK_BACKGROUND,
-    focus: np.ndarray | None = None,
-    reach: int = 0,
-    depth_as_color: bool = False,
-    antialiased: bool = False,
-    buffers: BufferPool | None = None,
-) -> RenderOutput:
+    splats: Parameters, face: np.ndarray, frames: CameraFrames, degree: int,
+    background: np.ndarray = BLACK_BACKGROUND, focus: np.ndarray | None = None, reach: int = 0,
+    depth_as_color: bool = False, antialiased: bool = False, buffers: BufferPool | None = None,
+) -> RenderOutput:  # fmt: skip
     """Render N embedded splats over a background color (3,).
 
     splats: numpy arrays; face (N,) int32; degree: of the spherical harmonics used.
@@ -153,15 +146,10 @@ def render_forward(
 
 
 def render_backward(
-    output: RenderOutput,
-    splats: Parameters,
-    face: np.ndarray,
-    frames: CameraFrames,
-    v_image: np.ndarray,
-    gradients: Parameters,
-    v_transmittance: np.ndarray | None = None,
+    output: RenderOutput, splats: Parameters, face: np.ndarray, frames: CameraFrames,
+    v_image: np.ndarray, gradients: Parameters, v_transmittance: np.ndarray | None = None,
     buffers: BufferPool | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients`
@@ -269,7 +257,7 @@ def sort_by_depth(
     for shift in range(tiling.RADIX_BITS, greatest.bit_length(), tiling.RADIX_BITS):
         digit = np.uint32(least), np.uint32(shift)
         tiling.count_digits(counts, keys, *digit)
-        tiling.sum_digits(counts)
+        tiling.sum_counts(counts)
         tiling.move_by_digit(counts, keys, order, *digit, moved_keys, moved)
         keys, moved_keys, order, moved = moved_keys, keys, moved, order
     return visible, order, first_pair, pairs, total

@@ -78,13 +78,13 @@ def sum_parts(parts, counts):
         splats, pairs = splats + count, pairs + before
         least, greatest = min(least, parts[k, LEAST]), max(greatest, parts[k, GREATEST])
     parts[last, SPLATS], parts[last, PAIRS] = splats, pairs
-    _sum_counts(counts)
+    sum_counts(counts)
     least = least // DIGITS * DIGITS
     return least, max(0, greatest - least)
 
 
-@part_jit
-def _sum_counts(counts):
+@jit
+def sum_counts(counts):
     """Turn counts (parts, columns) int32 into places: column by column, in each one part after the
     other.
 
@@ -104,12 +104,6 @@ def _sum_counts(counts):
             counts[k, c] = place[c]
             place[c] += count
     return start
-
-
-@jit
-def sum_digits(counts):
-    """Turn the counts of `count_digits` into the place of each part's first key of each digit."""
-    _sum_counts(counts)
 
 
 @parallel(lambda parts, *_: len(parts) - 1)
@@ -154,7 +148,7 @@ def count_digits(work, counts, keys, least, shift):
 
 @parallel(lambda counts, *_: len(counts))
 def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
-    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_digits` and is
+    """Write keys and values (M,) sorted by a digit; `place` holds the places of `sum_counts` and is
     advanced."""
     for part, past_part in pieces(work):
         for k in range(part, past_part):
@@ -225,7 +219,7 @@ def arrange_tiles(counts, tile_rows):
     tile's list begins, and
     tiles (T,) int32: those with a needed row, in the order in which they are rendered.
     """
-    start = _sum_counts(counts)
+    start = sum_counts(counts)
     tiles, count = np.empty(len(tile_rows), np.int32), 0
     for tile in range(len(tile_rows)):
         tiles[count] = tile

@@ -257,19 +257,16 @@ class Recording:
         self._end_pass()
         self._encoder.clear_buffer(buffer, 0, None if words is None else 4 * words)
 
-    def submit(self) -> None:
-        """Hand the work to the device and return without waiting for it."""
-        with self.device.errors():
-            self._end_pass()
-            self.device.gpu.queue.submit([self._encoder.finish()])
-            self.device.submits += 1
-
     def __enter__(self) -> "Recording":
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """Hand the work to the device, without waiting for it, unless there was an error."""
         if error is None:
-            self.submit()
+            with self.device.errors():
+                self._end_pass()
+                self.device.gpu.queue.submit([self._encoder.finish()])
+                self.device.submits += 1
 
     def _end_pass(self) -> None:
         if self._pass is not None:

@@ -29,12 +29,9 @@ one."""
 
 
 def upload_target(
-    device: Device,
-    target: np.ndarray,
-    ssim_weight: float,
-    mask: np.ndarray | None = None,
+    device: Device, target: np.ndarray, ssim_weight: float, mask: np.ndarray | None = None,
     change: Any = (0, 0, 0),
-) -> None:
+) -> None:  # fmt: skip
     """Send the target (H, W, 3) uint8 of the next image, and how it is compared.
 
     mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's
@@ -86,13 +83,9 @@ class OptimizerTables(NamedTuple):
 
 
 def upload_step(
-    device: Device,
-    rates: Mapping[str, float],
-    options: AdamOptions,
-    weights: tuple[float, float, float],
-    statistics: bool,
-    triangles: int = 0,
-) -> None:
+    device: Device, rates: Mapping[str, float], options: AdamOptions,
+    weights: tuple[float, float, float], statistics: bool, triangles: int = 0,
+) -> None:  # fmt: skip
     """Send the numbers of the next step.
 
     rates by name; weights: of the limits of scale, distance and, divided by the number of
@@ -103,9 +96,8 @@ def upload_step(
     device.uniform(
         "Step", rates=np.reshape([*(rates[name] for name in RATES), 0], (2, 4)),
         **options._asdict(), log_beta1=math.log(options.beta1), log_beta2=math.log(options.beta2),
-        scale_weight=scale_weight,
-        distance_weight=distance_weight, opacity_weight=opacity_weight, statistics=statistics,
-        triangles=triangles,
+        scale_weight=scale_weight, distance_weight=distance_weight, opacity_weight=opacity_weight,
+        statistics=statistics, triangles=triangles,
     )  # fmt: skip
 
 
@@ -158,12 +150,9 @@ def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
 
 
 def step_offsets(
-    work: Recording,
-    triangles: int,
-    offsets: Mapping[str, OffsetTables],
-    signals: Mapping[str, Any],
-    **given: Any,
-) -> None:
+    work: Recording, triangles: int, offsets: Mapping[str, OffsetTables],
+    signals: Mapping[str, Any], **given: Any,
+) -> None:  # fmt: skip
     """Record a step of the triangles that have a wanted splat, with the numbers of `upload_step`.
 
     signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the
