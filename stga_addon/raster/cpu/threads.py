@@ -52,7 +52,7 @@ def parallel(units: Callable[..., int], piece: int = 1) -> Callable[[Any], Calla
     def decorate(function: Any) -> Callable[..., None]:
         kernel = jit(function)
 
-        @wraps(function)
+        @wraps(kernel)
         def call(*arguments: Any) -> None:
             if count := units(*arguments):
                 _run(kernel, count, piece, arguments)
