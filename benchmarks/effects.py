@@ -287,7 +287,7 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
 def changes(effect: str) -> bool:
     """Whether the effect changes training; those of Blender's rig do not."""
     known = EFFECTS[effect]
-    return known.off != {} or known.offset is not None or effect == "exposure"
+    return bool(known.switch or known.off or known.offset) or effect == "exposure"
 
 
 def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:

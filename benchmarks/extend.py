@@ -40,8 +40,7 @@ from stga_addon.training.effects.plan import add_effects, plan_effects
 from stga_addon.training.evaluate.metrics import evaluate, known_exposure
 from stga_addon.training.optimize.image_preparation import image_preparation
 from stga_addon.training.optimize.precompile import precompile_kernels
-from stga_addon.training.optimize.strategies import Strategy
-from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.optimize.trainer import Strategy, Trainer
 from stga_addon.training.run.continuation import (
     DENSITY_INTERVAL,
     continued_evaluation_views,

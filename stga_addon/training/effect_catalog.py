@@ -14,7 +14,8 @@ class Effect:
     """An effect: its name, as in `--effect NAME=on`, and its cost while it is on.
 
     title, price  for everybody: two or three words, and one of "free", "slower" and "larger"
-    on, off       changes to `TrainingSettings`
+    switch        the setting that is true where it is on, and false where it is off
+    on, off       other changes to `TrainingSettings`
     offset        the driven offset (`avatar.offsets.table`) that it trains, if any
     added_later   whether a continuation may switch it on in a run that went without: only where it
                   adds coefficients, which leave the splats as they were while they are zero
@@ -24,6 +25,7 @@ class Effect:
     title: str
     price: str
     cost: str
+    switch: str = ""
     on: Mapping[str, Any] = field(default_factory=dict)
     off: Mapping[str, Any] = field(default_factory=dict)
     offset: str | None = None
@@ -35,111 +37,49 @@ RELIGHT = "relight"
 place."""
 WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
-
-
-def _effect(
-    name: str, title: str, price: str, cost: str, switch: str = "", **values: Any
-) -> Effect:
-    """An effect; switch: the setting that is true where it is on, and false where it is off."""
-    on, off = ({switch: each} if switch else {} for each in (True, False))
-    return Effect(name, title, price, cost, **{"on": on, "off": off, **values})
-
-
 _SHAPES = "shape keys and drivers in Blender"
 _STRAIN = "and the strain of every frame"
 _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03}
 _EFFECTS = (
-    _effect(
-        "view-color",
-        "Moving highlights",
-        "slower",
-        "3, 8 or 15 coefficients more a splat and channel",
-        off={"sh_degree": 0, "sh_steps": ()},
-    ),
-    _effect("exposure", "Even brightness", "free", "a pass over each image when it is read"),
-    _effect("antialiasing", "Sharp from afar", "free", "a root a splat", "antialiased"),
-    _effect(
-        "background",
-        "Clean outline",
-        "slower",
-        "a pass over the image in every iteration, and one when it is read where the backdrop is "
-        "not of one color",
-        on={"random_background": True, "backdrop": "plain"},
-        off={"random_background": False, "backdrop": "plain"},
-    ),
-    _effect(
-        "hull-points",
-        "Hair beyond face",
-        "larger",
-        "a splat for every 4 mm beside the mesh",
-        "hull_points",
-    ),
-    _effect(
-        "depth-limits",
-        "No stray splats",
-        "free",
-        "none: splats are smaller and nearer to their triangles",
-        on=_LIMITS,
-    ),
-    _effect(
-        "density",
-        "Finer detail",
-        "slower",
-        "up to a quarter more splats, more in the preset final",
-        off={"density_interval": 0},
-    ),
-    _effect(
-        "selection",
-        "Moving parts only",
-        "free",
-        "none: local iterations are cheaper than global ones",
-        on={"strategy": "selective"},
-        off={"strategy": "global"},
-    ),
-    _effect(
-        "strain-color",
-        "Color of wrinkles",
-        "slower",
-        f"3 coefficients more a splat and channel, {_STRAIN}",
-        "strain_color",
-        added_later=True,
-    ),
-    _effect(
-        "strain-position",
-        "Shape of wrinkles",
-        "slower",
-        f"9 coefficients a triangle, {_STRAIN}",
-        offset="strain_position",
-        added_later=True,
-    ),
-    _effect(
-        RELIGHT,
-        "Other lighting",
-        "slower",
-        "seconds after training, and 30 bytes a vertex in the avatar file",
-    ),
-    _effect(
-        WORLD, "Room behind", "slower", "seconds to a minute after training, and a file of its own"
-    ),
-    _effect("teeth", "Teeth", "free", "splats on 168 triangles", "teeth"),
-    _effect(
-        "torso", "Shoulders", "free", "none: splats below the neck follow other triangles", "torso"
-    ),
-    _effect("neck", "Turning neck", "free", f"9 {_SHAPES}"),
-    _effect("jaw", "Turning jaw", "free", f"9 {_SHAPES}"),
-    _effect("eyes", "Turning eyes", "free", f"18 {_SHAPES}"),
-    _effect(
-        "dynamic-offsets", "Recorded details", "larger", "a mesh a frame beside the parameters"
-    ),
-    _effect(
-        "tracking",
-        "Better tracking",
-        "slower",
-        "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
-        "head's motion",
-        "tracking",
-    ),
-)
+    Effect("view-color", "Moving highlights", "slower",
+           "3, 8 or 15 coefficients more a splat and channel",
+           off={"sh_degree": 0, "sh_steps": ()}),
+    Effect("exposure", "Even brightness", "free", "a pass over each image when it is read"),
+    Effect("antialiasing", "Sharp from afar", "free", "a root a splat", "antialiased"),
+    Effect("background", "Clean outline", "slower",
+           "a pass over the image in every iteration, and one when it is read where the backdrop "
+           "is not of one color",
+           "random_background", on={"backdrop": "plain"}, off={"backdrop": "plain"}),
+    Effect("hull-points", "Hair beyond face", "larger", "a splat for every 4 mm beside the mesh",
+           "hull_points"),
+    Effect("depth-limits", "No stray splats", "free",
+           "none: splats are smaller and nearer to their triangles", on=_LIMITS),
+    Effect("density", "Finer detail", "slower",
+           "up to a quarter more splats, more in the preset final", off={"density_interval": 0}),
+    Effect("selection", "Moving parts only", "free",
+           "none: local iterations are cheaper than global ones",
+           on={"strategy": "selective"}, off={"strategy": "global"}),
+    Effect("strain-color", "Color of wrinkles", "slower",
+           f"3 coefficients more a splat and channel, {_STRAIN}", "strain_color", added_later=True),
+    Effect("strain-position", "Shape of wrinkles", "slower",
+           f"9 coefficients a triangle, {_STRAIN}", offset="strain_position", added_later=True),
+    Effect(RELIGHT, "Other lighting", "slower",
+           "seconds after training, and 30 bytes a vertex in the avatar file"),
+    Effect(WORLD, "Room behind", "slower",
+           "seconds to a minute after training, and a file of its own"),
+    Effect("teeth", "Teeth", "free", "splats on 168 triangles", "teeth"),
+    Effect("torso", "Shoulders", "free", "none: splats below the neck follow other triangles",
+           "torso"),
+    Effect("neck", "Turning neck", "free", f"9 {_SHAPES}"),
+    Effect("jaw", "Turning jaw", "free", f"9 {_SHAPES}"),
+    Effect("eyes", "Turning eyes", "free", f"18 {_SHAPES}"),
+    Effect("dynamic-offsets", "Recorded details", "larger",
+           "a mesh a frame beside the parameters"),
+    Effect("tracking", "Better tracking", "slower",
+           "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
+           "head's motion",
+           "tracking"),
+)  # fmt: skip
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
 """By name, in display order."""
 CHOICES = ("auto", "on", "off")

@@ -15,8 +15,8 @@ from ..capture.images import read_view
 from ..capture.model import Capture, View, evenly_spread
 from ..flame.quaternions import from_matrices
 from ..progress import Progress, Report, counted, ignore
-from .optimize.hull_points import pixels_of
 from .optimize.image_preparation import Correction, exposure_correction
+from .optimize.initial_splats import pixels_of
 from .optimize.state import new_state
 from .optimize.trainer import Trainer
 from .settings import Rates, TrainingSettings

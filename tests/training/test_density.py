@@ -9,7 +9,7 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.training.optimize.density import MIN_OPACITY, control_density
+from stga_addon.training.optimize.post_step import MIN_OPACITY, control_density
 from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 
 from .toys import bits, random_state

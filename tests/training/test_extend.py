@@ -23,7 +23,7 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.jobs.train import Extend, Prepared, prepare
 from stga_addon.progress import Progress, ignore
-from stga_addon.training.optimize.strategies import EXTEND_LOCAL_SHARE, Strategy
+from stga_addon.training.optimize.trainer import EXTEND_LOCAL_SHARE, Strategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
 from stga_addon.training.run.folder import Run, open_run, read_run

@@ -18,7 +18,7 @@ from stga_addon.flame.forward import neutral_frame
 from stga_addon.flame.model import torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 from stga_addon.tracking.folder import TorsoPoints, write_torso_points
-from stga_addon.training.optimize.hull_points import (
+from stga_addon.training.optimize.initial_splats import (
     MIN_MESH_DISTANCE_M,
     SEEN_COPIES,
     VOXEL_SIZE_M,
@@ -156,7 +156,7 @@ def test_blocks_leave_nothing_out(
         views[number] = replace(view, camera=replace(view.camera, width=width), mask=path)
     capture, found = replace(beside, views={"train": tuple(views)}), []
     for voxels in (1, 5):
-        monkeypatch.setattr("stga_addon.training.optimize.hull_points.BLOCK_VOXELS", voxels)
+        monkeypatch.setattr("stga_addon.training.optimize.initial_splats.BLOCK_VOXELS", voxels)
         found.append(hull_points(capture, views, "stga", 0).xyz)
     assert len(found[0]) > 100
     assert np.array_equal(*found)

@@ -7,7 +7,7 @@ import torch
 
 from stga_addon.raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.density import reset_strays
+from stga_addon.training.optimize.post_step import reset_strays
 from stga_addon.training.optimize.state import new_state
 
 from .toys import bits, random_splats, random_state

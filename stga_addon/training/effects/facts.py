@@ -7,26 +7,14 @@ import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
 from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
-from ...capture.camera import Camera
 from ...capture.model import Capture, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
 from ...flame.teeth import lip_pairs
 from ...selection import select_capture
 from ..settings import TrainingSettings
-from .evidence import (
-    MIN_EXPOSURE_LEVELS,
-    CameraColors,
-    Evidence,
-    camera_evidence,
-    consecutive_folds,
-    drift_evidence,
-    fit_cameras,
-    fit_drift,
-    linear_evidence,
-    scattered_folds,
-    stable_colors,
-)
+from . import evidence
+from .evidence import CameraColors, Evidence
 from .samples import Samples, take_samples
 
 MAX_TIMESTEPS = 64
@@ -34,17 +22,13 @@ MAX_TIMESTEPS = 64
 MIN_WHITE_SHARE = 0.1
 """Share of the pixels beside the mesh that a white background is: hair and shoulders leave more
 than that of it."""
-MAX_VIEW_ERROR_RATIO = 4.0
-"""Errors above this multiple of the median come from lids, lips and teeth, not from the direction
-of view."""
 
 
 class CaptureFacts:
-    """A capture with training views, and the settings it is to be trained with; cameras,
-    timesteps: how many there are to train on."""
+    """A capture with training views, and the settings and the device (`choose_device`) it is to be
+    trained with; cameras, timesteps: how many there are to train on."""
 
     def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
-        """device: one of `choose_device`."""
         self.capture, self.settings, self.device = capture, settings, device
         self.views = capture.views["train"]
         self.cameras = len({view.camera_index for view in self.views})
@@ -57,69 +41,48 @@ class CaptureFacts:
     @cached_property
     def stable_colors(self) -> np.ndarray:
         """(S, K, 3) sampled colors of the triangles that change little."""
-        return stable_colors(self.samples.color.astype(np.float64))
+        return evidence.stable_colors(self.samples.color.astype(np.float64))
 
     @cached_property
     def camera_colors(self) -> CameraColors:
-        return fit_cameras(self.samples, self.stable_colors)
+        return evidence.fit_cameras(self.samples, self.stable_colors)
+
+    @cached_property
+    def drift(self) -> np.ndarray:
+        """(S, 3) gains of the sampled views against their camera's mean."""
+        return evidence.fit_drift(self.samples, self._matched_cameras)
+
+    @cached_property
+    def drifts(self) -> Evidence:
+        return evidence.drift_evidence(self.samples, self._matched_cameras)
+
+    @cached_property
+    def _matched_cameras(self) -> np.ndarray:
+        return self.camera_colors.undo(self.stable_colors, self.samples.camera)
 
     @cached_property
     def matched_colors(self) -> np.ndarray:
         """(S, K, 3) sampled colors without the differences between cameras, and in time."""
         colors = self.camera_colors.undo(self.samples.color.astype(np.float64), self.samples.camera)
-        return colors / self.drift[:, None] if self.drifts.gain >= MIN_EXPOSURE_LEVELS else colors
+        drifts = self.drifts.gain >= evidence.MIN_EXPOSURE_LEVELS
+        return colors / self.drift[:, None] if drifts else colors
 
-    @cached_property
-    def _unexposed(self) -> np.ndarray:
-        return self.camera_colors.undo(self.stable_colors, self.samples.camera)
-
-    @cached_property
-    def drift(self) -> np.ndarray:
-        """(S, 3) gains of the sampled views against their camera's mean."""
-        return fit_drift(self.samples, self._unexposed)
-
-    @cached_property
-    def drifts(self) -> Evidence:
-        return drift_evidence(self.samples, self._unexposed)
-
-    @cached_property
-    def camera_difference(self) -> Evidence:
-        return camera_evidence(self.samples, self.stable_colors)
-
-    @cached_property
-    def view_dependence(self) -> Evidence:
-        """Errors are clipped, so that motion that the mesh does not follow counts little."""
-        direction = self.samples.direction
-        folds = scattered_folds(np.arange(len(direction)))
-        return linear_evidence(self.matched_colors, direction, folds, MAX_VIEW_ERROR_RATIO)
-
-    @cached_property
-    def strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on their triangle's strain, in the range that the other views would train."""
-        rest = rest_strain(color_range(len(self.samples.faces)))
-        return self._strain_evidence(self.samples.strain, rest)
-
-    @cached_property
-    def smoothed_strain_dependence(self) -> dict[str, Evidence]:
-        """Of colors on the strain around their triangle, as what moves over it changes them."""
-        rest = np.zeros_like(self.samples.smoothed_strain[0])
-        return self._strain_evidence(self.samples.smoothed_strain, rest)
-
-    def _strain_evidence(self, strain: np.ndarray, rest: np.ndarray) -> dict[str, Evidence]:
-        """In "frames" that are left out, as unseen expressions, and in "cameras" that are, as other
-        views of known expressions; a single camera is not left out."""
-        folds = {"frames": consecutive_folds(self.samples.timestep)}
+    def strain_dependence(self, is_smoothed: bool) -> dict[str, Evidence]:
+        """Of colors on their triangle's strain, in the range that the other views would train, or
+        smoothed around it, as what moves over the triangle changes them: in "frames" that are left
+        out, as unseen expressions, and in "cameras" that are, as other views of known expressions;
+        a single camera is not left out."""
+        samples = self.samples
+        strain, rest = samples.strain, rest_strain(color_range(len(samples.faces)))
+        if is_smoothed:
+            strain, rest = samples.smoothed_strain, np.zeros_like(samples.smoothed_strain[0])
+        folds = {"frames": evidence.consecutive_folds(samples.timestep)}
         if self.cameras > 1:
-            folds["cameras"] = scattered_folds(self.samples.camera)
-        colors = self.matched_colors
-        return {n: linear_evidence(colors, strain, each, rest=rest) for n, each in folds.items()}
-
-    @cached_property
-    def pixel_range(self) -> float:
-        """Width of the widest pixel at the head over that of the narrowest, among the sampled views
-        that show it."""
-        widths = self.samples.pixel_width[~np.isnan(self.samples.pixel_width)]
-        return float(widths.max() / widths.min()) if len(widths) else 1.0
+            folds["cameras"] = evidence.scattered_folds(samples.camera)
+        return {
+            kind: evidence.linear_evidence(self.matched_colors, strain, own, rest=rest)
+            for kind, own in folds.items()
+        }
 
     def pixels_per_splat(self, percentile: float) -> float:
         """Percentile over the visible triangles, in trained images; 0 where none is visible."""
@@ -127,21 +90,6 @@ class CaptureFacts:
         pixels = self.samples.pixels[~np.isnan(self.samples.pixels)] * self.settings.scale**2
         splats = splats_per_triangle(lattice)
         return float(np.percentile(pixels, percentile)) / splats if len(pixels) else 0.0
-
-    @cached_property
-    def uncovered(self) -> float:
-        """Share of the foreground that the mesh does not cover; NaN without masks."""
-        return float(self.samples.uncovered.sum() / max(self.samples.foreground.sum(), 1))
-
-    @cached_property
-    def outside(self) -> float:
-        """Share of the mesh outside of the foreground by two pixels or more; NaN without masks."""
-        return float(self.samples.outside.sum() / max(self.samples.mesh.sum(), 1))
-
-    @cached_property
-    def unmasked(self) -> int:
-        """How many of the sampled views have no mask."""
-        return int(np.isnan(self.samples.foreground).sum())
 
     @cached_property
     def shows_backdrop(self) -> bool:
@@ -153,23 +101,10 @@ class CaptureFacts:
         """By how many of 255 levels what lies outside the masks differs within a sampled view and
         between them; None where views have no mask or nothing lies outside."""
         known = ~np.isnan(self.samples.background_spread)
-        if self.unmasked or not known.any():
+        if np.isnan(self.samples.foreground).any() or not known.any():
             return None
         within, backgrounds = self.samples.background_spread[known], self.samples.background[known]
         return float(max(within.max(), abs(backgrounds - backgrounds.mean(0)).max()))
-
-    @cached_property
-    def moving_cameras(self) -> int:
-        """How many cameras have another pose or lens in some training view than in their first."""
-        names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
-        first: dict[int, Camera] = {}
-        moved = set()
-        for view in self.views:
-            known, own = first.setdefault(view.camera_index, view.camera), view.camera
-            pairs = [(getattr(known, name), getattr(own, name)) for name in names]
-            if known is not own and not all(np.allclose(*pair, atol=1e-6) for pair in pairs):
-                moved.add(view.camera_index)
-        return len(moved)
 
     @property
     def sampled_timesteps(self) -> tuple[int, ...]:
@@ -217,5 +152,4 @@ class CaptureFacts:
 
     @property
     def has_teeth(self) -> bool:
-        """Whether the mesh has teeth."""
         return self.capture.flame is not None and "teeth" in self.capture.flame.model.masks

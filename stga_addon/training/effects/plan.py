@@ -2,25 +2,29 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...avatar.offsets import OFFSETS
+from ...capture.camera import Camera
 from ...capture.model import Capture
 from ...errors import StgaError
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
 from ...tracking.folder import is_tracked, read_torso_motion
 from ..effect_catalog import EFFECTS, Effect, EffectDecision
 from ..settings import TrainingSettings
-from .evidence import MIN_EXPOSURE_LEVELS, Evidence
+from .evidence import MIN_EXPOSURE_LEVELS, camera_evidence, linear_evidence, scattered_folds
 from .facts import CaptureFacts
 
 MIN_CAMERAS_FOR_VIEW_COLOR = 4
 """With fewer, view-dependent color is not constrained between the cameras."""
 MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255 from which color depends on the direction of view."""
+MAX_VIEW_ERROR_RATIO = 4.0
+"""Errors above this multiple of the median come from lids, lips and teeth, which move as the mesh
+does not, rather than from the direction of view."""
 MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
 deformation: with less, trainings with and without differ by no more than their noise
@@ -75,7 +79,9 @@ def view_color(facts: CaptureFacts) -> Verdict:
     if facts.cameras < MIN_CAMERAS_FOR_VIEW_COLOR:
         reason = f"{facts.cameras} cameras are too few to tell how color depends on the view"
         return Verdict(False, reason)
-    found = facts.view_dependence
+    direction = facts.samples.direction
+    folds = scattered_folds(np.arange(len(direction)))
+    found = linear_evidence(facts.matched_colors, direction, folds, MAX_VIEW_ERROR_RATIO)
     variance = f"({found.share:.1%} of the variance)"
     reason = f"colors depend on the view by {found.gain:.1f} of 255 levels {variance}"
     return Verdict(found.gain >= MIN_VIEW_DEPENDENCE_LEVELS, reason)
@@ -86,7 +92,7 @@ def exposure(facts: CaptureFacts) -> Verdict:
         return Verdict(False, "a single image has no other to differ from", fixed=True)
     colors, samples = facts.camera_colors, facts.samples
     table = np.column_stack([colors.camera, colors.gain, colors.offset])
-    found, drift = facts.camera_difference.gain, facts.drifts.gain
+    found, drift = camera_evidence(samples, facts.stable_colors).gain, facts.drifts.gain
     reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
     if drift >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
         own = table[np.searchsorted(colors.camera, samples.camera)]
@@ -99,9 +105,10 @@ def exposure(facts: CaptureFacts) -> Verdict:
 
 
 def antialiasing(facts: CaptureFacts) -> Verdict:
-    settings, widest = facts.settings, facts.pixel_range
-    if settings.scale < 1:
+    if facts.settings.scale < 1:
         return Verdict(True, "images are trained at a smaller size than they are rendered at")
+    widths = facts.samples.pixel_width[~np.isnan(facts.samples.pixel_width)]
+    widest = float(widths.max() / widths.min()) if len(widths) else 1.0
     if widest > MAX_PIXEL_WIDTH_RATIO:
         return Verdict(True, f"the widest pixel at the head is {widest:.2f} times the narrowest")
     pixels = facts.pixels_per_splat(50)
@@ -113,7 +120,8 @@ def antialiasing(facts: CaptureFacts) -> Verdict:
 def background(facts: CaptureFacts) -> Verdict:
     samples = facts.samples
     if facts.shows_backdrop:
-        count = f"{facts.unmasked} of {len(samples.white)} sampled images have no mask"
+        unmasked = int(np.isnan(samples.foreground).sum())
+        count = f"{unmasked} of {len(samples.white)} sampled images have no mask"
         reason = f"{count}, and show more than white behind the head: {MESH_AS_MASK}"
         return Verdict(True, reason, changes={"backdrop": "mesh"})
     spread, every = facts.backdrop_spread, "every image has a mask"
@@ -137,13 +145,15 @@ def hull_points(facts: CaptureFacts) -> Verdict:
     if facts.shows_backdrop:
         reason = "without masks, it is not known what beside the mesh belongs to the head"
         return Verdict(False, reason, fixed=True)
-    if np.isnan(facts.uncovered):
+    samples = facts.samples
+    if np.isnan(samples.foreground).any():
         reason = "without masks, it is not known how much lies beside the mesh"
         return Verdict(facts.settings.hull_points, reason)
-    reason = f"{facts.uncovered:.1%} of the foreground lies beside the mesh"
+    uncovered = float(samples.uncovered.sum() / max(samples.foreground.sum(), 1))
+    reason = f"{uncovered:.1%} of the foreground lies beside the mesh"
     if facts.cameras == 1:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
-    return Verdict(facts.uncovered > MIN_UNCOVERED_SHARE, reason)
+    return Verdict(uncovered > MIN_UNCOVERED_SHARE, reason)
 
 
 def depth_limits(facts: CaptureFacts) -> Verdict:
@@ -170,16 +180,7 @@ def selection(facts: CaptureFacts) -> Verdict:
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
-def strain_color(facts: CaptureFacts) -> Verdict:
-    return _following(facts, "color follows", "deformation", "strain_dependence")
-
-
-def strain_position(facts: CaptureFacts) -> Verdict:
-    what = "deformation around a triangle"
-    return _following(facts, "positions follow", what, "smoothed_strain_dependence")
-
-
-def _following(facts: CaptureFacts, follows: str, what: str, evidence: str) -> Verdict:
+def strain(facts: CaptureFacts, follows: str, what: str, is_smoothed: bool) -> Verdict:
     """On where what follows brings enough in the mean of frames and cameras that were left out: of
     what a head shows, unseen expressions and unseen views count alike."""
     if facts.strain < MIN_STRETCH:
@@ -187,7 +188,7 @@ def _following(facts: CaptureFacts, follows: str, what: str, evidence: str) -> V
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
         reason = f"{facts.timesteps} frames are too few to tell how {follows} deformation"
         return Verdict(False, reason)
-    left_out: Mapping[str, Evidence] = getattr(facts, evidence)
+    left_out = facts.strain_dependence(is_smoothed)
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
     figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
     is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
@@ -206,8 +207,17 @@ def world(facts: CaptureFacts) -> Verdict:
         return Verdict(False, reason, fixed=True)
     if spread <= MAX_BACKGROUND_SPREAD_LEVELS:
         return Verdict(False, "what lies behind the person is of one color", fixed=True)
-    if facts.moving_cameras:
-        return Verdict(False, f"{facts.moving_cameras} of {facts.cameras} cameras move", fixed=True)
+    # which have another pose or lens in some view than in their first
+    names = ("width", "height", "fl_x", "fl_y", "cx", "cy", "world_to_camera")
+    first: dict[int, Camera] = {}
+    moving = set()
+    for view in facts.views:
+        known, own = first.setdefault(view.camera_index, view.camera), view.camera
+        pairs = [(getattr(known, name), getattr(own, name)) for name in names]
+        if known is not own and not all(np.allclose(*pair, atol=1e-6) for pair in pairs):
+            moving.add(view.camera_index)
+    if moving:
+        return Verdict(False, f"{len(moving)} of {facts.cameras} cameras move", fixed=True)
     return Verdict(False, "kept only where it is asked for; no export has it but its own file")
 
 
@@ -229,17 +239,12 @@ def torso(facts: CaptureFacts) -> Verdict | None:
     return Verdict(found.motion != "head", found.description)
 
 
-def _turning(name: str, *joints: int) -> Rule:
+def turning(facts: CaptureFacts, joints: Sequence[int]) -> Verdict | None:
     """On where one of these FLAME joints turns."""
-
-    def rule(facts: CaptureFacts) -> Verdict | None:
-        if not facts.frames:
-            return None
-        turn = facts.joint_angle(*joints)
-        return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
-
-    rule.__name__ = name
-    return rule
+    if not facts.frames:
+        return None
+    turn = facts.joint_angle(*joints)
+    return Verdict(turn > MIN_JOINT_ANGLE_DEG, f"turns by up to {turn:.1f}°")
 
 
 def dynamic_offsets(facts: CaptureFacts) -> Verdict | None:
@@ -261,19 +266,29 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     if is_tracked(facts.capture.root):
         sharper = "splats see motion more sharply than landmarks do"
         return Verdict(True, f"the capture is from `stga track`: {sharper}")
-    if np.isnan(facts.outside):
+    # by two pixels or more
+    outside = float(facts.samples.outside.sum() / max(facts.samples.mesh.sum(), 1))
+    if np.isnan(outside):
         return Verdict(False, "without masks, the mesh cannot be compared with the images")
-    reason = f"{facts.outside:.2%} of the mesh sticks out of the masks"
-    return Verdict(facts.outside > MAX_OUTSIDE_SHARE, reason)
+    reason = f"{outside:.2%} of the mesh sticks out of the masks"
+    return Verdict(outside > MAX_OUTSIDE_SHARE, reason)
 
 
-_RULES: tuple[Rule, ...] = (
-    view_color, exposure, antialiasing, background, hull_points, depth_limits, density, selection,
-    strain_color, strain_position, relight, world, teeth, torso, _turning("neck", 1),
-    _turning("jaw", 2), _turning("eyes", 3, 4), dynamic_offsets, tracking,
-)  # fmt: skip
-RULES = {rule.__name__.replace("_", "-"): rule for rule in _RULES}
-"""Effect -> its rule, a function of that name."""
+_AROUND = "deformation around a triangle"
+RULES: dict[str, Rule] = {
+    "view-color": view_color, "exposure": exposure, "antialiasing": antialiasing,
+    "background": background, "hull-points": hull_points, "depth-limits": depth_limits,
+    "density": density, "selection": selection,
+    "strain-color": partial(
+        strain, follows="color follows", what="deformation", is_smoothed=False),
+    "strain-position": partial(
+        strain, follows="positions follow", what=_AROUND, is_smoothed=True),
+    "relight": relight, "world": world, "teeth": teeth, "torso": torso,
+    "neck": partial(turning, joints=[1]), "jaw": partial(turning, joints=[2]),
+    "eyes": partial(turning, joints=[3, 4]), "dynamic-offsets": dynamic_offsets,
+    "tracking": tracking,
+}  # fmt: skip
+"""Effect -> its rule."""
 Plan = tuple[EffectDecision, ...]
 
 
@@ -304,7 +319,7 @@ def plan_effects(
         on = verdict.on if choice == "auto" else choice == "on"
         if verdict.fixed and on != verdict.on:
             raise StgaError(f"{flag}: is not possible, because {verdict.reason}")
-        decided = switched(decided, effect, on, verdict.changes)
+        decided = _switched(decided, effect, on, verdict)
         plan.append(EffectDecision(effect.name, choice, on, verdict.reason, effect.cost))
     return decided, tuple(plan)
 
@@ -322,18 +337,16 @@ def add_effects(
         verdict = RULES[effect.name](facts) if decision.choice == "auto" else None
         if verdict is not None:
             plan[effect.name] = replace(decision, on=verdict.on, reason=verdict.reason)
-            settings = switched(settings, effect, verdict.on)
+            settings = _switched(settings, effect, verdict.on, verdict)
     return settings, tuple(plan.values())
 
 
-def switched(
-    settings: TrainingSettings,
-    effect: Effect,
-    on: bool,
-    changes: Mapping[str, Any] = MappingProxyType({}),
+def _switched(
+    settings: TrainingSettings, effect: Effect, on: bool, verdict: Verdict
 ) -> TrainingSettings:
-    """The settings with an effect on or off; changes: further ones for when it is on."""
-    changed = {**effect.on, **changes} if on else dict(effect.off)
+    changed = {**effect.on, **verdict.changes} if on else dict(effect.off)
+    if effect.switch:
+        changed[effect.switch] = on
     if effect.offset is not None:
         offsets = {*settings.driven_offsets} - {effect.offset} | ({effect.offset} if on else set())
         changed["driven_offsets"] = tuple(name for name in OFFSETS if name in offsets)

@@ -13,7 +13,7 @@ from ...avatar.offsets import OFFSETS, moved_frames
 from ...avatar.strain import color_range, strain_basis
 from ...capture.model import Capture
 from ..settings import TrainingSettings
-from .hull_points import voxel_size
+from .initial_splats import voxel_size
 
 CACHED_TIMESTEPS = 12
 """Timesteps kept in memory: about 1 MB each for 10,000 triangles."""

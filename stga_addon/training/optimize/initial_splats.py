@@ -1,20 +1,25 @@
-"""The splats that training starts with."""
+"""The splats that training starts with: a lattice on the mesh, colored as the images show it, and
+hull points for what the mesh does not cover (hair, shoulders, clothes); a flat layer for a single
+camera."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
 from scipy.spatial import cKDTree
 
-from ...avatar.embedding import face_frames, to_world
-from ...avatar.lattice import lattice_splats
+from ...avatar.embedding import face_frames, to_local, to_world
+from ...avatar.lattice import lattice_splats, lattice_weights
 from ...avatar.splats import ADDED, SH_C0, Splats, joined
-from ...capture.images import read_view
-from ...capture.mesh_geometry import connected_parts, rasterize
+from ...capture.camera import Camera
+from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
+from ...capture.mesh_geometry import MIN_DEPTH_M, connected_parts, rasterize, silhouette
 from ...capture.model import Capture, View, evenly_spread
+from ...flame.model import torso_faces
+from ...flame.sequence import below_neck
+from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
-from .hull_points import flat_points, hull_points, pixels_of
 
 SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
@@ -29,6 +34,33 @@ mesh: below it, the cameras stand on both sides of the head."""
 MAX_ASYMMETRY_SHARE = 0.015
 """Median distance of the mesh from its mirror image, as a share of its diagonal, beyond which it is
 not symmetric."""
+VOXEL_SIZE_M = 0.004
+"""Distance between hull points, on a mesh of a head's size."""
+MIN_VOXEL_SIZE_SHARE = 1 / 200
+"""Lower bound of the voxel size, as a share of the mesh's diagonal, so that a mesh in millimeters
+fits into memory."""
+MIN_MESH_DISTANCE_M = 0.006
+"""Points nearer to the mesh are covered by the mesh's own splats."""
+GRID_MARGIN_SHARE = 0.25
+"""Margin of the grid around the mesh's bounding box, as a share of its diagonal."""
+BLOCK_VOXELS = 5
+"""Edge of the blocks that are carved before single voxels are, in voxels."""
+MIN_VISIBLE_SHARE = 0.25
+"""Share of the views in whose image a voxel must lie; it must be foreground in all of these."""
+MIN_EXPOSED_SHARE = 0.125
+"""Share of the views in which a voxel must be visible beside the mesh. Otherwise, volumes behind
+the head that no view contradicts would become floaters in other views."""
+SILHOUETTE_TOLERANCE_SHARE = 0.01
+"""Error of the tracked silhouette, as a share of the image height."""
+FEW_CAMERAS = 4
+"""Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints`
+are better."""
+CONTINUED_SHARE, CONTINUED_OPACITY = 0.4, 3.0
+"""How far a torso is continued beyond the image of a single camera, as a share of the image's
+width; and the logit of these splats' opacity, which may never be trained."""
+SEEN_COPIES, SEEN_SPREAD = 3, 0.5
+"""Splats for each of these points, and the standard deviation of their distance from it, in
+voxels."""
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
@@ -137,3 +169,206 @@ def mirror_images(
     if np.median(distance) > MAX_ASYMMETRY_SHARE * np.linalg.norm(np.ptp(capture.neutral, axis=0)):
         rows = rows[:0]
     return rows, partner[rows]
+
+
+def hull_points(
+    capture: Capture, views: Sequence[View], convention: str, sh_degree: int, torso: bool = False
+) -> Splats:
+    """Unbound splats on the surface of the visual hull of one timestep, outside the mesh.
+
+    views: all of one timestep. The hull is carved on a grid of VOXEL_SIZE_M (coarser on a larger
+    mesh) from the masks or, without masks, from pixels that differ from white. Each splat is
+    embedded in the nearest triangle and follows it; torso: below the base of FLAME's neck, in the
+    nearest one of the torso, and of few cameras where `stga track` has seen it instead of on the
+    hull.
+    """
+    mesh = capture.mesh(views[0].timestep)
+    voxel = voxel_size(mesh)
+    points = _hull_surface(mesh, capture.faces, views, voxel)
+    distance, face = _followed(capture, views[0].timestep, points, torso)
+    outside = distance > MIN_MESH_DISTANCE_M
+    world = _new_splats(points[outside], voxel, sh_degree)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    hull = to_local(world, frames, face[outside])
+    seen = read_torso_points(capture.root) if torso and len(views) <= FEW_CAMERAS else None
+    if seen is None or capture.flame is None or seen.timestep not in capture.timesteps:
+        return hull
+    triangles = np.flatnonzero(torso_faces(capture.flame.model))
+    if not len(triangles):
+        return hull
+    rest = hull.rows(~below_neck(capture.flame, views[0].timestep, points[outside]))
+    # around the points at which the torso is seen, in its triangles
+    mesh, voxel = capture.mesh(seen.timestep), voxel_size(capture.mesh(seen.timestep))
+    spread = np.random.default_rng(0).normal(0, SEEN_SPREAD * voxel, (SEEN_COPIES, *seen.at.shape))
+    points = (seen.at + spread).reshape(-1, 3)
+    _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    shown = to_local(_new_splats(points, voxel, sh_degree), frames, triangles[among])
+    return joined([rest, shown])
+
+
+def flat_points(
+    capture: Capture, view: View, convention: str, sh_degree: int, torso: bool = False
+) -> Splats:
+    """Unbound splats for what a single camera shows beside the mesh: one layer at the depth of the
+    mesh's outline.
+
+    A single camera does not show how far away hair or shoulders are. Each splat lies on the ray of
+    its pixel, as deep as the part of the mesh that is nearest in the image, follows the same
+    triangle as a hull point there, and has its size and distance. torso: what the image cuts off
+    below the neck is continued beyond it, as its border looks, for other timesteps that show more;
+    where none does, it stays so.
+    """
+    mesh, camera = capture.mesh(view.timestep), view.camera
+    voxel = voxel_size(mesh)
+    samples = _mesh_samples(mesh, capture.faces)
+    pixels, depth = camera.project(samples)
+    step = max(1.0, voxel * (camera.fl_x + camera.fl_y) / 2 / float(np.median(depth)))
+    neck = capture.flame if torso else None
+    beyond = 0.0 if neck is None else round(CONTINUED_SHARE * camera.width / step) * step
+    rows, columns = np.meshgrid(
+        np.arange(step / 2, camera.height + beyond, step),
+        np.arange(step / 2 - beyond, camera.width + beyond, step),
+        indexing="ij",
+    )
+    pixel = (
+        np.clip(rows.astype(int), 0, camera.height - 1),
+        np.clip(columns.astype(int), 0, camera.width - 1),
+    )
+    beside = (_foreground(view) & ~_silhouette(mesh, capture.faces, camera))[pixel]
+    centers = np.stack([columns[beside], rows[beside]], axis=1)
+    if not len(centers):
+        return _new_splats(np.zeros((0, 3)), voxel, sh_degree)
+    points = camera.unproject(centers, depth[cKDTree(pixels).query(centers)[1]])
+    _, face = _followed(capture, view.timestep, points, torso)
+    frames = face_frames(mesh, capture.faces, capture.neutral, convention)
+    splats = _new_splats(points, voxel, sh_degree)
+    if neck is None:
+        return to_local(splats, frames, face)
+    cut = ~pixels_of(points, camera)[2]
+    splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
+    splats.log_scale[cut], splats.opacity[cut] = np.log(voxel), CONTINUED_OPACITY
+    below = below_neck(neck, view.timestep, points)
+    return to_local(splats, frames, face).rows(~cut | below)
+
+
+def voxel_size(mesh: np.ndarray) -> float:
+    """Distance in meters between hull points around a mesh (V, 3)."""
+    return max(VOXEL_SIZE_M, MIN_VOXEL_SIZE_SHARE * float(np.linalg.norm(np.ptp(mesh, axis=0))))
+
+
+def _nearest_triangle(
+    points: np.ndarray, mesh: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) to the mesh and nearest triangle (N,), by samples of every triangle."""
+    samples = _mesh_samples(mesh, faces)
+    distance, nearest = cKDTree(samples).query(points)
+    return distance, nearest // (len(samples) // len(faces))
+
+
+def _followed(
+    capture: Capture, timestep: int, points: np.ndarray, torso: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (N,) to the mesh, and triangle (N,) of each point: the nearest, of those below the
+    base of the neck with `torso` the nearest of the torso."""
+    mesh = capture.mesh(timestep)
+    distance, face = _nearest_triangle(points, mesh, capture.faces)
+    if torso and capture.flame is not None:
+        own = np.flatnonzero(torso_faces(capture.flame.model))
+        below = below_neck(capture.flame, timestep, points)
+        if len(own) and below.any():
+            face[below] = own[_nearest_triangle(points[below], mesh, capture.faces[own])[1]]
+    return distance, face
+
+
+def _mesh_samples(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Points (F · S, 3) of a lattice on every triangle, triangle by triangle."""
+    samples = np.einsum("pc,fci->fpi", lattice_weights(4, inset=0.02), mesh[faces])
+    return np.asarray(samples.reshape(-1, 3))
+
+
+def _hull_surface(
+    mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float
+) -> np.ndarray:
+    """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
+    low, high = mesh.min(0), mesh.max(0)
+    margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
+    axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
+    foreground = [_foreground(view) for view in views]
+    min_visible = max(2, MIN_VISIBLE_SHARE * len(views))
+    # first blocks are carved, whose bounding sphere lies in the background of an image, or outside
+    # of too many images
+    centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
+    points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
+    kept, outside = np.ones(len(points), bool), np.zeros(len(points), int)
+    for view, mask in zip(views, foreground, strict=True):
+        camera = view.camera
+        pixels, depth = camera.project(points)
+        before, nearest = depth - radius > MIN_DEPTH_M, np.maximum(depth - radius, MIN_DEPTH_M)
+        # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
+        # radius)).
+        focal = [camera.fl_x, camera.fl_y]
+        slope = np.hypot(1, (pixels - [camera.cx, camera.cy]) / focal)
+        reach = np.ceil((slope * focal).max(1) * radius / nearest) + 1
+        beyond = np.maximum(-pixels, pixels - [camera.width, camera.height]).max(1)
+        outside += np.where(before, beyond > reach, depth + radius <= MIN_DEPTH_M)
+        # Beyond an image, what is background is not known.
+        clear = distance_transform_cdt(np.pad(~mask, 1), "chessboard")[1:-1, 1:-1]
+        x, y, seen = pixels_of(points, camera)
+        kept &= ~(before & seen & (clear[y, x] > reach))
+    kept &= len(views) - outside >= min_visible
+    within = kept.reshape([len(along) for along in centers])
+    for number, axis in enumerate(axes):
+        within = within.repeat(BLOCK_VOXELS, number).take(range(len(axis)), number)
+    # then voxels
+    rows = np.nonzero(within)
+    points = np.stack([axis[row] for axis, row in zip(axes, rows, strict=True)], axis=1)
+    inside = np.ones(len(points), bool)
+    visible, exposed = np.zeros((2, len(points)), np.int32)
+    for view, mask in zip(views, foreground, strict=True):
+        beside = ~_silhouette(mesh, faces, view.camera)
+        remaining = np.flatnonzero(inside)
+        x, y, seen = pixels_of(points[remaining], view.camera)
+        remaining, x, y = remaining[seen], x[seen], y[seen]
+        visible[remaining] += 1
+        exposed[remaining] += beside[y, x]
+        inside[remaining] = mask[y, x]
+    solid = within.copy()
+    solid[within] = inside & (visible >= min_visible)
+    surface = (solid & ~binary_erosion(solid))[within]
+    return np.asarray(points[surface & (exposed >= np.maximum(1, MIN_EXPOSED_SHARE * len(views)))])
+
+
+def _silhouette(mesh: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: pixels that the mesh covers, dilated by the tolerance."""
+    tolerance = max(1, round(SILHOUETTE_TOLERANCE_SHARE * camera.height))
+    return np.asarray(binary_dilation(silhouette(mesh, faces, camera), iterations=tolerance))
+
+
+def _foreground(view: View) -> np.ndarray:
+    """(H, W) bool from the mask or, without one, from the image's difference to white."""
+    mask = read_mask(view)
+    if mask is not None:
+        return np.asarray(mask > 127)
+    return np.asarray((read_image(view) < WHITE_LEVEL).any(axis=2))
+
+
+def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in
+    the image."""
+    pixels, depth = camera.project(points)
+    x, y = np.floor(pixels).T
+    seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return np.where(seen, x, 0).astype(int), np.where(seen, y, 0).astype(int), seen
+
+
+def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
+    """Gray unbound spheres of one voxel's size at world points (N, 3)."""
+    n = len(points)
+    rotation, log_scale = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)), np.log(voxel / 2)
+    return Splats(
+        points.astype(np.float32), rotation, np.full((n, 3), log_scale, np.float32),
+        np.zeros(n, np.float32), np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
+        np.zeros(n, np.int32), np.ones(n, bool),
+    )  # fmt: skip

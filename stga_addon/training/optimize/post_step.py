@@ -1,5 +1,5 @@
-"""Changes of the splats between steps beside density control: pruning outside of the masks, and
-colors of sides of the head that no training view shows.
+"""Changes of the splats between steps: density control and stray resets (STGA, training), pruning
+outside of the masks, and colors of sides of the head that no training view shows.
 
 A needle beside the hair, which a few images call for and many others push back, would survive the
 training. And nothing but what shines through the front trains a hidden side, which gives it any
@@ -7,23 +7,26 @@ color.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from ...avatar.embedding import FaceFrames, points_to_world
-from ...avatar.splats import SH_C0
+from ...avatar.splats import SH_C0, joined
 from ...capture.camera import Camera, look_at
 from ...capture.images import area_mean, read_mask
 from ...capture.mesh_geometry import connected_parts, rasterize
 from ...capture.model import Capture, evenly_spread
-from .density import prunable
-from .hull_points import pixels_of
-from .initial_splats import mean_colors, mirror_images
-from .state import TrainState, keep_rows
+from ...flame.quaternions import to_matrices
+from .initial_splats import mean_colors, mirror_images, pixels_of
+from .state import TrainState, join, keep_rows, new_state
 
+MIN_OPACITY = 0.02
+"""Splats with a lower opacity are pruned."""
+SPLIT_SCALE = 1.6
+"""By which both halves of a split splat are narrower along the axis it is split on."""
 MAX_OUTLINES = 16
 MAX_OUTLINE_HEIGHT_PX = 400
 """Masks higher than this are shrunk to it."""
@@ -42,6 +45,88 @@ SOURCE_TRIANGLES = 100
 OUTSIDE_CAMERAS, OUTSIDE_DISTANCE = 18, 4.0
 """Cameras around the neutral head that tell its outside from its inside; their distance, in its
 radius."""
+
+
+def control_density(
+    state: TrainState,
+    budget: int,
+    rng: np.random.Generator,
+    max_share: float,
+    region: np.ndarray | None = None,
+) -> TrainState:
+    """Split the splats with the largest mean screen gradient and prune those of low opacity.
+
+    budget: how many splats may be added; max_share: largest share of the splats that is split;
+    region (F,) bool: the triangles whose splats may change, None for all. Every triangle with bound
+    splats keeps one. Children, on either side of the parent's center along its longest axis,
+    inherit triangle, binding and unseen share, lie within the parent's Gaussian in local units, and
+    keep Adam's second moment and step count, without which their first steps would all be as long
+    as the rate.
+    """
+    gradient = state.screen_gradient / np.maximum(state.gradient_count, 1)
+    within = np.ones(len(state), bool) if region is None else region[state.face]
+    gradient[~within] = 0.0
+    count = max(0, min(budget, int(max_share * within.sum())))
+    split = np.argsort(-gradient, kind="stable")[:count]
+    split = split[gradient[split] > 0]
+    kept = keep_rows(state, split)
+    parents, pairs, n = kept.splats(), join(kept, kept), np.arange(len(split))
+    longest = np.argmax(parents.log_scale, axis=1)
+    length = np.exp(parents.log_scale[n, longest])[:, None]
+    offset = to_matrices(parents.rotation)[n, :, longest] * length * 0.5
+    jitter = 1 + 0.1 * rng.standard_normal((len(parents), 1))
+    parents.log_scale[n, longest] -= np.log(SPLIT_SCALE)
+    # of two Gaussians beside each other, so much narrower, that cover as much as one
+    opacity = np.maximum(SPLIT_SCALE / 2 * _sigmoid(parents.opacity), 2 * MIN_OPACITY)
+    parents.opacity[:] = np.log(opacity / (1 - opacity))
+    sides = [(parents.xyz + side * offset * jitter).astype(np.float32) for side in (-1, 1)]
+    halves = joined([replace(parents, xyz=xyz) for xyz in sides])
+    children = new_state(halves, pairs.unseen_share)
+    children.second, children.steps = pairs.second, pairs.steps
+    faint = _sigmoid(state.parameters.opacity) < MIN_OPACITY
+    keep = ~prunable(state, faint & within)
+    keep[split] = False
+    state = join(keep_rows(state, keep), children)
+    zero = np.zeros(len(state), np.float32)
+    return replace(state, screen_gradient=zero, gradient_count=zero.copy())
+
+
+def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
+    """Move bound splats farther than `limit` from their triangle's origin back to `share` of it;
+    returns how many.
+
+    limit (F,) in local units, infinite where none is moved. Works in place. (STGA, training, which
+    moves them onto the origin: share = 0.) Adam's first moment of the position is reset. The second
+    moment is kept: with it at zero and the step count of the row, which all its parameters share,
+    in the thousands, the bias correction would make the next step 3.2 times as long as the learning
+    rate (0.1 / √0.001).
+    """
+    distance = np.linalg.norm(state.parameters.xyz, axis=1)
+    allowed = limit[state.face]
+    strays = np.flatnonzero(~state.unbound & (distance > allowed))
+    # Rounding must not leave them just beyond the limit, or they would be strays again.
+    factor = (share * (1 - 1e-6) * allowed[strays] / distance[strays])[:, None]
+    state.parameters.xyz[strays] = np.where(factor > 0, factor * state.parameters.xyz[strays], 0)
+    state.first.xyz[strays] = 0
+    state.average.xyz[strays] = state.parameters.xyz[strays]
+    return len(strays)
+
+
+def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
+    """(N,) bool: the unwanted splats (N,) bool but for a bound one of each triangle that would have
+    none left: the most opaque one."""
+    face, bound = state.face, np.flatnonzero(~state.unbound)
+    order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
+    first = np.ones(len(order), bool)
+    first[1:] = face[order][1:] != face[order][:-1]
+    prunable = unwanted.copy()
+    prunable[order[first]] = False
+    return prunable
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    """In float64."""
+    return np.asarray(1 / (1 + np.exp(-x.astype(np.float64))))
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,13 @@ from ...capture.model import Capture, View
 from ...errors import StgaError
 from ...render.device import adapter_name
 from ..schedule import learning_rates, sh_degree
-from ..settings import TrainingSettings
+from ..settings import CONTINUATIONS, TrainingSettings
+from . import post_step
 from .avatar_tracking import RefinedTracking
 from .cpu_backend import CpuBackend
-from .density import control_density, reset_strays
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .post_step import Outline, UnseenSides, prune_outside, read_outlines, unseen_sides
 from .state import Batch, TrainState, new_state, with_offsets
-from .strategies import Strategy
 
 if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend
@@ -29,6 +27,47 @@ MAX_REGION_SPLIT_SHARE = 0.1
 rounds."""
 OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
 """Iterations between turns of pruning outside of the masks, and of coloring unseen sides."""
+EXTEND_LOCAL_SHARE = 0.5
+"""Share of an extension's budget that trains what the new takes need, before all splats are
+trained."""
+
+
+class Strategy:
+    """Decides which triangles each iteration trains, as `TrainingSettings.strategy` says.
+
+    region  (F,) bool: the only triangles whose splats the run may change; None for all
+
+    "selective" alternates local iterations, which train a frame's selected triangles, with global
+    ones (STGA, training). "refine" trains the same region throughout, "extend" first what new takes
+    need, in views of all takes, and then all splats. Not in turn: where some splats are frozen in
+    the new views only, the others make up for them there, and drift.
+    """
+
+    def __init__(self, settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> None:
+        """selection: timestep -> (F,) bool triangles; continuations train the union."""
+        self._settings, self._selection = settings, selection
+        continues = settings.strategy in CONTINUATIONS
+        self.region = np.any(list(selection.values()), axis=0) if continues else None
+
+    def triangles(
+        self, iteration: int, visit: int, timestep: int, progress: float
+    ) -> np.ndarray | None:
+        """(F,) bool triangles whose splats are trained; None trains all splats.
+
+        iteration, visit  count iterations and visits of frames (consecutive views of one timestep)
+                          from 0
+        progress          share of the budget spent
+        """
+        settings, region = self._settings, self.region
+        if region is not None:
+            is_local = progress < EXTEND_LOCAL_SHARE and region.any()
+            return region if settings.strategy == "refine" or is_local else None
+        selected = self._selection.get(timestep)
+        count = iteration if settings.global_unit == "iteration" else visit
+        is_global = count % (settings.global_interval + 1) == settings.global_interval
+        if settings.strategy != "selective" or progress < settings.warm_up_share or is_global:
+            return None
+        return selected if selected is not None and selected.any() else None
 
 
 class Trainer:
@@ -69,8 +108,8 @@ class Trainer:
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
             state = with_offsets(state, settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self.frames, state)
-        self._outlines: list[Outline] | None = None
-        self._sides: UnseenSides | None = None
+        self._outlines: list[post_step.Outline] | None = None
+        self._sides: post_step.UnseenSides | None = None
         cameras = {view.camera_index for view in capture.views["train"]}
         self._has_one_camera = len(cameras) == 1
         self.initial_count = len(self)
@@ -155,21 +194,21 @@ class Trainer:
             limit = settings.stray_limit * self.frames.units
             if region is not None:
                 limit = np.where(region, limit, np.inf).astype(limit.dtype)
-            reset_strays(state, limit, settings.stray_reset_share)
+            post_step.reset_strays(state, limit, settings.stray_reset_share)
         if splits:
             budget = round(self.initial_count * (1 + settings.growth)) - len(state)
             share = settings.split_share if region is None else MAX_REGION_SPLIT_SHARE
             rng = np.random.default_rng([settings.seed, count])
-            state = control_density(state, budget, rng, share, region)
+            state = post_step.control_density(state, budget, rng, share, region)
         if prunes:
             coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
             frames = partial(self.frames.moved, coefficients=coefficients)
             if self._outlines is None:
-                self._outlines = read_outlines(self.capture, settings.seed)
-            state = prune_outside(state, frames, self._outlines, region)
+                self._outlines = post_step.read_outlines(self.capture, settings.seed)
+            state = post_step.prune_outside(state, frames, self._outlines, region)
         if colors:
             if self._sides is None:
-                self._sides = unseen_sides(self.capture)
+                self._sides = post_step.unseen_sides(self.capture)
             state = self._sides.restore(state)
         self.state = state
 
