@@ -162,7 +162,7 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     order = np.concatenate([rng.permutation(len(plates)) for _ in range(turns)])[:steps]
     for number in counted(order, steps, report, "World", "Step"):
         trainer.step(views[number], targets[number], trainer.iteration / steps)
-    return replace(to_world(trainer.state.averaged(), frames), face=face)
+    return replace(to_world(trainer.state.splats(averaged=True), frames), face=face)
 
 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:

@@ -72,7 +72,8 @@ def person(right: Made) -> tuple[Avatar, TrainingSettings]:
         small, image, mask = ready[view.name]
         trainer.step(small, image, n / 300, mask)
     neutral = capture.neutral.astype(np.float32)
-    return Avatar(trainer.state.averaged(), settings.convention, neutral, capture.faces), settings
+    splats = trainer.state.splats(averaged=True)
+    return Avatar(splats, settings.convention, neutral, capture.faces), settings
 
 
 def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:

@@ -124,8 +124,8 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
     view = capture.views["val"][0]
     seen = trained_strain_range(capture, capture.mesh, None)
     avatar = Avatar(
-        trainer.state.averaged(), "stga", capture.neutral.astype(np.float32), capture.faces,
-        strain_range=seen, driven_offsets={"strain_position": position.average},
+        trainer.state.splats(averaged=True), "stga", capture.neutral.astype(np.float32),
+        capture.faces, strain_range=seen, driven_offsets={"strain_position": position.average},
     )  # fmt: skip
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))

@@ -32,7 +32,6 @@ from ...flame.forward import (
 from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import (
     SHIFT_SIZE,
-    FlameSequence,
     sequence_mesh,
     torso_offset,
     torso_shapes,
@@ -41,31 +40,17 @@ from ...flame.sequence import (
 from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar
-from ...tracking.appearance import (
-    CHANNEL_WEIGHTS,
-    NOISE_LEVELS,
-    POINT_SHARE,
-    inside,
-    projection_derivative,
-    pyramid,
-    sampled,
-)
+from ...tracking import appearance, solve
+from ...tracking.appearance import NOISE_LEVELS, POINT_SHARE
 from ...tracking.head_model import HeadModel
 from ...tracking.posed_points import PosedPoints
 from ...tracking.seen_surface import facing, in_sight, surface_points
-from ...tracking.solve import (
-    TRANSLATION_ACCELERATION_M,
-    WEIGHT_EXCESS_SIGMA,
-    acceleration_precision,
-    parameter_precision,
-    smoothed,
-)
 from ..schedule import sh_degree
 from ..settings import TrainingSettings
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
-from .state import new_offset, new_state
+from .state import state_of_avatar
 
 RENDERINGS, RENDERINGS_AGAIN = 7, 5
 """Of each view of a timestep, at first and once it was tracked by the avatar already: more of them
@@ -113,10 +98,10 @@ class AvatarTracking:
         """Smooth over time where the images do not say; model: of the person. Not where scale was
         sought."""
         count = model.n_expression
-        shift = np.full(SHIFT_SIZE, TRANSLATION_ACCELERATION_M**-2)
-        stiffness = np.insert(acceleration_precision(model), count, shift)
+        shift = np.full(SHIFT_SIZE, solve.TRANSLATION_ACCELERATION_M**-2)
+        stiffness = np.insert(solve.acceleration_precision(model), count, shift)
         parts = self.parameters[:, :count], self.shift, self.parameters[:, count:]
-        values = smoothed(np.concatenate(parts, axis=1), self.information, stiffness)
+        values = solve.smoothed(np.concatenate(parts, axis=1), self.information, stiffness)
         expression, shift, pose = np.split(values, [count, count + SHIFT_SIZE], axis=1)
         return replace(self, parameters=np.concatenate([expression, pose], axis=1), shift=shift)
 
@@ -152,17 +137,14 @@ class RefinedTracking:
         self._person = replace(with_identity(self.sequence), frame=self.frame)
         self._torso = torso_shapes(self._person.model)
 
-    def refines(self, timestep: int) -> bool:
-        return timestep in self._row
-
     def frame(self, timestep: int) -> FlameFrame:
         values, source = self.parameters[self._row[timestep]], self._source(timestep)
         offset = torso_offset(self._torso, values[-SHIFT_SIZE:], source.dynamic_offset)
         return frame_of(values[:-SHIFT_SIZE], offset)
 
-    def mesh(self, timestep: int) -> np.ndarray:
-        """(V, 3) meters."""
-        return sequence_mesh(self._person, timestep)
+    def mesh(self, timestep: int) -> np.ndarray | None:
+        """(V, 3) meters; None where the timestep is not tracked."""
+        return sequence_mesh(self._person, timestep) if timestep in self._row else None
 
     def refined(self, capture: Capture) -> Capture:
         """The capture with the parameters of now."""
@@ -237,21 +219,6 @@ def normal_images(
     return seen, found
 
 
-class _Posed:
-    """The head at the parameters that are being tried, in place of the capture's (`FrameStore`)."""
-
-    def __init__(self, sequence: FlameSequence, model: FlameModel) -> None:
-        self._sequence, self._model = sequence, model
-        self.values = np.zeros(0)
-
-    def refines(self, timestep: int) -> bool:
-        return True
-
-    def mesh(self, timestep: int) -> np.ndarray:
-        offset = self._sequence.frame(timestep).dynamic_offset
-        return flame_forward(self._model, np.zeros(0), frame_of(self.values, offset))
-
-
 class _Tracker:
     def __init__(
         self,
@@ -286,16 +253,17 @@ class _Tracker:
         self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
         self._posed_points = PosedPoints(person, self._points)
-        self._posed = _Posed(sequence, person)
-        state = new_state(avatar.splats)
-        state.driven_offsets = {
-            name: new_offset(own) for name, own in avatar.driven_offsets.items()
-        }
-        limits = avatar.strain_range
+        self._values = np.zeros(0)  # parameters that are being tried
+        state = state_of_avatar(avatar)
         self._frames = FrameStore(
-            capture, settings.convention, settings.follows_strain, self._posed, limits
+            capture, settings.convention, settings.follows_strain, self._mesh, avatar.strain_range
         )
         self._backend = CpuBackend(settings, self._frames, state)
+
+    def _mesh(self, timestep: int) -> np.ndarray:
+        """(V, 3) of the parameters that are being tried."""
+        offset = self._sequence.frame(timestep).dynamic_offset
+        return flame_forward(self._head.model, np.zeros(0), frame_of(self._values, offset))
 
     def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float, float, float]:
         """Parameters (E + 18,) with the torso's shift, and the scale where it is sought, after the
@@ -348,8 +316,8 @@ class _Tracker:
             values = start + solve_triangular(root, whitened, lower=True, trans=1)
             loss, gradient = known or self._loss(values, timestep, shots)
             change, excess = values - tracked, self._excess(values)
-            gradient = gradient + precision * change + excess / WEIGHT_EXCESS_SIGMA**2
-            prior = precision @ change**2 + (excess**2).sum() / WEIGHT_EXCESS_SIGMA**2
+            gradient = gradient + precision * change + excess / solve.WEIGHT_EXCESS_SIGMA**2
+            prior = precision @ change**2 + (excess**2).sum() / solve.WEIGHT_EXCESS_SIGMA**2
             return loss + prior / 2, solve_triangular(root, gradient, lower=True)
 
         zero = np.zeros(len(tracked))
@@ -366,8 +334,8 @@ class _Tracker:
         return start + change, known, before, float(best.fun)
 
     def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
-        self._posed.values = values
-        mesh, missed, count = self._posed.mesh(shots[0][0].timestep), 0, 0
+        self._values = values
+        mesh, missed, count = self._mesh(shots[0][0].timestep), 0, 0
         for view, image in shots:
             head = rasterize(mesh, self._capture.faces, view.camera)[0] >= 0
             drawn = render_avatar(self._avatar, mesh, view.camera, self._settings.background)
@@ -404,7 +372,7 @@ class _Tracker:
         precision = sigma**-2.0
         rigid = slice(count, count + len(absent))
         precision[rigid] = np.where(
-            absent, parameter_precision(self._head)[rigid], precision[rigid]
+            absent, solve.parameter_precision(self._head)[rigid], precision[rigid]
         )
         return precision
 
@@ -420,7 +388,7 @@ class _Tracker:
         self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
     ) -> tuple[float, np.ndarray]:
         """The images' loss in the points' units, and its gradient (E + 18,)."""
-        self._posed.values = values
+        self._values = values
         self._frames.clear()
         background = np.array(self._settings.background, np.float32)
         weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
@@ -434,8 +402,8 @@ class _Tracker:
     ) -> np.ndarray:
         """(E + 18, E + 18): how much parameters change what the images show at points of the
         surface."""
-        self._posed.values = values
-        mesh, faces = self._posed.mesh(timestep), self._capture.faces
+        self._values = values
+        mesh, faces = self._mesh(timestep), self._capture.faces
         at, normals = (
             self._points.on(mesh, faces),
             self._points.on(vertex_normals(mesh, faces), faces),
@@ -444,18 +412,19 @@ class _Tracker:
         curvature = np.zeros((len(at), 3, 3))
         for view, image in shots:
             camera = view.camera
-            level = pyramid(camera, image, at.mean(0))[0]
+            level = appearance.pyramid(camera, image, at.mean(0))[0]
             pixels, depth = level.camera.project(at)
             small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
             cosine = facing(camera, at, normals)
             seen = (
                 (cosine > MIN_COSINE)
                 & in_sight(small, mesh, faces, at)
-                & inside(level.camera, pixels, depth)
+                & appearance.inside(level.camera, pixels, depth)
             )
-            slopes = np.stack(sampled(list(level.gradient), pixels), -1)  # (N, 3 channels, 2)
-            moved = slopes @ projection_derivative(level.camera, at) / NOISE_LEVELS
-            weight = POINT_SHARE * (cosine * seen)[:, None] * CHANNEL_WEIGHTS
+            # (N, 3 channels, 2)
+            slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
+            moved = slopes @ appearance.projection_derivative(level.camera, at) / NOISE_LEVELS
+            weight = POINT_SHARE * (cosine * seen)[:, None] * appearance.CHANNEL_WEIGHTS
             curvature += np.einsum("nc,ncx,ncy->nxy", weight, moved, moved)
         _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         flat = jacobian.reshape(-1, jacobian.shape[2])

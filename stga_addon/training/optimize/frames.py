@@ -4,7 +4,6 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -19,15 +18,6 @@ CACHED_TIMESTEPS = 12
 """Timesteps kept in memory: about 1 MB each for 10,000 triangles."""
 
 
-class MovedHead(Protocol):
-    """Meshes of some timesteps in place of the capture's, which may change."""
-
-    def refines(self, timestep: int) -> bool: ...
-
-    def mesh(self, timestep: int) -> np.ndarray:
-        """(V, 3) in meters."""
-
-
 @dataclass
 class _Timestep:
     mesh: np.ndarray
@@ -39,7 +29,6 @@ class FrameStore:
     """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
-    tracking  what its timesteps' meshes are from instead of the capture, None if none is refined
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
     """
 
@@ -48,11 +37,13 @@ class FrameStore:
         capture: Capture,
         convention: str,
         strain: bool = False,
-        tracking: MovedHead | None = None,
+        moved_mesh: Callable[[int], np.ndarray | None] = lambda timestep: None,
         limits: np.ndarray | None = None,
     ) -> None:
-        """limits (F, 2, 3): lowest and highest strain that is followed; None: COLOR_RANGE."""
-        self.capture, self.convention, self.tracking = capture, convention, tracking
+        """moved_mesh: (V, 3) of a timestep in place of the capture's, which may change, None where
+        it is the capture's; limits (F, 2, 3): lowest and highest strain that is followed; None:
+        COLOR_RANGE."""
+        self.capture, self.convention, self._moved_mesh = capture, convention, moved_mesh
         limits = color_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self.units = np.ones(len(capture.faces), np.float32)
@@ -93,15 +84,10 @@ class FrameStore:
         """The timestep's frames, moved by the driven offsets of these coefficients."""
         return moved_frames(self.of(timestep), coefficients, self.signals(timestep))
 
-    def mesh(self, timestep: int) -> np.ndarray:
-        """(V, 3) that the frames of the timestep are computed from."""
-        return self._latest(timestep).mesh
-
-    def add(self, timestep: int, mesh: np.ndarray) -> None:
-        """Use `mesh`, already read from the capture, if the timestep is not cached; refined
-        timesteps ignore it."""
-        if self.tracking is None or not self.tracking.refines(timestep):
-            self._latest(timestep, mesh)
+    def mesh(self, timestep: int, read: np.ndarray | None = None) -> np.ndarray:
+        """(V, 3) that the frames of the timestep are computed from; read: the capture's, where it
+        has been read already."""
+        return self._latest(timestep, read).mesh
 
     def clear(self) -> None:
         """Forget all meshes and frames, because what they are computed from has changed."""
@@ -122,11 +108,11 @@ class FrameStore:
             self.strain = before
             self.clear()
 
-    def _latest(self, timestep: int, mesh: np.ndarray | None = None) -> _Timestep:
-        entry, tracking = self._cached.pop(timestep, None), self.tracking
+    def _latest(self, timestep: int, read: np.ndarray | None = None) -> _Timestep:
+        entry = self._cached.pop(timestep, None)
         if entry is None:
-            if mesh is None and tracking is not None and tracking.refines(timestep):
-                mesh = tracking.mesh(timestep)
+            moved = self._moved_mesh(timestep)
+            mesh = read if moved is None else moved
             entry = _Timestep(np.asarray(self.capture.mesh(timestep)) if mesh is None else mesh)
         self._cached[timestep] = entry  # dictionaries keep insertion order, so the oldest is first
         if len(self._cached) > CACHED_TIMESTEPS:

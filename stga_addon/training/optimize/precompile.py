@@ -9,22 +9,15 @@ from ...avatar.embedding import WORLD
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...capture.camera import Camera
-from ...raster.cpu import USES_BUNDLED_KERNELS
-from ...raster.cpu.image_loss import change_background
+from ...raster.cpu import USES_BUNDLED_KERNELS, image_loss, optimizer
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import (
-    add_screen_gradients,
-    distance_limit,
-    opacity_weight,
-    scale_limit,
-)
 from ...raster.cpu.precompile import compile_gradients, rasterizer_helper
 from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
 from .losses import image_gradient, whole_image
-from .state import TrainState, new_state, with_offsets
+from .state import TrainState, new_state, with_effects
 
 HELPER_TIMEOUT_S = 120.0
 POLL_INTERVAL_S = 0.05
@@ -55,47 +48,39 @@ def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
     compile_gradients()
-    _step()
-    if helper is not None:
-        try:
-            helper.wait(HELPER_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            helper.kill()
-    _render()  # loads from the cache what the second process has compiled
-
-
-def _render() -> None:
-    """Forward and backward pass."""
-    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
-    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
-    v_image = np.zeros_like(rendering.image)
-    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
-
-
-def _step() -> None:
-    """Limits, replacement of the background, loss and Adam."""
+    # limits, replacement of the background, loss and Adam
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
     mask, rows = np.zeros((16, 16), np.uint8), np.arange(2, dtype=np.int32)
     for loaded in (target, mask):  # read-only arrays are a type of their own
         loaded.setflags(write=False)
     black, white = np.zeros(3, np.float32), np.ones(3, np.float32)
-    change_background(target, mask, black, white, np.empty_like(target))
+    image_loss.change_background(target, mask, black, white, np.empty_like(target))
     state = _two_splats()
     face, unbound, gradients = state.face, state.unbound, state.gradients
     xyz, _, log_scale, opacity, *_ = state.parameters
     # Smaller than the splats: without an excess, its gradient is not computed.
     limits = np.full((2, 1), 0.01, np.float32)
-    scale_limit(rows, log_scale, face, unbound, limits, 1.0, gradients.log_scale)
-    opacity_weight(rows, opacity, state.unseen_share, 1.0, gradients.opacity)
-    distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradients.xyz)
+    optimizer.scale_limit(rows, log_scale, face, unbound, limits, 1.0, gradients.log_scale)
+    optimizer.opacity_weight(rows, opacity, state.unseen_share, 1.0, gradients.opacity)
+    optimizer.distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradients.xyz)
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
     adam.step(state, rows, dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3))
-    add_screen_gradients(rows, np.zeros(2, np.float32), state.screen_gradient, state.gradient_count)
+    screen, total = state.screen_gradient, state.gradient_count
+    optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
     adam.step_offsets(
-        with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
-        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3,
-        adam.PLAIN,
+        with_effects(state, (), OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
+        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, adam.PLAIN,
     )  # fmt: skip
+    if helper is not None:
+        try:
+            helper.wait(HELPER_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            helper.kill()
+    # a forward and a backward pass, loaded from the cache where the second process has compiled it
+    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
+    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
+    v_image = np.zeros_like(rendering.image)
+    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
 
 
 def _two_splats() -> TrainState:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ...avatar.file import Avatar
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import ADDED, Splats
 from ...capture.model import View
@@ -22,10 +23,8 @@ class Batch:
     """Input of one iteration: one view.
 
     target      (H, W, 3) uint8 over the settings' background
-    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`,
-                else None
+    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`
     background  (3,) float32 behind the splats
-    sh_degree   degree of spherical harmonics in use
     selected    (F,) bool triangles whose splats are trained; None trains all
     rates       learning rate by parameter name, and "sh_rest"
     accumulate  whether screen gradients are summed for density control
@@ -44,12 +43,7 @@ class Batch:
 @dataclass
 class OffsetState:
     """Coefficients of a driven offset (`Avatar.driven_offsets`) of a mesh's F triangles in
-    training.
-
-    value, first, second, average  (F, S, 3) float32 coefficients, Adam's two moments, and the
-                                   exponential moving average from which the avatar is made
-    steps                          (F,) int32 Adam steps of each triangle
-    """
+    training: as in `TrainState`, (F, S, 3) float32 and (F,) int32."""
 
     value: np.ndarray
     first: np.ndarray
@@ -121,10 +115,6 @@ class TrainState:
         arrays = {name: array.copy() for name, array in kept._asdict().items()}
         return Splats(**arrays, face=self.face.copy(), unbound=self.unbound.copy())
 
-    def averaged(self) -> Splats:
-        """A copy of the splats' exponential moving average."""
-        return self.splats(averaged=True)
-
 
 _SPLAT_FIELDS = [field.name for field in fields(TrainState) if field.name != "driven_offsets"]
 
@@ -143,6 +133,12 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
     )  # fmt: skip
 
 
+def state_of_avatar(avatar: Avatar) -> TrainState:
+    """A copy of an avatar's splats and driven offsets with zero moments."""
+    offsets = {name: new_offset(values) for name, values in avatar.driven_offsets.items()}
+    return replace(new_state(avatar.splats), driven_offsets=offsets)
+
+
 def keep_rows(state: TrainState, keep: np.ndarray) -> TrainState:
     """The rows at `keep`, a mask (N,) or indices, of every array."""
     kept = state_of({name: array[keep] for name, array in arrays_of(state).items()})
@@ -156,24 +152,18 @@ def join(state: TrainState, other: TrainState) -> TrainState:
     return replace(state_of(rows), driven_offsets=state.driven_offsets)
 
 
-def with_added(state: TrainState, names: Collection[str]) -> TrainState:
-    """The state with these arrays of ADDED; they and their moments are zero where there were
-    none."""
+def with_effects(
+    state: TrainState, added: Collection[str], offsets: Collection[str], triangles: int
+) -> TrainState:
+    """The state with these arrays of ADDED and these driven offsets of so many triangles, too;
+    those that it lacked begin by zero."""
     flat = arrays_of(state)
-    for table, name in product(("parameters", "gradients", "first", "second", "average"), names):
+    for table, name in product(("parameters", "gradients", "first", "second", "average"), added):
         if not flat[f"{table}/{name}"].shape[1]:
             flat[f"{table}/{name}"] = np.zeros((len(state), ADDED[name], 3), np.float32)
-    return replace(state_of(flat), driven_offsets=state.driven_offsets)
-
-
-def with_offsets(state: TrainState, names: Collection[str], triangles: int) -> TrainState:
-    """The state with these driven offsets of so many triangles too; those that it lacked begin by
-    zero."""
-    zeros = {
-        name: new_offset(np.zeros((triangles, OFFSETS[name].signals, 3), np.float32))
-        for name in names
-    }
-    return replace(state, driven_offsets={**zeros, **state.driven_offsets})
+    sizes = {name: (triangles, OFFSETS[name].signals, 3) for name in offsets}
+    zeros = {name: new_offset(np.zeros(size)) for name, size in sizes.items()}
+    return replace(state_of(flat), driven_offsets={**zeros, **state.driven_offsets})
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:

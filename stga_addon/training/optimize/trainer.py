@@ -17,7 +17,7 @@ from .avatar_tracking import RefinedTracking
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .state import Batch, TrainState, new_state, with_offsets
+from .state import Batch, TrainState, new_state, with_effects
 
 if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend
@@ -35,7 +35,8 @@ trained."""
 class Strategy:
     """Decides which triangles each iteration trains, as `TrainingSettings.strategy` says.
 
-    region  (F,) bool: the only triangles whose splats the run may change; None for all
+    region          (F,) bool: the only triangles whose splats the run may change; None for all
+    refined_region  the same of a refinement; None for any other run
 
     "selective" alternates local iterations, which train a frame's selected triangles, with global
     ones (STGA, training). "refine" trains the same region throughout, "extend" first what new takes
@@ -48,6 +49,7 @@ class Strategy:
         self._settings, self._selection = settings, selection
         continues = settings.strategy in CONTINUATIONS
         self.region = np.any(list(selection.values()), axis=0) if continues else None
+        self.refined_region = self.region if settings.strategy == "refine" else None
 
     def triangles(
         self, iteration: int, visit: int, timestep: int, progress: float
@@ -96,8 +98,9 @@ class Trainer:
         self.capture, self.settings = capture, settings
         self.strategy = Strategy(settings, selection)
         self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
+        moved = {} if self.tracking is None else {"moved_mesh": self.tracking.mesh}
         self.frames = FrameStore(
-            capture, settings.convention, settings.follows_strain, self.tracking, strain_range
+            capture, settings.convention, settings.follows_strain, limits=strain_range, **moved
         )
         self.iteration, self.visit = 0, -1
         self.last_timestep: int | None = None
@@ -106,7 +109,7 @@ class Trainer:
         if state is None:
             splats = initial_splats(capture, settings)
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
-            state = with_offsets(state, settings.driven_offsets, len(capture.faces))
+            state = with_effects(state, (), settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self.frames, state)
         self._outlines: list[post_step.Outline] | None = None
         self._sides: post_step.UnseenSides | None = None
@@ -154,16 +157,17 @@ class Trainer:
         settings = self.settings
         self.visit += view.timestep != self.last_timestep
         self.last_timestep = view.timestep
-        if mesh is not None:
-            self.frames.add(view.timestep, mesh)
+        self.frames.mesh(view.timestep, mesh)
         background, mask = self._background, mask if settings.random_background else None
         if mask is not None:
             rng = np.random.default_rng([settings.seed, self.iteration])
             background = rng.random(3, np.float32)
-        degree, rates = sh_degree(settings, progress), learning_rates(settings.rates, progress)
         selected = self.strategy.triangles(self.iteration, self.visit, view.timestep, progress)
-        accumulate = selected is None or self.strategy.region is not None
-        batch = Batch(view, target, mask, background, degree, selected, rates, accumulate)
+        batch = Batch(
+            view, target, mask, background, sh_degree(settings, progress), selected,
+            learning_rates(settings.rates, progress),
+            accumulate=selected is None or self.strategy.region is not None,
+        )  # fmt: skip
         loss = self._backend.step(batch)
         self.iteration += 1
         self._post_step(progress)

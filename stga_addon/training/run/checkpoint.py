@@ -13,12 +13,13 @@ import numpy as np
 
 from ...avatar.file import Avatar, check_array, read_avatar
 from ...avatar.offsets import OFFSETS
-from ...avatar.splats import ARRAYS
+from ...avatar.splats import ADDED, ARRAYS
 from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
 from ...capture.model import Capture
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
+from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run, float_array
 
 VERSION = 3
@@ -33,14 +34,12 @@ OTHER_RUN = "belongs to another run than run.json; remove it, or train into anot
 
 @dataclass
 class Checkpoint:
-    """State of training between two iterations.
+    """State of training between two iterations: of the trainer, the session and the evaluator.
 
-    elapsed_s  seconds of training so far, evaluation not counted
     best_difference  of avatar.npz (`Quality.detail_difference`); ∞ before the first evaluation
-    losses     of the last global iterations
-    identity   digest of the run's identity
     tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
     rounds     in which they were
+    identity   digest of the run's identity
     """
 
     state: TrainState
@@ -179,6 +178,29 @@ def _check_state(path: Path, state: TrainState) -> None:
         check_array(path, name, array, whole.get(name, "float32"), shape)
 
 
+def check_fits(
+    folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
+) -> None:
+    """Raise StgaError where a checkpoint's splats do not fit the mesh or the settings."""
+    face, splats, faces = state.face, state.splats(), len(capture.faces)
+    text = ""
+    if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
+        text = f"its splats refer to triangles that {capture.root} does not have"
+    elif splats.sh_degree != settings.sh_degree:
+        found = f"SH degree {splats.sh_degree}, run.json says {settings.sh_degree}"
+        text = f"its splats have {found}"
+    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
+        text = text or f"its splats and run.json disagree on {name}"
+    for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
+        text = text or f"its checkpoint and run.json disagree on the driven offset {name}"
+    for name, offset in state.driven_offsets.items():
+        if len(offset.steps) != faces:
+            found = f"of {len(offset.steps)} triangles, {capture.root} has {faces}"
+            text = text or f"its {name} is {found}"
+    if text:
+        raise StgaError(f"{folder}: {text}")
+
+
 def trained_strain_range(
     capture: Capture, mesh: Callable[[int], np.ndarray], continuation: Continuation | None
 ) -> np.ndarray:
@@ -210,8 +232,7 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     """
     if not run.settings.follows_strain or run.settings.tracking:
         return None
-    assert run.identity is not None
-    path, identity = folder / STRAIN_RANGE, _packed(run.identity.digest)
+    path, identity = folder / STRAIN_RANGE, _packed(run.digest)
     if not path.exists():
         limits = trained_strain_range(capture, capture.mesh, run.continuation)
         write_npz(path, {"strain_range": limits, IDENTITY: identity}, compressed=True)

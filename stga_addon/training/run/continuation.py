@@ -26,7 +26,7 @@ from ..evaluate.metrics import (
 )
 from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
 from ..optimize.image_preparation import image_preparation
-from ..optimize.state import TrainState, new_offset, new_state, with_added, with_offsets
+from ..optimize.state import TrainState, state_of_avatar, with_effects
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
 from .checkpoint import read_checkpoint, require_color_range
@@ -102,28 +102,22 @@ def starting_state(
         )
     avatar = read_avatar(folder / AVATAR)
     require_color_range(folder / AVATAR, avatar)
-    state = new_state(avatar.splats)
-    state.driven_offsets = {
-        name: new_offset(values) for name, values in avatar.driven_offsets.items()
-    }
+    state = state_of_avatar(avatar)
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
-        pairs = [(vars(avatar.splats), vars(kept.averaged())), (avatar.driven_offsets, offsets)]
-        if all(
-            ours.keys() == theirs.keys()
-            and all(np.array_equal(ours[name], theirs[name]) for name in ours)
-            for ours, theirs in pairs
-        ):
+        ours = {**vars(avatar.splats), **avatar.driven_offsets}
+        theirs = {**vars(kept.splats(averaged=True)), **offsets}
+        alike = (np.array_equal(array, theirs[name]) for name, array in ours.items())
+        if ours.keys() == theirs.keys() and all(alike):
             parameters = Parameters(*(array.copy() for array in kept.average))
-            zero = np.zeros(len(kept), np.float32)
+            screen, count = np.zeros((2, len(kept)), np.float32)
             state = replace(
-                kept, parameters=parameters, screen_gradient=zero, gradient_count=zero.copy()
+                kept, parameters=parameters, screen_gradient=screen, gradient_count=count
             )
             for offset in kept.driven_offsets.values():
                 offset.value = offset.average.copy()
-    state = with_added(state, settings.added)
-    return with_offsets(state, settings.driven_offsets, triangles)
+    return with_effects(state, settings.added, settings.driven_offsets, triangles)
 
 
 def continued_settings(

@@ -109,6 +109,12 @@ class Run:
     takes: tuple[Take, ...] = ()
     continuation: Continuation | None = None
 
+    @property
+    def digest(self) -> str:
+        """Of the identity of a run that has begun."""
+        assert self.identity is not None
+        return self.identity.digest
+
 
 def write_run(folder: Path, run: Run) -> None:
     write_json(folder / RUN, {"format": FORMAT, "version": VERSION, **to_json(run)})

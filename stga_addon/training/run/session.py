@@ -18,7 +18,6 @@ from time import perf_counter
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
-from ...avatar.splats import ADDED
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture, evenly_spread
 from ...errors import DeviceError, StgaError, shorten
@@ -27,15 +26,9 @@ from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
-from ..evaluate import lpips
+from ..evaluate import lpips, metrics
 from ..evaluate.evaluator import Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
-from ..evaluate.metrics import (
-    choose_evaluation_views,
-    known_exposure,
-    peak_memory_mb,
-    read_evaluation_view,
-)
 from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import RefinedTracking, track_by_avatar
 from ..optimize.image_preparation import image_preparation
@@ -43,36 +36,10 @@ from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
 from ..optimize.trainer import Trainer
 from ..schedule import image_scales, view_order
-from ..settings import TrainingSettings
-from .checkpoint import (
-    OTHER_RUN,
-    STRAIN_RANGE,
-    Checkpoint,
-    read_checkpoint,
-    read_selection,
-    require_color_range,
-    strain_range_of,
-    trained_strain_range,
-    write_checkpoint,
-    write_selection,
-)
+from . import checkpoint as checkpoints
+from . import folder as folders
 from .continuation import continued_evaluation_views, continued_order, starting_state
-from .folder import (
-    AVATAR,
-    CHECKPOINT,
-    SELECTION,
-    TRACKING,
-    WORLD_FILE,
-    Run,
-    check_identity,
-    has_run,
-    locked,
-    read_run,
-    with_refined_tracking,
-    write_residuals,
-    write_run,
-    write_tracking,
-)  # fmt: skip
+from .folder import AVATAR, CHECKPOINT, TRACKING, Run
 from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
 
 _log = logging.getLogger(__name__)
@@ -83,6 +50,8 @@ CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
 """Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may
 take."""
+Selection = Mapping[int, np.ndarray]
+"""timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
 """Global iterations that the loss in messages and metrics is the mean of."""
 RESIDUAL_VIEWS = 24
@@ -93,21 +62,20 @@ def train(
     capture: Capture,
     out: Path,
     run: Run,
-    selection: Mapping[int, np.ndarray] | None = None,
+    selection: Selection | None = None,
     resume: bool = False,
     report: Report = ignore,
     falls_back: bool = False,
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
-    selection: timestep -> (F,) bool to use instead of the rule. With `resume`, continues from the
-    folder's checkpoint to the parameters that an unbroken run would have reached (same seed, number
-    of threads and device).
+    selection: instead of the rule's. With `resume`, continues from the folder's checkpoint to the
+    parameters that an unbroken run would have reached (same seed, number of threads and device).
     falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
     Raises StgaError where the capture has nothing to train on, the folder is in use, is the
-    capture's or holds another run or one that cannot be continued (`require_color_range`), or
-    STGA_LPIPS names a file without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar
-    and checkpoint are saved, a second one at once.
+    capture's or holds another run or one that cannot be continued, or STGA_LPIPS names a file
+    without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint are
+    saved, a second one at once.
     """
     try:
         return _train(capture, out, run, selection, resume, report)
@@ -121,12 +89,7 @@ def train(
 
 
 def _train(
-    capture: Capture,
-    out: Path,
-    run: Run,
-    selection: Mapping[int, np.ndarray] | None,
-    resume: bool,
-    report: Report,
+    capture: Capture, out: Path, run: Run, selection: Selection | None, resume: bool, report: Report
 ) -> Path:
     """`train` on the device of the run."""
     lpips.load_network()  # read now, because it is needed only when everything is trained
@@ -137,18 +100,17 @@ def _train(
         raise StgaError(f"--target-psnr: {text}")
     if out.resolve() == capture.root:
         raise StgaError(f"{out}: is the folder of the capture; train into another one")
-    with locked(out):
-        exists = has_run(out)
+    with folders.locked(out):
+        exists = folders.has_run(out)
         if exists and not resume:
             raise StgaError(f"{out}: already holds a run; resume it, or choose another folder")
-        has_begun = exists and read_run(out).identity is not None
-        identity = check_identity(out, run, capture)
-        run = replace(run, identity=identity)
+        has_begun = exists and folders.read_run(out).identity is not None
+        run = replace(run, identity=folders.check_identity(out, run, capture))
         if has_begun and (out / CHECKPOINT).exists():
             session = _resume(capture, out, run, report)
         else:
-            if has_begun and selection is None and (out / SELECTION).exists():
-                selection = read_selection(out, len(capture.faces), identity.digest)
+            if has_begun and selection is None and (out / folders.SELECTION).exists():
+                selection = checkpoints.read_selection(out, len(capture.faces), run.digest)
             session = _begin(capture, out, run, selection, report)
         session.work()
     return out / AVATAR
@@ -218,7 +180,7 @@ class _Session:
     def _train(self) -> None:
         trainer, tracking = self.trainer, self.trainer.tracking
         saved, started, first = self.elapsed_s, self.elapsed_s, trainer.iteration
-        asked_s = _asked_interval_s()
+        interval_s = _asked_interval_s()
         with self._loader() as loader:
             while not self._spent().share >= 1:
                 begin = perf_counter()
@@ -227,7 +189,7 @@ class _Session:
                 self.elapsed_s += perf_counter() - begin
                 if loss is not None:
                     self.losses.append(loss)
-                is_due = tracking is not None and self._spent().share >= TRACKING_START_SHARE
+                is_due = self._spent().share >= TRACKING_START_SHARE
                 if tracking is not None and is_due and not tracking.rounds:
                     begin = perf_counter()
                     timesteps = {view.timestep for view in self.capture.views["train"]}
@@ -239,7 +201,7 @@ class _Session:
                     self._evaluate()
                     if self._is_finished():
                         break
-                if self.elapsed_s - saved > (CHECKPOINT_S if asked_s is None else asked_s):
+                if self.elapsed_s - saved > (CHECKPOINT_S if interval_s is None else interval_s):
                     self._write_checkpoint()
                     saved = self.elapsed_s
                 elapsed_s = max(self.elapsed_s - started, 1e-9)
@@ -255,9 +217,8 @@ class _Session:
             views = capture.views["train"]
             order = view_order(views, settings.views_per_visit, settings.seed, first)
         else:
-            region = _refined_region(self.run, self.trainer)
+            region = self.trainer.strategy.refined_region
             order = continued_order(self.run.continuation, capture, region, settings.seed, first)
-
         coarse, full = image_scales(settings, capture.views["train"])
 
         def scale(position: int) -> float:
@@ -309,7 +270,7 @@ class _Session:
             **quality,
             "evaluation_s": round(now - begin, 3),
             "wall_s": round(now - self.began, 3),
-            "peak_memory_mb": peak_memory_mb(),
+            "peak_memory_mb": metrics.peak_memory_mb(),
         }
         append_metrics(self.folder, self.evaluator.record(is_kept, line, self._spent()))
 
@@ -332,7 +293,7 @@ class _Session:
         }  # fmt: skip
 
         def known() -> dict[str, float]:
-            values = {**figures, "memory_mb": peak_memory_mb()}
+            values = {**figures, "memory_mb": metrics.peak_memory_mb()}
             return {name: float(value) for name, value in values.items() if value is not None}
 
         def preview(path: Path) -> None:
@@ -348,7 +309,7 @@ class _Session:
             self._measure_refined_strain()
         state, settings = self.trainer.state, self.run.settings
         return Avatar(
-            splats=state.averaged(),
+            splats=state.splats(averaged=True),
             convention=settings.convention,
             neutral=self.capture.neutral.astype(np.float32),
             faces=self.capture.faces,
@@ -362,54 +323,51 @@ class _Session:
         )
 
     def _measure_refined_strain(self) -> None:
-        """Measure the strain of the training timesteps, whose meshes refined tracking has moved."""
+        """Of the training timesteps, whose meshes refined tracking has moved."""
         if self.run.settings.follows_strain:
-            self.strain_range = trained_strain_range(self.capture, self.trainer.frames.mesh, None)
+            mesh = self.trainer.frames.mesh
+            self.strain_range = checkpoints.trained_strain_range(self.capture, mesh, None)
 
     def _require_folder(self) -> None:
         """Raise StgaError where the folder was moved: writing would make it anew."""
-        if not has_run(self.folder) or read_run(self.folder).identity != self.run.identity:
+        folder = self.folder
+        if not folders.has_run(folder) or folders.read_run(folder).identity != self.run.identity:
             raise StgaError(
-                f"{self.folder}: was moved or deleted while its run trained; resume the run from "
+                f"{folder}: was moved or deleted while its run trained; resume the run from "
                 "its checkpoint, in the folder where it is now"
             )
 
     def _write_avatar(self) -> None:
         write_avatar(self.folder / AVATAR, self._avatar())
-        refined = self.trainer.tracking
-        if refined is not None:
-            write_tracking(self.folder, refined.sequence, refined.parameters, refined.tracked)
+        found = self.trainer.tracking
+        if found is not None:
+            folders.write_tracking(self.folder, found.sequence, found.parameters, found.tracked)
 
     def _write_checkpoint(self) -> None:
         trainer, tracking, evaluator = self.trainer, self.trainer.tracking, self.evaluator
-        assert self.run.identity is not None
         self._require_folder()
-        checkpoint = Checkpoint(
+        checkpoint = checkpoints.Checkpoint(
             trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep,
             trainer.initial_count, self.elapsed_s, evaluator.best_difference, evaluator.count,
             list(self.losses), None if tracking is None else tracking.parameters,
-            0 if tracking is None else tracking.rounds, self.run.identity.digest,
+            0 if tracking is None else tracking.rounds, self.run.digest,
         )  # fmt: skip
-        write_checkpoint(self.folder, checkpoint)
+        checkpoints.write_checkpoint(self.folder, checkpoint)
 
     def _write_residuals(self) -> None:
         """Measure the written avatar's error by triangle, over a few views of all frames."""
         capture, settings = self.capture, self.run.settings
         if self.trainer.tracking is not None:
-            capture = with_refined_tracking(capture, self.folder)
+            capture = folders.with_refined_tracking(capture, self.folder)
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
         shown, prepare = evenly_spread(views, RESIDUAL_VIEWS), image_preparation(capture, settings)
         avatar = read_avatar(self.folder / AVATAR)
         residuals = triangle_residuals(avatar, capture, shown, prepare, RESIDUAL_SCALE)
-        write_residuals(self.folder, residuals.mean())
+        folders.write_residuals(self.folder, residuals.mean())
 
 
 def _begin(
-    capture: Capture,
-    folder: Path,
-    run: Run,
-    selection: Mapping[int, np.ndarray] | None,
-    report: Report,
+    capture: Capture, folder: Path, run: Run, selection: Selection | None, report: Report
 ) -> _Session:
     """Start a new run: select triangles, by the rule or as given, place splats, write its files."""
     report(Progress(stage="Placing splats"))
@@ -419,36 +377,35 @@ def _begin(
         selection = select_capture(capture, settings.selection) if selective else {}
     if continuation is not None:
         state = starting_state(continuation, settings, len(capture.faces))
-        _check_state(folder, capture, settings, state)
+        checkpoints.check_fits(folder, capture, settings, state)
     # of a run whose run.json was removed
-    for stale in (TRACKING, CHECKPOINT, METRICS, STRAIN_RANGE, WORLD_FILE):
+    for stale in (TRACKING, CHECKPOINT, METRICS, checkpoints.STRAIN_RANGE, folders.WORLD_FILE):
         (folder / stale).unlink(missing_ok=True)
     session = _session(capture, folder, run, selection, state, report)
     if continuation is not None and (continuation.parent / TRACKING).exists():
         with replacing(folder / TRACKING) as partial_file:
             copyfile(continuation.parent / TRACKING, partial_file)
-    assert run.identity is not None
-    write_selection(folder, selection, run.identity.digest)
-    write_run(folder, run)
+    checkpoints.write_selection(folder, selection, run.digest)
+    folders.write_run(folder, run)
     return session
 
 
 def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Session:
     """Continue from the folder's checkpoint. Raises StgaError where it does not fit."""
     report(Progress(stage="Reading the checkpoint"))
-    assert run.identity is not None
-    found = read_checkpoint(folder)
-    if found.identity != run.identity.digest:
-        raise StgaError(f"{folder / CHECKPOINT}: {OTHER_RUN}")
-    selection = read_selection(folder, len(capture.faces), run.identity.digest)
-    _check_state(folder, capture, run.settings, found.state)
+    found = checkpoints.read_checkpoint(folder)
+    if found.identity != run.digest:
+        raise StgaError(f"{folder / CHECKPOINT}: {checkpoints.OTHER_RUN}")
+    selection = checkpoints.read_selection(folder, len(capture.faces), run.digest)
+    checkpoints.check_fits(folder, capture, run.settings, found.state)
     session = _session(capture, folder, run, selection, found.state, report)
     trainer, tracking, evaluator = session.trainer, session.trainer.tracking, session.evaluator
-    refined = found.tracking
-    if tracking is not None and refined is not None and refined.shape == tracking.tracked.shape:
-        # of a version that shifted no torso
-        refined = np.pad(refined, ((0, 0), (0, SHIFT_SIZE)))
-    wanted = None if tracking is None else tracking.parameters.shape
+    refined, wanted = found.tracking, None
+    if tracking is not None:
+        wanted = tracking.parameters.shape
+        if refined is not None and refined.shape == tracking.tracked.shape:
+            # of a version that shifted no torso
+            refined = np.pad(refined, ((0, 0), (0, SHIFT_SIZE)))
     if wanted != (None if refined is None else refined.shape):
         text = "its checkpoint's refined tracking does not fit the capture or the settings"
         raise StgaError(f"{folder}: {text}")
@@ -464,61 +421,32 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     if not (folder / AVATAR).exists():
         evaluator.best_difference = math.inf  # so that the next evaluation writes one
     elif not session._is_finished():
-        require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
-    write_run(folder, run)  # capture, model and device may be others now
+        checkpoints.require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
+    folders.write_run(folder, run)  # capture, model and device may be others now
     return session
 
 
 def _session(
-    capture: Capture,
-    folder: Path,
-    run: Run,
-    selection: Mapping[int, np.ndarray],
-    state: TrainState | None,
+    capture: Capture, folder: Path, run: Run, selection: Selection, state: TrainState | None,
     report: Report,
-) -> _Session:
+) -> _Session:  # fmt: skip
     settings = run.settings
     if settings.follows_strain:
         report(Progress(stage="Measuring strain"))
-    strain_range = strain_range_of(folder, capture, run)
+    strain_range = checkpoints.strain_range_of(folder, capture, run)
     trainer = Trainer(capture, settings, selection, state, run.device, strain_range)
     if run.continuation is not None:
-        views = continued_evaluation_views(run, capture, _refined_region(run, trainer))
+        views = continued_evaluation_views(run, capture, trainer.strategy.refined_region)
     else:
+        background, backdrop = settings.background, settings.backdrop
         views = [
-            read_evaluation_view(capture, view, settings.background, settings.backdrop)
-            for view in choose_evaluation_views(capture)
+            metrics.read_evaluation_view(capture, view, background, backdrop)
+            for view in metrics.choose_evaluation_views(capture)
         ]
     rows = settings.exposure  # where images are corrected for it
-    exposure = known_exposure(rows, capture.views["train"]) if rows else None
+    exposure = metrics.known_exposure(rows, capture.views["train"]) if rows else None
     evaluator = Evaluator(settings, views, run.continuation is not None, exposure)
     return _Session(capture, folder, run, report, trainer, evaluator, strain_range)
-
-
-def _refined_region(run: Run, trainer: Trainer) -> np.ndarray | None:
-    return trainer.strategy.region if run.settings.strategy == "refine" else None
-
-
-def _check_state(
-    folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
-) -> None:
-    """Raise StgaError where the checkpoint's splats do not fit the mesh or the settings."""
-    face, splats, faces = state.face, state.splats(), len(capture.faces)
-    if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
-        text = f"its splats refer to triangles that {capture.root} does not have"
-        raise StgaError(f"{folder}: {text}")
-    if splats.sh_degree != settings.sh_degree:
-        text = f"SH degree {splats.sh_degree}, run.json says {settings.sh_degree}"
-        raise StgaError(f"{folder}: its splats have {text}")
-    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
-        raise StgaError(f"{folder}: its splats and run.json disagree on {name}")
-    for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
-        text = f"its checkpoint and run.json disagree on the driven offset {name}"
-        raise StgaError(f"{folder}: {text}")
-    for name, offset in state.driven_offsets.items():
-        if len(offset.steps) != faces:
-            text = f"its {name} is of {len(offset.steps)} triangles, {capture.root} has {faces}"
-            raise StgaError(f"{folder}: {text}")
 
 
 def _asked_interval_s() -> float | None:
