@@ -21,28 +21,21 @@ STRATEGIES = {
 }
 CONTINUATIONS = ("refine", "extend")
 """Strategies of runs that continue a finished one (`run.continuation`)."""
-SCHEDULES = ("default", "paper")
 BACKDROPS = ("plain", "masked", "mesh")
 """plain: one color, that of the settings' background; masked: anything, replaced by that color
 outside the masks; mesh: the same, and images without a mask have the tracked mesh's silhouette for
 one."""
-GLOBAL_UNITS = ("iteration", "frame")
 MAX_WEIGHT = 1e6
 """Largest weight or limit of a loss; larger ones overflow float32."""
 MAX_RATE = 1e3
 MAX_GROWTH = 100
-EXPOSURE_SIZES = 7, 8
-"""Numbers of a row of `TrainingSettings.exposure`: of a whole recording, and of a timestep of one
-that drifts."""
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates at the start; each decays exponentially to `position_end` or `end` of
-    itself.
-
-    Positions in local units (meters of the neutral mesh), scales as logarithms, opacity as logit.
-    """
+    """Adam's learning rates at the start, of positions in local units (meters of the neutral mesh),
+    scales as logarithms and opacity as logit; each decays exponentially to `position_end` or `end`
+    of itself."""
 
     xyz: float = setting(4e-4, 0, MAX_RATE)
     rotation: float = setting(1e-2, 0, MAX_RATE)
@@ -62,12 +55,8 @@ same images as 6."""
 
 @dataclass(frozen=True)
 class Preset:
-    """A level of quality: its purpose, the settings that differ from the defaults, and how long to
-    train.
-
-    iterations, passes  train so many iterations, but at least so many passes over all training
-                        views
-    """
+    """A level of quality: its purpose, and the settings that differ from the defaults; it trains so
+    many iterations, but at least so many passes over all training views."""
 
     purpose: str
     iterations: int
@@ -92,19 +81,14 @@ class TrainingSettings:
     """Settings of one training run.
 
     strategy       "selective" trains local and global iterations in turn (STGA, training); "global"
-                   only global ones, which measured best at equal time (docs/results.md);
-                   "gaussian-avatars" is global training with that method's binding, losses and
-                   rates; "refine" and "extend" continue a finished run
-    schedule       "paper": with `PAPER_SETTINGS` instead of the defaults
+                   only global ones, which measured best at equal time (docs/results.md); "refine"
+                   and "extend" continue a finished run
     seconds, iterations   the budget: wall time of training (evaluation not counted), or iterations;
                           one of the two, or neither with a preset, which brings its iterations
-                          (`with_budget`)
-    seed           fixes the order of views and every random choice
     lattice        order of the barycentric lattice per triangle: 0 → 1 splat, 2 → 6, 4 → 15 (STGA,
                    embedding); None: 2, or 1 (3 splats) on meshes of more than MAX_FINE_TRIANGLES
     coarse_lattice  without a given `lattice`, begin one order lower, where density control adds the
                    other splats
-    convention     embedding convention
     views_per_visit  how many views of a frame are trained before the next frame; 0 means all (the
                      paper's batches)
     global_interval, global_unit   a global iteration after every so many local iterations, or
@@ -140,18 +124,13 @@ class TrainingSettings:
                    hull points
     background     color behind the head in the capture's images, and behind transparent ones
     random_background  where there are masks, put a random color behind the head in every iteration,
-                       so that splats
-                   of the background's color cannot hide in it and alpha is learned
-    backdrop       what is behind the head in the images, one of BACKDROPS: but for
-                   "plain", training and evaluations see the head over the color `background`
+                   so that splats of the background's color cannot hide in it and alpha is learned
+    backdrop       what is behind the head in the images, one of BACKDROPS: but for "plain",
+                   training and evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
                           first `coarse_share` of the budget half of that
-    target_psnr    stop when the held-out views reach this many dB
-    stop_when_flat  stop when more time no longer helps (`forecast.flat_since`)
-    preset         the preset that these settings began with, or none
     strain_color   splats have color that depends on the deformation of their triangle
-                   (`avatar.strain`)
-    driven_offsets  names of `avatar.offsets.table`: splats move with signals of the pose
+    driven_offsets  names of `avatar.offsets.OFFSETS`: splats move with signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     torso          hull points below the neck follow FLAME's root joint, not the head's nearest
@@ -169,10 +148,9 @@ class TrainingSettings:
         "global", choices=(*STRATEGIES, *CONTINUATIONS), offered=STRATEGIES,
     )  # fmt: skip
     schedule: str = option(
-        "paper: the settings of the STGA paper (default: what measured best)",
-        "default",
-        choices=SCHEDULES,
-    )
+        "paper: the settings of the STGA paper (default: what measured best)", "default",
+        choices=("default", "paper"),
+    )  # fmt: skip
     seconds: float | None = option(
         "training time such as 90s, 10m (default 2m)", None, above=0,
         flag="--budget", metavar="TIME", parse=duration, group="budget",
@@ -186,7 +164,7 @@ class TrainingSettings:
     convention: str = setting("stga", choices=CONVENTIONS)
     views_per_visit: int = setting(1, 0, MAX_COUNT)
     global_interval: int = setting(1, 1, MAX_COUNT)
-    global_unit: str = setting("iteration", choices=GLOBAL_UNITS)
+    global_unit: str = setting("iteration", choices=("iteration", "frame"))
     warm_up_share: float = setting(0.6, 0, 1)
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     rates: Rates = field(default_factory=Rates)
@@ -238,7 +216,7 @@ class TrainingSettings:
 
     @property
     def added(self) -> tuple[str, ...]:
-        """The arrays that effects add to splats (`avatar.splats.ADDED`)."""
+        """The arrays of ADDED that effects add to splats."""
         return tuple(name for name in ADDED if getattr(self, name))
 
     @property
@@ -247,8 +225,7 @@ class TrainingSettings:
         return self.strain_color or bool(self.driven_offsets)
 
     def lattice_order(self, triangles: int) -> int:
-        """Order of the lattice on a mesh of so many triangles, which decides how many splats there
-        will be."""
+        """Of a mesh of so many triangles: decides how many splats there will be."""
         if self.lattice is not None:
             return self.lattice
         return 2 if triangles <= MAX_FINE_TRIANGLES else 1
@@ -266,11 +243,10 @@ class TrainingSettings:
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
         for row in self.exposure:
-            if len(row) not in EXPOSURE_SIZES or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
-                expected = (
-                    "rows of a camera index, three gains above 0, three offsets, and a timestep "
-                    "where they drift"
-                )
+            # of a whole recording, and of a timestep of one that drifts
+            if len(row) not in (7, 8) or not 0 <= row[0] <= MAX_COUNT or min(row[1:4]) <= 0:
+                rows = "rows of a camera index, three gains above 0, three offsets"
+                expected = f"{rows}, and a timestep where they drift"
                 raise StgaError(complaint("exposure", expected, row))
         if not set(self.driven_offsets) <= set(OFFSETS):
             expected = f"names among {', '.join(OFFSETS)}"
