@@ -229,11 +229,7 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
     capture, true = lost
     quality = {}
     for on in (True, False):
-        train(
-            capture,
-            tmp_path / str(on),
-            make_run(capture, tracking=on, iterations=300),
-        )
+        train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
     before, after = (
         millimeters(capture, true),

@@ -36,12 +36,7 @@ from stga_addon.training.settings import TrainingSettings
 from .toys import quick_settings
 
 ITERATIONS = 12
-OLD = {
-    "adam_beta2": 0.999,
-    "adam_nesterov": False,
-    "split_share": 0.02,
-    "coarse_lattice": False,
-}
+OLD = {"adam_beta2": 0.999, "adam_nesterov": False, "split_share": 0.02, "coarse_lattice": False}
 """What runs of format version 5 were trained with, and lack."""
 
 
@@ -157,11 +152,7 @@ def test_moved_captures_and_refined_meshes_are_accepted(
     ("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD)), (6, {"adam_nesterov"})]
 )
 def test_runs_of_earlier_format_versions_are_resumed(
-    toy: Capture,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    version: int,
-    lacks: set[str],
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int, lacks: set[str]
 ) -> None:
     """Catches a run of an earlier version that is refused for settings that it lacks, goes on with
     other ones, or with another value of one."""

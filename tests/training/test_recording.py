@@ -25,11 +25,7 @@ from stga_addon.training.optimize.avatar_tracking import (
     track_by_avatar,
 )
 from stga_addon.training.run.folder import AVATAR, Run, write_run
-from stga_addon.training.run.recording import (
-    avatar_person,
-    scale_capture,
-    track_recording,
-)
+from stga_addon.training.run.recording import avatar_person, scale_capture, track_recording
 from stga_addon.worker.helpers import Helpers
 
 from .heads import TIMESTEPS

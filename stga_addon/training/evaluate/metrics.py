@@ -20,12 +20,7 @@ from ...capture.mesh_geometry import MIN_DEPTH_M
 from ...capture.model import Capture, View, ViewExposure, evenly_spread
 from ...render.render import render_avatar
 from ...selection import SelectionOptions, select_capture
-from ..optimize.image_preparation import (
-    NO_CORRECTION,
-    fit_lines,
-    view_exposure,
-    without_backdrop,
-)
+from ..optimize.image_preparation import NO_CORRECTION, fit_lines, view_exposure, without_backdrop
 from ..optimize.losses import mean_ssim
 from . import lpips
 

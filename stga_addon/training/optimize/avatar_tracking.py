@@ -30,13 +30,7 @@ from ...flame.forward import (
     parameters_gradient,
 )
 from ...flame.model import JOINTS, FlameModel
-from ...flame.sequence import (
-    SHIFT_SIZE,
-    sequence_mesh,
-    torso_offset,
-    torso_shapes,
-    with_identity,
-)
+from ...flame.sequence import SHIFT_SIZE, sequence_mesh, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis
 from ...progress import Cancelled
 from ...render.render import render_avatar
