@@ -40,7 +40,7 @@ from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings
 
 from .heads import TIMESTEPS, write_head
-from .toys import quick_settings
+from .toys import quick_settings, stop_at
 
 Made = tuple[Capture, dict[int, np.ndarray]]
 NAMES = ("origin", "rotation", "scale")
@@ -244,12 +244,7 @@ def test_stopped_and_resumed_is_the_unbroken_run(
 ) -> None:
     """Catches anything of the tracking that a step depends on and a checkpoint does not hold."""
     capture, _ = lost
-    train(
-        capture,
-        tmp_path,
-        make_run(capture),
-        report=lambda progress: progress.figures().get("iteration", 0) >= 31,
-    )
+    train(capture, tmp_path, make_run(capture), report=stop_at(31))
     assert read_checkpoint(tmp_path).rounds == 1
     train(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))

@@ -22,7 +22,7 @@ from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.jobs.train import Extend, Prepared, prepare
-from stga_addon.progress import Progress, ignore
+from stga_addon.progress import ignore
 from stga_addon.training.optimize.trainer import EXTEND_LOCAL_SHARE, Strategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
@@ -32,8 +32,7 @@ from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
-from .test_run import assert_same_state
-from .toys import quick_settings
+from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 15
 CAP_PX = 8
@@ -80,10 +79,7 @@ def extend(
 ) -> Path:
     prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
-    def report(progress: Progress) -> bool:
-        return progress.figures().get("iteration", 0) == stop
-
-    train(prepared.capture, out, prepared.run, prepared.selection, report=report)
+    train(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 

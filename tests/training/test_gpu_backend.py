@@ -34,9 +34,9 @@ from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
 from .test_driven_offsets import squeezed
-from .test_run import assert_same_state, make_run, stop_at
+from .test_run import make_run
 from .test_trainer import large, view_of
-from .toys import bits, quick_settings
+from .toys import assert_same_state, bits, quick_settings, stop_at
 
 pytestmark = pytest.mark.needs("adapter")
 

@@ -33,7 +33,7 @@ from stga_addon.training.run.identity import RunIdentity, difference, identity_o
 from stga_addon.training.run.session import train
 from stga_addon.training.settings import TrainingSettings
 
-from .toys import quick_settings
+from .toys import quick_settings, stop_at
 
 ITERATIONS = 12
 OLD = {"adam_beta2": 0.999, "adam_nesterov": False, "split_share": 0.02, "coarse_lattice": False}
@@ -45,10 +45,6 @@ def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run
         "global", **{"iterations": ITERATIONS, "lattice": 0, "sh_degree": 0, **changes}
     )
     return Run(capture.root, flame, "vhap", settings)
-
-
-def stop_at(iteration: int) -> Callable[[Progress], bool]:
-    return lambda progress: progress.figures().get("iteration", 0) >= iteration
 
 
 @pytest.fixture(scope="session")

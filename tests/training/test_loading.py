@@ -19,7 +19,8 @@ from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
 from stga_addon.training.run.session import train
 
-from .test_run import assert_same_state, make_run
+from .test_run import make_run
+from .toys import assert_same_state
 
 
 def no_residuals(*arguments: Any) -> Residuals:

@@ -23,7 +23,7 @@ from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
 
-from .toys import quick_settings
+from .toys import quick_settings, stop_at
 
 LAYERS = (
     (3, 64, 11, 4, 2),
@@ -195,12 +195,7 @@ def test_only_the_final_evaluation_measures_lpips(
     """Catches slow evaluations during training, a canceled run that waits for LPIPS, and a missing
     final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
-    train(
-        toy,
-        tmp_path / "run",
-        run_of(toy),
-        report=lambda progress: progress.figures().get("iteration", 0) >= 11,
-    )
+    train(toy, tmp_path / "run", run_of(toy), report=stop_at(11))
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
     train(toy, tmp_path / "run", run_of(toy), resume=True)
     *before, last = read_metrics(tmp_path / "run")

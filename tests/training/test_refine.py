@@ -16,7 +16,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 from stga_addon.jobs.train import Prepared, Refine, prepare
-from stga_addon.progress import Progress, ignore
+from stga_addon.progress import ignore
 from stga_addon.training.optimize.state import TrainState, arrays_of
 from stga_addon.training.run import continuation as module
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -34,8 +34,7 @@ from stga_addon.training.run.session import train
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates, TrainingSettings
 
-from .test_run import assert_same_state
-from .toys import quick_settings
+from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 16
 
@@ -90,10 +89,7 @@ def prepare_refinement(
 def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:
     prepared = prepare_refinement(parent, "mouth", **{"growth": 0.5, **changes})
 
-    def report(progress: Progress) -> bool:
-        return progress.figures().get("iteration", 0) == stop
-
-    train(prepared.capture, out, prepared.run, prepared.selection, report=report)
+    train(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 

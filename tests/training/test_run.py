@@ -1,7 +1,6 @@
 """A whole run: budget, evaluation, the best avatar, and resumption to the same numbers."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -16,7 +15,6 @@ from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import Quality
-from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
 from stga_addon.training.run.folder import Run, read_residuals, read_run
@@ -24,7 +22,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
 from stga_addon.training.settings import STRATEGIES
 
-from .toys import quick_settings
+from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
@@ -45,10 +43,6 @@ def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> R
     return Run(capture.root, None, "vhap", settings)
 
 
-def stop_at(iteration: int) -> Callable[[Progress], bool]:
-    return lambda progress: progress.figures().get("iteration", 0) >= iteration
-
-
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Metrics without wall times; losses and SSIMs, whose rows are summed in float32, to seven
     digits."""
@@ -57,20 +51,6 @@ def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
         {k: float(f"{v:.7g}") if k.startswith(("loss", "ssim")) else v for k, v in line.items()}
         for line in kept
     ]
-
-
-def assert_same_state(folder: Path, expected: Path) -> None:
-    ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
-    right = arrays_of(theirs.state)
-    for name, array in arrays_of(ours.state).items():
-        np.testing.assert_array_equal(
-            array.view(np.uint8), right[name].view(np.uint8), err_msg=name
-        )
-    assert (ours.iteration, ours.visit, ours.initial_count) == (
-        theirs.iteration,
-        theirs.visit,
-        theirs.initial_count,
-    )
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
 from stga_addon.training.settings import Rates
 
-from .toys import quick_settings, random_splats
+from .toys import quick_settings, random_splats, stop_at
 
 
 def deformed(toy: Capture, timestep: int) -> np.ndarray:
@@ -107,7 +107,7 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
     and one that is finished but cannot be opened."""
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
-    path = train(toy, out, run, report=lambda progress: progress.figures().get("iteration", 0) == 2)
+    path = train(toy, out, run, report=stop_at(2))
     avatar = read_avatar(path)
     wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 3)).copy()
     write_avatar(path, replace(avatar, strain_range=wider if limited else None))
@@ -168,7 +168,7 @@ def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
     """Catches a resumed run that clips its colors to what another run has seen."""
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
-    train(toy, out, run, report=lambda progress: progress.figures().get("iteration", 0) == 2)
+    train(toy, out, run, report=stop_at(2))
     limits, digest = color_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
     for (stored, identity), says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from capture import factory
 from cli.conftest import refused
+from command_line import stga
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.render.render import render
 from stga_addon.training import world
 from stga_addon.training.world import (
@@ -48,10 +48,8 @@ def camera_at(degrees: float) -> Camera:
 
 
 def plates_of(texture: np.ndarray) -> list[CleanPlate]:
-    cameras = [camera_at(degrees) for degrees in (-24, -8, 8, 24)]
-    return [
-        CleanPlate(camera, wall(camera, texture), np.ones((160, 120), bool)) for camera in cameras
-    ]
+    cameras, seen = [camera_at(degrees) for degrees in (-24, -8, 8, 24)], np.ones((160, 120), bool)
+    return [CleanPlate(camera, wall(camera, texture), seen) for camera in cameras]
 
 
 def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
@@ -69,19 +67,20 @@ def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
 
 
 def test_a_wall_of_one_color() -> None:
-    """Catches a distance that is read from noise, and a wall that is darker between its splats or
-    at its border."""
+    """Catches a distance that is read from noise, a wall that is darker between its splats or at
+    its border, and a search for larger blocks that never ends."""
     plates = plates_of(np.full((512, 512, 3), 0.6))
     assert shell_radius(plates, np.zeros(3)) == pytest.approx(3 * 1.1, rel=0.01)
     splats = trained_on(plates, np.zeros(3))
     assert all(abs(render(splats, plate.camera) - 0.6).max() < 0.02 for plate in plates)
+    # a search for larger blocks ends where they are as large as they may be
+    busy = plates_of(np.random.default_rng(0).random((512, 512, 3)))[:1] * 3
+    with patch.object(world, "MAX_FIRST_SPLATS", 10):
+        assert 10 < len(first_splats(busy, np.zeros(3))) < 500
 
 
-STRIPES = (
-    (np.array([110, 90, 150]) + 50 * np.cos(np.arange(factory.WIDTH)[None, :, None] / 3))
-    .round()
-    .astype(np.uint8)
-)
+WAVES = 50 * np.cos(np.arange(factory.WIDTH)[None, :, None] / 3)
+STRIPES = (np.array([110, 90, 150]) + WAVES).round().astype(np.uint8)
 """(1, W, 3): what stands behind the ball, the same for every camera."""
 
 
@@ -102,7 +101,7 @@ EFFECTS = ("--effect", "world=on", "--effect", "exposure=off")
 @pytest.fixture(scope="module")
 def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "run"
-    assert main(["train", str(walled), "--out", str(folder), "--iterations", "60", *EFFECTS]) == 0
+    assert stga("train", walled, "--out", folder, "--iterations 60", *EFFECTS) == 0
     return folder
 
 
@@ -124,24 +123,11 @@ def test_measured_with_the_world(
 ) -> None:
     """Catches figures of matted images that are called those of whole ones: the same from `stga
     render --world`."""
-    assert main(["eval", str(run), "--split", "train"]) == 0
+    assert stga("eval", run, "--split train") == 0
     assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
     cameras = walled / "transforms_train.json"
-    assert (
-        main(
-            [
-                "render",
-                str(run),
-                "--world",
-                "--cameras",
-                str(cameras),
-                "--out",
-                str(run / "pictures"),
-            ]
-        )
-        == 0
-    )
+    assert stga("render", run, "--world --cameras", cameras, "--out", run / "pictures") == 0
     errors = []
     for view in open_capture(walled).views["train"]:
         rendered, recorded = (
@@ -167,12 +153,3 @@ def test_no_world(
     plain = factory.write_mesh_capture(tmp_path / "plain", (0, 1), range(3))
     told = refused(capsys, "train", plain, "--out", tmp_path / "run", "--iterations", "1", *EFFECTS)
     assert "world=on: is not possible, because what lies behind the person is of one color" in told
-
-
-def test_many_cameras_before_a_busy_wall() -> None:
-    """Catches a search for larger blocks that never ends, because they are as large as they may
-    be."""
-    noise = np.random.default_rng(0).random((512, 512, 3))
-    plates = plates_of(noise)[:1] * 3
-    with patch.object(world, "MAX_FIRST_SPLATS", 10):
-        assert 10 < len(first_splats(plates, np.zeros(3))) < 500

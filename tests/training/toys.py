@@ -1,11 +1,15 @@
 """States and settings small enough to check by hand."""
 
+import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stga_addon.avatar.splats import Splats
+from stga_addon.progress import Report
 from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
+from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.settings import TrainingSettings, make_settings
 
 
@@ -40,6 +44,23 @@ def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> Trai
 def quick_settings(strategy: str = "selective", **changes: Any) -> TrainingSettings:
     """Without hull points, which have tests of their own."""
     return make_settings(strategy, **{"iterations": 100, "hull_points": False, **changes})
+
+
+def stop_at(iteration: int | None) -> Report:
+    """A report that stops a training after so many iterations; None: not at all."""
+    return lambda progress: progress.figures().get("iteration", 0) >= (iteration or math.inf)
+
+
+def assert_same_state(folder: Path, expected: Path) -> None:
+    """The checkpoints of two runs, bit for bit."""
+    ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
+    right = arrays_of(theirs.state)
+    for name, array in arrays_of(ours.state).items():
+        np.testing.assert_array_equal(
+            array.view(np.uint8), right[name].view(np.uint8), err_msg=name
+        )
+    for name in ("iteration", "visit", "initial_count"):
+        assert getattr(ours, name) == getattr(theirs, name)
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:

@@ -48,7 +48,25 @@ def compile_for_cpu() -> None:
     """`precompile_kernels` for the CPU, whether or not another process compiles."""
     helper = rasterizer_helper()
     compile_gradients()
-    # limits, replacement of the background, loss and Adam
+    _step()
+    if helper is not None:
+        try:
+            helper.wait(HELPER_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            helper.kill()
+    _render()  # loads from the cache what the second process has compiled
+
+
+def _render() -> None:
+    """Forward and backward pass."""
+    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
+    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
+    v_image = np.zeros_like(rendering.image)
+    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
+
+
+def _step() -> None:
+    """Limits, replacement of the background, loss and Adam."""
     image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
     mask, rows = np.zeros((16, 16), np.uint8), np.arange(2, dtype=np.int32)
     for loaded in (target, mask):  # read-only arrays are a type of their own
@@ -71,16 +89,6 @@ def compile_for_cpu() -> None:
         with_effects(state, (), OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
         lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, adam.PLAIN,
     )  # fmt: skip
-    if helper is not None:
-        try:
-            helper.wait(HELPER_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            helper.kill()
-    # a forward and a backward pass, loaded from the cache where the second process has compiled it
-    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
-    rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
-    v_image = np.zeros_like(rendering.image)
-    render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
 
 
 def _two_splats() -> TrainState:

@@ -42,6 +42,13 @@ def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.nd
     return 60 * np.clip(mirrored @ light, 0, 1) ** 3
 
 
+def unlike_cameras() -> tuple[np.ndarray, np.ndarray]:
+    """Gain and offset (8, 3) of eight cameras, against their mean."""
+    rng = np.random.default_rng(5)
+    gain, offset = rng.uniform(0.92, 1.08, (8, 3)), rng.normal(0, 3, (8, 3))
+    return gain / gain.mean(0), offset - offset.mean(0)
+
+
 @dataclass(frozen=True)
 class Scene:
     """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, gain over time

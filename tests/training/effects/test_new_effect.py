@@ -32,7 +32,7 @@ from stga_addon.training.run.identity import file_digest
 from stga_addon.training.run.session import train
 
 from ..test_driven_offsets import squeezed
-from ..toys import bits, quick_settings
+from ..toys import bits, quick_settings, stop_at
 
 NAME = "toy_growth"
 
@@ -92,12 +92,7 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(
     assert run.settings.driven_offsets == (NAME,)
     assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
     train(capture, tmp_path / "whole", run)
-    train(
-        capture,
-        tmp_path / "parts",
-        run,
-        report=lambda progress: progress.figures().get("iteration", 0) == 13,
-    )
+    train(capture, tmp_path / "parts", run, report=stop_at(13))
     assert read_checkpoint(tmp_path / "parts").iteration == 13
     train(capture, tmp_path / "parts", run, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))

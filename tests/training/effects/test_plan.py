@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 from capture import factory
+from command_line import stga
 
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
 from stga_addon.training.effect_catalog import EFFECTS
@@ -27,8 +27,8 @@ def root(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(root, tmp_path_factory):
     out = tmp_path_factory.mktemp("effects") / "run"
-    choices = ["--effect", "strain-color=on", "--effect", "hull-points=off"]
-    assert main(["train", str(root), "--out", str(out), "--iterations", "4", *choices]) == 0
+    choices = "--iterations 4 --effect strain-color=on --effect hull-points=off"
+    assert stga("train", root, "--out", out, choices) == 0
     return out
 
 
@@ -37,16 +37,12 @@ def test_the_run_keeps_its_plan(trained):
     them."""
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.effect_plan}
-    assert (plan["strain-color"].choice, plan["strain-color"].on, run.settings.strain_color) == (
-        "on",
-        True,
-        True,
-    )
-    assert (plan["hull-points"].choice, plan["hull-points"].on, run.settings.hull_points) == (
-        "off",
-        False,
-        False,
-    )
+    for effect, switch, choice in (
+        ("strain-color", "strain_color", "on"),
+        ("hull-points", "hull_points", "off"),
+    ):
+        assert plan[effect].choice == choice
+        assert plan[effect].on == getattr(run.settings, switch) == (choice == "on")
     assert plan["exposure"].choice == "auto"
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
 
@@ -59,7 +55,8 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     capture = open_capture(root)
     settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
     settings, plan = plan_effects(capture, settings)
-    on = EFFECTS[effect].on or {"driven_offsets": (EFFECTS[effect].offset,)}
+    switch, offset = EFFECTS[effect].switch, EFFECTS[effect].offset
+    on = {switch: True} if switch else {"driven_offsets": (offset,)}
     assert not on.items() <= vars(settings).items()
     monkeypatch.setitem(planning.RULES, effect, lambda facts: Verdict(True, "two takes say so"))
     extended, later = add_effects(capture, settings, plan)
@@ -75,14 +72,12 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
     """Catches a run that goes on with other effects than it began with."""
     monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
     before = read_run(trained)
-    train = ["train", str(root), "--out", str(trained), "--resume"]
-    assert main([*train, "--effect", "strain-color=on"]) == 0
+    train = "train", root, "--out", trained, "--resume --effect"
+    assert stga(*train, "strain-color=on") == 0
     assert read_run(trained) == before
-    assert any(
-        line.split()[:4] == ["strain-color", "on,", "as", "asked:"]
-        for line in capsys.readouterr().out.splitlines()
-    )
-    assert main([*train, "--effect", "strain-color=off"]) == 2
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert any(line.startswith("strain-color on, as asked:") for line in lines)
+    assert stga(*train, "strain-color=off") == 2
     assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
@@ -90,40 +85,22 @@ def test_info_shows_the_plan(tmp_path, capsys):
     """Catches an overview without the plan or the figures behind it, or with choices that it does
     not heed."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 2, 3, 4, 5), range(3))
-    assert main(["info", str(root), "--effect", "strain-color=on"]) == 0
+    assert stga("info", root, "--effect strain-color=on") == 0
     lines = capsys.readouterr().out.splitlines()
     (strain,) = [line for line in lines if line.startswith("strain-color")]
     assert "on, as asked: " in strain
     assert "coefficients more a splat" in strain
-    assert re.search(
-        r"[+-]\d\.\d\d dB in left-out frames and [+-]\d\.\d\d dB in left-out cameras", strain
-    )
+    gain = r"[+-]\d\.\d\d dB in left-out"
+    assert re.search(rf"{gain} frames and {gain} cameras", strain)
     assert any(line.startswith("view-color") and "off: " in line for line in lines)
 
 
-@pytest.mark.parametrize(
-    ("effect", "says"),
-    [
-        ("jaw=on", "--effect jaw=on: "),
-        ("teeth=on", "--effect teeth=on: "),
-        ("strain=on", "'strain=on' is not NAME=on"),
-    ],
-)
-def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect, says):
+@pytest.mark.parametrize("effect", ["jaw=on", "teeth=on", "strain=on"])
+def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect):
     """Catches an impossible choice that is taken in silence, or ends in a traceback."""
+    says = "'strain=on' is not NAME=on" if effect == "strain=on" else f"--effect {effect}: "
     try:
-        code = main(
-            [
-                "train",
-                str(root),
-                "--out",
-                str(tmp_path / "run"),
-                "--iterations",
-                "2",
-                "--effect",
-                effect,
-            ]
-        )
+        code = stga("train", root, "--out", tmp_path / "run", "--iterations 2 --effect", effect)
     except SystemExit as stop:  # argparse's, of a value that no capture could have
         code = stop.code
     assert code == 2
@@ -133,17 +110,13 @@ def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect, says):
 
 def test_baselines_decide_nothing(root, tmp_path, capsys):
     """Catches the paper's letter, or GaussianAvatars' method, with effects of ours."""
-    for options in (["--schedule", "paper"], ["--strategy", "gaussian-avatars"]):
-        out = tmp_path / options[1]
-        assert main(["train", str(root), "--out", str(out), "--iterations", "2", *options]) == 0
+    for number, options in enumerate(("--schedule paper", "--strategy gaussian-avatars")):
+        out, train = tmp_path / str(number), ("train", root, "--iterations 2", options, "--out")
+        assert stga(*train, out) == 0
         run = read_run(out)
-        assert (run.effect_plan, run.settings.effects, run.settings.strain_color) == (
-            (),
-            None,
-            False,
-        )
-        again = ["train", str(root), "--out", str(tmp_path / "no"), "--iterations", "2", *options]
-        assert main([*again, "--effect", "strain-color=on"]) == 2
+        assert (run.effect_plan, run.settings.effects) == ((), None)
+        assert not run.settings.strain_color
+        assert stga(*train, tmp_path / "no", "--effect strain-color=on") == 2
         assert "--effect cannot be combined with" in capsys.readouterr().err
 
 
@@ -158,19 +131,11 @@ def test_a_damaged_plan(tmp_path):
     write_run(tmp_path, Run(Path("/capture"), None, "vhap", make_settings(iterations=5)))
     whole = read_json(tmp_path / "run.json")
     good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
-    for plan in (
-        7,
-        [7],
-        [{**good, "on": "yes"}],
-        [{**good, "choice": "maybe"}],
-        [{"effect": "jaw"}],
-    ):
-        write_json(tmp_path / "run.json", {**whole, "effect_plan": plan})
-        with pytest.raises(StgaError, match=r"run\.json: "):
-            read_run(tmp_path)
-    for row in ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0]):
-        write_json(
-            tmp_path / "run.json", {**whole, "settings": {**whole["settings"], "exposure": [row]}}
-        )
+    plans = (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}])
+    rows = ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0])
+    damages = [{"effect_plan": plan} for plan in plans]
+    damages += [{"settings": {**whole["settings"], "exposure": [row]}} for row in rows]
+    for damage in damages:
+        write_json(tmp_path / "run.json", {**whole, **damage})
         with pytest.raises(StgaError, match=r"run\.json: "):
             read_run(tmp_path)

@@ -21,7 +21,7 @@ from stga_addon.training.effects.samples import MAX_VIEWS, sample_views, take_sa
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.settings import TrainingSettings, make_settings
 
-from .scenes import gloss, sliding, wrinkles
+from .scenes import gloss, sliding, unlike_cameras, wrinkles
 
 FEW_VIEWS = {"cameras": 3, "timesteps": 3}
 """For what does not depend on how sure evidence is."""
@@ -158,9 +158,7 @@ def test_color_that_follows_the_view(painted):
 def test_cameras_of_different_exposure(painted):
     """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than
     two levels."""
-    rng = np.random.default_rng(5)
-    gain, offset = rng.uniform(0.92, 1.08, (8, 3)), rng.normal(0, 3, (8, 3))
-    gain, offset = gain / gain.mean(0), offset - offset.mean(0)
+    gain, offset = unlike_cameras()
     plan, settings = planned(painted(gain=gain, offset=offset))
     assert on(plan) == {*USUAL, "exposure"}
     rows = np.array(settings.exposure)
