@@ -26,12 +26,8 @@ FACES = 5
 
 
 def make_run(**changes: Any) -> Run:
-    return Run(
-        Path("/data/head"),
-        Path("/data/flame.npz"),
-        "opencv",
-        make_settings(iterations=9, **changes),
-    )
+    settings = make_settings(iterations=9, **changes)
+    return Run(Path("/data/head"), Path("/data/flame.npz"), "opencv", settings)
 
 
 def make_checkpoint() -> Checkpoint:
@@ -45,54 +41,35 @@ def edit_json(path: Path, **changes: Any) -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
     """Catches a setting that a resumed run would not have."""
-    run = make_run(strategy=strategy)
-    folder.write_run(tmp_path, run)
-    assert folder.read_run(tmp_path) == run
     bare = Run(Path("/x"), None, "vhap", make_settings(seconds=60.0))
-    folder.write_run(tmp_path, bare)
-    assert folder.read_run(tmp_path) == bare
+    for run in (make_run(strategy=strategy), bare):
+        folder.write_run(tmp_path, run)
+        assert folder.read_run(tmp_path) == run
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("field", "value", "message"),
     [
-        ({"version": 2}, r"run\.json: has run format version 2, this add-on reads 4 to 7$"),
-        ({"version": None}, r"run\.json: has run format version None"),
-        ({"format": "stga-avatar"}, r"run\.json: is not a run"),
-        ({"capture": None}, r"run\.json: setting capture: expected a path, got None"),
-        ({"settings": None}, r"run\.json: settings: fields are missing"),
-        (
-            {"settings": {}},
-            r"run\.json: settings: fields are missing or unknown \(adam_beta2, adam_epsilon, ",
-        ),
-        (
-            {"device": "toaster"},
-            r"run\.json: setting device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'",
-        ),
-        (
-            {"principal_point": "corner"},
-            r"run\.json: setting principal_point: expected one of vhap, .*, got 'corner'",
-        ),
-        (
-            {"identity": {"faces": 5}},
-            r"run\.json: identity: fields are missing or unknown \(cameras, ",
-        ),
-        (
-            {"takes": [{"capture": "a"}]},
-            r"run\.json: takes\.0: fields are missing or unknown \(identity, start\)",
-        ),
-        (
-            {"continuation": {"parent": "a", "avatar": "b", "first": 5, "last": 3}},
-            r"run\.json: continuation: its last timestep 3 is before its first, 5",
-        ),
+        ("version", 2, "has run format version 2, this add-on reads 4 to 7$"),
+        ("version", None, "has run format version None"),
+        ("format", "stga-avatar", "is not a run"),
+        ("capture", None, "setting capture: expected a path, got None"),
+        ("settings", None, "settings: fields are missing"),
+        ("settings", {}, r"settings: fields are missing or unknown \(adam_beta2, adam_epsilon, "),
+        ("device", "toaster", "device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'"),
+        ("principal_point", "corner", "expected one of vhap, .*, got 'corner'"),
+        ("identity", {"faces": 5}, r"identity: fields are missing or unknown \(cameras, "),
+        ("takes", [{"capture": "a"}], r"takes\.0: fields are missing or .* \(identity, start\)"),
+        ("continuation", {"parent": "a", "avatar": "b", "first": 5, "last": 3},
+         "continuation: its last timestep 3 is before its first, 5"),
     ],
-)
-def test_damaged_runs(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+)  # fmt: skip
+def test_damaged_runs(tmp_path: Path, field: str, value: Any, message: str) -> None:
     """Catches a run of another version read as one's own, and a traceback for one edited by
     hand."""
     folder.write_run(tmp_path, make_run())
-    edit_json(tmp_path / "run.json", **change)
-    with pytest.raises(StgaError, match=message):
+    edit_json(tmp_path / "run.json", **{field: value})
+    with pytest.raises(StgaError, match=rf"run\.json: .*{message}"):
         folder.read_run(tmp_path)
 
 
@@ -107,9 +84,8 @@ def test_selection_round_trip(tmp_path: Path) -> None:
     for timestep, faces in selection.items():
         np.testing.assert_array_equal(again[timestep], faces)
         assert again[timestep].dtype == bool
-    with pytest.raises(
-        StgaError, match=r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"
-    ):
+    other = r"selection\.npz: '00000' is bool \(5,\), expected bool \(6,\)"
+    with pytest.raises(StgaError, match=other):
         checkpoint_files.read_selection(tmp_path, FACES + 1)
     checkpoint_files.write_selection(tmp_path, {0: np.ones(FACES, np.float32)}, "a")
     with pytest.raises(StgaError, match="float32"):
@@ -120,7 +96,8 @@ def test_selection_round_trip(tmp_path: Path) -> None:
 
 
 def test_checkpoint_round_trip(tmp_path: Path) -> None:
-    """Catches a moment or a count that resumption would lose."""
+    """Catches a moment or a count that resumption would lose, and arrays of another order than
+    rows, of which Adam would step a copy."""
     checkpoint = make_checkpoint()
     checkpoint_files.write_checkpoint(tmp_path, checkpoint)
     again = checkpoint_files.read_checkpoint(tmp_path)
@@ -133,11 +110,6 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
         assert theirs[name].dtype == array.dtype
     left, right = ({k: v for k, v in vars(c).items() if k != "state"} for c in (again, checkpoint))
     assert left == right
-
-
-def test_arrays_by_columns_are_read(tmp_path: Path) -> None:
-    """Catches arrays of another order than rows, of which Adam would step a copy."""
-    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as stored:
         by_columns = {name: np.asfortranarray(array) for name, array in stored.items()}
@@ -159,69 +131,49 @@ def meta(**changes: Any) -> np.ndarray:
 def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
     """The moments of positions that follow strain, of FACES triangles, and what is changed of
     them."""
-    rows = np.zeros((FACES, 3, 3), np.float32)
-    arrays = {
-        "value": rows, "average": rows, "first": rows, "second": rows, "steps": np.zeros(FACES,
-        np.int32), **changes,
-    }  # fmt: skip
+    tables = dict.fromkeys(("value", "average", "first", "second"), np.zeros((5, 3, 3), np.float32))
+    arrays = {**tables, "steps": np.zeros(FACES, np.int32), **changes}
     return {f"strain_position/{name}": array for name, array in arrays.items()}
 
 
-DAMAGES: dict[str, tuple[dict[str, np.ndarray | None], str]] = {
-    "no moments": ({"second/sh": None}, "a field is missing"),
-    "no meta": ({"meta": None}, "a field is missing"),
-    "shorter array": (
-        {"first/xyz": np.zeros((11, 3), np.float32)},
-        r"/xyz is .* \(11, 3\), expected .* \(12, 3\)",
-    ),
-    "scalar": ({"opacity": np.zeros((), np.float32)}, "an array has no rows"),
-    "meta is a list": ({"meta": np.frombuffer(b"[]", np.uint8)}, "meta is no object"),
-    "another version": ({"meta": meta(version=1)}, "was written by another version"),
-    "unknown count": ({"meta": meta(color=3)}, "malformed .*color"),
-    "negative iteration": (
-        {"meta": meta(iteration=-1)},
-        "iteration is -1, expected a whole number from 0 up",
-    ),
-    "iteration beyond what is exact": (
-        {"meta": meta(iteration=1 << 53)},
-        "iteration is 9007199254740992",
-    ),
-    "visit before the first": (
-        {"meta": meta(visit=-2)},
-        "visit is -2, expected a whole number from -1 up",
-    ),
-    "negative splats": ({"meta": meta(initial_count=-1)}, "initial_count is -1"),
-    "negative evaluations": ({"meta": meta(evaluations=-1)}, "evaluations is -1"),
-    "endless time": ({"meta": meta(elapsed_s=math.inf)}, "elapsed_s is inf"),
-    "time before the start": ({"meta": meta(elapsed_s=-1.0)}, "elapsed_s is -1.0"),
-    "negative timestep": ({"meta": meta(last_timestep=-1)}, "last_timestep is -1"),
-    "identity that is no text": (
-        {"meta": meta(identity=None)},
-        "identity is None, expected a text",
-    ),
-    "wrong kind": ({"parameters/xyz": np.zeros((12, 3), np.float64)}, "parameters/xyz is float64"),
-    "strain of other triangles": (
-        strain_position(first=np.zeros((4, 3, 3), np.float32)),
-        r"strain_position/first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)",
-    ),
-    "steps that are no int32": (
-        strain_position(steps=np.zeros(FACES, np.int64)),
-        "strain_position/steps is int64",
-    ),
+METAS: dict[str, dict[str, Any]] = {
+    "was written by another version": {"version": 1},
+    "malformed .*color": {"color": 3},
+    "iteration is -1, expected a whole number from 0 up": {"iteration": -1},
+    "iteration is 9007199254740992": {"iteration": 1 << 53},  # beyond what is exact
+    "visit is -2, expected a whole number from -1 up": {"visit": -2},
+    "initial_count is -1": {"initial_count": -1},
+    "evaluations is -1": {"evaluations": -1},
+    "elapsed_s is inf": {"elapsed_s": math.inf},
+    "elapsed_s is -1.0": {"elapsed_s": -1.0},
+    "last_timestep is -1": {"last_timestep": -1},
+    "identity is None, expected a text": {"identity": None},
+}
+"""What is said of counts and other values -> them."""
+SHAPES = r"first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)"
+DAMAGES: dict[str, dict[str, np.ndarray | None]] = {
+    **{says: {"meta": meta(**changes)} for says, changes in METAS.items()},
+    "a field is missing": {"second/sh": None},
+    "a field is missing or malformed": {"meta": None},
+    r"/xyz is .* \(11, 3\), expected .* \(12, 3\)": {"first/xyz": np.zeros((11, 3), np.float32)},
+    "an array has no rows": {"opacity": np.zeros((), np.float32)},
+    "meta is no object": {"meta": np.frombuffer(b"[]", np.uint8)},
+    "parameters/xyz is float64": {"parameters/xyz": np.zeros((12, 3), np.float64)},
+    f"strain_position/{SHAPES}": strain_position(first=np.zeros((4, 3, 3), np.float32)),
+    "strain_position/steps is int64": strain_position(steps=np.zeros(FACES, np.int64)),
 }
 
 
-@pytest.mark.parametrize("name", DAMAGES)
-def test_damaged_checkpoints(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("says", DAMAGES)
+def test_damaged_checkpoints(tmp_path: Path, says: str) -> None:
     """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check,
     and one that is refused for another reason than what is wrong with it."""
     checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
         arrays: dict[str, np.ndarray | None] = dict(data)
-    changes, message = DAMAGES[name]
-    np.savez(path, **{k: v for k, v in {**arrays, **changes}.items() if v is not None})
-    with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{message}"):
+    np.savez(path, **{k: v for k, v in {**arrays, **DAMAGES[says]}.items() if v is not None})
+    with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{says}"):
         checkpoint_files.read_checkpoint(tmp_path)
 
 
@@ -239,13 +191,8 @@ def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
 
 def line(iteration: int, **changes: Any) -> dict[str, Any]:
     """A line of metrics with the fields that every line has."""
-    times = {
-        "seconds": 0.5 * iteration,
-        "splats": 80,
-        "evaluation_s": 0.1,
-        "wall_s": float(iteration),
-    }
-    return {"iteration": iteration, **times, **changes}
+    times = {"seconds": 0.5 * iteration, "evaluation_s": 0.1, "wall_s": float(iteration)}
+    return {"iteration": iteration, "splats": 80, **times, **changes}
 
 
 def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
@@ -324,20 +271,15 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
         assert lock_owner(target / "run.lock") == os.getpid()
 
 
-@pytest.mark.parametrize(
-    "content", ["", "hello", "0", "1", pytest.param(str(os.getpid()), id="own process")]
-)
-def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path, content: str) -> None:
+def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path) -> None:
     """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number
-    lives on in another process (1 always does)."""
-    (tmp_path / "run.lock").write_text(content)
-    with folder.locked(tmp_path):
-        pass
-    assert not (tmp_path / "run.lock").exists()
-
-
-def test_a_folder_that_cannot_be_one(tmp_path: Path) -> None:
-    """Catches a traceback, or talk of another run, where the name is that of a file."""
+    lives on in another process (1 always does); and a traceback, or talk of another run, where the
+    name is that of a file."""
+    for content in ("", "hello", "0", "1", str(os.getpid())):
+        (tmp_path / "run.lock").write_text(content)
+        with folder.locked(tmp_path):
+            pass
+        assert not (tmp_path / "run.lock").exists()
     (tmp_path / "file").write_text("x")
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(StgaError, match="cannot be written"), folder.locked(path):

@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 from capture import factory
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import request_folder, write_request
 from stga_addon.jobs.train import Resume
 from stga_addon.progress import Progress
 from stga_addon.render import device as device_choice
 from stga_addon.schema import to_json
-from stga_addon.training.optimize.state import arrays_of
 from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, device_of, open_run, read_run, write_run
@@ -33,7 +32,7 @@ from stga_addon.training.run.identity import RunIdentity, difference, identity_o
 from stga_addon.training.run.session import train
 from stga_addon.training.settings import TrainingSettings
 
-from .toys import quick_settings, stop_at
+from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 12
 OLD = {"adam_beta2": 0.999, "adam_nesterov": False, "split_share": 0.02, "coarse_lattice": False}
@@ -97,24 +96,26 @@ def larger_neutral(root: Path) -> None:
     factory.write_mesh(root / "meshes/neutral.obj", 1.15 * vertices, faces)
 
 
-CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "poses": (move_cameras, "other camera poses or intrinsics"),
-    "focal length": (
-        lambda root: edit_frames(root, lambda f: f.update(fl_x=101.0)),
-        "other camera poses",
-    ),
-    "sizes": (halve_images, "other images or image sizes"),
-    "names": (rename_images, "other images or image sizes"),
-    "triangles": (other_topology, "a mesh with other triangles"),
-    "neutral mesh": (larger_neutral, "another neutral mesh"),
-}
+def other_lens(root: Path) -> None:
+    edit_frames(root, lambda frame: frame.update(fl_x=101.0))
 
 
-@pytest.mark.parametrize("name", CHANGES)
-def test_changed_captures_are_refused(copy: Path, toy: Capture, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (move_cameras, "other camera poses or intrinsics"),
+        (other_lens, "other camera poses"),
+        (halve_images, "other images or image sizes"),
+        (rename_images, "other images or image sizes"),
+        (other_topology, "a mesh with other triangles"),
+        (larger_neutral, "another neutral mesh"),
+    ],
+)
+def test_changed_captures_are_refused(
+    copy: Path, toy: Capture, tmp_path: Path, change: Callable[[Path], None], message: str
+) -> None:
     """Catches a run that is resumed or measured on another capture, by its path or replaced in
     place."""
-    change, message = CHANGES[name]
     other = shutil.copytree(toy.root, tmp_path / "other")
     change(other)
     both = rf"was trained on {toy.root} \(4 cameras, 4 timesteps\), but {other} \(.*{message}"
@@ -197,9 +198,9 @@ def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
     assert difference(one, two) is None
 
 
-def test_another_flame_model_is_refused(tmp_path: Path) -> None:
+def test_another_flame_model_is_refused(toy: Capture, tmp_path: Path) -> None:
     """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a
-    moved one."""
+    moved one, and one that blames the FLAME file where it is resumed on tracked meshes."""
     root, model = factory.write_flame_capture(tmp_path / "capture")
     capture, out = open_capture(root, model), tmp_path / "run"
     train(capture, out, make_run(capture, model), report=stop_at(4))
@@ -209,19 +210,10 @@ def test_another_flame_model_is_refused(tmp_path: Path) -> None:
     message = f"was trained with FLAME model {model}, but {other} has other content"
     with pytest.raises(StgaError, match=message):
         open_run(out, flame=other)
-    arguments = ["train", str(root), "--out", str(out), "--resume", "--flame"]
-    assert main([*arguments, str(other)]) == 2
-    assert main([*arguments, str(moved)]) == 0
-
-
-def test_a_capture_of_another_kind_is_named_as_such(toy: Capture, tmp_path: Path) -> None:
-    """Catches a run on a FLAME capture, resumed on tracked meshes, that blames the FLAME file
-    instead."""
-    root, model = factory.write_flame_capture(tmp_path / "flame")
-    capture, out = open_capture(root, model), tmp_path / "run"
-    train(capture, out, make_run(capture, model), report=stop_at(4))
     with pytest.raises(StgaError, match=rf"was trained on {root} .* but {toy.root} \(.* has "):
         open_run(out, toy.root)
+    assert stga("train", root, "--out", out, "--resume --flame", other) == 2
+    assert stga("train", root, "--out", out, "--resume --flame", moved) == 0
 
 
 def test_every_command_checks_the_identity(
@@ -232,24 +224,21 @@ def test_every_command_checks_the_identity(
     other = shutil.copytree(toy.root, tmp_path / "other")
     move_cameras(other)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
-    assert main(["train", str(other), "--out", str(copy), "--resume"]) == 2
+    assert stga("train", other, "--out", copy, "--resume") == 2
     for request in (Resume(copy, toy.root, principal_point="opencv"), Resume(copy, other)):
         write_request(request_folder(copy), request)
-        assert main(["perform", str(request_folder(copy))]) == 2
+        assert stga("perform", request_folder(copy)) == 2
     assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
-    cameras = str(other / "transforms_test.json")
-    assert main(["eval", str(copy)]) == 2
-    assert (
-        main(["render", str(copy), "--cameras", cameras, "--out", str(tmp_path / "pictures")]) == 2
-    )
-    assert main(["export", str(copy), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 2
+    cameras, ply = other / "transforms_test.json", tmp_path / "a.ply"
+    assert stga("eval", copy) == 2
+    assert stga("render", copy, "--cameras", cameras, "--out", tmp_path / "pictures") == 2
+    assert stga("export", copy, "--format ply --out", ply) == 2
     told = capsys.readouterr().err
     assert told.count("other camera poses or intrinsics; train into another folder") == 5
     assert told.count("principal point 'vhap', not 'opencv'") == 1
     # Another capture that is named drives the avatar: only its triangles must fit.
-    baked = ["--format", "ply", "--timestep", "0", "--out", str(tmp_path / "a.ply")]
-    assert main(["export", str(copy), "--capture", str(other), *baked]) == 0
+    assert stga("export", copy, "--capture", other, "--format ply --timestep 0 --out", ply) == 0
 
 
 def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Capture) -> None:
@@ -295,26 +284,16 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
     out = tmp_path / "run"
     train(capture, out, replace(make_run(capture), principal_point="opencv"))
     assert read_avatar(out / "avatar.npz").principal_point == "opencv"
-    cameras = str(root / "transforms_test.json")
+    cameras = root / "transforms_test.json"
 
     def pictures(source: Path, *options: str) -> list[bytes]:
         folder = tmp_path / f"{source.name}{len(options)}"
-        driver = ["--capture", str(root)] if source.is_file() else []
-        command = [
-            "render",
-            str(source),
-            "--cameras",
-            cameras,
-            "--out",
-            str(folder),
-            *driver,
-            *options,
-        ]
-        assert main(command) == 0
+        driver = ("--capture", root) if source.is_file() else ()
+        assert stga("render", source, "--cameras", cameras, "--out", folder, *driver, *options) == 0
         return [path.read_bytes() for path in sorted(folder.iterdir())]
 
-    expected = pictures(out, "--principal-point", "opencv")
-    assert expected != pictures(out / "avatar.npz", "--principal-point", "vhap")
+    expected = pictures(out, "--principal-point opencv")
+    assert expected != pictures(out / "avatar.npz", "--principal-point vhap")
     assert pictures(out) == pictures(out / "avatar.npz") == expected
 
 
@@ -323,11 +302,8 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
     to another GPU."""
     run = read_run(copy)
     assert run.device == "cpu"
-    monkeypatch.setattr(
-        open_run_module,
-        "choose_device",
-        lambda wanted: (wanted if wanted == "cpu" else "gpu:Card", "why"),
-    )
+    card = {"cpu": "cpu", "gpu": "gpu:Card"}
+    monkeypatch.setattr(open_run_module, "choose_device", lambda wanted: (card[wanted], "why"))
     assert device_of(run)[0] == "cpu"
     assert device_of(run, "gpu")[0] == "gpu:Card"
     monkeypatch.setattr(open_run_module, "adapter_names", lambda: ["Card", "Second Card"])
@@ -338,9 +314,8 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
         device_of(replace(run, settings=replace(run.settings, tracking=True)), "gpu")
     monkeypatch.undo()
     monkeypatch.setattr(device_choice, "find_spec", lambda name: None)
-    with pytest.raises(
-        StgaError, match=r"trained on gpu: .*wgpu .* is not installed; give --device cpu"
-    ):
+    missing = r"trained on gpu: .*wgpu .* is not installed; give --device cpu"
+    with pytest.raises(StgaError, match=missing):
         device_of(replace(run, device="gpu:Card"))
     assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
 
@@ -362,9 +337,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Pa
     assert len(read_avatar(out / "avatar.npz").splats) == len(toy.faces)
     train(toy, out, make_run(toy), resume=True)
     train(toy, unbroken, make_run(toy))
-    ours, theirs = (arrays_of(read_checkpoint(folder).state) for folder in (out, unbroken))
-    for name, array in ours.items():
-        np.testing.assert_array_equal(array, theirs[name], err_msg=name)
+    assert_same_state(out, unbroken)
 
 
 def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
