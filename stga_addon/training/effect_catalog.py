@@ -33,8 +33,7 @@ class Effect:
 
 
 RELIGHT = "relight"
-"""The light of the capture is estimated after training, so that the lights of a scene can take its
-place."""
+"""The capture's light is estimated after training, so that a scene's lights can take its place."""
 WORLD = "world"
 """What stands still behind the person becomes splats of its own, after training."""
 _SHAPES = "shape keys and drivers in Blender"

@@ -1,5 +1,4 @@
-"""Preset timing: how long each preset would train on this machine, measured on the capture
-itself."""
+"""How long each preset would train on this machine, measured on the capture itself."""
 
 from dataclasses import dataclass
 from itertools import cycle, islice
@@ -30,8 +29,7 @@ MAX_ITERATIONS = 2000
 
 @dataclass(frozen=True)
 class PresetTiming:
-    """A preset's iterations for a capture, and the seconds of training that they are expected to
-    take."""
+    """A preset's iterations for a capture, and the seconds that they are expected to take."""
 
     preset: str
     purpose: str

@@ -1,5 +1,4 @@
-"""Schedules over the training budget: order of views, degree of spherical harmonics, learning
-rates, image scale."""
+"""Schedules over the training budget: views, harmonics, learning rates, image scale."""
 
 from collections.abc import Iterator, Sequence
 from itertools import count
@@ -51,8 +50,7 @@ def learning_rates(rates: Rates, progress: float) -> dict[str, float]:
 
 
 def image_scales(settings: TrainingSettings, views: Sequence[View]) -> tuple[float, float]:
-    """Size of the views' images during `coarse_share` of the budget, and afterwards, as a share of
-    the captured size."""
+    """Size of images during `coarse_share` of the budget and afterwards, of the captured."""
     least = min(min(view.camera.width, view.camera.height) for view in views)
     is_large = COARSE_SCALE * settings.scale * least >= MIN_COARSE_SIDE_PX
     return settings.scale * (COARSE_SCALE if is_large else 1.0), settings.scale

@@ -49,8 +49,7 @@ class Rates:
 
 
 MAX_FINE_TRIANGLES = 16_000
-"""Of FLAME's size and less; on meshes of 20,000 and more triangles, 3 splats a triangle give the
-same images as 6."""
+"""FLAME's; on 20,000 and more triangles, 3 splats a triangle give the same images as 6."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +236,7 @@ class TrainingSettings:
         return self.lattice_order(triangles) - begins_coarse
 
     def check(self) -> None:
-        """Raise StgaError for settings at odds with each other, and for rows and names that types
-        do not tell."""
+        """Raise StgaError for settings at odds, and rows and names that types do not tell."""
         given = (self.seconds is not None) + (self.iterations is not None)
         if given > 1 or (given == 0 and self.preset is None):
             raise StgaError("the budget must be given either in seconds or in iterations")
@@ -283,8 +281,7 @@ PAPER_SETTINGS = {
     "lattice": 4,
     "selection": SelectionOptions(threshold=0.01, zero_pose="all"),
 }
-"""The paper's settings where they differ from the defaults, which measured best
-(docs/results.md)."""
+"""Where they differ from the defaults, which measured best (docs/results.md)."""
 
 GAUSSIAN_AVATARS_SETTINGS = {
     **_PUBLISHED,
@@ -296,13 +293,11 @@ GAUSSIAN_AVATARS_SETTINGS = {
     "stray_reset_interval": 0,
     "growth": 8.0,
 }
-"""GaussianAvatars' binding, loss threshold and learning rates (Qian et al. 2024, section 3 and
-released settings)."""
+"""Binding, loss threshold, learning rates (Qian et al. 2024, section 3, released settings)."""
 
 
 def with_budget(settings: TrainingSettings, views: int) -> TrainingSettings:
-    """The settings with the iterations of their preset for so many training views, where they give
-    no budget."""
+    """With the iterations of their preset for so many training views, if they give no budget."""
     if settings.preset is None or settings.seconds is not None or settings.iterations is not None:
         return settings
     return replace(settings, iterations=PRESETS[settings.preset].iterations_for(views))

@@ -26,13 +26,11 @@ MAX_PLATE_VIEWS = 24
 MAX_PLATE_PIXELS = 500_000
 """Larger images are read smaller."""
 MATTE_MARGIN_SHARE = 0.008
-"""Around the person nothing is taken from a view, where a matte is uncertain; share of the image's
-height."""
+"""Around the person, where a matte is uncertain; share of the image's height."""
 PERSON = 256
 """Above every level of a pixel: sorts behind them."""
 RADII, NEAREST_RADIUS, FARTHEST_RADIUS = 24, 0.3, 12.0
-"""Shells that are tried, and the smallest and the largest, in distances of the cameras from the
-person."""
+"""Shells that are tried, smallest and largest in distances of the cameras from the person."""
 DEFAULT_RADIUS = 3.0
 """Where the plates do not tell, because a wall is of one color or a single camera sees it."""
 SAMPLED_POINTS = 4000
@@ -41,16 +39,14 @@ MIN_SHARED, MIN_LIKENESS = 0.1, 0.3
 """A shell tells how far away the world is where at least this share of the sampled pixels lies in
 another plate as well, and what both show there correlates at least so much."""
 DETAIL_SHARES = 0.003, 0.03
-"""Standard deviations of the filters between which details lie by which plates are compared; of the
-image's height."""
+"""Filters between which lie the details that plates are compared by; of the image's height."""
 LARGEST_BLOCK, SMALLEST_BLOCK = 16, 2
 """Pixels."""
 FLAT_LEVELS, MAX_FIRST_SPLATS = 1.5, 60_000
 """A block whose colors deviate less from their mean (standard deviation, of 255) is one splat; by
 more, twice as much and so on, where there would be too many."""
 SAME_LEVELS = 8.0
-"""A block is left out whose color another plate shows there already, to within so many of 255
-levels."""
+"""A block is left out whose color another plate shows there, to so many of 255 levels."""
 BLOCK_WIDTH = 0.8
 """Standard deviation of a block's splat, in sides of the block."""
 THICKNESS_SHARE = 0.2
@@ -136,8 +132,7 @@ def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Sp
 
 
 def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report = ignore) -> Splats:
-    """Splats in world space, meters, that show the plates from their cameras; center: (3,) of the
-    person."""
+    """In world space, meters, that show plates from their cameras; center: (3,) of the person."""
     start, steps = first_splats(plates, center), max(MIN_STEPS, STEPS_PER_CAMERA * len(plates))
     # a capture of one timestep, whose views are the plates' and whose mesh is one triangle
     mesh, faces = center + TRIANGLE, np.arange(3, dtype=np.int32)[None]
@@ -166,8 +161,7 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
 
 
 def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
-    """Meters from the person's center (3,) to the shell on which plates of different cameras look
-    most alike."""
+    """Meters from the person's center (3,) to the shell on which plates look most alike."""
     details = []  # without coarse colors, which light and exposure change, and without noise
     for plate in plates:
         sizes = [np.array([share, share, 0.0]) * len(plate.image) for share in DETAIL_SHARES]
@@ -183,8 +177,7 @@ def shell_radius(plates: Sequence[CleanPlate], center: np.ndarray) -> float:
 def _likeness(
     plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float
 ) -> float:
-    """Correlation of what two plates show of the same points of a shell; 0 where they share too
-    few."""
+    """Correlation of plates at the same points of a shell; 0 where they share too few."""
     mine, theirs, rng = [], [], np.random.default_rng(0)
     for plate, detail in zip(plates, details, strict=True):
         rows, columns = np.nonzero(plate.seen)

@@ -13,8 +13,7 @@ from .samples import Samples
 FOLDS = 4
 MIN_SAMPLES_PER_TRIANGLE = 6
 CAMERA_FIT_ITERATIONS = 30
-"""Alternations between cameras and triangles; cameras on opposite sides share few triangles, so it
-converges slowly."""
+"""Alternations between cameras and triangles, slow as opposite cameras share few triangles."""
 CAMERA_PRIOR_SAMPLES = 5.0
 """Weight, in samples, of the prior that a camera is like the others."""
 TYPICAL_LEVEL = 100.0
@@ -34,8 +33,7 @@ RIDGE_WEIGHT = 1.0
 
 @dataclass(frozen=True)
 class Evidence:
-    """Root mean square errors, in levels of 255, without and with a model, of other colors than it
-    was fitted to."""
+    """Root mean square errors, in levels of 255, without and with a model, of held-out colors."""
 
     before: float
     after: float
@@ -79,8 +77,7 @@ class CameraColors:
 
 
 def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
-    """Gains and offsets from color (S, K, 3), NaN where not seen: least squares, cameras and
-    triangles in turn."""
+    """From color (S, K, 3), NaN where not seen: least squares, cameras and triangles in turn."""
     camera, row = np.unique(samples.camera, return_inverse=True)
     fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
     for _ in range(CAMERA_FIT_ITERATIONS):
@@ -126,8 +123,7 @@ def stable_colors(color: np.ndarray) -> np.ndarray:
 
 
 def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
-    """Gains (S, 3) of the views against their camera's mean, from color (S, K, 3), NaN where not
-    seen."""
+    """Gains (S, 3) of views against their camera's mean, from color (S, K, 3), NaN if unseen."""
     known, gain = ~np.isnan(color), np.ones((len(color), 3))
     prior = CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2
     _, row = np.unique(samples.camera, return_inverse=True)

@@ -20,8 +20,7 @@ from .samples import Samples, take_samples
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
 MIN_WHITE_SHARE = 0.1
-"""Share of the pixels beside the mesh that a white background is: hair and shoulders leave more
-than that of it."""
+"""Of the pixels beside the mesh, that are white before white: hair and shoulders leave more."""
 
 
 class CaptureFacts:

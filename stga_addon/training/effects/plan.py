@@ -34,8 +34,7 @@ MIN_TIMESTEPS_FOR_STRAIN = 4
 MIN_STRETCH = 1e-6
 """Share of a triangle's size; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
-"""Widest pixel at the head over the narrowest; above it, splats narrower than a pixel look
-different to each camera."""
+"""Of pixels at the head; above it, splats narrower than a pixel look different to each camera."""
 FINE_SPLAT_PIXELS = 4.0
 """Median pixels per splat below which the screen-space low-pass filter changes how splats look."""
 MAX_BACKGROUND_SPREAD_LEVELS = 6.0

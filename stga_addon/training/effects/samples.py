@@ -14,11 +14,9 @@ from ...capture.model import Capture, View, evenly_spread
 MAX_VIEWS = 48
 MAX_TIMESTEPS = 12
 MAX_FACES = 3000
-"""More of each would change no decision, and take more than a few seconds; of more cameras, each
-gives one view."""
+"""More of each would change no decision, and take long; of more cameras, each gives one view."""
 SAMPLED_HEIGHT_PIXELS = 400
-"""Images at least half as high again are shrunk to this height: triangles are then two or three
-pixels wide."""
+"""Images half as high again are shrunk to this: triangles are then two or three pixels wide."""
 MIN_NEAR_DEPTH_M = 0.01
 MIN_FACING_COSINE = 0.35
 """Between normal and line of sight; below it, a triangle is too oblique to have a color."""
@@ -27,8 +25,7 @@ MASK_EDGE_PIXELS = 3
 TRACKING_ERROR_SHARE = 0.01
 """Foreground up to this share of the image's height beside the mesh counts as tracking error."""
 DEPTH_TOLERANCE_SHARE = 0.003
-"""A triangle is visible if its center lies at most this share of its distance behind the nearest
-triangle there."""
+"""How far the center of a visible triangle may lie behind the nearest one, of its distance."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +67,7 @@ class Samples:
 
 
 def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
-    """MAX_VIEWS of them, or one of each camera where that is more: timesteps evenly spread, cameras
-    equally often."""
+    """MAX_VIEWS, or one of each camera: timesteps evenly spread, cameras equally often."""
     used = dict.fromkeys((view.camera_index for view in views), 0)
     every = sorted({view.timestep for view in views})
     timesteps = evenly_spread(every, max(MAX_TIMESTEPS, MAX_VIEWS // len(used)))
@@ -90,8 +86,7 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
 
 
 def take_samples(capture: Capture, seed: int = 0) -> Samples:
-    """Sample a few training views of a capture, one image at a time. Raises StgaError where one
-    cannot be read."""
+    """Of a few training views, one image at a time. Raises StgaError where one cannot be read."""
     views = sample_views(capture.views["train"], seed)
     rng = np.random.default_rng(seed)
     count = len(capture.faces)

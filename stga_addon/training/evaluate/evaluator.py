@@ -1,5 +1,4 @@
-"""Evaluations of a run while it trains: when they are due, what they find, which avatar is kept,
-and when to stop."""
+"""Evaluations of a run while it trains: when they are due, what is kept, and when to stop."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +15,7 @@ from .metrics import EvaluationView, evaluate
 EVALUATIONS = 10
 """Evaluations over a budget in iterations, at fixed shares of it, so that runs are reproducible."""
 EVALUATION_SHARE = 0.04
-"""Largest share of the training time that evaluations add to a budget in seconds, without the last
-one."""
+"""Largest share that evaluations, without the last one, add to a budget in seconds."""
 MAX_EVALUATIONS = 40
 """Evaluations over a budget in seconds, even where they cost little."""
 RENDERING_COST = 0.5
@@ -26,8 +24,7 @@ RENDERING_COST = 0.5
 
 @dataclass(frozen=True)
 class Spent:
-    """How much a run has trained: share of its budget (may exceed 1), seconds without evaluations,
-    iterations."""
+    """Trained so far: share of the budget (may exceed 1), seconds without evaluations, steps."""
 
     share: float
     seconds: float
@@ -35,8 +32,7 @@ class Spent:
 
     @property
     def left_s(self) -> float:
-        """Seconds of training until the budget is spent, at the speed so far; NaN before the first
-        step."""
+        """Seconds of training left, at the speed so far; NaN before the first step."""
         return max(0.0, self.seconds * (1 / self.share - 1)) if self.share > 0 else math.nan
 
 
@@ -74,8 +70,7 @@ class Evaluator:
         return spent.seconds - last >= max(budget_s / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
 
     def is_finished(self, spent: Spent) -> bool:
-        """Whether the budget is spent, the target PSNR is reached, or a stop at a flat curve is
-        due."""
+        """Whether the budget is spent, the target reached, or a stop at a flat curve due."""
         target = self.settings.target_psnr
         reached = target is not None and any(psnr >= target for _, psnr in curve_of(self.lines))
         if spent.share >= 1 or reached:
@@ -100,8 +95,7 @@ class Evaluator:
         return quality, self.keeps_latest or reached or is_sharp
 
     def record(self, is_kept: bool, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
-        """Remember an evaluation; returns its metrics line, to which a forecast is added that can
-        be checked later."""
+        """Remember an evaluation; returns its metrics line with a forecast, to be checked later."""
         self.count = max(self.count, int(min(1.0, spent.share) * EVALUATIONS))
         if is_kept:
             self.best_difference = line.get(DETAIL, self.best_difference)

@@ -18,8 +18,7 @@ UNMATCHED = "psnr_unmatched"
 MIN_EVALUATIONS = 4
 """Evaluations that a forecast needs."""
 FITTED_SINCE_SHARE = 2 / 3
-"""The fit uses only evaluations since this share of the time: earlier ones belong to a steeper
-phase."""
+"""The fit uses evaluations since this share of the time: before, the phase is a steeper one."""
 FORECAST_CONFIDENCE = 0.8
 """Share of forecasts that should hold within their error."""
 PRIOR_RELATIVE_ERROR = 0.8
@@ -40,8 +39,7 @@ the fit already lies above the target but no evaluation does."""
 
 @dataclass(frozen=True)
 class Forecast:
-    """PSNR ± error in dB at `seconds` of training, `ahead` seconds after the forecast; `gain` is in
-    dB from then."""
+    """PSNR ± error in dB at `seconds` of training, `ahead` after the forecast; `gain` in dB."""
 
     seconds: float
     psnr: float
@@ -79,8 +77,7 @@ def forecast(curve: Curve, ahead: float) -> Forecast | None:
 
 
 def forecast_horizon(elapsed: float, left: float) -> float | None:
-    """Longest of HORIZONS_S within the remaining budget `left` and half of `elapsed` (seconds);
-    None if none fits."""
+    """Longest of HORIZONS_S within `left` and half of `elapsed` (seconds); None if none fits."""
     fitting = [ahead for ahead in HORIZONS_S if ahead <= min(left, elapsed / 2)]
     return float(fitting[-1]) if fitting else None
 
@@ -97,8 +94,7 @@ def plateau_start(curve: Curve) -> float | None:
 
 
 def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """How many forecasts in a metrics.jsonl held within their error, and how many could be
-    checked."""
+    """How many forecasts of a metrics.jsonl held within their error, of how many checked."""
     curve = curve_of(lines)
     if not curve:
         return 0, 0
@@ -115,15 +111,13 @@ def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
-    """The evaluation of the saved avatar, of those with a PSNR: the last that reached the target,
-    or the sharpest."""
+    """Of the saved avatar, of those with a PSNR: the last to reach the target, or the sharpest."""
     reached = [line for line in lines if target is not None and line["psnr"] >= target]
     return reached[-1] if reached else min(lines, key=lambda line: line.get(DETAIL, np.inf))
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
-    """(seconds, value of `key`) of the evaluations in a metrics.jsonl, without repeated times or
-    values not finite."""
+    """(seconds, value of `key`) of evaluations, without repeated times or values not finite."""
     curve: list[tuple[float, float]] = []
     for line in lines:
         if key in line and np.isfinite(line[key]) and (not curve or line["seconds"] > curve[-1][0]):
@@ -132,8 +126,7 @@ def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tupl
 
 
 def detail_curve(lines: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """(seconds, −20·log10 of the detail difference) of the evaluations: dB like PSNR, higher is
-    sharper."""
+    """(seconds, −20·log10 of the detail difference): dB like PSNR, higher is sharper."""
     return [(t, -20 * np.log10(value)) for t, value in curve_of(lines, DETAIL) if value > 0]
 
 
@@ -146,8 +139,7 @@ def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
-    """What `ahead` more seconds of training would bring, in PSNR and in the detail difference;
-    empty if unknown."""
+    """What `ahead` more seconds would bring, in PSNR and detail difference; empty if unknown."""
     predicted, detail = forecast(curve_of(lines), ahead), forecast(detail_curve(lines), ahead)
     if predicted is None:
         return ""

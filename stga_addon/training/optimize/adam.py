@@ -16,8 +16,7 @@ PLAIN = AdamOptions(*map(np.float32, (0.9, 0.999, 1e-15, 0.0, 1.0)))
 
 
 def adam_options(settings: TrainingSettings, camera: Camera) -> AdamOptions:
-    """For gradients of a mean over the values of a camera's image: ε is a share of the weight of
-    one of them."""
+    """For gradients of a mean over an image's values: ε is a share of the weight of one of them."""
     return PLAIN._replace(
         beta2=np.float32(settings.adam_beta2),
         epsilon=np.float32(settings.adam_epsilon / (3 * camera.width * camera.height)),

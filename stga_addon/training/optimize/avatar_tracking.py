@@ -47,11 +47,9 @@ from .image_preparation import MAX_GAIN, image_preparation
 from .state import state_of_avatar
 
 RENDERINGS, RENDERINGS_AGAIN = 7, 5
-"""Of each view of a timestep, at first and once it was tracked by the avatar already: more of them
-hardly lower the loss."""
+"""Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
-"""Cameras, spread over the rig, whose images are compared; images higher than this are shrunk to
-it."""
+"""Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
 PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 20
 """Heights of the images in which the first timestep of another recording is tracked before, as a
 pattern on clothes leads astray by more than its width, and renderings in each."""
@@ -65,8 +63,7 @@ EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 FIRST_STEP = 0.01
-"""Length of the first step, as a share of the one down a loss as steep as the points say: it is
-steeper."""
+"""Length of the first step, of the one down a loss as steep as the points say: it is steeper."""
 MISS_LEVELS = 24
 """Mean over the channels, of 255, by which a pixel's color is missed that is not explained."""
 
@@ -89,8 +86,7 @@ class AvatarTracking:
     information: np.ndarray
 
     def smoothed(self, model: FlameModel) -> "AvatarTracking":
-        """Smooth over time where the images do not say; model: of the person. Not where scale was
-        sought."""
+        """Over time, where images do not say; model: the person's. Not where scale was sought."""
         count = model.n_expression
         shift = np.full(SHIFT_SIZE, solve.TRANSLATION_ACCELERATION_M**-2)
         stiffness = np.insert(solve.acceleration_precision(model), count, shift)
@@ -110,8 +106,7 @@ class RefinedTracking:
     """
 
     def __init__(self, capture: Capture, convention: str) -> None:
-        """Raises StgaError where the capture has no parameters, or for an embedding convention
-        without gradients."""
+        """Raises StgaError for a capture without parameters or a convention without gradients."""
         if convention != "stga":
             raise StgaError(
                 f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'"
@@ -145,8 +140,7 @@ class RefinedTracking:
         return with_sequence(capture, replace(self.sequence, frame=self.frame))
 
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
-        """Give some timesteps what was found: those in between that were left out change as their
-        neighbors do."""
+        """Give timesteps what was found: those left out in between change as their neighbors."""
         rows, at = (
             [self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps)
         )
@@ -394,8 +388,7 @@ class _Tracker:
     def _gauss_newton(
         self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
     ) -> np.ndarray:
-        """(E + 18, E + 18): how much parameters change what the images show at points of the
-        surface."""
+        """(E + 18, E + 18): how parameters change what images show at points of the surface."""
         self._values = values
         mesh, faces = self._mesh(timestep), self._capture.faces
         at, normals = (

@@ -32,8 +32,7 @@ from .state import Batch, TrainState
 
 
 class CpuBackend:
-    """Trains in host memory: `state` is the trained arrays themselves, and every loss is returned
-    at once."""
+    """Trains in host memory: `state` is the trained arrays, and losses are returned at once."""
 
     def __init__(self, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         self.state = state
@@ -45,8 +44,7 @@ class CpuBackend:
         return len(self.state)
 
     def step(self, batch: Batch) -> float | None:
-        """Forward, backward and optimizer step; returns the image loss of a global iteration, None
-        for a local one."""
+        """Forward, backward, optimizer; returns the image loss, None of a local iteration."""
         state, settings, target = self.state, self._settings, batch.target
         face, gradients, unbound = state.face, state.gradients, state.unbound
         focus = None if batch.selected is None else batch.selected.take(face)
@@ -94,8 +92,7 @@ class CpuBackend:
         sh_degree: int,
         focus: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
-        """Fill the gradients of the trained rows; returns those rows, the screen gradients (N,) and
-        the loss."""
+        """Fill the trained rows' gradients; returns these rows, screen gradients (N,) and loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
         state, frames = self.state, self._moved_frames(view.timestep)
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
@@ -114,8 +111,7 @@ class CpuBackend:
         return rows, screen, loss if focus is None else None
 
     def _moved_frames(self, timestep: int, averaged: bool = False) -> FaceFrames:
-        """The timestep's frames, moved by the driven offsets; averaged: by their moving
-        averages."""
+        """Moved by the driven offsets; averaged: by their moving averages."""
         offsets = self.state.driven_offsets.items()
         coefficients = {name: state.average if averaged else state.value for name, state in offsets}
         return self._frames.moved(timestep, coefficients)

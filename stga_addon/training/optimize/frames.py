@@ -1,5 +1,4 @@
-"""Cache of meshes and face frames by timestep, and the limits on size and position in their units
-(STGA, training)."""
+"""Cache of meshes and face frames by timestep; limits in their units (STGA, training)."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -85,8 +84,7 @@ class FrameStore:
         return moved_frames(self.of(timestep), coefficients, self.signals(timestep))
 
     def mesh(self, timestep: int, read: np.ndarray | None = None) -> np.ndarray:
-        """(V, 3) that the frames of the timestep are computed from; read: the capture's, where it
-        has been read already."""
+        """(V, 3) of the timestep's frames; read: the capture's, if it has been read already."""
         return self._latest(timestep, read).mesh
 
     def clear(self) -> None:

@@ -37,8 +37,7 @@ TABLES = ("gradients", "first", "second", "average")
 
 @dataclass
 class _Queued:
-    """An iteration on its way, whose batch is kept in case that it has to be repeated; loss: of a
-    global one."""
+    """An iteration on its way, with its batch in case it is repeated; loss: of a global one."""
 
     batch: Batch
     readback: Readback
@@ -124,8 +123,7 @@ class GpuBackend:
             self._offsets[name] = OffsetTables._make([*parts, splats_of])
 
     def step(self, batch: Batch) -> float | None:
-        """Queue one step; returns the loss of the iteration before the last if it was a global
-        one."""
+        """Queue one step; returns the loss of the iteration before the last, if global."""
         loss = None
         if len(self._pending) == QUEUED_ITERATIONS:
             self._finish(0)
@@ -137,8 +135,7 @@ class GpuBackend:
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' moving average after all queued iterations: a new (3, H, W)
-        float32 image."""
+        """With the splats' moving average after all iterations: a new (3, H, W) float32 image."""
         self._finish_all()
         average = replace(self._splats, rows=self._tables.average)
         moved = {name: tables.average for name, tables in self._offsets.items()}
@@ -155,8 +152,7 @@ class GpuBackend:
             self._finish(n)
 
     def _finish(self, n: int) -> None:
-        """Wait for the n-th queued iteration, and repeat it and those behind it if its pairs did
-        not fit."""
+        """Wait for the n-th queued iteration; repeat it and the later if its pairs did not fit."""
         pending = list(self._pending)
         queued = pending[n]
         while not queued.done:

@@ -27,8 +27,7 @@ and the difference in 0…1 beyond which pixels are outliers."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
-    """Takes away the settings' `backdrop`, then inverts their `exposure`; None where neither
-    changes anything."""
+    """Takes away the settings' `backdrop`, inverts their `exposure`; None where nothing changes."""
     backdrop, background = settings.backdrop, settings.background
     correct = exposure_correction(settings)
     if correct is None and backdrop == "plain":
@@ -136,8 +135,7 @@ def fit_lines(
 
 
 def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
-    """Exposure of the cameras in `TrainingSettings.exposure`, where it drifts interpolated between
-    timesteps."""
+    """Of `TrainingSettings.exposure`; where it drifts, interpolated between timesteps."""
     listed: dict[int, list[Sequence[float]]] = {}
     for row in rows:
         listed.setdefault(int(row[0]), []).append(row[1:])

@@ -32,13 +32,11 @@ MIN_ONE_SIDED_SHARE = 0.05
 """Area of the triangles that no view shows, but whose mirror images are shown, as a share of the
 mesh: below it, the cameras stand on both sides of the head."""
 MAX_ASYMMETRY_SHARE = 0.015
-"""Median distance of the mesh from its mirror image, as a share of its diagonal, beyond which it is
-not symmetric."""
+"""Largest median distance of a symmetric mesh from its mirror image, of its diagonal."""
 VOXEL_SIZE_M = 0.004
 """Distance between hull points, on a mesh of a head's size."""
 MIN_VOXEL_SIZE_SHARE = 1 / 200
-"""Lower bound of the voxel size, as a share of the mesh's diagonal, so that a mesh in millimeters
-fits into memory."""
+"""Of the mesh's diagonal, so that the grid of a mesh in millimeters fits into memory."""
 MIN_MESH_DISTANCE_M = 0.006
 """Points nearer to the mesh are covered by the mesh's own splats."""
 GRID_MARGIN_SHARE = 0.25
@@ -53,14 +51,12 @@ the head that no view contradicts would become floaters in other views."""
 SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 FEW_CAMERAS = 4
-"""Up to which the visual hull of a torso bulges by centimeters, so that the points of `TorsoPoints`
-are better."""
+"""Up to which a torso's visual hull bulges by centimeters: `TorsoPoints` are better."""
 CONTINUED_SHARE, CONTINUED_OPACITY = 0.4, 3.0
 """How far a torso is continued beyond the image of a single camera, as a share of the image's
 width; and the logit of these splats' opacity, which may never be trained."""
 SEEN_COPIES, SEEN_SPREAD = 3, 0.5
-"""Splats for each of these points, and the standard deviation of their distance from it, in
-voxels."""
+"""Splats for each of these points, and standard deviation from it, in voxels."""
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
@@ -141,8 +137,7 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
 
 
 def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean color (F, 3) from 0 to 1 of each triangle in the views, and (F,) bool whether any shows
-    it."""
+    """Mean color (F, 3) in 0…1 of each triangle in the views; (F,) bool whether any shows it."""
     total, count = np.zeros((len(capture.faces), 3)), np.zeros(len(capture.faces))
     for view in views:
         small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
@@ -355,8 +350,7 @@ def _foreground(view: View) -> np.ndarray:
 
 
 def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel columns (N,) and rows (N,) of world points (N, 3), and (N,) bool whether they lie in
-    the image."""
+    """Pixel columns (N,), rows (N,) of world points (N, 3), and (N,) bool: within the image."""
     pixels, depth = camera.project(points)
     x, y = np.floor(pixels).T
     seen = (depth > MIN_DEPTH_M) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

@@ -16,8 +16,7 @@ BAND_TILES = 4
 
 @cache
 def _bands(height: int, count: int) -> int:
-    """How many bands cost the busiest of `count` threads the fewest rows, if there are more pieces
-    than threads."""
+    """How many bands cost the busiest of `count` threads the fewest rows."""
     fewest, most, beyond = -(-count // 2), 2 * count, 2 * LOSS_REACH_PX
     return min(
         range(fewest, most + 1), key=lambda n: -(-3 * n // count) * (-(-height // n) + beyond)

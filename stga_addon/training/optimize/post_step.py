@@ -43,8 +43,7 @@ may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 OUTSIDE_CAMERAS, OUTSIDE_DISTANCE = 18, 4.0
-"""Cameras around the neutral head that tell its outside from its inside; their distance, in its
-radius."""
+"""Cameras that tell the neutral head's outside from its inside; their distance, in its radius."""
 
 
 def control_density(
@@ -113,8 +112,7 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
 
 
 def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
-    """(N,) bool: the unwanted splats (N,) bool but for a bound one of each triangle that would have
-    none left: the most opaque one."""
+    """(N,) bool: those unwanted (N,), but a triangle's most opaque bound one if none was left."""
     face, bound = state.face, np.flatnonzero(~state.unbound)
     order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
     first = np.ones(len(order), bool)
@@ -131,8 +129,7 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Outline:
-    """What a training view's mask leaves clear, with a margin, (H, W) bool; camera: of that
-    size."""
+    """What a mask leaves clear, with a margin, (H, W) bool; camera: of that size."""
 
     timestep: int
     camera: Camera
@@ -140,8 +137,7 @@ class Outline:
 
 
 def read_outlines(capture: Capture, seed: int) -> list[Outline]:
-    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError as
-    `read_mask` does."""
+    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError."""
     views, outlines = capture.views["train"], []
     for n in np.random.default_rng(seed).permutation(len(views))[:MAX_OUTLINES]:
         view, mask = views[n], read_mask(views[n])
@@ -181,15 +177,13 @@ def prune_outside(
 
 @dataclass(frozen=True)
 class UnseenSides:
-    """Triangles (F,) bool of the head's outside that no view shows, and the color (F, 3) from 0 to
-    1 that they keep."""
+    """Triangles (F,) bool of the outside that no view shows; the color (F, 3) in 0…1 they keep."""
 
     triangles: np.ndarray
     color: np.ndarray
 
     def restore(self, state: TrainState) -> TrainState:
-        """Give bound splats on these triangles their color, the same from everywhere and in every
-        expression."""
+        """Give bound splats there their color, from everywhere and in every expression."""
         rows = self.triangles[state.face] & ~state.unbound
         flat = (self.color[state.face[rows]] - 0.5) / SH_C0
         for kept in (state.parameters, state.average, state.first, state.second):
@@ -199,8 +193,7 @@ class UnseenSides:
 
 
 def unseen_sides(capture: Capture) -> UnseenSides:
-    """Colors of mirror images, as far as these are shown, else of the nearest connected triangles
-    that are."""
+    """Colored as mirror images that are shown, else as the nearest connected triangles."""
     views = evenly_spread(capture.views["train"], SIDE_VIEWS)
     cosine = np.full(len(capture.faces), -1.0)  # with the camera that a triangle faces most
     for view in views:

@@ -1,5 +1,4 @@
-"""State of the splats in training: parameters, optimizer moments and statistics for density
-control."""
+"""State of the splats in training: parameters, moments, statistics for density control."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -95,8 +94,7 @@ class TrainState:
 
     @cached_property
     def tables(self) -> dict[str, AdamTables]:
-        """Parameter -> its values, gradient, moments and average as views (N, D), and room for
-        learning rates (D,)."""
+        """Parameter -> values, gradient, moments, average as views (N, D); room for rates (D,)."""
         kept = self.parameters, self.gradients, self.first, self.second, self.average
         found = {}
         for name, arrays in zip(self.parameters._fields, zip(*kept, strict=True), strict=True):
@@ -167,8 +165,7 @@ def with_effects(
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
-    """Every array of the splats under a flat name such as "first/xyz"; the inverse of
-    `state_of`."""
+    """The splats' arrays by a flat name such as "first/xyz"; inverse of `state_of`."""
     flat = {}
     for name in _SPLAT_FIELDS:
         value = getattr(state, name)

@@ -23,13 +23,11 @@ if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend
 
 MAX_REGION_SPLIT_SHARE = 0.1
-"""Largest share of a region's splats that one round of density control splits: a refinement has few
-rounds."""
+"""Largest share of a region's splats that is split at a time: a refinement has few rounds."""
 OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
 """Iterations between turns of pruning outside of the masks, and of coloring unseen sides."""
 EXTEND_LOCAL_SHARE = 0.5
-"""Share of an extension's budget that trains what the new takes need, before all splats are
-trained."""
+"""Of an extension's budget, in which what the new takes need is trained, before all splats."""
 
 
 class Strategy:
@@ -128,8 +126,7 @@ class Trainer:
 
     @property
     def state(self) -> TrainState:
-        """The splats and their optimizer. A GPU backend copies them, so do not read it in every
-        iteration."""
+        """A GPU backend copies it, so do not read it in every iteration."""
         return self._backend.state
 
     @state.setter
@@ -174,8 +171,7 @@ class Trainer:
         return loss
 
     def render(self, view: View, progress: float = 1.0) -> np.ndarray:
-        """The view with the splats' exponential moving average: a new (3, H, W) float32 image over
-        the background."""
+        """With the splats' moving average: a new (3, H, W) float32 image over the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
     def _post_step(self, progress: float) -> None:
@@ -220,8 +216,7 @@ class Trainer:
 def make_backend(
     device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState
 ) -> "CpuBackend | GpuBackend":
-    """The backend of a device of `choose_device`. Raises StgaError if the device does not support
-    the settings."""
+    """Of a device of `choose_device`. Raises StgaError if it does not support the settings."""
     if device == "cpu":
         return CpuBackend(settings, frames, state)
     if settings.tracking:

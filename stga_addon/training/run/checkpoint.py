@@ -63,8 +63,7 @@ def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity:
 
 
 def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool. Raises StgaError where the file does not fit the mesh, or has not this
-    `identity`."""
+    """timestep -> (F,) bool. Raises StgaError for another mesh, or another `identity` if given."""
     path = folder / SELECTION
     arrays = read_npz(path)
     stored = arrays.pop(IDENTITY, None)
@@ -79,8 +78,7 @@ def read_selection(folder: Path, faces: int, identity: str | None = None) -> dic
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint as a whole. Gradients are not kept: they are overwritten before they
-    are read."""
+    """Replaced as a whole. Gradients are not kept: they are overwritten before they are read."""
     every = arrays_of(checkpoint.state).items()
     arrays = {name: array for name, array in every if not name.startswith("gradients/")}
     for effect, offset in checkpoint.state.driven_offsets.items():
@@ -163,8 +161,7 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
 
 
 def _check_state(path: Path, state: TrainState) -> None:
-    """Kernels trust shapes and types, so a checkpoint's are checked. Raises StgaError naming the
-    array."""
+    """Kernels trust shapes and types. Raises StgaError naming the array."""
     n, tails = len(state), {}
     for field, kind in ARRAYS.items():
         size = getattr(state.parameters, field).shape[1] if kind.sizes else 0

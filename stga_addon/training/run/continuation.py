@@ -38,13 +38,11 @@ START_SHARE = 0.5
 DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
 MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
-"""How much larger the residual of a triangle must be in new takes than in old ones to call for
-training."""
+"""How much larger a triangle's residual in new takes than in old ones calls for training."""
 COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
 MIN_UNLIKE_RATIO, MIN_UNLIKE_RESIDUAL = 3.0, 0.05
-"""How much larger than the median of its take, and how large, the residual of a view is that shows
-something else."""
+"""How much larger than its take's median, and how large, the residual of a strange view is."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
 
@@ -191,21 +189,17 @@ def continued_evaluation_views(
 
 
 REPLAY_SHARE = 1 / 3
-"""Share of a refinement's iterations that train views outside the continuation's frames, where
-there are any."""
+"""Share of a refinement's iterations that train views outside its frames, if any."""
 EXTEND_REPLAY_SHARE = 0.4
 """Share of an extension's iterations that train views of the old takes."""
 REPLAY_TIMESTEPS = 12
 """Timesteps that are replayed: those that differ most from each other."""
 REPLAY_VIEWS = 120
-"""Views that are replayed at most; the cameras take turns from timestep to timestep. Fewer would be
-overfitted."""
+"""Replayed at most; cameras take turns from timestep to timestep. Fewer would be overfitted."""
 MAX_CANDIDATES = 200
-"""Timesteps among which the replayed ones are chosen, evenly spread: long takes are not read as a
-whole."""
+"""Evenly spread, of which replayed timesteps are chosen: long takes are not read as a whole."""
 MIN_REGION_SHARE = 0.3
-"""A view refines a region if it sees at least this share of what the view that sees most of it
-sees."""
+"""A view refines a region if it sees this share of what the view that sees most does."""
 
 
 def continued_order(
@@ -239,8 +233,7 @@ def continued_order(
 def replayed_views(
     capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS
 ) -> list[View]:
-    """At most `limit` of the views: some cameras each of the timesteps whose expressions differ
-    most."""
+    """At most `limit` views: some cameras each of the timesteps that differ most."""
     by_timestep: dict[int, list[View]] = {}
     for view in views:
         by_timestep.setdefault(view.timestep, []).append(view)
@@ -256,8 +249,7 @@ def replayed_views(
 def distinct_timesteps(
     capture: Capture, timesteps: Sequence[int], count: int = REPLAY_TIMESTEPS
 ) -> list[int]:
-    """At most `count` timesteps: the most neutral one, then always the one farthest from all chosen
-    so far."""
+    """At most `count`: the most neutral one, then always the one farthest from those chosen."""
     if len(timesteps) <= count:
         return list(timesteps)
     candidates = evenly_spread(timesteps, MAX_CANDIDATES)
@@ -278,8 +270,7 @@ def _distance(meshes: np.ndarray, mesh: np.ndarray) -> np.ndarray:
 
 
 def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray) -> list[View]:
-    """The views in which the region (F,) bool is seen large: turned to the camera, whatever may
-    cover it."""
+    """In which the region (F,) bool is seen large: turned to the camera, whatever covers it."""
     seen = np.array([_facing_area(capture, view, region) for view in views])
     large = [area >= MIN_REGION_SHARE * seen.max() > 0 for area in seen]
     return [view for view, is_large in zip(views, large, strict=True) if is_large]

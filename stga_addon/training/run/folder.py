@@ -53,8 +53,7 @@ WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
 
 @dataclass(frozen=True)
 class Take:
-    """A capture that joined a run after its first one; `start` is added to its timesteps
-    (`join_takes`)."""
+    """A capture that joined a run later; `start` is added to its timesteps (`join_takes`)."""
 
     capture: Path
     start: int
@@ -219,8 +218,7 @@ def avatar_version(run: Path) -> list[str]:
 
 
 def open_refined(folder: Path, capture: Path | None = None, flame: Path | None = None) -> Capture:
-    """The capture of a run, with the FLAME parameters that the run refined. Errors as of
-    `open_run`."""
+    """A run's capture with the parameters that it refined. Errors as of `open_run`."""
     if not folder.is_dir():
         raise StgaError(f"{folder}: is not a folder; expected that of a run")
     return with_refined_tracking(open_run(folder, capture, flame).capture, folder)
@@ -282,8 +280,7 @@ def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
 def write_tracking(
     folder: Path, sequence: FlameSequence, refined: np.ndarray, tracked: np.ndarray
 ) -> None:
-    """Write `RefinedTracking.parameters` (T, P + 3), and those that were tracked (T, P), of the
-    timesteps of a sequence."""
+    """Write `RefinedTracking.parameters` (T, P + 3), and those tracked (T, P), of a sequence."""
     frame = frame_of(refined[:, :-SHIFT_SIZE].T)
     arrays = {name: getattr(frame, name).T for name in FRAME_FIELDS}
     arrays["shape"] = sequence.shape
@@ -328,8 +325,7 @@ def write_residuals(folder: Path, mean: np.ndarray) -> None:
 
 
 def read_residuals(folder: Path, faces: int) -> np.ndarray:
-    """(F,) float32 as written. Raises StgaError where there is no such file, or it is of another
-    mesh."""
+    """(F,) float32. Raises StgaError where there is no such file, or of another mesh."""
     path = folder / RESIDUALS
     return float_array(path, read_npz(path), "residual", (faces,))
 

@@ -1,5 +1,4 @@
-"""Identity of a training run: digests of the capture, the FLAME model and the settings that it was
-trained with."""
+"""Identity of a training run: digests of its capture, FLAME model and settings."""
 
 import hashlib
 import json
@@ -23,8 +22,7 @@ LATER_SETTINGS: dict[int, dict[str, Any]] = {
     6: {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False},
     7: {"adam_nesterov": False},
 }
-"""Format version of runs -> settings that earlier ones do not have, with what these were trained
-with."""
+"""Format version -> settings that earlier runs lack, with what these were trained with."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,7 @@ class RunIdentity:
 
 
 def identity_of(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
-    """Identity of a run. Reads the FLAME model file but no images and no tracked meshes. Raises
-    StgaError."""
+    """Reads the FLAME model file but no images and no tracked meshes. Raises StgaError."""
     views = [(split, view) for split, members in sorted(capture.views.items()) for view in members]
     cameras = {view.camera_index for _, view in views}
     timesteps = {view.timestep for _, view in views}
@@ -82,8 +79,7 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
 
 
 def settings_since(version: int) -> dict[str, Any]:
-    """The settings that runs of this format version do not have, with what they were trained
-    with."""
+    """What runs of this format version lack, with what they were trained with."""
     later = (values for since, values in LATER_SETTINGS.items() if since > version)
     return {name: value for values in later for name, value in values.items()}
 
@@ -91,8 +87,7 @@ def settings_since(version: int) -> dict[str, Any]:
 def earlier_identity(
     identity: RunIdentity, settings: TrainingSettings, version: int
 ) -> RunIdentity:
-    """The identity as a run of an earlier format version recorded it; the same where the settings
-    are not those of one."""
+    """As an earlier format version recorded it; the same for settings that are not of one."""
     later, known = settings_since(version), to_json(settings)
     if any(known.pop(name) != value for name, value in later.items()):
         return identity
@@ -100,8 +95,7 @@ def earlier_identity(
 
 
 def difference(trained: RunIdentity, given: RunIdentity) -> str | None:
-    """The first part of `given` that differs from `trained`, as in "has other images"; None where
-    they agree."""
+    """The first part of `given` that differs, as in "has other images"; None where none does."""
     phrases = {
         "faces": "has a mesh with other triangles",
         "images": "has other images or image sizes",

@@ -57,8 +57,7 @@ def cut_metrics(folder: Path, iteration: int) -> None:
 
 
 def _fault(line: Any) -> str | None:
-    """What is wrong with a line; None for a good one. Numbers other than the required ones need not
-    be finite."""
+    """What is wrong with a line, or None. Numbers other than the required need not be finite."""
     if not isinstance(line, dict):
         return "is no object"
     for name in REQUIRED:

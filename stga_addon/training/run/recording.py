@@ -224,8 +224,7 @@ def _light(
 
 
 def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Harmonics (9, 3) of a factor by the normal (3, N) that takes colors (3, N) to those seen;
-    robust."""
+    """Harmonics (9, 3) by the normal (3, N) of a factor from colors (3, N) to those seen."""
     by_normal, usual = basis(normals.T), uniform(1.0)
     found = usual.copy()
     for _ in range(SHADING_ITERATIONS):

@@ -1,5 +1,4 @@
-"""Training of a run in its folder: begun or resumed, then steps, evaluations and checkpoints in
-turn."""
+"""Training of a run in its folder: begun or resumed; steps, evaluations and checkpoints."""
 
 import logging
 import math
@@ -48,8 +47,7 @@ CHECKPOINT_S = 30.0
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
-"""Of the budget, after which the avatar tracks its head; and of a budget in seconds, what that may
-take."""
+"""Of the budget, after which the avatar tracks its head; what that may take of seconds."""
 Selection = Mapping[int, np.ndarray]
 """timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
