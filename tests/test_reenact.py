@@ -16,8 +16,7 @@ from stga_addon.render.render import render_avatar, to_uint8
 
 @pytest.fixture
 def parts(tmp_path: Path) -> dict[str, Path]:
-    """A capture's model, an avatar on its identity, another person's motion of two frames, and
-    cameras."""
+    """A capture's model, an avatar of its identity, another's motion of two frames, cameras."""
     folder, model = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
     factory.write_avatar_of(capture, tmp_path / "a.npz", is_colored=True)
@@ -39,8 +38,7 @@ def render(parts: dict[str, Path], out: Path, *more: object) -> int:
 
 
 def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Path) -> None:
-    """Catches the other's identity on this avatar, a wrong timestep, and cameras that come more
-    than once."""
+    """Catches the other's identity, a wrong timestep, and cameras that come more than once."""
     out = tmp_path / "out"
     assert render(parts, out, "--flame", parts["model"]) == 0
     assert sorted(path.name for path in out.iterdir()) == [

@@ -127,8 +127,7 @@ def test_the_reason_for_no_curve(toy, tmp_path, monkeypatch):
 
 
 def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a picture that comes only at the end, is drawn again without need, or takes more than
-    its share."""
+    """Catches a picture only at the end, drawn without need, or that takes more than its share."""
     now, drawn = [0.0], []
 
     def draw(folder: Path) -> None:
@@ -155,8 +154,7 @@ def evaluations(count: int) -> list[dict[str, Any]]:
 
 
 def test_run_chart_shows_regions_and_the_forecast() -> None:
-    """Catches swapped axes, a missing region, and a forecast that does not start at the latest
-    evaluation."""
+    """Catches swapped axes, a missing region, a forecast that starts elsewhere than the latest."""
     lines = evaluations(4)
     lines[-1]["forecast"] = {"seconds": 8.0, "psnr": 24.0, "error": 0.5}
     (axes,) = run_chart(lines).axes
@@ -169,8 +167,7 @@ def test_run_chart_shows_regions_and_the_forecast() -> None:
 
 
 def test_a_run_of_any_length_is_rendered() -> None:
-    """Catches a chart that fails before the second evaluation, or on a capture without masks, and
-    an empty picture."""
+    """Catches a chart that fails before two evaluations or without masks, and an empty one."""
     for lines in (
         [],
         evaluations(1),

@@ -1,5 +1,4 @@
-"""A FLAME capture whose images are drawn from true parameters, and whose tracked parameters are
-off."""
+"""A FLAME capture drawn from true parameters, whose tracked parameters are off."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,8 +24,7 @@ NOISE = {"expr": 0.5, "rotation": 0.02, "jaw_pose": 0.04, "translation": 0.002}
 
 
 def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.ndarray]]:
-    """The ball in FLAME's format, painted in smooth colors, and timestep -> mesh (V, 3) that its
-    images show."""
+    """The ball in FLAME's format, and timestep -> mesh (V, 3) that its images show."""
     _, model = factory.write_flame_capture(root, TIMESTEPS, CAMERAS)
     factory.write_splits(
         root, [_entry(timestep, camera) for timestep in TIMESTEPS for camera in CAMERAS]

@@ -1,5 +1,4 @@
-"""Adam with true freezing against torch's Adam, which counts steps per tensor: here one tensor a
-row."""
+"""Adam with true freezing against torch's, which counts per tensor: here one a row."""
 
 import numpy as np
 import pytest
@@ -93,8 +92,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
-    """Catches one NaN from a degenerate view spreading into parameters or moments, where it would
-    stay for ever."""
+    """Catches one NaN spreading into parameters or moments, where it would stay for ever."""
     state = random_state(4, 3)
     before = bits(state)
     state.gradients.log_scale[1, 2] = bad

@@ -1,5 +1,4 @@
-"""A head tracked by its own avatar, finished or in training: the gradient, what it brings, and who
-gets to see it."""
+"""A head tracked by its avatar, finished or in training: gradient, gain, who sees it."""
 
 import shutil
 from collections.abc import Callable
@@ -259,8 +258,7 @@ def test_stopped_and_resumed_is_the_unbroken_run(
 
 
 def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
-    """Catches a run that continues with the tracked meshes after having been trained on refined
-    ones."""
+    """Catches a run that goes on with tracked meshes after it was trained on refined ones."""
     run = shutil.copytree(run_folder, tmp_path / "run")
     with pytest.raises(StgaError, match="was begun with other settings"):
         train(lost[0], run, make_run(lost[0], tracking=False), resume=True)
@@ -296,8 +294,7 @@ def test_damaged_checkpoints(
 
 
 def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_folder: Path) -> None:
-    """Catches a quality measured on other meshes than were trained on, and meshes of another
-    capture's timesteps."""
+    """Catches a quality on other meshes than trained on, and meshes of another capture."""
     capture, _ = lost
     checkpoint, tracking = read_checkpoint(run_folder), RefinedTracking(capture, "stga")
     assert checkpoint.tracking is not None
@@ -387,8 +384,7 @@ def test_damaged_files(lost: Made, run_folder: Path, tmp_path: Path) -> None:
 def test_a_run_that_refines_nothing_leaves_nothing(
     lost: Made, run_folder: Path, tmp_path: Path
 ) -> None:
-    """Catches a file of the run that was there before, which the new one's avatar would be shown
-    with."""
+    """Catches a file of the run before, which the new avatar would be shown with."""
     shutil.copy(run_folder / "tracking.npz", tmp_path)
     train(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
     assert not (tmp_path / "tracking.npz").exists()
@@ -401,8 +397,7 @@ def test_where_it_cannot_work(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches a traceback where there are no parameters, and a GPU that trains on while nothing is
-    refined."""
+    """Catches a traceback without parameters, and a GPU on which nothing is refined."""
     with pytest.raises(StgaError, match="is not tracked with FLAME"):
         Trainer(toy, quick_settings("global", tracking=True), {})
     with pytest.raises(StgaError, match="needs the embedding convention 'stga'"):

@@ -1,5 +1,4 @@
-"""Images without what lies behind the head: by masks, by the mesh, and over another background in
-every iteration."""
+"""Images without what lies behind the head: by masks, by the mesh, over random colors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,16 +35,14 @@ def room() -> np.ndarray:
 
 
 def person() -> tuple[np.ndarray, np.ndarray]:
-    """Levels (SIZE, SIZE, 3), and coverage (SIZE, SIZE) in 0…1 with an edge of six pixels, as hair
-    has."""
+    """Levels (SIZE, SIZE, 3), and coverage in 0…1 with an edge of six pixels, as of hair."""
     y, x = np.mgrid[:SIZE, :SIZE]
     distance = np.hypot(x - 38, y - 42)
     return np.stack([70 + x, 40 + 0.5 * y, 30 + 0 * x], -1), np.clip((26 - distance) / 6, 0, 1)
 
 
 def test_soft_edge_keeps_no_wall() -> None:
-    """Catches a rim of the wall's color: compared with the true foreground over the color; plain
-    blending has a rim."""
+    """Catches a rim of the wall's color, as plain blending has: against the true foreground."""
     colors, cover = person()
     alpha, mask = cover[..., None], (255 * cover).round().astype(np.uint8)
     image = (alpha * colors + (1 - alpha) * room()).round().astype(np.uint8)
@@ -97,8 +94,7 @@ def in_a_room(capture: Capture, folder: Path, keeps_masks: bool) -> Capture:
 
 
 def test_what_is_trained_and_evaluated_is_what_masks_show(toy: Capture, tmp_path: Path) -> None:
-    """Catches a wall in training images, in evaluations, or in one of both only: the same as of the
-    plain capture."""
+    """Catches a wall in training images or evaluations: the same as of the plain capture."""
     walled = in_a_room(toy, tmp_path, keeps_masks=True)
     settings = make_settings(iterations=1, backdrop="masked")
     prepare = image_preparation(walled, settings)
@@ -116,8 +112,7 @@ def test_what_is_trained_and_evaluated_is_what_masks_show(toy: Capture, tmp_path
 
 
 def test_without_masks_the_mesh_is_the_mask(toy: Capture, tmp_path: Path) -> None:
-    """Catches a wall beside the mesh, and a head taken away with it: compared with the depth
-    buffer's pixels."""
+    """Catches a wall beside the mesh, and a head taken away: against the depth buffer."""
     walled = in_a_room(toy, tmp_path, keeps_masks=False)
     view = walled.views["train"][0]
     small, image, mask = read_view(view, 0.7)
@@ -132,8 +127,7 @@ def test_without_masks_the_mesh_is_the_mask(toy: Capture, tmp_path: Path) -> Non
 
 
 def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
-    """Catches a wrong sign or scale in the compositing: compared with blending the foreground
-    itself."""
+    """Catches a wrong sign or scale: against blending the foreground itself."""
     rng = np.random.default_rng(0)
     foreground = rng.integers(0, 256, (9, 7, 3))
     coverage = rng.integers(0, 256, (9, 7)).astype(np.uint8)
@@ -148,8 +142,7 @@ def test_exchanged_background_is_the_composite_over_the_new_one() -> None:
 
 
 def transmittance_error(capture: Capture, random_background: bool) -> float:
-    """Mean square of alpha − mask on the held-out views, after a short training on a white head
-    before white."""
+    """Mean square of held-out alpha − mask, trained shortly on a white head before white."""
     trainer = Trainer(
         capture, quick_settings("global", lattice=1, random_background=random_background), {}
     )
@@ -166,8 +159,7 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
 
 
 def test_alpha_becomes_the_mask(toy: Capture) -> None:
-    """Catches splats whose opacity no image can tell, because they have the background's color: a
-    white fringe."""
+    """Catches a white fringe: splats of the background's color, whose opacity no image tells."""
     assert transmittance_error(toy, random_background=True) < 0.6 * transmittance_error(
         toy, random_background=False
     )

@@ -19,8 +19,7 @@ FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
 def busy_state(listed: list[int]) -> TrainState:
-    """Forty splats on six triangles, of which the listed ones have a screen gradient, the first the
-    largest."""
+    """Forty splats on six triangles; the listed ones have a screen gradient, in this order."""
     state = random_state(COUNT, FACES)
     state.face[:] = np.arange(COUNT) % FACES
     state.screen_gradient[:] = 0
@@ -62,8 +61,7 @@ def test_survivors_keep_everything_and_children_what_steadies_them() -> None:
 
 
 def test_children_stand_on_either_side_along_the_longest_axis() -> None:
-    """Catches a rotation that is transposed or forgotten, an offset in the wrong unit, and a lost
-    triangle."""
+    """Catches a rotation transposed or forgotten, an offset's wrong unit, a lost triangle."""
     listed = [3, 17, 30, 8]
     state = busy_state(listed)
     parents = state.splats()
@@ -94,8 +92,7 @@ def test_children_stand_on_either_side_along_the_longest_axis() -> None:
 
 @pytest.mark.parametrize("opacity", [0.2, 0.5, 0.9, 0.99])
 def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
-    """Catches halves that leave a hole or darken the picture: the next steps would only repair what
-    splitting broke."""
+    """Catches halves that leave a hole or darken the picture, for the next steps to repair."""
     splats = Splats(
         xyz=np.zeros((1, 3), np.float32),
         rotation=np.array([[0.9, 0.1, -0.3, 0.2]], np.float32),
@@ -137,8 +134,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity: float) -> None:
     ("budget", "share", "split"), [(0, 1.0, 0), (2, 1.0, 2), (1000, 0.05, 2), (1000, 1.0, 5)]
 )
 def test_budget_and_share_bound_the_growth(budget: int, share: float, split: int) -> None:
-    """Catches unbounded growth, and splits of other splats than those with the largest screen
-    gradient."""
+    """Catches unbounded growth, and splits of others than have the largest screen gradient."""
     listed = [20, 4, 33, 11, 26]
     state = busy_state(listed)
     gone = {tuple(p) for p in state.splats().xyz[listed[:split]].tolist()}
@@ -161,8 +157,7 @@ def test_the_screen_gradient_is_a_mean() -> None:
 
 
 def test_faint_splats_go_but_no_triangles_last_one() -> None:
-    """Catches bald triangles, which nothing would ever fill again; unbound splats do not count as a
-    triangle's own."""
+    """Catches bald triangles, for ever; unbound splats are not a triangle's own."""
     state = busy_state([])
     state.unbound[:] = np.arange(COUNT) % 7 == 3
     state.parameters.opacity[:] = np.where(

@@ -1,5 +1,4 @@
-"""Extending a finished run by further takes: what is selected, what is remembered, and resumption
-to the same bits."""
+"""Extending a run by takes: what is selected, remembered, and resumed to the same bits."""
 
 import json
 import shutil
@@ -36,8 +35,7 @@ from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 15
 CAP_PX = 8
-"""Height above the ball's center, in pixels, from which it is yellow in the second take: about 4
-cm."""
+"""Pixels above the ball's center from which the second take is yellow: some 4 cm."""
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +84,7 @@ def extend(
 def test_the_run_remembers_its_takes(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path
 ) -> None:
-    """Catches an extended run that opens without its new take, or with one whose images were
-    exchanged."""
+    """Catches a run that opens without its new take, or with one of exchanged images."""
     before = {path.name: path.read_bytes() for path in parent.iterdir()}
     moved = Path(shutil.copytree(takes[1], tmp_path / "new"))
     out = extend(parent, moved, tmp_path / "extended")
@@ -110,8 +107,7 @@ def test_the_run_remembers_its_takes(
 
 
 def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches a selection by motion alone, which would not learn a changed skin, and one of the
-    whole head."""
+    """Catches a selection by motion alone, which learns no changed skin, or of the whole head."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     capture = prepared.capture
     height = capture.mesh(4)[capture.faces].mean(1)[:, 1]
@@ -124,8 +120,7 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
 def test_selection_is_written_without_training(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path
 ) -> None:
-    """Catches a selection at the joined takes' timesteps instead of the new take's own, and a run
-    that is begun."""
+    """Catches a selection at other timesteps than the new take's own, and a run begun."""
     path = tmp_path / "selection.npz"
     assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
     expected = prepare_extension(parent, (takes[1],), iterations=1).selection
@@ -144,8 +139,7 @@ def test_selection_is_written_without_training(
 def test_each_take_is_evaluated_apart(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path
 ) -> None:
-    """Catches what was forgotten hidden in a mean, and an extension that does not learn the new
-    take."""
+    """Catches what was forgotten hidden in a mean, and a new take that is not learned."""
     first, *_, last = read_metrics(extend(parent, takes[1], tmp_path / "extended"))
     assert first["iteration"] == 0
     assert last["psnr_take_2"] > first["psnr_take_2"] + 0.1
@@ -160,8 +154,7 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     growth: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches an order, a selection, a take or a count of splats that a resumed extension does not
-    find again."""
+    """Catches an order, selection, take or count of splats that resuming does not find again."""
     monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
     whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
     stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
@@ -190,8 +183,7 @@ def test_a_resumed_extension_needs_no_parent(
 def test_what_follows_strain_can_begin_with_a_further_take(
     takes: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Catches splats that cannot gain coefficients, or do not train them, and an avatar that they
-    change at once."""
+    """Catches splats that cannot gain coefficients or train them, and an avatar that jumps."""
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
@@ -215,8 +207,7 @@ def test_what_follows_strain_can_begin_with_a_further_take(
 
 
 def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that forgets because it sees the new take only, or that sees old views
-    at one end only."""
+    """Catches an extension that sees the new take only, or old views at one end only."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     assert prepared.run.continuation is not None
     views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
@@ -226,8 +217,7 @@ def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
 
 
 def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches strain coefficients as slow as colors that the old takes have trained, and other
-    rates that jump."""
+    """Catches strain coefficients as slow as trained colors, and other rates that jump."""
     original = read_run(parent).settings.rates
     extended = prepare_extension(parent, (takes[1],), iterations=1).run.settings.rates
     middle = learning_rates(original, START_SHARE)
@@ -255,8 +245,7 @@ def test_takes_that_do_not_fit(
     change: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Catches another head, or a take without images, that is found out after minutes of
-    training."""
+    """Catches another head, or a take without images, found after minutes of training."""
 
     def changed(path: Path, *rest: Any) -> Capture:
         capture = open_capture(path, *rest)
@@ -310,16 +299,14 @@ def test_a_take_in_millimeters(
     meshes: bool,
     expected: str,
 ) -> None:
-    """Catches a take in another unit than the run's, on which training is wasted without an
-    error."""
+    """Catches a take in another unit, on which training is wasted without an error."""
     take = in_millimeters(Path(shutil.copytree(takes[0], tmp_path / "new")), cameras, meshes)
     with pytest.raises(StgaError, match=expected):
         prepare_extension(parent, (take,))
 
 
 def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
-    """Catches a FLAME take whose cameras and translation are in millimeters; its meshes' size is
-    the model's."""
+    """Catches a FLAME take in millimeters; its meshes' size is the model's."""
     root, model = factory.write_flame_capture(tmp_path / "old")
     run = tmp_path / "run"
     settings = quick_settings("global", iterations=1, lattice=0, density_interval=0)
@@ -355,8 +342,7 @@ def test_a_take_given_twice(takes: tuple[Path, Path], parent: Path) -> None:
 def test_views_that_show_something_else_are_named(
     takes: tuple[Path, Path], parent: Path, tmp_path: Path
 ) -> None:
-    """Catches exchanged images that are trained without a warning, and a warning about a take that
-    looks different."""
+    """Catches exchanged images without a warning, and a warning about a changed look."""
     said: list[str] = []
     request = Extend(parent / "unused", parent, (takes[1],), iterations=1, device="cpu")
     prepare(request, ignore, said.append)

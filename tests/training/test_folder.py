@@ -65,8 +65,7 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
     ],
 )  # fmt: skip
 def test_damaged_runs(tmp_path: Path, field: str, value: Any, message: str) -> None:
-    """Catches a run of another version read as one's own, and a traceback for one edited by
-    hand."""
+    """Catches a run of another version taken for one's own, and a traceback of one edited."""
     folder.write_run(tmp_path, make_run())
     edit_json(tmp_path / "run.json", **{field: value})
     with pytest.raises(StgaError, match=rf"run\.json: .*{message}"):
@@ -74,8 +73,7 @@ def test_damaged_runs(tmp_path: Path, field: str, value: Any, message: str) -> N
 
 
 def test_selection_round_trip(tmp_path: Path) -> None:
-    """Catches timesteps mixed up or masks that lose their kind, and a selection made for another
-    mesh."""
+    """Catches timesteps mixed up, masks that lose their kind, and those of another mesh."""
     rng = np.random.default_rng(0)
     selection = {t: rng.random(FACES) < 0.5 for t in (0, 3, 123456)}
     checkpoint_files.write_selection(tmp_path, selection, "a")
@@ -129,8 +127,7 @@ def meta(**changes: Any) -> np.ndarray:
 
 
 def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
-    """The moments of positions that follow strain, of FACES triangles, and what is changed of
-    them."""
+    """The arrays of positions that follow strain, of FACES triangles, with changes."""
     tables = dict.fromkeys(("value", "average", "first", "second"), np.zeros((5, 3, 3), np.float32))
     arrays = {**tables, "steps": np.zeros(FACES, np.int32), **changes}
     return {f"strain_position/{name}": array for name, array in arrays.items()}
@@ -178,8 +175,7 @@ def test_damaged_checkpoints(tmp_path: Path, says: str) -> None:
 
 
 def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
-    """Catches a run that cannot be resumed because its first or last possible value counts as
-    damaged."""
+    """Catches a first or last possible value that counts as damaged."""
     largest = (1 << 53) - 1
     for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
         checkpoint = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, np.inf, 0, [])
@@ -196,8 +192,7 @@ def line(iteration: int, **changes: Any) -> dict[str, Any]:
 
 
 def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
-    """Catches a run that cannot be resumed because a kill cut its last line, and lines lost before
-    that one."""
+    """Catches a last line that a kill cut in the way of resuming, and lines lost before it."""
     assert metrics_log.read_metrics(tmp_path) == []
     lines = [line(n, psnr=20.0 + n, ssim=0.9) for n in (10, 20, 30)]
     for written in lines:
@@ -235,8 +230,7 @@ FORECAST = {"seconds": 1.0, "psnr": 30.0, "error": 0.1, "ahead": 5.0, "gain": 0.
     ],
 )
 def test_damaged_metrics(tmp_path: Path, damaged: Any, message: str) -> None:
-    """Catches a traceback in resume, curve or summary for a line that lacks a field or has a wrong
-    one."""
+    """Catches a traceback in resume, curve or summary for a missing or wrong field."""
     for written in (line(5), damaged, line(20)):
         metrics_log.append_metrics(tmp_path, written)
     with pytest.raises(StgaError, match=rf"metrics\.jsonl: line 2: {message}") as caught:

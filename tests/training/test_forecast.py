@@ -64,8 +64,7 @@ def test_four_of_five_forecasts_come_true(noise: float) -> None:
 
 
 def test_one_bad_evaluation_does_not_tilt_the_forecast() -> None:
-    """Catches least squares: right after splats were put back, an evaluation may be a decibel too
-    low."""
+    """Catches least squares: after splats were put back, one may be a decibel too low."""
     psnr = rising(TIMES)
     psnr[-3] -= 2
     told = forecast(curve(TIMES, psnr), 20.0)
@@ -111,8 +110,7 @@ def test_a_run_is_flat_when_neither_measure_rises() -> None:
 
 
 def test_forecast_of_both_measures() -> None:
-    """Catches a detail difference that is forecast in dB, upwards, or for a run that does not
-    measure it."""
+    """Catches a detail difference forecast in dB, upwards, or where it is not measured."""
     lines = evaluations(rising(TIMES), 10 ** (-(30 - 20 / np.sqrt(TIMES)) / 20))
     assert detail_curve(lines)[-1][1] == pytest.approx(30 - 20 / np.sqrt(120))
     gain = 20 / np.sqrt(120) - 20 / np.sqrt(240)
@@ -126,8 +124,7 @@ def test_forecast_of_both_measures() -> None:
 
 
 def test_hits() -> None:
-    """Catches forecasts counted that cannot be checked yet, and ones compared with the wrong
-    moment."""
+    """Catches forecasts counted too early, or compared with the wrong moment."""
 
     def told(seconds: float, psnr: float) -> dict[str, float]:
         return Forecast(seconds, psnr, 0.2, 10.0, 0.0).as_json()
@@ -143,8 +140,7 @@ def test_hits() -> None:
 
 
 def test_why_a_target_was_missed() -> None:
-    """Catches "train longer" where that does not help, and another time than the curve will
-    take."""
+    """Catches "train longer" where that is no help, and another time than it will take."""
     risen = curve(TIMES, rising(TIMES))  # in 120 s; 36 − 20/√400 = 35
     assert explain_missed_target(risen, 35).endswith(
         "extrapolating the curve, it would take about 4.7 min more"

@@ -38,8 +38,7 @@ def scores(values: Iterator[float]) -> Evaluate:
 
 
 class Clock:
-    """A clock that only training and evaluation move: by fixed amounts, so that no machine is too
-    slow for the test."""
+    """A clock that only training and evaluation move, by fixed amounts."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -121,8 +120,7 @@ def test_a_reached_target_ends_the_run(
 def test_the_avatar_that_reached_the_target_is_kept(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches "30 dB was reached" beside a file that has less, because an earlier one was
-    sharper."""
+    """Catches "30 dB was reached" beside a file of less, as an earlier one was sharper."""
     found = iter(
         [
             Quality(25.0, 0.5, detail_difference=0.1),
@@ -142,8 +140,7 @@ def test_the_avatar_that_reached_the_target_is_kept(
 def test_a_run_that_no_longer_improves(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock, stop: bool
 ) -> None:
-    """Catches overfitting that nobody is told about, and a run that stops without having been asked
-    to."""
+    """Catches overfitting that nobody is told about, and a stop that nobody asked for."""
     falling = (30 - n / 10 for n in count())
     monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told: list[str] = []

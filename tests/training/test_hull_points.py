@@ -259,8 +259,7 @@ def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, convention: str) -> None:
-    """Catches points off their pixels' rays, holes in the layer, and a layer in front of or behind
-    the head."""
+    """Catches points off their rays, holes in the layer, and one before or behind the head."""
     view = next(view for view in beside.views["train"] if _gap(view.camera) > 0.02)
     world = in_world(beside, flat_points(beside, view, convention, 1), convention)
     pixels, depth = view.camera.project(world.xyz.astype(np.float64))
@@ -293,8 +292,7 @@ def _gap(camera: Camera) -> float:
 def test_a_single_camera_continues_the_torso_that_it_cuts_off(
     tmp_path: Path, right: float, up: float, continued: bool
 ) -> None:
-    """Catches a chest that ends in the air where the image did, and hair that is continued like
-    one."""
+    """Catches a chest that ends in the air, and hair that is continued like one."""
     model = small_head(0)
     frame = neutral_frame(model)
     head = FlameSequence(

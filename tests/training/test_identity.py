@@ -1,5 +1,4 @@
-"""Identity of a run: what was trained on one capture is not continued, measured or rendered on
-another."""
+"""What was trained on one capture is not continued, measured or rendered on another."""
 
 import hashlib
 import json
@@ -114,8 +113,7 @@ def other_lens(root: Path) -> None:
 def test_changed_captures_are_refused(
     copy: Path, toy: Capture, tmp_path: Path, change: Callable[[Path], None], message: str
 ) -> None:
-    """Catches a run that is resumed or measured on another capture, by its path or replaced in
-    place."""
+    """Catches a run resumed or measured on another capture, named or replaced in place."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     change(other)
     both = rf"was trained on {toy.root} \(4 cameras, 4 timesteps\), but {other} \(.*{message}"
@@ -132,8 +130,7 @@ def test_changed_captures_are_refused(
 def test_moved_captures_and_refined_meshes_are_accepted(
     copy: Path, toy: Capture, tmp_path: Path
 ) -> None:
-    """Catches a run that is lost with its capture's old path, or with a better tracking of its
-    frames."""
+    """Catches a run lost with its capture's old path, or with a better tracking."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     vertices, faces = factory.ball()
     for timestep in toy.timesteps:
@@ -180,8 +177,7 @@ def test_runs_of_earlier_format_versions_are_resumed(
 
 
 def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
-    """Catches a run that cannot be resumed where another linear algebra library rounds
-    differently."""
+    """Catches a run lost where another linear algebra library rounds differently."""
     rng = np.random.default_rng(0)
 
     def shifted(view: Any) -> Any:
@@ -219,8 +215,7 @@ def test_another_flame_model_is_refused(toy: Capture, tmp_path: Path) -> None:
 def test_every_command_checks_the_identity(
     copy: Path, toy: Capture, tmp_path: Path, capsys: Any
 ) -> None:
-    """Catches a command that opens a run without the check: each ends with one sentence and exit
-    code 2."""
+    """Catches a command without the check: each ends with one sentence and exit code 2."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     move_cameras(other)
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
@@ -242,8 +237,7 @@ def test_every_command_checks_the_identity(
 
 
 def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Capture) -> None:
-    """Catches a new run that continues a removed one, because it died before its first
-    checkpoint."""
+    """Catches a new run that continues a removed one, as it died before a checkpoint."""
     (copy / "run.json").unlink()
     run = make_run(toy, seed=5)
 
@@ -276,8 +270,7 @@ def test_files_of_another_run_are_refused(
 
 
 def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path) -> None:
-    """Catches `render` that reads cameras by another convention than the one that the avatar was
-    trained with."""
+    """Catches `render` that reads cameras by another convention than the avatar's."""
     root = shutil.copytree(toy.root, tmp_path / "capture")
     edit_frames(root, lambda frame: frame.update(cy=frame["cy"] + 7))
     capture = open_capture(root, principal_point="opencv")
@@ -298,8 +291,7 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
 
 
 def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a run that moves from the CPU to a GPU, where refined tracking cannot be resumed, or
-    to another GPU."""
+    """Catches a run that moves from the CPU to a GPU, or to another GPU."""
     run = read_run(copy)
     assert run.device == "cpu"
     card = {"cpu": "cpu", "gpu": "gpu:Card"}
@@ -321,8 +313,7 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Path) -> None:
-    """Catches Ctrl-C that loses what was trained since the last checkpoint, or saves half an
-    iteration."""
+    """Catches Ctrl-C that loses what was trained, or saves half an iteration."""
 
     def interrupt(progress: Progress) -> bool:
         if progress.figures().get("iteration", 0) == 5 and progress.stage == "Training":
@@ -356,8 +347,7 @@ def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
 
 
 def test_a_prepared_run_begins_with_its_identity(toy: Capture, tmp_path: Path) -> None:
-    """Catches a run.json written ahead of the training (as the benchmark does) that stays without
-    identity."""
+    """Catches a run.json written ahead of the training that stays without identity."""
     write_run(tmp_path, make_run(toy))
     assert json.loads((tmp_path / "run.json").read_text())["identity"] is None
     train(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))

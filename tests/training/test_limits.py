@@ -1,5 +1,4 @@
-"""The limits that keep a splat near what it covers, against autograd of their formulas; stray
-resets."""
+"""Limits that keep a splat near what it covers, against autograd; stray resets."""
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ FACES, WEIGHT = 5, 0.7
 
 @pytest.fixture(params=range(3))
 def scene(request: pytest.FixtureRequest):
-    """Splats about half of which are over their limits, rows that leave some out, and limits (F,)
-    per triangle."""
+    """Splats, half of them over their limits, some rows, and limits (F,) per triangle."""
     splats = random_splats(50, FACES, request.param)
     rng = np.random.default_rng(request.param)
     rows = np.flatnonzero(rng.random(50) < 0.7).astype(np.int32)
@@ -55,8 +53,7 @@ def test_scale_limit(scene) -> None:
 
 
 def test_distance_limit(scene) -> None:
-    """Catches a gradient along the wrong axis or of the squared norm, and unbound splats pulled
-    towards the mesh."""
+    """Catches a gradient along a wrong axis or of the square, and unbound splats pulled."""
     splats, rows, limit = scene
     limit = limit * np.float32(0.015)
     limits = np.stack([limit, np.full_like(limit, np.inf)])
@@ -71,8 +68,7 @@ def test_distance_limit(scene) -> None:
 
 
 def test_opacity_weight(scene) -> None:
-    """Catches a pull on unlisted splats, in the wrong direction, without the share, or of the logit
-    itself."""
+    """Catches a pull on unlisted splats, in the wrong direction, or without the share."""
     splats, rows, _ = scene
     share = np.random.default_rng(3).random(50, np.float32)
     x = torch.tensor(splats.opacity, dtype=torch.float64, requires_grad=True)
@@ -98,8 +94,7 @@ def test_within_the_limits_nothing_happens(kernel) -> None:
 
 @pytest.mark.parametrize("to", [0.0, 0.5, 1.0])
 def test_stray_resets(to: float) -> None:
-    """Catches a limit of another triangle, unbound splats pulled home, and momentum that throws a
-    splat out again."""
+    """Catches a limit of another triangle, unbound splats pulled home, and momentum kept."""
     state = random_state(60, FACES)
     state.unbound[:] = np.arange(60) % 4 == 0
     limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
@@ -132,8 +127,7 @@ def test_stray_resets(to: float) -> None:
 
 
 def test_the_first_step_after_a_stray_reset_is_no_longer_than_the_rate() -> None:
-    """Catches moments that do not fit the row's step count: zeroed ones make a first step of 3.2
-    times the rate."""
+    """Catches moments of another step count: zeroed ones step 3.2 times the rate."""
     rates = dict.fromkeys(
         ("xyz", "rotation", "log_scale", "opacity", "sh", "sh_rest", "strain_color"), 1e-3
     )

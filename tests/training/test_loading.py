@@ -30,8 +30,7 @@ def no_residuals(*arguments: Any) -> Residuals:
 def test_no_mesh_is_read_on_the_training_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches training that waits for mesh files on captures longer than the cache, and numbers
-    that depend on it."""
+    """Catches training that waits for mesh files, and numbers that depend on it."""
     timesteps = range(2 * CACHED_TIMESTEPS)
     opened = open_capture(factory.write_mesh_capture(tmp_path / "capture", timesteps, range(2)))
     read: list[tuple[int, bool]] = []
@@ -64,8 +63,7 @@ def test_no_mesh_is_read_on_the_training_thread(
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_frames_are_those_of_the_timesteps_mesh(toy: Capture, convention: str) -> None:
-    """Catches frames of another timestep, of another convention, or scaled by the posed mesh
-    instead of the neutral."""
+    """Catches frames of another timestep or convention, or scaled by the posed mesh."""
     store = FrameStore(toy, convention)
     for timestep in (3, 0, 3):
         expected = face_frames(toy.mesh(timestep), toy.faces, toy.neutral, convention)

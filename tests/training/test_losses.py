@@ -32,8 +32,7 @@ def random_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.
 def reference(
     image: np.ndarray, target: np.ndarray, weight: float
 ) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
-    """Gradient (3, H, W), |difference| and SSIM maps: plain convolutions in float64, gradient by
-    autograd."""
+    """Gradient (3, H, W), |difference| and SSIM maps, in float64 by autograd."""
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
     y = torch.tensor(target * np.float32(1 / 255), dtype=torch.float64).permute(2, 0, 1)
@@ -49,8 +48,7 @@ def assert_same_gradient(gradient: np.ndarray, expected: np.ndarray) -> None:
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_gradient_and_values(height: int, width: int, weight: float) -> None:
-    """Catches a wrong window, padding, constant or derivative, rows lost between bands, and images
-    below the window."""
+    """Catches a wrong window, padding, constant or derivative, lost rows, small images."""
     image, target = random_pair(height, width)
     out = np.full_like(image, np.nan)
     l1, ssim = image_gradient(image, target, whole_image(height, width), weight, out)
@@ -63,8 +61,7 @@ def test_gradient_and_values(height: int, width: int, weight: float) -> None:
 
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_constant_images(value: int) -> None:
-    """Catches 0/0 and a negative variance where nothing varies, and a sign for pixels that already
-    agree."""
+    """Catches 0/0 and a negative variance, and a sign for pixels that already agree."""
     target = np.full((20, 25, 3), value, np.uint8)
     same = np.full((3, 20, 25), np.float32(value) * np.float32(1 / 255), np.float32)
     out = np.empty_like(same)
@@ -88,8 +85,7 @@ RECTANGLES = {
 
 @pytest.mark.parametrize("name", RECTANGLES)
 def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
-    """Catches pixels further than LOSS_REACH_PX being read (they are NaN here), and pixels outside
-    being written."""
+    """Catches pixels read beyond LOSS_REACH_PX (they are NaN), and written outside."""
     image, target = random_pair(59, 71, seed=1)
     rectangles = np.array(RECTANGLES[name], np.int64)
     expected, absolute, ssim = reference(image, target, 0.2)
@@ -113,8 +109,7 @@ def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
 @pytest.mark.parametrize("bands", [1, 2, 3, 64])
 def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
-    """Catches a pixel that two rectangles or none covers, and an empty one where the image has
-    fewer rows than bands."""
+    """Catches a pixel that two rectangles or none cover, and an empty one."""
     covered = np.zeros((height, width), int)
     for x0, y0, x1, y1 in whole_image(height, width, bands):
         assert x0 < x1
@@ -124,8 +119,7 @@ def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
 
 
 def test_bands_do_not_change_a_bit() -> None:
-    """Catches a run that goes another way on another number of threads, which decides how many
-    bands there are."""
+    """Catches a run that goes another way on another number of threads, and so bands."""
     image, target = random_pair(75, 110, seed=2)
     whole, cut = np.empty_like(image), np.empty_like(image)
     losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
@@ -167,8 +161,7 @@ def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None
 
 
 def test_separate_tiles_get_separate_rectangles() -> None:
-    """Catches one box around everything, which is right but costs the whole image; and touching
-    tiles split."""
+    """Catches one box around everything, which costs the whole image; touching tiles split."""
     tiles = np.zeros((6, 8), bool)
     tiles[0, 0] = tiles[1, 1] = tiles[5, 7] = True
     found = {tuple(r) for r in tile_rectangles(tiles, 90, 125).tolist()}

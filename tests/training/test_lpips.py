@@ -1,5 +1,4 @@
-"""LPIPS against the same network in numpy with random weights, and against figures of the package
-lpips."""
+"""LPIPS against the network in numpy with random weights, and the package lpips."""
 
 import hashlib
 import os
@@ -96,8 +95,7 @@ def features(image: np.ndarray, weights: dict[str, Any]) -> list[np.ndarray]:
 
 
 def test_distance_is_that_of_the_network_in_numpy(weights_file: Path) -> None:
-    """Catches transposed kernels, another stride, padding or pooling, and features weighted before
-    normalization."""
+    """Catches transposed kernels, another stride, padding or pooling, and a wrong order."""
     weights = random_weights()
     image, target = pair(47, 68)
     expected = 0.0
@@ -164,8 +162,7 @@ def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:
 
 
 def test_another_file_is_refused(tmp_path: Path) -> None:
-    """Catches figures that are measured with other weights: the checksum is that of the file as
-    published."""
+    """Catches figures of other weights: the checksum is that of the published file."""
     path = write_weights(tmp_path / "alexnet.ckpt", random_weights())
     with pytest.raises(
         StgaError, match=r"ckpt: is not the weights file .* expected 443c5bc35326b81e.*d744b1\)$"
@@ -192,8 +189,7 @@ def test_a_missing_file_is_reported_before_training(
 def test_only_the_final_evaluation_measures_lpips(
     toy: Capture, tmp_path: Path, weights_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches slow evaluations during training, a canceled run that waits for LPIPS, and a missing
-    final figure."""
+    """Catches slow evaluations, a cancel that waits for LPIPS, and a missing final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     train(toy, tmp_path / "run", run_of(toy), report=stop_at(11))
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))

@@ -1,5 +1,4 @@
-"""Image quality: figures against the same by numpy and scipy, fitted exposure, which pixels count,
-residuals per triangle."""
+"""Image quality against numpy and scipy: exposure, which pixels count, residuals."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -48,8 +47,7 @@ def random_image(seed: int) -> np.ndarray:
 
 
 def reference_ssim(image: np.ndarray, target: np.ndarray, where: np.ndarray | None = None) -> float:
-    """Mean SSIM of two (H, W, 3) images in 0…1: Gaussian window of 11 pixels, σ 1.5, zeros around
-    the image."""
+    """Mean SSIM of (H, W, 3) images in 0…1: Gaussian of 11 pixels, σ 1.5, zeros around."""
 
     def blur(a: np.ndarray) -> np.ndarray:
         return gaussian_filter(a, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
@@ -73,8 +71,7 @@ def write_views(root: Path, count: int) -> list[View]:
 
 
 def test_psnr() -> None:
-    """Catches a mean over the wrong axes, a peak of 255, natural logarithms, and a mask that is
-    ignored."""
+    """Catches wrong axes, a peak of 255, natural logarithms, and a mask ignored."""
     target = random_image(0)
     image = np.random.default_rng(1).random((3, HEIGHT, WIDTH)).astype(np.float32)
     error = (image.astype(float) - np.moveaxis(target / 255, 2, 0)) ** 2
@@ -86,8 +83,7 @@ def test_psnr() -> None:
 
 
 def test_evaluate_means_over_views_and_clips(tmp_path: Path) -> None:
-    """Catches PSNR of the mean error instead of the mean PSNR, another SSIM, and values over one
-    that count double."""
+    """Catches PSNR of the mean error, another SSIM, and values over one counted double."""
     views = write_views(tmp_path, 3)
     drawn = {
         view.name: np.random.default_rng(9).normal(0.5, 0.5, (3, HEIGHT, WIDTH)).astype(np.float32)
@@ -109,8 +105,7 @@ def test_evaluate_means_over_views_and_clips(tmp_path: Path) -> None:
 
 
 def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
-    """Catches a region's figures that depend on the rest of the image, and views without the region
-    that count."""
+    """Catches figures that depend on the rest of the image, and views without the region."""
     views = write_views(tmp_path, 2)
     where = np.zeros((HEIGHT, WIDTH), bool)
     where[4:24, 3:18] = True
@@ -138,8 +133,7 @@ def test_regions_are_measured_by_themselves(tmp_path: Path) -> None:
 
 
 def test_peak_memory_never_falls() -> None:
-    """Catches bytes, or kilobytes, taken for mebibytes, and the memory of now for that of the
-    peak."""
+    """Catches bytes or kilobytes taken for mebibytes, and memory of now for the peak."""
     before = peak_memory_mb()
     if before is None:
         pytest.skip("this system does not say how much memory a process held")
@@ -182,8 +176,7 @@ def test_against_the_formula() -> None:
 
 
 def test_detail_that_is_a_pixel_off_beats_blur() -> None:
-    """Catches a criterion that, like PSNR, keeps the blurred state of a run instead of the one with
-    hair."""
+    """Catches a criterion that, like PSNR, keeps the blurred state instead of hair."""
     rng = np.random.default_rng(1)
     strands = np.repeat(gaussian_filter(rng.random((96, 96)), (4, 0.8))[None], 3, 0).astype(
         np.float32
@@ -210,8 +203,7 @@ def head_and_image() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_inverts_what_training_corrects() -> None:
-    """Catches another model than the effect's: gain and offset swapped, mixed channels, a
-    background that changes."""
+    """Catches gain and offset swapped, mixed channels, a background that changes."""
     head, image = head_and_image()
     gain, offset = np.array([1.1, 0.9, 1.2]), np.array([5.0, -8.0, 2.0])
     levels = 255 * image.transpose(1, 2, 0)
@@ -227,8 +219,7 @@ def test_inverts_what_training_corrects() -> None:
 
 
 def test_a_rendering_of_one_color_stays_finite() -> None:
-    """Catches a singular system where gain and offset cannot be told apart, and a crash without a
-    mask or pixels."""
+    """Catches a singular system, and a crash without a mask or pixels."""
     head, _ = head_and_image()
     flat = np.full((3, SIDE, SIDE), 0.5, np.float32)
     target = np.full((SIDE, SIDE, 3), 153, np.uint8)
@@ -237,8 +228,7 @@ def test_a_rendering_of_one_color_stays_finite() -> None:
 
 
 def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
-    """Catches six numbers fitted to views of cameras whose exposure training has estimated, which
-    hides its errors."""
+    """Catches six numbers fitted where training knows the exposure, which hides its errors."""
     head, image = head_and_image()
     gain, offset = np.array([0.8, 1.1, 0.9]), np.array([4.0, -6.0, 3.0])
     levels = 255 * image.transpose(1, 2, 0)
@@ -264,8 +254,7 @@ def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
 
 
 def test_evaluation_views_are_evenly_spread(toy: Capture) -> None:
-    """Catches evaluations while training that cost more than the training, or look at one end of
-    the sequence."""
+    """Catches evaluations that cost too much, or look at one end of the sequence."""
     view = toy.views["val"][0]
     many = tuple(replace(view, timestep=t) for t in range(100))
     chosen = [v.timestep for v in choose_evaluation_views(replace(toy, views={"val": many}))]
@@ -293,8 +282,7 @@ def test_regions_of_a_view(toy: Capture) -> None:
 
 
 def test_interior_leaves_out_the_matte_s_border(toy: Capture, tmp_path: Path) -> None:
-    """Catches an avatar that is chosen by the matte's border or the background, which differ from
-    view to view."""
+    """Catches an avatar chosen by the matte's border or the background."""
     view, size = toy.views["val"][0], 400
     camera = replace(view.camera, width=size, height=size)
     mask = np.zeros((size, size), np.uint8)
@@ -398,8 +386,7 @@ def test_an_error_belongs_to_the_triangles_that_show_it(toy: Capture) -> None:
 
 
 def test_triangles_that_nothing_shows_are_unknown() -> None:
-    """Catches a triangle at the back of the head that is called perfect because no camera sees
-    it."""
+    """Catches a triangle called perfect because no camera sees it."""
     residuals = Residuals(np.array([1.0, 0.0, 3.0]), np.array([4.0, MIN_WEIGHT_PX / 2, 6.0]))
     np.testing.assert_array_equal(residuals.mean(), [0.25, np.nan, 0.5])
     np.testing.assert_array_equal((residuals + residuals).mean(), [0.25, 0.0, 0.5])

@@ -30,8 +30,7 @@ UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
 
 def place(trainer: Trainer, row: int, position: list[float]) -> None:
-    """Make a splat an opaque, upright needle at a world position in meters (the toy's upper part
-    never moves)."""
+    """Make a splat an opaque, upright needle at a position in meters, which never moves."""
     state, capture = trainer.state, trainer.capture
     frames = face_frames(capture.mesh(0), capture.faces, capture.neutral)
     needle = replace(
@@ -63,8 +62,7 @@ def splats_after_a_turn(
 
 
 def test_a_needle_beside_the_head_does_not_outlive_its_turn(toy: Capture) -> None:
-    """Catches a spike over the hair that lies outside of all masks and stays in every picture of
-    the avatar."""
+    """Catches a spike over the hair, outside of all masks, that stays."""
     before, after = splats_after_a_turn(toy, [0.0, 0.15, 0.0])
     assert after == before - 1
 
@@ -81,8 +79,7 @@ def test_without_masks_nothing_is_pruned(toy: Capture) -> None:
 
 
 def test_outlines_are_the_masks_of_some_training_views(tmp_path: Path) -> None:
-    """Catches masks of other views or of another size than their cameras, too many of them, and a
-    lost margin."""
+    """Catches masks of other views or size, too many of them, and a lost margin."""
     capture = open_capture(factory.write_mesh_capture(tmp_path / "many", range(11), range(3)))
     for path in (tmp_path / "many" / "fg_masks").iterdir():
         mask = Image.open(path).resize(
@@ -122,8 +119,7 @@ def pictures(rng: np.random.Generator) -> tuple[list[Outline], dict[int, FaceFra
 
 
 def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
-    """Whether a point, given for each outline, is clear in more than half of the images that show
-    it."""
+    """Whether a point, given for each outline, is clear in most images that show it."""
     clear = []
     for point, outline in zip(points, outlines, strict=True):
         camera: Camera = outline.camera
@@ -183,8 +179,7 @@ def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_what_is_hidden_and_what_it_looks_like(from_one_side: Capture) -> None:
-    """Catches a side taken for another, a normal turned inside, and a mirror at a wrong plane:
-    against the ball."""
+    """Catches a side, a normal or a mirror plane taken for another: against the ball."""
     capture, sides = from_one_side, unseen_sides(from_one_side)
     neutral, posed = (
         mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))

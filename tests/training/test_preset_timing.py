@@ -47,8 +47,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def test_the_mean_over_the_whole_course(toy: Capture, shares: list[float]) -> None:
-    """Catches a calibration of the cheap beginning only: images of 40 x 60 pixels, a third of the
-    time at half size."""
+    """Catches a calibration of the cheap beginning only, with images of half the size."""
     settings = make_settings(iterations=100, coarse_share=1 / 3)
     pace = seconds_per_iteration(toy, settings, 2.4)
     assert pace == pytest.approx(0.006 / 3 + 0.024 * 2 / 3, rel=0.05)

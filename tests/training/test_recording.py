@@ -103,8 +103,7 @@ def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
 
 
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch) -> None:
-    """Catches a cancelled tracking that begins anew, or goes on with what an avatar found that was
-    trained again since."""
+    """Catches a cancelled tracking that begins anew, or goes on with another avatar's."""
     (run, root), calls = recording, list[int]()
     every, twice = [1] * len(TIMESTEPS), [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")

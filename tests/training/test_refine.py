@@ -1,5 +1,4 @@
-"""Refining a region of a finished run: nothing else changes, and a stopped refinement is continued
-to the same bits."""
+"""Refining a region: nothing else changes; a stopped one is continued to the same bits."""
 
 import shutil
 from collections.abc import Callable
@@ -41,8 +40,7 @@ ITERATIONS = 16
 
 @pytest.fixture(scope="module")
 def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with strain color, density control and hull points; its avatar is that of the last
-    iteration."""
+    """With strain color, density control and hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
         "global", iterations=12, strain_color=True, lattice=1, density_interval=10,
@@ -63,8 +61,7 @@ def parent(finished: Path, toy: Capture, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def opening(toy: Capture) -> Callable[..., Any]:
-    """`open_run` for the capture without held-out views, which is a file of its own to nobody but
-    this test."""
+    """`open_run` for the capture without held-out views, which has no file of its own."""
     from stga_addon.training.run.folder import OpenedRun
 
     capture = replace(toy, views={"train": toy.views["train"]})
@@ -131,8 +128,7 @@ def test_nothing_outside_the_region_changes_by_one_bit(
 def test_a_stopped_refinement_is_continued_to_the_same_bits(
     parent: Path, toy: Capture, tmp_path: Path
 ) -> None:
-    """Catches an order of views, a region or a rate that a resumed refinement does not find
-    again."""
+    """Catches an order, a region or a rate that resuming does not find again."""
     whole = refine(parent, tmp_path / "whole", frames=(1, 3))
     stopped = refine(parent, tmp_path / "stopped", stop=7, frames=(1, 3))
     capture = replace(toy, views={"train": toy.views["train"]})
@@ -144,8 +140,7 @@ def test_a_stopped_refinement_is_continued_to_the_same_bits(
 def test_the_avatar_before_is_the_first_evaluation(
     parent: Path, toy: Capture, tmp_path: Path
 ) -> None:
-    """Catches a report without what it is compared with, and a region that is not measured
-    apart."""
+    """Catches a report without what came before, and a region that is not measured apart."""
     prepared = prepare_refinement(parent, "mouth", (1, 3))
     train(toy, tmp_path / "refined", prepared.run, prepared.selection)
     first, *_, last = read_metrics(tmp_path / "refined")
@@ -157,8 +152,7 @@ def test_the_avatar_before_is_the_first_evaluation(
 def test_a_region_that_no_camera_faces_is_refused(
     parent: Path, toy: Capture, tmp_path: Path
 ) -> None:
-    """Catches a refinement that has no view to train on, which ends in a traceback after the
-    start."""
+    """Catches a refinement without a view to train on, which ends in a traceback."""
     away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
     write_npz(tmp_path / "away.npz", {"weights": away})
     with pytest.raises(
@@ -178,8 +172,7 @@ def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
 def test_without_its_checkpoint_an_avatar_is_refined_as_well(
     parent: Path, toy: Capture, tmp_path: Path
 ) -> None:
-    """Catches a refinement that needs optimizer moments, or takes those of another state than the
-    avatar's."""
+    """Catches a refinement that needs moments, or takes those of another state."""
     (parent / "checkpoint.npz").unlink()
     after = read_avatar(refine(parent, tmp_path / "refined", growth=0.0) / "avatar.npz").splats
     before = read_avatar(parent / "avatar.npz").splats
@@ -215,8 +208,7 @@ def test_late_rates_are_the_rest_of_the_schedule() -> None:
 
 
 def test_order_of_views_continues_and_replays(toy: Capture) -> None:
-    """Catches a resumed order that starts anew, and other frames that are forgotten or trained too
-    often."""
+    """Catches a resumed order that starts anew, and frames forgotten or too often trained."""
     continuation = Continuation(Path(), "", 1, 1)
     for region, count in ((np.ones(len(toy.faces), bool), 27), (None, 24)):  # to refine, to extend
         whole = list(islice(continued_order(continuation, toy, region, 5), 40))
@@ -230,8 +222,7 @@ def test_order_of_views_continues_and_replays(toy: Capture) -> None:
 
 
 def test_replayed_timesteps_differ_most(toy: Capture) -> None:
-    """Catches a replay of neighbors that all look alike, and one that grows with the length of the
-    takes."""
+    """Catches a replay of neighbors alike, and one that grows with the takes' length."""
     offsets = {0: 0.0, 1: 0.001, 2: 0.05, 3: 0.051, 4: -0.04}
     capture = replace(
         toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep]

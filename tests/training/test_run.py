@@ -44,8 +44,7 @@ def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> R
 
 
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Metrics without wall times; losses and SSIMs, whose rows are summed in float32, to seven
-    digits."""
+    """Metrics without wall times; sums of float32 rows to seven digits."""
     kept = [{k: v for k, v in line.items() if k not in CLOCKED} for line in lines]
     return [
         {k: float(f"{v:.7g}") if k.startswith(("loss", "ssim")) else v for k, v in line.items()}
@@ -96,8 +95,7 @@ class Crash(Exception):
 
 @pytest.fixture(scope="module")
 def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that crashed after iteration 13, went on from a checkpoint of iteration 8, and came to
-    its end."""
+    """Crashed after iteration 13, went on from a checkpoint of 8, and came to its end."""
     out = tmp_path_factory.mktemp("continued")
     with pytest.MonkeyPatch.context() as patch:
 
@@ -120,8 +118,7 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path) -> None:
-    """Catches evaluations that stand twice, or are missing, after going on from an older
-    checkpoint."""
+    """Catches evaluations twice, or missing, after going on from an older checkpoint."""
     assert_same_state(continued, unbroken)
     ours, theirs = (
         [
@@ -142,8 +139,7 @@ def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path
 
 
 def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a farm's wish that is ignored, and a nonsensical one that ends in a traceback or in
-    no checkpoints."""
+    """Catches a farm's wish ignored, and a traceback or no checkpoints of a nonsensical one."""
     for text, seconds in (("", None), ("0.5", 0.5), ("0", 0.0)):
         monkeypatch.setenv("STGA_CHECKPOINT_S", text)
         assert run_module._asked_interval_s() == seconds
@@ -156,8 +152,7 @@ def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.Monkey
 
 
 def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path) -> None:
-    """Catches what an artist painted replaced by the rule when a run resumes that had no checkpoint
-    yet."""
+    """Catches a painted selection replaced by the rule where there was no checkpoint yet."""
     painted = {timestep: np.arange(len(toy.faces)) < 7 for timestep in toy.timesteps}
 
     def crash(progress: Progress) -> bool:
@@ -211,8 +206,7 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
 
 @pytest.mark.parametrize("change", ["renamed", "emptied"])
 def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, change: str) -> None:
-    """Catches a renamed run that is begun a second time under its old name, without what it needs
-    to be resumed."""
+    """Catches a renamed run begun again under its old name, without what resuming needs."""
     out, moved = tmp_path / "run", tmp_path / "moved"
 
     def move(progress: Progress) -> bool:
@@ -233,8 +227,7 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
 def test_the_best_avatar_is_kept(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a run that gets worse with time taking its best avatar with it, also over an
-    interruption."""
+    """Catches a run that gets worse and takes its best avatar with it."""
     scores = iter([0.3, 0.1, 0.2, 0.11, *[0.15] * 20])
     written: list[Avatar] = []
 
@@ -288,8 +281,7 @@ def test_what_is_refused_changes_nothing(toy: Capture, unbroken: Path, tmp_path:
 
 
 def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches wall time that is not counted, counted twice when resumed, or overrun by more than an
-    iteration."""
+    """Catches wall time not counted, counted twice when resumed, or overrun."""
     ticks = count()  # a clock that ticks when it is read, so that every step takes 0.01 s
     monkeypatch.setattr(run_module, "perf_counter", lambda: next(ticks) / 100)
     shares: list[float] = []
@@ -313,8 +305,7 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
 def test_every_strategy_and_schedule_runs(
     toy: Capture, tmp_path: Path, strategy: str, schedule: str
 ) -> None:
-    """Catches a combination of settings that no other test trains, and an avatar in the wrong
-    convention."""
+    """Catches a combination that no other test trains, and an avatar's wrong convention."""
     settings = quick_settings(
         strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3
     )

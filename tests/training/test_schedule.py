@@ -51,8 +51,7 @@ def visits(per_visit: int) -> list[int]:
 
 
 def test_views_of_a_visit_stay_together() -> None:
-    """Catches frames torn apart in the paper's batches, and full shuffling that keeps frames
-    together."""
+    """Catches frames torn apart in the paper's batches, or kept together in full shuffling."""
     assert sorted(visits(0)) == [1, 3, 4, 5]
     assert len(visits(1)) > 6
     # Groups of two: a run is as long as the groups it is made of, of which the first of a frame are
@@ -74,8 +73,7 @@ def test_sh_degree_rises_step_by_step() -> None:
 
 
 def test_rates_decay_to_their_ends() -> None:
-    """Catches a rate without its own end, linear decay, and rates that rise again past the
-    budget."""
+    """Catches a rate without its own end, linear decay, and a rise past the budget."""
     rates = Rates(xyz=1e-3, sh=4e-2, sh_rest=2e-3, position_end=0.01, end=0.25)
     assert learning_rates(rates, 0.0) == {n: getattr(rates, n) for n in learning_rates(rates, 0.0)}
     half, end = learning_rates(rates, 0.5), learning_rates(rates, 1.0)

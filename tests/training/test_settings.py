@@ -81,8 +81,7 @@ REFUSED: list[tuple[str, Any]] = [
 
 @pytest.mark.parametrize(("name", "value"), REFUSED)
 def test_one_schema_for_new_and_stored_settings(name: str, value: Any) -> None:
-    """Catches a setting that begins a run which cannot be read again, or a stored one that breaks
-    training."""
+    """Catches a setting whose run cannot be read again, or a stored one that breaks it."""
     budget = {} if name == "seconds" else {"iterations": 5}
     with pytest.raises(StgaError, match=f"^setting {name}") as caught:
         make_settings(**{**budget, name: value})
@@ -111,8 +110,7 @@ STORED = to_json(make_settings(iterations=5))
     ],
 )  # fmt: skip
 def test_damaged_stored_settings(change: dict[str, Any], named: str) -> None:
-    """Catches a stored selection rule that could not have been made, and a misspelt field that is
-    dropped without a message."""
+    """Catches a stored rule that could not be made, and a misspelt field dropped."""
     with pytest.raises(StgaError, match=named):
         from_json(TrainingSettings, {**STORED, **change})
 

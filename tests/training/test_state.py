@@ -8,8 +8,7 @@ from .toys import random_splats, random_state
 
 
 def test_keep_and_join() -> None:
-    """Catches an array left at its old length or in another order after pruning, which would mix
-    rows up."""
+    """Catches an array left at its old length or in another order after pruning."""
     state = random_state(9, 5)
     keep = np.array([True, False, True, True, False, False, True, False, True])
     kept, rest = keep_rows(state, keep), keep_rows(state, ~keep)
@@ -23,8 +22,7 @@ def test_keep_and_join() -> None:
 
 
 def test_memory_is_shared_where_promised_and_only_there() -> None:
-    """Catches training that changes the splats it started from, and Adam on a copy of the
-    parameters."""
+    """Catches training that changes the splats it began with, and Adam on a copy."""
     splats = random_splats(6, 4)
     xyz, face = splats.xyz.copy(), splats.face.copy()
     state = new_state(splats)

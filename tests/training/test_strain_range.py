@@ -40,8 +40,7 @@ def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
 
 
 def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path) -> None:
-    """Catches a range of held-out expressions too, one that clips what was trained, and one where
-    nothing needs it."""
+    """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
     found = read_avatar(train(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
@@ -125,8 +124,7 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
 
 
 def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
-    """Catches a blink of six frames in twelve hundred that is trained, but clipped out of the
-    avatar."""
+    """Catches a blink of six frames in 1,200 that is trained, but clipped."""
     view, blink = toy.views["train"][0], range(1003, 1009)
     views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
 

@@ -1,5 +1,4 @@
-"""One step of training: what a local iteration may touch, and that its gradient is the whole
-image's."""
+"""One step of training: what a local iteration touches, and its whole gradient."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -56,8 +55,7 @@ def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
 
 
 def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
-    """The view in a larger image, and a noisy target for it: many tiles and a gradient
-    everywhere."""
+    """In a larger image, and a noisy target: many tiles and a gradient everywhere."""
     view = replace(view, camera=view.camera.scaled(factor))
     target = np.random.default_rng(0).integers(
         0, 256, (view.camera.height, view.camera.width, 3), np.uint8
@@ -74,8 +72,7 @@ def disturb(trainer: Trainer) -> None:
 
 
 def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> None:
-    """Catches momentum, limits, decay or statistics that reach rows which the frame does not
-    select."""
+    """Catches momentum, limits or statistics that reach rows which are not selected."""
     trainer = make_trainer(toy, distance_weight=0.1, distance_limit=0.01, scale_limit=0.1)
     view = view_of(toy, 1)
     target = read_image(view)
@@ -99,8 +96,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy: Capture) -> Non
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("camera", [0, 2])
 def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: int) -> None:
-    """Catches tiles left out around the selection, and pixels read that no tile rendered (all
-    buffers hold NaN)."""
+    """Catches tiles left out, and pixels read that no tile rendered (they are NaN)."""
     trainer = make_trainer(toy)
     disturb(trainer)
     view, target = large(view_of(toy, 1, camera))
@@ -131,8 +127,7 @@ def test_local_gradient_is_the_whole_images(toy: Capture, degree: int, camera: i
 
 @pytest.mark.parametrize("timestep", [0, 4])
 def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: int) -> None:
-    """Catches iterations that train nothing, for an empty selection and for a timestep that has
-    none."""
+    """Catches iterations that train nothing, without a selection or with an empty one."""
     trainer = make_trainer(toy)
     view = view_of(toy, timestep)
     loss = trainer.step(view, read_image(view), 0.5)
@@ -145,8 +140,7 @@ def test_a_frame_that_selects_nothing_trains_globally(toy: Capture, timestep: in
 
 
 def test_kinds_of_iterations(toy: Capture) -> None:
-    """Catches a schedule that the trainer does not follow: by iterations, by visits of frames, and
-    in the warm-up."""
+    """Catches a schedule not followed: by iterations, by visits, in the warm-up."""
     views = [view_of(toy, timestep, camera) for timestep in (1, 3, 1, 3) for camera in (0, 1)]
     images = [read_image(view) for view in views]
 
@@ -166,8 +160,7 @@ def test_kinds_of_iterations(toy: Capture) -> None:
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
-    """Catches a gradient of the wrong sign, rates that are not applied, and a strategy that does
-    not learn."""
+    """Catches a wrong sign, rates not applied, and a strategy that does not learn."""
     trainer = make_trainer(
         toy, strategy, lattice=1 if strategy != "gaussian-avatars" else 0, warm_up_share=0.3
     )
@@ -184,8 +177,7 @@ def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
 
 
 def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
-    """Catches maintenance that never runs, runs outside its span, or grows beyond what was
-    allowed."""
+    """Catches maintenance that never runs, or outside its span, or grows too far."""
     options = {
         "lattice": 2,
         "density_interval": 2,
@@ -217,8 +209,7 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
 
 
 def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture) -> None:
-    """Catches selected regions that are split more because they are drawn more often, not because
-    they are worse."""
+    """Catches regions split more because they are drawn more often."""
     trainer = make_trainer(toy)
     view = view_of(toy, 1)
     for expected in (0, 0, 1, 1, 1, 2):
@@ -227,8 +218,7 @@ def test_screen_gradients_are_accumulated_by_global_iterations_only(toy: Capture
 
 
 def test_initial_splats_with_hull_points(tmp_path: Path) -> None:
-    """Catches hull points that are mixed up with the lattice, which would be exempt from its limits
-    then."""
+    """Catches hull points mixed up with the lattice, which would escape its limits."""
     hairy = open_capture(factory.write_mesh_capture(tmp_path / "hairy"))
     rows, columns = np.mgrid[: factory.HEIGHT, : factory.WIDTH] + 0.5
     mask = np.hypot(columns - factory.CX, rows - factory.CY) < 29  # the ball itself: 20 pixels
@@ -263,8 +253,7 @@ def test_splats_of_a_triangle_by_the_mesh(
 
 
 def test_unseen_share(toy: Capture) -> None:
-    """Catches seen taken for unseen, a camera of another timestep, pixels off the image, and shares
-    of bound splats."""
+    """Catches seen taken for unseen, another timestep, and shares of bound splats."""
     splats = initial_splats(toy, quick_settings(lattice=0))
     splats.unbound[::2] = True
     splats.xyz[:] += np.random.default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
@@ -303,8 +292,7 @@ def test_render_shows_the_average(toy: Capture) -> None:
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_scale_limits_in_meters(toy: Capture, convention: str) -> None:
-    """Catches bound and unbound limits that are mixed up, and hull points limited in triangles
-    instead of meters."""
+    """Catches bound and unbound limits mixed up, and triangles taken for meters."""
     settings = quick_settings(convention=convention, scale_limit=3.0, unbound_scale_limit=2.0)
     store = FrameStore(toy, convention)
     bound, unbound = store.scale_limits(settings)

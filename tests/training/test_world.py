@@ -1,5 +1,4 @@
-"""What stands still behind a person: clean plates, splats that show them, and what is rendered and
-measured so."""
+"""What stands still behind a person: clean plates, splats, renderings, figures."""
 
 import json
 from pathlib import Path
@@ -30,8 +29,7 @@ WALL_M = 1.0
 
 
 def wall(camera: Camera, texture: np.ndarray) -> np.ndarray:
-    """(H, W, 3): what a camera sees of a textured wall at z = −WALL_M, one texel to a centimeter,
-    by its rays."""
+    """(H, W, 3): a textured wall at z = −WALL_M, one texel to a centimeter, by rays."""
     y, x = np.mgrid[: camera.height, : camera.width]
     origin = camera.position
     toward = camera.unproject(np.stack([x.ravel(), y.ravel()], 1) + 0.5, np.ones(x.size)) - origin
@@ -53,8 +51,7 @@ def plates_of(texture: np.ndarray) -> list[CleanPlate]:
 
 
 def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
-    """Catches a wall at a wrong distance, and splats that show it from the cameras of the plates
-    alone."""
+    """Catches a wall at a wrong distance, or right from the plates' cameras alone."""
     noise = np.random.default_rng(0).random((512, 512, 3))
     texture = gaussian_filter(noise, (4, 4, 0), mode="wrap")
     texture = (texture - texture.min()) / (texture.max() - texture.min())
@@ -106,8 +103,7 @@ def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_plates_without_the_person(walled: Path) -> None:
-    """Catches a person who remains in a plate, a wall that is blurred, and holes without a
-    color."""
+    """Catches a person who remains, a blurred wall, and holes without a color."""
     for plate in clean_plates(open_capture(walled)):
         stripes = np.broadcast_to(STRIPES, plate.image.shape) / 255
         assert 0.3 < plate.seen.mean() < 1
@@ -121,8 +117,7 @@ def test_plates_without_the_person(walled: Path) -> None:
 def test_measured_with_the_world(
     walled: Path, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches figures of matted images that are called those of whole ones: the same from `stga
-    render --world`."""
+    """Catches figures of matted images called whole ones: against `stga render --world`."""
     assert stga("eval", run, "--split train") == 0
     assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
@@ -142,8 +137,7 @@ def test_measured_with_the_world(
 def test_no_world(
     walled: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Catches a traceback where there is no world, and one that is asked for where nothing tells it
-    apart."""
+    """Catches a traceback without a world, and one where nothing tells it apart."""
     avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
     avatar.write_bytes((run / "avatar.npz").read_bytes())
     asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")

@@ -64,8 +64,7 @@ def assert_same_state(folder: Path, expected: Path) -> None:
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:
-    """A copy of every array as bytes per row, so that NaN and −0 compare by their bits; gradients
-    left out."""
+    """Every array as bytes per row, so that NaN and −0 compare; without gradients."""
     arrays = {
         name: array for name, array in arrays_of(state).items() if not name.startswith("gradients")
     }

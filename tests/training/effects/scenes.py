@@ -1,5 +1,4 @@
-"""Captures of a ball that deforms, painted triangle by triangle, of which it is known what colors
-depend on."""
+"""Captures of a ball that deforms, painted by known causes of its triangles' colors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

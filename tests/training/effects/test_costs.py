@@ -1,5 +1,4 @@
-"""Cost of effects: one that is off takes no memory and makes no calls; one that is on reaches the
-training."""
+"""An effect that is off takes no memory and no calls; one that is on reaches the training."""
 
 from collections import Counter
 from dataclasses import replace
@@ -59,8 +58,7 @@ def counting(calls, effect, function):
 
 
 def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
-    """Catches work and memory that an effect takes although it is off, and an effect that is on but
-    not called."""
+    """Catches work and memory of an effect that is off, and one that is on but not called."""
     calls, splats = train(painted(), tmp_path / "off", monkeypatch, "off")
     assert calls == {}
     assert splats.sh.shape[1] == 1
@@ -75,8 +73,7 @@ def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("choice", ["on", "off"])
 def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
-    """Catches parameters that are refined or written with the effect off, or not refined with it
-    on."""
+    """Catches parameters refined or written with the effect off, or not refined with it on."""
     capture, _ = write_head(tmp_path / "head")
     settings, _ = plan_effects(
         capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice})
@@ -140,8 +137,7 @@ def test_no_splats_on_teeth(painted):
 
 
 def test_antialiasing_reaches_training_and_evaluation(painted):
-    """Catches an effect that is decided and then forgotten: losses and pixels must be those of the
-    reference."""
+    """Catches an effect that is decided and then forgotten: against the reference in float64."""
     capture, losses, pictures = painted(), [], []
     view, image, _ = read_view(capture.views["train"][0], 0.4)
     target = torch.from_numpy(image.transpose(2, 0, 1) / 255)

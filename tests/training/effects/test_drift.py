@@ -56,8 +56,7 @@ def test_drift_is_found(drifting):
 
 
 def test_images_in_no_order_do_not_drift(tmp_path_factory):
-    """Catches gains that are interpolated between images that have nothing to do with each
-    other."""
+    """Catches gains interpolated between images that have nothing to do with each other."""
     shuffled = np.random.default_rng(1).permutation(DRIFT)
     for drift in (shuffled, None):
         decision = planned(recorded(tmp_path_factory.mktemp("no_drift"), drift))[1]
@@ -65,8 +64,7 @@ def test_images_in_no_order_do_not_drift(tmp_path_factory):
 
 
 def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path):
-    """Catches drift that is averaged into the avatar, or not given to renderings of other
-    timesteps."""
+    """Catches drift averaged into the avatar, or not given to renderings of other timesteps."""
     psnr = {}
     for choice in ("on", "off"):
         settings, _ = planned(drifting, iterations=200, exposure=choice)

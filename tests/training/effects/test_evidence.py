@@ -43,8 +43,7 @@ def test_features_beyond_the_fitted_range_are_clipped() -> None:
 
 
 def test_the_range_is_counted_from_rest() -> None:
-    """Catches a margin counted from 0: a constant added to all strain, at rest too, changes nothing
-    that colors say."""
+    """Catches a margin counted from 0: a constant added to all strain changes nothing."""
     rng = np.random.default_rng(2)
     rest, features = np.zeros((TRIANGLES, 3)), rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
@@ -56,8 +55,7 @@ def test_the_range_is_counted_from_rest() -> None:
 
 
 def slowly(rng, timesteps, *shape):
-    """(timesteps, *shape) noise of standard deviation 1 that is like itself for three timesteps or
-    so."""
+    """(timesteps, *shape) noise of deviation 1, like itself for some three timesteps."""
     weights = np.hanning(8)[1:-1]
     noise = rng.normal(size=(timesteps + len(weights) - 1, *shape))
     windows = np.lib.stride_tricks.sliding_window_view(noise, len(weights), 0)
@@ -90,8 +88,7 @@ def test_slow_expressions_that_colors_follow():
 
 @pytest.mark.parametrize(("timesteps", "folds"), [(1, 0), (2, 0), (3, 2), (5, 4), (12, 4)])
 def test_each_timestep_is_held_out_once(timesteps, folds):
-    """Catches timesteps beside the fold that the model is fitted to, and folds without anything to
-    fit."""
+    """Catches a model fitted to timesteps beside the fold, and folds without any to fit."""
     timestep = np.repeat(7 * np.arange(timesteps), 2)
     found = consecutive_folds(timestep)
     assert len(found) == folds

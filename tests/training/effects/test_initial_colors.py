@@ -16,8 +16,7 @@ from .scenes import own_colors
 
 
 def test_splats_start_with_the_colors_of_the_images(painted):
-    """Catches colors of other triangles, mirrored images, channels in another order, and colors
-    mixed with white."""
+    """Catches colors of other triangles, mirrored images, mixed channels, and white mixed in."""
     capture = painted()
     splats = initial_splats(capture, make_settings(iterations=1, lattice=1, hull_points=False))
     found = 255 * (0.5 + SH_C0 * splats.sh[:, 0])
@@ -44,8 +43,7 @@ def test_what_no_view_shows_has_the_nearest_color(painted):
 
 
 def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted):
-    """Catches a head whose other side has the color of the outline, where the camera sees it
-    worst."""
+    """Catches a far side of the outline's color, where the camera sees it worst."""
     capture = painted()
     views = [view for view in capture.views["train"] if view.camera_index == 0]
     center = capture.neutral[capture.faces].mean(1)
@@ -86,8 +84,7 @@ PLATES = {
 
 
 def test_teeth_behind_closed_lips_have_their_own_color(tmp_path):
-    """Catches teeth that start with the color of the lips, and stay so where no image shows
-    them."""
+    """Catches teeth that start, and where no image shows them stay, in the color of the lips."""
     capture = _mouth(tmp_path)
     lip, tooth, molar = (
         colors.mean(0) for colors in np.split(triangle_colors(capture, capture.views["train"]), 3)

@@ -1,5 +1,4 @@
-"""The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy that the
-product does not know."""
+"""The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -152,8 +151,7 @@ def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) ->
 
 
 def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
-    """Catches an offset in other axes or units than those of the triangle: against float64, by
-    hand."""
+    """Catches an offset in other axes or units than the triangle's: against float64."""
     avatar, posed = made()
     [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
     frames = face_frames(posed, avatar.faces, avatar.neutral)
@@ -166,8 +164,7 @@ def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
 
 
 def test_blender_keeps_it() -> None:
-    """Catches a parameter that is lost in a .blend file, which is what the viewport and renders
-    pose."""
+    """Catches a parameter lost in a .blend file, which viewport and renders pose."""
     bpy = pytest.importorskip("bpy")
     from stga_addon.scene.arrays import triangle_mesh
     from stga_addon.scene.display.splat_object import show_avatar, stored_avatar

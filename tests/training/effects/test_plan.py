@@ -33,8 +33,7 @@ def trained(root, tmp_path_factory):
 
 
 def test_the_run_keeps_its_plan(trained):
-    """Catches decisions or their reasons that are lost in run.json, and settings that do not follow
-    them."""
+    """Catches decisions or reasons lost in run.json, and settings that do not follow them."""
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.effect_plan}
     for effect, switch, choice in (
@@ -50,8 +49,7 @@ def test_the_run_keeps_its_plan(trained):
 @pytest.mark.parametrize("effect", ["strain-color", "strain-position"])
 @pytest.mark.parametrize(("choice", "expected"), [("auto", True), ("off", False)])
 def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
-    """Catches an extended run that cannot hold its takes' expressions, and a user's choice that is
-    overruled."""
+    """Catches an extension that cannot hold its takes' expressions, or overrules a choice."""
     capture = open_capture(root)
     settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
     settings, plan = plan_effects(capture, settings)
@@ -82,8 +80,7 @@ def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
 
 
 def test_info_shows_the_plan(tmp_path, capsys):
-    """Catches an overview without the plan or the figures behind it, or with choices that it does
-    not heed."""
+    """Catches an overview without plan or figures, or that does not heed choices."""
     root = factory.write_mesh_capture(tmp_path / "ball", (0, 1, 2, 3, 4, 5), range(3))
     assert stga("info", root, "--effect strain-color=on") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -136,8 +136,7 @@ def test_what_is_gained_outweighs_what_is_lost(rule, frames, cameras, gained, on
 
 @pytest.mark.parametrize("rule", STRAIN_RULES)
 def test_few_frames_tell_nothing_of_unseen_ones(rule):
-    """Catches a figure of 0 levels given as the reason, where no timestep could be left out with
-    its neighbors."""
+    """Catches a figure of 0 levels as the reason where nothing could be left out."""
     verdict = rule(SimpleNamespace(strain=0.1, timesteps=3))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert verdict.reason.startswith("3 frames are too few to tell how")
@@ -156,8 +155,7 @@ def test_color_that_follows_the_view(painted):
 
 
 def test_cameras_of_different_exposure(painted):
-    """Catches gains and offsets that are not found, mixed up between cameras, or wrong by more than
-    two levels."""
+    """Catches gains and offsets not found, mixed up, or wrong by more than two levels."""
     gain, offset = unlike_cameras()
     plan, settings = planned(painted(gain=gain, offset=offset))
     assert on(plan) == {*USUAL, "exposure"}
@@ -170,8 +168,7 @@ def test_cameras_of_different_exposure(painted):
 
 
 def test_background(painted):
-    """Catches a background that is guessed without masks, and a wrong color that splats are trained
-    against."""
+    """Catches a background guessed without masks, and a wrong color that is trained against."""
     plan, settings = planned(painted(background=(0, 0, 0), **FEW_VIEWS))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
@@ -210,8 +207,7 @@ def test_a_room_behind_the_head(painted):
 
 
 def test_a_room_without_masks(painted):
-    """Catches a run that makes splats of the wall behind the head, or that does not say what it
-    leaves out."""
+    """Catches splats of the wall behind the head, and what is left out unsaid."""
     capture = painted(masks=False, background=(90, 110, 70), **FEW_VIEWS)
     plan, settings = planned(capture)
     assert (settings.backdrop, settings.hull_points) == ("mesh", False)
@@ -221,8 +217,7 @@ def test_a_room_without_masks(painted):
 
 
 def test_something_beside_the_mesh_of_one_camera(painted):
-    """Catches hair that a single camera shows and nothing is trained for, and depth that is
-    promised from it."""
+    """Catches hair of a single camera that is not trained, or is promised a depth."""
     capture = painted(cameras=1)
     # the ball's top is cut off
     low = capture.faces[(capture.neutral[capture.faces][:, :, 1] < 0.06).all(1)]
@@ -300,8 +295,7 @@ def test_joints_that_move(name, pose):
 
 
 def test_dynamic_offsets():
-    """Catches offsets that are switched off although the tracked mesh is made with them, and the
-    other way round."""
+    """Catches offsets off although the tracked mesh is made with them, and the other way round."""
     assert rules.dynamic_offsets(with_frames(frame())).on is False
     moved = frame(dynamic_offset=np.ones((10, 3)))
     found = rules.dynamic_offsets(with_frames(frame(), moved))
@@ -320,8 +314,7 @@ def off_track(capture, meters, device="cpu"):
 
 
 def test_mesh_and_mask_disagree(painted):
-    """Catches a tracking that is off and left so, and one that is refined although nothing says
-    that it is off."""
+    """Catches a tracking that is off and left so, and one refined for no reason."""
     assert not rules.tracking(off_track(painted(), 0.0)).on
     found = rules.tracking(off_track(painted(), 0.012))  # five pixels
     assert found.on
@@ -338,8 +331,7 @@ def test_mesh_and_mask_disagree(painted):
 
 
 def test_a_capture_that_was_tracked_here(painted, tmp_path):
-    """Catches the effect left off where masks are filled and the tracking is known to be that of
-    landmarks."""
+    """Catches the effect left off where the tracking is known to be that of landmarks."""
     facts = off_track(painted(), 0.0)
     facts.capture = replace(facts.capture, root=tmp_path)
     assert not rules.tracking(facts).on
@@ -363,8 +355,7 @@ def test_overrides(painted):
 
 
 def test_torso(tmp_path):
-    """Catches shoulders that are taken off the head without evidence, and evidence that is not
-    shown."""
+    """Catches shoulders taken off the head without evidence, and evidence not shown."""
 
     def judged(torso):
         write_json(tmp_path / REPORT_FILE, torso)
@@ -414,8 +405,7 @@ def test_samples(painted):
 
 
 def test_hidden_triangles(painted):
-    """Catches colors of whatever stands in front, a hand or the nose, that are taken for the
-    triangle's own."""
+    """Catches colors of what stands in front, a hand or the nose, taken for the triangle's."""
     capture = painted()
     # above the ball's equator
     plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])
@@ -459,8 +449,7 @@ def test_every_camera_is_sampled(painted):
 
 
 def test_each_timestep_is_posed_once(painted, monkeypatch):
-    """Catches a long capture of which every timestep is posed, or one several times, to decide its
-    effects."""
+    """Catches a long capture whose timesteps are all posed, or one several times."""
     monkeypatch.setattr(
         "stga_addon.training.effects.facts.lip_pairs", lambda model: np.arange(30).reshape(2, 15)
     )
@@ -487,8 +476,7 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
 
 
 def test_lips_that_part(painted, shared_data):
-    """Catches lips that are not those of FLAME's mesh, and a head that turns taken for lips that
-    part."""
+    """Catches other vertices than FLAME's lips, and a turn taken for lips that part."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, faces = data["v_template"].astype(float), data["faces"]
     closed = np.concatenate([template, np.zeros((TEETH_VERTICES, 3))])
@@ -514,8 +502,7 @@ def test_lips_that_part(painted, shared_data):
 
 
 def test_a_sample_without_motion_does_not_forbid_selection(painted):
-    """Catches a choice that is refused because the few timesteps that were posed happen not to
-    move."""
+    """Catches a choice refused because the few timesteps posed happen not to move."""
     capture = painted()
     still = replace(
         capture,
