@@ -54,8 +54,8 @@ from stga_addon.raster.cpu.tiles import (
     sum_tiles,
 )
 from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
 from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.losses import image_gradient, whole_image
 from stga_addon.training.optimize.state import Batch, new_state
 from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.settings import make_settings

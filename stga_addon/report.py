@@ -13,17 +13,8 @@ import numpy as np
 from .errors import StgaError
 from .files import replacing
 from .format import format_duration
-from .training.evaluate.forecast import (
-    DETAIL,
-    UNMATCHED,
-    checked_forecasts,
-    curve_of,
-    detail_curve,
-    explain_missed_target,
-    flat_since,
-    is_exposure_fitted,
-    saved_line,
-)  # fmt: skip
+from .training.evaluate import forecast as forecasts
+from .training.evaluate.forecast import DETAIL, UNMATCHED, curve_of, detail_curve
 from .training.run.folder import read_run
 from .training.run.metrics_log import METRICS, read_metrics
 
@@ -72,9 +63,8 @@ def report_run(folder: Path) -> list[str]:
     """Write the curve of a finished run and return the lines of its summary."""
     write_curve(folder)
     run, metrics = read_run(folder), read_metrics(folder)
-    continued = run.continuation is not None
     lines = summarize_run(metrics, run.settings.target_psnr)
-    if continued:
+    if run.continuation is not None:
         lines = summarize_continuation(metrics)
     if (folder / CURVE).exists():
         return lines
@@ -91,10 +81,10 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     lines, curve, last = [], curve_of(metrics), metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
-        best = saved_line(evaluations, target)
-        fitted = (
-            f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)" if UNMATCHED in best else ""
-        )
+        best = forecasts.saved_line(evaluations, target)
+        fitted = ""
+        if UNMATCHED in best:
+            fitted = f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)"
         parts = [f"{best['psnr']:.2f} dB{fitted}", f"SSIM {best['ssim']:.4f}"]
         named = (("psnr_mask", "in the head mask"), ("psnr_moving", "in the moving region"))
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
@@ -102,16 +92,15 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         when = format_duration(best["seconds"])
         lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
     if target is not None and curve:
-        reached = any(psnr >= target for _, psnr in curve)
-        text = f"{target:g} dB was reached" if reached else explain_missed_target(curve, target)
-        lines.append(f"{text} (exposure fitted)" if is_exposure_fitted(metrics) else text)
-    plateau = flat_since(metrics)
+        text = f"{target:g} dB was reached"
+        if all(psnr < target for _, psnr in curve):
+            text = forecasts.explain_missed_target(curve, target)
+        lines.append(f"{text} (exposure fitted)" if forecasts.is_exposure_fitted(metrics) else text)
+    plateau = forecasts.flat_since(metrics)
     if plateau is not None:
-        since = format_duration(plateau)
-        lines.append(
-            f"nothing was gained after {since}: more time does not help with these settings"
-        )
-    held, checked = checked_forecasts(metrics)
+        helps = "more time does not help with these settings"
+        lines.append(f"nothing was gained after {format_duration(plateau)}: {helps}")
+    held, checked = forecasts.checked_forecasts(metrics)
     if checked:
         lines.append(f"forecasts: {held} of {checked} held within their error")
     memory = f", peak memory {last['peak_memory_mb']:,.0f} MB" if last.get("peak_memory_mb") else ""
@@ -152,7 +141,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
     """PSNR of a run in image, head mask and moving region, its latest forecast, and the detail
     difference, the best at the top."""
-    fitted = " (exposure fitted)" if is_exposure_fitted(metrics) else ""
+    fitted = " (exposure fitted)" if forecasts.is_exposure_fitted(metrics) else ""
     figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
     keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}
     for name, key in {**keys, "whole image, exposure not fitted": UNMATCHED}.items():
@@ -254,26 +243,18 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
         error = np.array([0.0, forecast["error"]])
         plot.band(x, y - error, y + error, FORECAST_COLOR)
         plot.line(x, y, FORECAST_COLOR)
-    detail_range = _draw_detail(plot, lines, (low, high))
+    when, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
+    detail_range = ""
+    if len(detail) > 1:
+        lowest = min(float(np.interp(when[-1] / 10, when, detail)), float(detail[-1]))
+        share = (detail - lowest) / max(float(detail.max()) - lowest, 1e-9)
+        plot.line(when, low + share * (high - low), DETAIL_COLOR)
+        worst, best = 10 ** (-lowest / 20), min(value for _, value in curve_of(lines, DETAIL))
+        detail_range = f"Detail difference {worst:.3f} to {best:.3f} (green)"
     plot.line(seconds, psnr, CURVE_COLOR)
     unmatched = lines[-1].get(UNMATCHED)
     fitted = "" if unmatched is None else f" (exposure fitted; {unmatched:.1f} without)"
     return plot.pixels, f"{low:g} to {high:g} dB{fitted}, 0 to {format_duration(end)}", detail_range
-
-
-def _draw_detail(
-    plot: "_Plot", lines: Sequence[Mapping[str, Any]], height: tuple[float, float]
-) -> str:
-    """Draw the detail difference, scaled to the height in dB; returns its range as text."""
-    seconds, detail = np.array(detail_curve(lines), np.float64).reshape(-1, 2).T
-    if len(detail) < 2:
-        return ""
-    lowest, highest = float(np.interp(seconds[-1] / 10, seconds, detail)), float(detail.max())
-    lowest = min(lowest, float(detail[-1]))
-    share = (detail - lowest) / max(highest - lowest, 1e-9)
-    plot.line(seconds, height[0] + share * (height[1] - height[0]), DETAIL_COLOR)
-    worst, best = 10 ** (-lowest / 20), min(value for _, value in curve_of(lines, DETAIL))
-    return f"Detail difference {worst:.3f} to {best:.3f} (green)"
 
 
 class _Plot:

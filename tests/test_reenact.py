@@ -74,11 +74,7 @@ def test_mistakes(parts, tmp_path, capsys):
     assert render(parts | {"motion": meshes}, tmp_path / "out", "--flame", parts["model"]) == 2
     assert "was not tracked with FLAME" in capsys.readouterr().err
     (tmp_path / "scan.ply").write_bytes(b"ply\n")
-    assert (
-        render(
-            parts | {"avatar": tmp_path / "scan.ply"}, tmp_path / "out", "--flame", parts["model"]
-        )
-        == 2
-    )
+    scan = parts | {"avatar": tmp_path / "scan.ply"}
+    assert render(scan, tmp_path / "out", "--flame", parts["model"]) == 2
     assert "scan.ply: is a PLY" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -11,7 +11,7 @@ from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import scale_limit
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.losses import image_gradient, tile_rectangles, whole_image
+from stga_addon.training.optimize.cpu_backend import image_gradient, tile_rectangles, whole_image
 from stga_addon.training.optimize.state import new_state
 
 from .scenes import NAMES, facing, random_cotangents

@@ -7,22 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import stga
 from PIL import Image
 
 from stga_addon import report
 from stga_addon.capture.model import Capture
-from stga_addon.cli.main import main
 from stga_addon.development.benchmark.benchmark import benchmark_chart
 from stga_addon.development.benchmark.statistics import MeanCurve
 from stga_addon.format import describe_figures
-from stga_addon.report import (
-    CURVE,
-    CurveUpdater,
-    report_run,
-    run_chart,
-    summarize_continuation,
-    summarize_run,
-)
+from stga_addon.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run, read_run
@@ -43,23 +36,18 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
 def test_summary_of_a_run() -> None:
     """Catches the last evaluation given for the best one, and figures that were not measured."""
     lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
-    assert lines[0] == (
+    assert lines == [
         "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
-        "0.0323, after 20 s"
-        " (the saved avatar)"
-    )
-    assert (
-        lines[-1]
-        == "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB"
-    )
-    assert len(lines) == 2
+        "0.0323, after 20 s (the saved avatar)",
+        "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB",
+    ]
     assert summarize_run([], None) == []
 
 
 def test_summary_of_a_continuation() -> None:
     """Catches before and after exchanged, and a fitted PSNR that is not called so."""
     before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
-    lines = summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
+    lines = report.summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
     assert lines == [
         "splats: 9 before, 12 after",
         "held-out views (exposure fitted): 30.00 dB before, 32.00 dB after (+2.00)",
@@ -102,28 +90,22 @@ def test_targets_and_plateaus() -> None:
     assert summarize_run(late, 30.0)[0].startswith("held-out views: 31.00 dB")
 
 
-def test_report_of_a_finished_run(toy: Capture, tmp_path: Path) -> None:
-    """Catches metrics that a run writes and the summary cannot read, and a missing picture."""
-    train(
-        toy,
-        tmp_path,
-        Run(toy.root, None, "vhap", make_settings(iterations=12, hull_points=False, lattice=0)),
-    )
-    assert report_run(tmp_path)[0].startswith("held-out views: ")
-    assert (tmp_path / CURVE).stat().st_size > 1000
-
-
-def test_the_reason_for_no_curve(toy, tmp_path, monkeypatch):
-    """Catches a missing library blamed where there was nothing to draw, and the other way round."""
-    run = Run(toy.root, None, "vhap", make_settings(iterations=3, hull_points=False, lattice=0))
-    train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
-    assert (
-        report_run(tmp_path / "bare")[-1]
-        == f"{CURVE} was not drawn: no held-out views (split 'val') were evaluated"
-    )
+def test_report_of_a_finished_run(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches metrics that a run writes and the summary cannot read, a missing picture, and a
+    missing library blamed where there was nothing to draw, and the other way round."""
+    settings = make_settings(iterations=12, hull_points=False, lattice=0)
+    run, why = Run(toy.root, None, "vhap", settings), f"{CURVE} was not drawn: "
     train(toy, tmp_path / "run", run)
+    assert report_run(tmp_path / "run")[0].startswith("held-out views: ")
+    assert (tmp_path / "run" / CURVE).stat().st_size > 1000
+    train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
+    nothing = "no held-out views (split 'val') were evaluated"
+    assert report_run(tmp_path / "bare")[-1] == f"{why}{nothing}"
+    (tmp_path / "run" / CURVE).unlink()
     monkeypatch.setattr(report, "find_spec", lambda name: None)
-    assert report_run(tmp_path / "run")[-1] == f"{CURVE} was not drawn: matplotlib is not installed"
+    assert report_run(tmp_path / "run")[-1] == f"{why}matplotlib is not installed"
 
 
 def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +118,7 @@ def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(report, "perf_counter", lambda: now[0])
     monkeypatch.setattr(report, "write_curve", draw)
-    keep = CurveUpdater(tmp_path)
+    keep = report.CurveUpdater(tmp_path)
     for second in range(51):
         now[0] = float(second)
         if second in (0, 31, 46):
@@ -168,11 +150,8 @@ def test_run_chart_shows_regions_and_the_forecast() -> None:
 
 def test_a_run_of_any_length_is_rendered() -> None:
     """Catches a chart that fails before two evaluations or without masks, and an empty one."""
-    for lines in (
-        [],
-        evaluations(1),
-        [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}],
-    ):
+    bare = [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}]
+    for lines in ([], evaluations(1), bare):
         stream = BytesIO()
         run_chart(lines).savefig(stream, format="png")
         picture = Image.open(stream)
@@ -220,7 +199,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Catches presets that are not told, or without their time, or without what was timed."""
-    assert main(["presets", str(toy_root), "--device", "cpu"]) == 0
+    assert stga("presets", toy_root, "--device cpu") == 0
     device, *lines = capsys.readouterr().out.splitlines()
     assert device == "Training on the CPU (--device cpu)"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
@@ -230,33 +209,33 @@ def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_what_is_timed_is_what_will_train(toy_root, tmp_path, capsys, monkeypatch):
     """Catches a GPU that is given the minutes of the CPU."""
     timed: list[str] = []
-    monkeypatch.setattr(
-        preset_timing, "seconds_per_iteration", lambda *call: timed.append(call[3]) or 1e-3
-    )
+
+    def time(*call):
+        timed.append(call[3])
+        return 1e-3
+
+    monkeypatch.setattr(preset_timing, "seconds_per_iteration", time)
     for module in ("jobs.analyze", "render.device"):
-        monkeypatch.setattr(
-            f"stga_addon.{module}.choose_device", lambda wanted: ("gpu:Card", "why")
-        )
-    device = ["--device", "gpu"]
-    assert main(["presets", str(toy_root), *device]) == 0
-    assert main(["info", str(toy_root), "--json", "--presets", *device]) == 0
+        name = f"stga_addon.{module}.choose_device"
+        monkeypatch.setattr(name, lambda wanted: ("gpu:Card", "why"))
+    assert stga("presets", toy_root, "--device gpu") == 0
+    assert stga("info", toy_root, "--json --presets --device gpu") == 0
     assert timed == ["gpu:Card"] * 6
 
 
 def test_a_preset_brings_its_iterations(toy_root, tmp_path, capsys, monkeypatch):
     """Catches a preset that changes nothing, and one that cannot be overruled."""
-    train = ["train", str(toy_root), "--out"]
-    assert main([*train, str(tmp_path / "preset"), "--preset", "draft", "--target-psnr", "5"]) == 0
+    train = "train", toy_root, "--out"
+    assert stga(*train, tmp_path / "preset", "--preset draft --target-psnr 5") == 0
     out = capsys.readouterr().out
     assert "Preset draft: 500 iterations\n" in out
     assert "5 dB was reached" in out
     assert "held-out views: " in out
     settings = read_run(tmp_path / "preset").settings
-    assert (settings.preset, settings.iterations, settings.lattice, settings.target_psnr) == (
-        "draft", 500, 1, 5.0,
-    )  # fmt: skip
-    assert main([*train, str(tmp_path / "counted"), "--preset", "final", "--iterations", "3"]) == 0
+    assert (settings.preset, settings.iterations) == ("draft", 500)
+    assert (settings.lattice, settings.target_psnr) == (1, 5.0)
+    assert stga(*train, tmp_path / "counted", "--preset final --iterations 3") == 0
     settings = read_run(tmp_path / "counted").settings
     assert (settings.preset, settings.seconds, settings.iterations) == ("final", None, 3)
-    assert main([*train, str(tmp_path / "counted"), "--resume", "--preset", "draft"]) == 2
+    assert stga(*train, tmp_path / "counted", "--resume --preset draft") == 2
     assert "--preset: this run began with final" in capsys.readouterr().err

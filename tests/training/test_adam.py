@@ -78,12 +78,8 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity", "strain_color"):
             # 25 float32 steps of at most the rate each
-            np.testing.assert_allclose(
-                getattr(state.parameters, name)[n],
-                row[name].detach(),
-                rtol=1e-5,
-                atol=25 * RATES[name] * 1e-5,
-            )
+            found, wanted = getattr(state.parameters, name)[n], row[name].detach()
+            np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=25 * RATES[name] * 1e-5)
         color = torch.cat([row["sh"], row["sh_rest"]]).detach()
         np.testing.assert_allclose(
             state.parameters.sh[n], color, rtol=1e-5, atol=25 * RATES["sh"] * 1e-5
@@ -105,11 +101,8 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
         np.testing.assert_array_equal(after[f"{part}/sh"][2, rest], before[f"{part}/sh"][2, rest])
         for row in (0, 2, 3):
             assert (after[f"{part}/log_scale"][row] != before[f"{part}/log_scale"][row]).any()
-    assert all(
-        np.isfinite(array).all()
-        for p in (state.parameters, state.first, state.second)
-        for array in p
-    )
+    for array in (*state.parameters, *state.first, *state.second):
+        assert np.isfinite(array).all()
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.1])

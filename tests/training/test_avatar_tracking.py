@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from command_line import stga
 from PIL import Image
 
 from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
@@ -99,7 +100,6 @@ def test_a_finished_avatar_finds_the_head(
     assert (before[:-1] > 2).all()
     assert np.median(after[:-1] / before[:-1]) < 0.3
     assert after[-1] < 0.8  # a third of a pixel
-    assert (found.after <= found.before).all()
     assert stages == [(done, len(TIMESTEPS)) for done in range(len(TIMESTEPS))]
     with pytest.raises(Cancelled):
         track_by_avatar(*person, capture, report=lambda done, total: done == 2)
@@ -112,7 +112,7 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
     tracking = RefinedTracking(lost[0], "stga")
     some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
     tracking.take(
-        AvatarTracking((0, 5), some, *np.zeros((3, 2)), np.zeros((2, 3)), np.ones(0), np.eye(1)),
+        AvatarTracking((0, 5), some, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1)),
         TIMESTEPS[:-1],
     )
     np.testing.assert_allclose(
@@ -132,7 +132,7 @@ def test_time_says_what_images_do_not(right: Made) -> None:
     shift = noise.normal(0, 0.003, (count, 3))
     none = np.zeros(count)
     each = np.tile(np.diag(known), (count, 1, 1))
-    found = AvatarTracking(tuple(range(count)), values, none, none, none, shift, none, each)
+    found = AvatarTracking(tuple(range(count)), values, none, shift, none, each)
     smooth = found.smoothed(model)
     assert smooth.parameters[:, -1].std() < 0.6 * values[:, -1].std()
     np.testing.assert_allclose(smooth.parameters[:, 1:-1], values[:, 1:-1], atol=1e-5)
@@ -212,13 +212,9 @@ def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make_run(capture: Capture, **changes: Any) -> Run:
-    ours = {
-        "iterations": 40,
-        "lattice": 1,
-        "tracking": True,
-        "driven_offsets": ("strain_position",),
-    }
-    settings = quick_settings("global", **{**ours, **changes})
+    ours = {"iterations": 40, "lattice": 1, "tracking": True}
+    changes = {**ours, "driven_offsets": ("strain_position",), **changes}
+    settings = quick_settings("global", **changes)
     return Run(capture.root, capture.root / "model.npz", "vhap", settings)
 
 
@@ -406,16 +402,7 @@ def test_where_it_cannot_work(
         Trainer(lost[0], quick_settings("global", tracking=True), {}, device="gpu")
     monkeypatch.setattr("stga_addon.jobs.train.choose_device", lambda wanted: ("gpu:Card", "why"))
     root = lost[0].root
-    train_on = [
-        "train",
-        str(root),
-        "--flame",
-        str(root / "model.npz"),
-        "--device",
-        "gpu",
-        "--iterations",
-        "2",
-    ]
-    assert main([*train_on, "--out", str(tmp_path / "run"), "--effect", "tracking=on"]) == 2
+    gpu = "--device gpu --iterations 2 --effect tracking=on --out"
+    assert stga("train", root, "--flame", root / "model.npz", gpu, tmp_path / "run") == 2
     assert "FLAME's parameters are refined on the CPU only" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

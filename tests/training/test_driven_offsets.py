@@ -130,25 +130,17 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     np.testing.assert_allclose(drawn, expected, atol=2e-5)
-    still = render_avatar(
-        replace(avatar, driven_offsets={}),
-        capture.mesh(view.timestep),
-        view.camera,
-        (1.0, 1.0, 1.0),
-    )
+    plain = replace(avatar, driven_offsets={})
+    still = render_avatar(plain, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     assert np.abs(still - drawn).max() > 0.005
 
 
 def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
     """Catches triangles that are not selected, whose splats would move in all frames."""
     capture = squeezed(toy)
-    settings = quick_settings(
-        "selective",
-        lattice=1,
-        driven_offsets=("strain_position",),
-        warm_up_share=0.0,
-        global_interval=1000,
-    )
+    local = {"warm_up_share": 0.0, "global_interval": 1000}
+    offsets = ("strain_position",)
+    settings = quick_settings("selective", lattice=1, driven_offsets=offsets, **local)
     selected = np.zeros(len(capture.faces), bool)
     selected[:200] = True
     trainer = Trainer(capture, settings, dict.fromkeys(capture.timesteps, selected))

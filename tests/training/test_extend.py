@@ -188,12 +188,8 @@ def test_what_follows_strain_can_begin_with_a_further_take(
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
     train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
     prepared = prepare_extension(tmp_path / "run", (takes[1],), iterations=6)
-    run = replace(
-        prepared.run,
-        settings=replace(
-            prepared.run.settings, strain_color=True, driven_offsets=("strain_position",)
-        ),
-    )
+    follows = {"strain_color": True, "driven_offsets": ("strain_position",)}
+    run = replace(prepared.run, settings=replace(prepared.run.settings, **follows))
     train(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
     assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
@@ -254,13 +250,9 @@ def test_takes_that_do_not_fit(
         return replace(capture, views={}) if change == "images" else capture
 
     monkeypatch.setattr("stga_addon.jobs.train.open_capture", changed)
-    sentences = {
-        "shape": "must be of the same head",
-        "images": "has no training views",
-        "folder": "is not a folder",
-    }
+    sentences = {"shape": "must be of the same head", "images": "has no training views"}
     take = tmp_path / "missing" if change == "folder" else takes[1]
-    with pytest.raises(StgaError, match=sentences[change]):
+    with pytest.raises(StgaError, match=sentences.get(change, "is not a folder")):
         prepare_extension(parent, (take,), iterations=1)
     assert read_run(parent).takes == ()
 
@@ -322,14 +314,12 @@ def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
 def test_takes_from_another_distance_fit(takes: tuple[Path, Path]) -> None:
     """Catches a refusal of cameras that stand three times as far away, or zoom."""
     first = open_capture(takes[0])
-    views = [
-        replace(
-            view, camera=replace(view.camera, fl_x=view.camera.fl_x / 3, fl_y=view.camera.fl_y / 3)
-        )
-        for view in first.views["train"]
-    ]
-    require_same_scale(first, replace(first, views={"train": tuple(views)}))
-    require_same_scale(replace(first, views={"train": tuple(views)}), first)
+    cameras = [view.camera for view in first.views["train"]]
+    wide = [replace(lens, fl_x=lens.fl_x / 3, fl_y=lens.fl_y / 3) for lens in cameras]
+    views = map(lambda view, lens: replace(view, camera=lens), first.views["train"], wide)
+    zoomed = replace(first, views={"train": tuple(views)})
+    require_same_scale(first, zoomed)
+    require_same_scale(zoomed, first)
 
 
 def test_a_take_given_twice(takes: tuple[Path, Path], parent: Path) -> None:

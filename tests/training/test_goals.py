@@ -83,21 +83,11 @@ def test_evaluation_keeps_to_its_share_of_the_time(
 def test_forecasts_are_noted_and_told(toy: Capture, tmp_path: Path, clock: Clock) -> None:
     """Catches forecasts that cannot be checked afterwards, or that nobody sees."""
     told: list[Progress] = []
-    train(
-        toy,
-        tmp_path,
-        run_of(toy, iterations=200),
-        report=lambda progress: bool(told.append(progress)),
-    )
+    run = run_of(toy, iterations=200)
+    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress)))
     lines = read_metrics(tmp_path)
-    assert [line["iteration"] for line in lines if "forecast" in line] == [
-        80,
-        100,
-        120,
-        140,
-        160,
-        180,
-    ]
+    foretold = [line["iteration"] for line in lines if "forecast" in line]
+    assert foretold == [80, 100, 120, 140, 160, 180]
     hit, checked = checked_forecasts(lines)
     assert 0 < hit <= checked == 6
     assert any("another" in progress.detail for progress in told)
@@ -121,12 +111,8 @@ def test_the_avatar_that_reached_the_target_is_kept(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches "30 dB was reached" beside a file of less, as an earlier one was sharper."""
-    found = iter(
-        [
-            Quality(25.0, 0.5, detail_difference=0.1),
-            *[Quality(30.5, 0.5, detail_difference=0.2)] * 2,
-        ]
-    )
+    blurred = Quality(30.5, 0.5, detail_difference=0.2)
+    found = iter([Quality(25.0, 0.5, detail_difference=0.1), blurred, blurred])
     monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
     run = run_of(toy, target_psnr=30.0)
     path = train(toy, tmp_path, run)

@@ -12,6 +12,7 @@ from raster import gpu_device
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture
 from stga_addon.errors import DeviceError, StgaError
+from stga_addon.progress import Progress
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
 from stga_addon.training.optimize.cpu_backend import CpuBackend
@@ -43,13 +44,8 @@ pytestmark = pytest.mark.needs("adapter")
 
 def settings_of(**changes: Any) -> TrainingSettings:
     """Every term of the loss at work on most splats."""
-    limits = {
-        "scale_limit": 0.2,
-        "distance_weight": 0.1,
-        "distance_limit": 0.3,
-        "unseen_opacity_weight": 0.5,
-        "lattice": 2,
-    }
+    limits = {"scale_limit": 0.2, "distance_weight": 0.1, "distance_limit": 0.3}
+    limits |= {"unseen_opacity_weight": 0.5, "lattice": 2}
     effects = {"strain_color": True, "antialiased": True, "driven_offsets": ("strain_position",)}
     return quick_settings("selective", **{**limits, **effects, **changes})
 
@@ -243,14 +239,11 @@ def test_a_lost_gpu_is_followed_by_the_cpu(
     assert read_checkpoint(tmp_path).iteration == 5
     done.clear()
     stages: list[str] = []
-    train(
-        toy,
-        tmp_path,
-        run,
-        resume=True,
-        report=lambda progress: bool(stages.append(progress.stage)),
-        falls_back=True,
-    )
+
+    def note(progress: Progress) -> bool:
+        return bool(stages.append(progress.stage))
+
+    train(toy, tmp_path, run, resume=True, report=note, falls_back=True)
     assert len(done) == 3
     assert "Continuing on the CPU" in stages
     assert "Card 9000 was lost; continuing on the CPU from the last checkpoint" in caplog.messages

@@ -14,8 +14,8 @@ from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.flame.forward import neutral_frame
-from stga_addon.flame.model import torso_faces
+from stga_addon.flame.forward import FlameFrame, neutral_frame
+from stga_addon.flame.model import FlameModel, torso_faces
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
 from stga_addon.tracking.folder import TorsoPoints, write_torso_points
 from stga_addon.training.optimize.initial_splats import (
@@ -184,19 +184,22 @@ def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> Non
     assert len(hull_points(beside, views, "stga", 0)) == 0
 
 
+def turned(model: FlameModel) -> FlameFrame:
+    """The torso turned under a head that stays."""
+    turn = np.array([0.0, 0.4, 0.0])
+    return replace(neutral_frame(model), rotation=turn, neck_pose=-turn)
+
+
+def posed_head(model: FlameModel, frame: FlameFrame) -> FlameSequence:
+    return FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda _: frame)
+
+
 @pytest.mark.parametrize("one", [False, True])
 def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -> None:
     """Catches a collar that turns with the chin it lies under, and hair beside the neck that does
     not."""
     model = small_head(0)
-    frame = replace(
-        neutral_frame(model),
-        rotation=np.array([0.0, 0.4, 0.0]),
-        neck_pose=np.array([0.0, -0.4, 0.0]),
-    )
-    head = FlameSequence(
-        model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame
-    )
+    head = posed_head(model, turned(model))
     mesh = sequence_mesh(head, TIMESTEP)
     for centre, carried in (([0.0, -0.175, 0.115], True), ([0.0, -0.135, 0.115], False)):
         views = scene(tmp_path, np.array(centre), 0.015).views
@@ -205,12 +208,8 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
             tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
             lambda timestep: mesh, lambda timestep, pose: mesh, head,
         )  # fmt: skip
-        before, after = (
-            flat_points(capture, side, "stga", 0, torso)
-            if one
-            else hull_points(capture, views["train"], "stga", 0, torso)
-            for torso in (False, True)
-        )
+        place, shown = (flat_points, side) if one else (hull_points, views["train"])
+        before, after = (place(capture, shown, "stga", 0, torso) for torso in (False, True))
         assert len(before) == len(after) > 20
         assert not torso_faces(model)[before.face].all()
         assert (
@@ -224,12 +223,7 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> No
     """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it
     turns, and a hull of many cameras that is thrown away."""
     model = small_head(0)
-    turned = replace(
-        neutral_frame(model),
-        rotation=np.array([0.0, 0.4, 0.0]),
-        neck_pose=np.array([0.0, -0.4, 0.0]),
-    )
-    frames = {TIMESTEP: turned, TIMESTEP + 1: neutral_frame(model)}
+    frames = {TIMESTEP: turned(model), TIMESTEP + 1: neutral_frame(model)}
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
     capture = Capture(
@@ -294,10 +288,7 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
 ) -> None:
     """Catches a chest that ends in the air, and hair that is continued like one."""
     model = small_head(0)
-    frame = neutral_frame(model)
-    head = FlameSequence(
-        model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda timestep: frame
-    )
+    head = posed_head(model, neutral_frame(model))
     number = min(range(20), key=lambda n: abs(float(cameras()[n].position[1])))
     ball = right * cameras()[number].world_to_camera[0, :3] + [0.0, up, 0.0]
     mesh, views = sequence_mesh(head, TIMESTEP), scene(tmp_path, ball, 0.08).views
@@ -316,11 +307,8 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
     if continued:
         assert (pixels[beyond, 1] > SIZE).any()
         assert pixels[beyond, 1].max() < 1.4 * SIZE
-        np.testing.assert_allclose(
-            whole.sh[beyond, 0] * SH_C0 + 0.5,
-            np.tile([90, 250, 40], (beyond.sum(), 1)) / 255,
-            atol=1e-6,
-        )
+        color = np.tile([90, 250, 40], (beyond.sum(), 1)) / 255
+        np.testing.assert_allclose(whole.sh[beyond, 0] * SH_C0 + 0.5, color, atol=1e-6)
         assert (whole.opacity[beyond] > 2).all()
 
 

@@ -160,13 +160,13 @@ def test_runs_of_earlier_format_versions_are_resumed(
     with monkeypatch.context() as before:
         before.setattr(open_run_module, "identity_of", recorded)
         train(toy, out, make_run(toy, **OLD), report=stop_at(ITERATIONS // 2))
-    factory.edit(
-        out / "run.json",
-        lambda document: (
-            document.update(version=version),
-            [document["settings"].pop(name) for name in lacks],
-        ),
-    )
+
+    def as_then(document: dict[str, Any]) -> None:
+        document["version"] = version
+        for name in lacks:
+            del document["settings"][name]
+
+    factory.edit(out / "run.json", as_then)
     opened = open_run(out)
     assert OLD.items() <= vars(opened.run.settings).items()
     train(opened.capture, out, opened.run, resume=True)

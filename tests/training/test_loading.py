@@ -13,7 +13,7 @@ from stga_addon.avatar.embedding import face_frames
 from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import Capture, evenly_spread
 from stga_addon.capture.open import open_capture
-from stga_addon.training.evaluate.residuals import Residuals
+from stga_addon.training.evaluate.metrics import Residuals
 from stga_addon.training.optimize.frames import CACHED_TIMESTEPS, FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session

@@ -18,7 +18,9 @@ from stga_addon.capture.model import Capture, View
 from stga_addon.render.render import render_avatar
 from stga_addon.training.evaluate.metrics import (
     MAX_EVALUATION_VIEWS,
+    MIN_WEIGHT_PX,
     EvaluationView,
+    Residuals,
     choose_evaluation_views,
     detail_difference,
     evaluate,
@@ -28,9 +30,9 @@ from stga_addon.training.evaluate.metrics import (
     peak_memory_mb,
     psnr,
     read_evaluation_view,
+    triangle_residuals,
     visible_pixels,
 )
-from stga_addon.training.evaluate.residuals import MIN_WEIGHT_PX, Residuals, triangle_residuals
 from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
@@ -236,12 +238,8 @@ def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path: Path) -> None:
     camera = Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4))
     views = [View(0, number, camera, "0.png", tmp_path / "0.png") for number in range(3)]
     known = known_exposure([[0, *gain, *offset]], views[:2])
-    trained, plain, other = (
-        evaluate(
-            lambda view: image, [EvaluationView(view, target, {"mask": head}, head)], exposure=known
-        )
-        for view in views
-    )
+    shown = [[EvaluationView(view, target, {"mask": head}, head)] for view in views]
+    trained, plain, other = (evaluate(lambda _: image, each, exposure=known) for each in shown)
     assert trained.psnr > 45
     assert trained.psnr_unmatched is None
     assert plain.psnr == pytest.approx(

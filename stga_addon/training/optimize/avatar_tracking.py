@@ -13,6 +13,8 @@ from functools import lru_cache
 from time import perf_counter
 
 import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
 
 from ...avatar.file import Avatar
 from ...capture.camera import Camera
@@ -70,16 +72,13 @@ MISS_LEVELS = 24
 
 @dataclass(frozen=True)
 class AvatarTracking:
-    """Parameters (T, E + 18) of timesteps; what was minimized, (T,), where they started and where
-    they are: the loss of their images, in the points' units, and the prior; and (T,) the share of
-    the head's pixels whose colors the avatar misses by more than MISS_LEVELS; (T, 3) by how much
-    the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and (T, P,
-    P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose."""
+    """Parameters (T, E + 18) of timesteps; (T,) the share of the head's pixels whose colors the
+    avatar misses by more than MISS_LEVELS; (T, 3) by how much the torso is shifted, of
+    `torso_shapes`; (T,) the head's scale, where it was sought; and (T, P, P) inverse covariances of
+    what was sought: expressions, the torso's shift, scale, pose."""
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
     misfit: np.ndarray
     shift: np.ndarray
     scale: np.ndarray
@@ -108,18 +107,14 @@ class RefinedTracking:
     def __init__(self, capture: Capture, convention: str) -> None:
         """Raises StgaError for a capture without parameters or a convention without gradients."""
         if convention != "stga":
-            raise StgaError(
-                f"--effect tracking=on: needs the embedding convention 'stga', got '{convention}'"
-            )
+            needs = f"needs the embedding convention 'stga', got '{convention}'"
+            raise StgaError(f"--effect tracking=on: {needs}")
         if capture.flame is None:
-            raise StgaError(
-                f"{capture.root}: is not tracked with FLAME, so --effect tracking=on cannot "
-                f"refine its parameters"
-            )
+            cannot = "so --effect tracking=on cannot refine its parameters"
+            raise StgaError(f"{capture.root}: is not tracked with FLAME, {cannot}")
         self.sequence = capture.flame
-        self.tracked = np.stack(
-            [self.sequence.frame(timestep).parameters for timestep in self.sequence.timesteps]
-        )
+        frames = map(self.sequence.frame, self.sequence.timesteps)
+        self.tracked = np.stack([frame.parameters for frame in frames])
         self.parameters, self.rounds = np.pad(self.tracked, ((0, 0), (0, SHIFT_SIZE))), 0
         self._row = {timestep: row for row, timestep in enumerate(self.sequence.timesteps)}
         self._source = lru_cache(CACHED_TIMESTEPS)(self.sequence.frame)
@@ -141,9 +136,7 @@ class RefinedTracking:
 
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
         """Give timesteps what was found: those left out in between change as their neighbors."""
-        rows, at = (
-            [self._row[timestep] for timestep in own] for own in (timesteps, found.timesteps)
-        )
+        rows, at = ([self._row[t] for t in own] for own in (timesteps, found.timesteps))
         values = np.concatenate([found.parameters, found.shift], axis=1)
         change = values - self.parameters[at]
         between = [np.interp(rows, at, column) for column in change.T]
@@ -185,14 +178,12 @@ def track_by_avatar(
         if number == 1 and seconds is not None:
             most = int(seconds / (perf_counter() - begin))
             chosen = sorted({chosen[0], *evenly_spread(chosen, max(2, most))})
-    values, information, *figures = zip(*found, strict=True)
-    rows, added = np.stack(values), np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
-    shift, scale = np.split(rows[:, added], [SHIFT_SIZE], axis=1)
-    rows = np.delete(rows, added, axis=1)
-    before, after, misfit = map(np.array, figures)
-    scale = 1 + scale.ravel()
-    known = np.stack(information).astype(np.float32)
-    return AvatarTracking(tuple(chosen), rows, before, after, misfit, shift, scale, known)
+    values, information, misfit = map(np.stack, zip(*found, strict=True))
+    added = np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
+    shift, scale = np.split(values[:, added], [SHIFT_SIZE], axis=1)
+    rows, scale = np.delete(values, added, axis=1), 1 + scale.ravel()
+    known = information.astype(np.float32)
+    return AvatarTracking(tuple(chosen), rows, misfit, shift, scale, known)
 
 
 def normal_images(
@@ -253,15 +244,15 @@ class _Tracker:
         offset = self._sequence.frame(timestep).dynamic_offset
         return flame_forward(self._head.model, np.zeros(0), frame_of(self._values, offset))
 
-    def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float, float, float]:
+    def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Parameters (E + 18,) with the torso's shift, and the scale where it is sought, after the
-        expressions; their inverse covariance; what was minimized before and after; and the misfit.
-        As tracked where no view shows the timestep."""
+        expressions; their inverse covariance; and the misfit. As tracked where no view shows the
+        timestep."""
         frame = self._sequence.frame(timestep).parameters
         tracked = np.insert(frame, len(frame) - RIGID_SIZE, np.zeros(self._added))
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
         if not views:
-            return tracked, np.diag(self._precision()), 0.0, 0.0, 0.0
+            return tracked, np.diag(self._precision()), 0.0
         shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
         found, first = tracked, None
@@ -274,11 +265,10 @@ class _Tracker:
             renderings = PYRAMID_RENDERINGS
             for height in PYRAMID_PX:
                 small = [self._read(view, height) for view in views]
-                found, *_ = self._minimize(timestep, small, tracked, found, renderings)
-        sought = timestep, shots, tracked, found, renderings, first
-        found, known, *energies = self._minimize(*sought)
+                found, _ = self._minimize(timestep, small, tracked, found, renderings)
+        found, known = self._minimize(timestep, shots, tracked, found, renderings, first)
         self._change = found - tracked
-        return found, known, energies[0], energies[1], self._misfit(found, shots)
+        return found, known, self._misfit(found, shots)
 
     def _minimize(
         self,
@@ -288,12 +278,9 @@ class _Tracker:
         start: np.ndarray,
         renderings: int,
         first: tuple[float, np.ndarray] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """Parameters from `start` on, their inverse covariance, and what was minimized before and
-        after; first: `_loss` of the start where it is known."""
-        from scipy.linalg import solve_triangular
-        from scipy.optimize import minimize
-
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters from `start` on, and their inverse covariance; first: `_loss` of the start
+        where it is known."""
         precision = self._precision()  # of the change from those that were tracked
         known = self._gauss_newton(start, timestep, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)
@@ -319,7 +306,7 @@ class _Tracker:
         options = {"maxfun": renderings, "maxiter": renderings}
         best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
         change = solve_triangular(root, scale * best.x, lower=True, trans=1)
-        return start + change, known, before, float(best.fun)
+        return start + change, known
 
     def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
         self._values = values
@@ -391,10 +378,8 @@ class _Tracker:
         """(E + 18, E + 18): how parameters change what images show at points of the surface."""
         self._values = values
         mesh, faces = self._mesh(timestep), self._capture.faces
-        at, normals = (
-            self._points.on(mesh, faces),
-            self._points.on(vertex_normals(mesh, faces), faces),
-        )
+        at = self._points.on(mesh, faces)
+        normals = self._points.on(vertex_normals(mesh, faces), faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         curvature = np.zeros((len(at), 3, 3))
         for view, image in shots:
@@ -403,11 +388,8 @@ class _Tracker:
             pixels, depth = level.camera.project(at)
             small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
             cosine = facing(camera, at, normals)
-            seen = (
-                (cosine > MIN_COSINE)
-                & in_sight(small, mesh, faces, at)
-                & appearance.inside(level.camera, pixels, depth)
-            )
+            seen = (cosine > MIN_COSINE) & in_sight(small, mesh, faces, at)
+            seen &= appearance.inside(level.camera, pixels, depth)
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
             moved = slopes @ appearance.projection_derivative(level.camera, at) / NOISE_LEVELS

@@ -1,34 +1,76 @@
-"""Training backend on the CPU (Numba kernels)."""
+"""Training backend on the CPU (Numba kernels), and its image loss (STGA, training)."""
 
 from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
 from ...avatar.offsets import offset_of
 from ...capture.model import View
-from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
-from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import (
-    add_frame_gradients,
-    add_screen_gradients,
-    distance_limit,
-    opacity_weight,
-    scale_limit,
-)
-from ...raster.cpu.rasterize import (
-    BufferPool,
-    RenderOutput,
-    frames_in_camera,
-    render_backward,
-    render_forward,
-)
+from ...raster.cpu import optimizer, rasterize
+from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, change_background, image_loss
+from ...raster.cpu.layout import TILE, Parameters
 from ...raster.cpu.threads import threads
+from ...raster.cpu.tiles import box_groups
 from ..settings import TrainingSettings
 from . import adam
 from .frames import FrameStore
-from .losses import image_gradient, tile_rectangles, whole_image
 from .state import Batch, TrainState
+
+BAND_TILES = 4
+"""Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
+
+
+@cache
+def _bands(height: int, count: int) -> int:
+    """How many bands cost the busiest of `count` threads the fewest rows."""
+    fewest, most, beyond = -(-count // 2), 2 * count, 2 * LOSS_REACH_PX
+    return min(
+        range(fewest, most + 1), key=lambda n: -(-3 * n // count) * (-(-height // n) + beyond)
+    )
+
+
+def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
+    """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
+    thread's work. bands: how many, over the whole width, because pixels beyond left and right edges
+    cost more; by default, so many that the threads are done soonest."""
+    count = min(bands or _bands(height, threads()), height)
+    tops = [height * n // count for n in range(count + 1)]
+    return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
+
+
+def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
+    the largest first; those of more than BAND_TILES rows are cut, for the threads."""
+    return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
+
+
+def image_gradient(
+    image: np.ndarray,
+    target: np.ndarray,
+    rectangles: np.ndarray,
+    ssim_weight: float,
+    out: np.ndarray,
+) -> tuple[float, float]:
+    """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within
+    the rectangles; of means over the whole image. Returns L1 and SSIM within the rectangles.
+
+    image, out (3, H, W) float32; target (H, W, 3) uint8.
+    """
+    sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
+    share = 1.0 / image.size
+    image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
+    l1, ssim = add_up(sums)
+    return l1 * share, ssim * share
+
+
+def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:
+    """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
+    unused = np.empty_like(image)
+    _, height, width = image.shape
+    return image_gradient(image, target, whole_image(height, width), 1.0, unused)[1]
 
 
 class CpuBackend:
@@ -38,7 +80,7 @@ class CpuBackend:
         self.state = state
         self._settings, self._frames = settings, frames
         self._scale_limits = frames.scale_limits(settings)
-        self._buffers = BufferPool()
+        self._buffers = rasterize.BufferPool()
 
     def __len__(self) -> int:
         return len(self.state)
@@ -66,17 +108,23 @@ class CpuBackend:
         if settings.scale_weight:
             log_scale, weight = state.parameters.log_scale, settings.scale_weight
             limits = self._scale_limits
-            scale_limit(rows, log_scale, face, unbound, limits, weight, gradients.log_scale)
+            optimizer.scale_limit(
+                rows, log_scale, face, unbound, limits, weight, gradients.log_scale
+            )
         if settings.unseen_opacity_weight and state.has_unseen:
             weight, share = settings.unseen_opacity_weight / len(state), state.unseen_share
-            opacity_weight(rows, state.parameters.opacity, share, weight, gradients.opacity)
+            optimizer.opacity_weight(
+                rows, state.parameters.opacity, share, weight, gradients.opacity
+            )
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._frames.units
             xyz, weight = state.parameters.xyz, settings.distance_weight
-            distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
+            optimizer.distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
         adam.step(state, rows, batch.rates, options, batch.sh_degree)
         if batch.accumulate:
-            add_screen_gradients(rows, screen, state.screen_gradient, state.gradient_count)
+            optimizer.add_screen_gradients(
+                rows, screen, state.screen_gradient, state.gradient_count
+            )
         return loss
 
     def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
@@ -103,7 +151,7 @@ class CpuBackend:
             rectangles = tile_rectangles(rendering.touched, height, width)
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
-        rows, screen = render_backward(
+        rows, screen = rasterize.render_backward(
             rendering, state.parameters, state.face, self._frames_in_camera, v_image,
             state.gradients, buffers=self._buffers,
         )  # fmt: skip
@@ -119,9 +167,9 @@ class CpuBackend:
     def _forward(
         self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray,
         sh_degree: int, focus: np.ndarray | None = None,
-    ) -> RenderOutput:  # fmt: skip
-        self._frames_in_camera = frames_in_camera(frames, view.camera)
-        return render_forward(
+    ) -> rasterize.RenderOutput:  # fmt: skip
+        self._frames_in_camera = rasterize.frames_in_camera(frames, view.camera)
+        return rasterize.render_forward(
             splats, self.state.face, self._frames_in_camera, sh_degree, background, focus,
             LOSS_REACH_PX, antialiased=self._settings.antialiased, buffers=self._buffers,
         )  # fmt: skip
@@ -162,6 +210,6 @@ def frame_gradient(
     splats."""
     found = np.zeros((len(frames.scale), 7))
     moved = gradients.xyz, gradients.rotation, gradients.log_scale
-    add_frame_gradients(rows, face, splats.xyz, splats.rotation, *moved, found)
+    optimizer.add_frame_gradients(rows, face, splats.xyz, splats.rotation, *moved, found)
     found[:, :3] /= frames.scale[:, None]
     return found

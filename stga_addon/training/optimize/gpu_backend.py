@@ -10,20 +10,11 @@ import numpy as np
 from ...avatar.offsets import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
-from ...raster.gpu import optimizer
+from ...raster.gpu import optimizer, rasterize
 from ...raster.gpu.device import Device, Readback, Recording
 from ...raster.gpu.frames import Embedding
 from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_rows
 from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
-from ...raster.gpu.rasterize import (
-    Rasterizer,
-    SplatTable,
-    Tables,
-    ViewOptions,
-    counts_buffer,
-    mark_focus,
-    upload_splats,
-)
 from ..settings import TrainingSettings
 from .adam import adam_options
 from .frames import FrameStore
@@ -59,7 +50,7 @@ class GpuBackend:
     ) -> None:
         capture = frames.capture
         self._settings, self._frames, self.device = settings, frames, device
-        self._rasterizer = Rasterizer(device)
+        self._rasterizer = rasterize.Rasterizer(device)
         self._embedding = Embedding(
             device, capture.neutral, capture.faces, frames.convention, frames.strain,
             state.driven_offsets,
@@ -115,7 +106,7 @@ class GpuBackend:
             **rows, history=upload("history", history), traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
         )  # fmt: skip
-        self._splats = upload_splats(self.device, state.parameters, state.face)
+        self._splats = rasterize.upload_splats(self.device, state.parameters, state.face)
         by_triangle = optimizer.splats_by_triangle(state.face, self._triangles)
         splats_of, self._offsets = upload("splats by triangle", by_triangle), {}
         for name, offset in state.driven_offsets.items():
@@ -198,26 +189,27 @@ class GpuBackend:
             limited = bool(settings.scale_weight or settings.distance_weight)
             given |= {"splats": splats.rows, "face": splats.face, "screen": screen}
             optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
-            queued.readback.copy_from(work, (counts_buffer(self.device), COUNTS), (loss, 1))
+            counts = rasterize.counts_buffer(self.device)
+            queued.readback.copy_from(work, (counts, COUNTS), (loss, 1))
         queued.readback.start()
 
     def _render(
-        self, work: Recording, splats: SplatTable, offsets: Mapping[str, Any], view: View,
+        self, work: Recording, splats: rasterize.SplatTable, offsets: Mapping[str, Any], view: View,
         background: np.ndarray, sh_degree: int, selected: np.ndarray | None = None,
-    ) -> Tables:  # fmt: skip
+    ) -> rasterize.Tables:  # fmt: skip
         """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on
         the device.
 
         Only the tiles around the splats on the selected triangles, if any are given.
         """
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
-        options = ViewOptions(
+        options = rasterize.ViewOptions(
             view.camera, sh_degree, background, self._embedding.strains,
             antialiased=self._settings.antialiased, focused=selected is not None,
             reach=LOSS_REACH_PX,
         )  # fmt: skip
         uniform = self._rasterizer.upload_view(splats, options)
         marked = None if selected is None else self.device.upload("selected", selected)
-        focus = None if marked is None else mark_focus(work, splats, uniform, marked)
+        focus = None if marked is None else rasterize.mark_focus(work, splats, uniform, marked)
         frames = self._embedding.compose(work, offsets)
         return self._rasterizer.forward(work, splats, frames, options, uniform, focus)

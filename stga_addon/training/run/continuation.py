@@ -17,14 +17,8 @@ from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
 from ...schema import validate
 from ...selection import select_capture
-from ..evaluate.metrics import (
-    MAX_EVALUATION_VIEWS,
-    MIN_REGION_PIXELS,
-    EvaluationView,
-    read_evaluation_view,
-    visible_pixels,
-)
-from ..evaluate.residuals import RESIDUAL_SCALE, Residuals, triangle_residuals
+from ..evaluate import metrics
+from ..evaluate.metrics import RESIDUAL_SCALE, EvaluationView, Residuals, triangle_residuals
 from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState, state_of_avatar, with_effects
 from ..schedule import learning_rates, view_order
@@ -175,14 +169,16 @@ def continued_evaluation_views(
         if run.settings.strategy == "extend":
             group = f"take_{1 + sum(take.start <= view.timestep for take in run.takes)}"
         groups.setdefault(group, []).append(view)
-    limit, chosen = max(MIN_GROUP_VIEWS, MAX_EVALUATION_VIEWS // max(1, len(groups))), []
+    limit, chosen = max(MIN_GROUP_VIEWS, metrics.MAX_EVALUATION_VIEWS // max(1, len(groups))), []
     background, backdrop = run.settings.background, run.settings.backdrop
     for name, members in groups.items():
         for view in evenly_spread(members, limit):
-            found = read_evaluation_view(capture, view, background, backdrop)
+            found = metrics.read_evaluation_view(capture, view, background, backdrop)
             found = replace(found, group=name if len(groups) > 1 else "")
-            pixels = np.zeros(0) if region is None else visible_pixels(capture, view, region)
-            if pixels.sum() >= MIN_REGION_PIXELS:
+            pixels = (
+                np.zeros(0) if region is None else metrics.visible_pixels(capture, view, region)
+            )
+            if pixels.sum() >= metrics.MIN_REGION_PIXELS:
                 found = replace(found, regions={**found.regions, "region": pixels})
             chosen.append(found)
     return chosen

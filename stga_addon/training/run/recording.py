@@ -17,14 +17,9 @@ from ...files import read_json, read_npz, write_json, write_npz
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar
+from ...tracking import folder as tracking_folder
 from ...tracking.fit import HeadFit
-from ...tracking.folder import (
-    AVATAR_MISFIT,
-    REPORT_FILE,
-    SPLIT_FILES,
-    read_torso_points,
-    write_torso_points,
-)
+from ...tracking.folder import REPORT_FILE, SPLIT_FILES
 from ...tracking.head_model import HeadModel
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
@@ -47,6 +42,12 @@ ROUNDS = 2
 """Of tracking, each from the smooth motion that the one before has led to."""
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
+Source = tuple[Path, int, Path, float, int]
+"""A run, when its avatar's file was written, and a capture, once it was scaled by a factor and
+tracked in a number of rounds."""
+Light = tuple[tuple[tuple[float, ...], ...], np.ndarray]
+"""`TrainingSettings.exposure` of a capture that the avatar was not trained on, and harmonics (9, 3)
+of its light's ratio to that of the training, by the surface's normal."""
 
 
 def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
@@ -56,13 +57,9 @@ def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
     sequence = open_refined(run).flame
     if sequence is None:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
-    fit = HeadFit(
-        HeadModel(with_identity(sequence).model, "flame"),
-        sequence.shape,
-        {},
-        Similarity(1.0, np.eye(3), np.zeros(3)),
-        sequence.static_offset,
-    )
+    head, still = HeadModel(with_identity(sequence).model, "flame"), np.zeros(3)
+    place = Similarity(1.0, np.eye(3), still)
+    fit = HeadFit(head, sequence.shape, {}, place, sequence.static_offset)
     return fit, read_run(run).flame
 
 
@@ -86,10 +83,9 @@ def track_recording(
     for number in range(rounds):
         sequence = _open(*source, number)[2].flame
         assert sequence is not None
-        parts = [
-            (*source, number, *light, timesteps[first : first + PART_TIMESTEPS], False)
-            for first in range(0, len(timesteps), PART_TIMESTEPS)
-        ]
+        starts = range(0, len(timesteps), PART_TIMESTEPS)
+        every = [timesteps[first : first + PART_TIMESTEPS] for first in starts]
+        parts = [((*source, number), light, some, False) for some in every]
 
         def count(done: int, before: int = number * len(timesteps)) -> None:
             report(min(before + done, total), total)
@@ -103,7 +99,8 @@ def track_recording(
     stored = read_json(root / REPORT_FILE)  # which scaling changes
     shares = zip(timesteps, tracked.misfit.tolist(), strict=True)
     stored["avatar"] = avatar_version(run)
-    stored["image_misfit"][AVATAR_MISFIT] = {str(t): round(share, 3) for t, share in shares}
+    misfit = {str(timestep): round(share, 3) for timestep, share in shares}
+    stored["image_misfit"][tracking_folder.AVATAR_MISFIT] = misfit
     write_json(root / REPORT_FILE, stored)
     return tracked
 
@@ -121,31 +118,23 @@ def _replace_heads(root: Path, sequence: FlameSequence, tracked: AvatarTracking)
 
 
 def _track_part(
-    run: Path,
-    trained_ns: int,
-    root: Path,
-    factor: float,
-    number: int,
-    exposure: Sequence[Sequence[float]],
-    shading: np.ndarray,
-    timesteps: Sequence[int],
-    scales: bool,
-    step: Step,
+    source: Source, light: Light, timesteps: Sequence[int], scales: bool, step: Step
 ) -> dict[str, np.ndarray]:
-    avatar, settings, capture = _open(run, trained_ns, root, factor, number)
-    settings = replace(settings, exposure=tuple(map(tuple, exposure)))
+    avatar, settings, capture = _open(*source)
+    exposure, shading = light
+    settings = replace(settings, exposure=exposure)
 
     def report(done: int, total: int) -> bool:
         if done:
             step()
         return False
 
-    again = number > 0
+    again = source[-1] > 0
     found = track_by_avatar(
         avatar, settings, capture, timesteps, None, report, not again, scales, shading, again
     )
     step()
-    names = ("parameters", "before", "after", "misfit", "shift", "scale", "information")
+    names = ("parameters", "misfit", "shift", "scale", "information")
     return {name: getattr(found, name) for name in names}
 
 
@@ -159,7 +148,7 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     light = _light(avatar, settings, capture)
-    parts = [(*source, *light, [timestep], True) for timestep in chosen]
+    parts = [(source, light, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
     scale_capture(root, read_run(run).flame, factor)
@@ -181,31 +170,24 @@ def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
         moved = arrays["translation"] + (factor - 1) * capture.mesh(timestep).mean(0)
         arrays["translation"] = moved.astype(np.float32)
         write_npz(root / PARAMETERS / f"{timestep:05d}.npz", arrays)
-    torso = read_torso_points(root)
+    torso = tracking_folder.read_torso_points(root)
     if torso is not None:
-        write_torso_points(root, replace(torso, at=factor * torso.at))
+        tracking_folder.write_torso_points(root, replace(torso, at=factor * torso.at))
     stored = read_json(root / REPORT_FILE)
-    write_json(
-        root / REPORT_FILE, {**stored, "meters_per_unit": factor * stored["meters_per_unit"]}
-    )
+    stored["meters_per_unit"] *= factor
+    write_json(root / REPORT_FILE, stored)
 
 
 @lru_cache(1)
 def _open(
     run: Path, trained_ns: int, root: Path, factor: float, number: int
 ) -> tuple[Avatar, TrainingSettings, Capture]:
-    """Of the capture once it was scaled by the factor, and tracked in a number of rounds;
-    trained_ns: when the avatar's file was written."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     return read_avatar(run / AVATAR), stored.settings, capture
 
 
-def _light(
-    avatar: Avatar, settings: TrainingSettings, capture: Capture
-) -> tuple[tuple[tuple[float, ...], ...], np.ndarray]:
-    """`TrainingSettings.exposure` of a capture that the avatar was not trained on, and harmonics
-    (9, 3) of its light's ratio to that of the training, by the surface's normal."""
+def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Light:
     by_camera: dict[int, list[View]] = {}
     for view in (view for views in capture.views.values() for view in views):
         by_camera.setdefault(view.camera_index, []).append(view)

@@ -28,7 +28,7 @@ from ...selection import select_capture
 from ..evaluate import lpips, metrics
 from ..evaluate.evaluator import Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
-from ..evaluate.residuals import RESIDUAL_SCALE, triangle_residuals
+from ..evaluate.metrics import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import RefinedTracking, track_by_avatar
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels

@@ -81,12 +81,8 @@ def photograph(folder: Path, scene: Scene) -> Capture:
         for c in range(scene.cameras):
             camera = _camera(c, scene.cameras)
             away = mesh[faces].mean(1) - camera.position
-            seen = (
-                colors
-                + scene.paint(strain, away / np.linalg.norm(away, axis=1, keepdims=True), place)[
-                    :, None
-                ]
-            )
+            away /= np.linalg.norm(away, axis=1, keepdims=True)
+            seen = colors + scene.paint(strain, away, place)[:, None]
             if scene.drift is not None:
                 seen = seen * scene.drift[t]
             if scene.gain is not None:
@@ -98,16 +94,9 @@ def photograph(folder: Path, scene: Scene) -> Capture:
             image = np.where(mask[..., None] > 0, noisy, np.array(scene.background))
             views.append(_keep(folder, t, c, camera, image, mask if scene.masks else None))
     return Capture(
-        root=folder,
-        layout="mesh",
-        faces=faces,
-        neutral=vertices,
-        views={"train": tuple(views)},
-        timesteps=tuple(meshes),
-        regions={},
-        mesh=meshes.__getitem__,
-        expression_mesh=lambda timestep, zero_pose: meshes[timestep],
-    )
+        folder, "mesh", faces, vertices, {"train": tuple(views)}, tuple(meshes), {},
+        meshes.__getitem__, lambda timestep, zero_pose: meshes[timestep],
+    )  # fmt: skip
 
 
 def own_colors(capture: Capture, seed: int = 0) -> np.ndarray:

@@ -68,11 +68,8 @@ def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path)
     psnr = {}
     for choice in ("on", "off"):
         settings, _ = planned(drifting, iterations=200, exposure=choice)
-        avatar = train(
-            drifting,
-            tmp_path / choice,
-            Run(drifting.root, None, "vhap", replace(settings, effects=None)),
-        )
+        run = Run(drifting.root, None, "vhap", replace(settings, effects=None))
+        avatar = train(drifting, tmp_path / choice, run)
         quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
         assert quality.psnr_unmatched is None
         psnr[choice] = quality.psnr

@@ -229,12 +229,11 @@ def test_something_beside_the_mesh_of_one_camera(painted):
 def test_different_pixels(painted):
     """Catches cameras whose pixels are of different size and are treated as alike."""
     capture = painted()
-    views = [
-        replace(view, camera=replace(view.camera, fl_x=840.0, fl_y=840.0))
-        if view.camera_index == 0
-        else view
-        for view in capture.views["train"]
-    ]
+    views = list(capture.views["train"])
+    for number, view in enumerate(views):
+        if view.camera_index == 0:
+            large = replace(view.camera, fl_x=840.0, fl_y=840.0)
+            views[number] = replace(view, camera=large)
     single = make_settings(iterations=1, lattice=0)
     verdict = rules.antialiasing(
         CaptureFacts(replace(capture, views={"train": tuple(views)}), single)
@@ -461,13 +460,8 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
         return neutral + 0.01
 
     flame = SimpleNamespace(model=SimpleNamespace(v_template=neutral, masks={"teeth": [0]}))
-    capture = replace(
-        painted(),
-        timesteps=tuple(range(500)),
-        neutral=neutral,
-        expression_mesh=expression_mesh,
-        flame=flame,
-    )
+    capture = replace(painted(), timesteps=tuple(range(500)), neutral=neutral, flame=flame)
+    capture = replace(capture, expression_mesh=expression_mesh)
     facts = CaptureFacts(capture, SETTINGS)
     assert facts.selected_share == 1
     assert facts.lip_gap_mm == pytest.approx(0)
@@ -504,11 +498,8 @@ def test_lips_that_part(painted, shared_data):
 def test_a_sample_without_motion_does_not_forbid_selection(painted):
     """Catches a choice refused because the few timesteps posed happen not to move."""
     capture = painted()
-    still = replace(
-        capture,
-        timesteps=tuple(range(500)),
-        expression_mesh=lambda timestep, zero_pose: capture.neutral,
-    )
+    still = replace(capture, expression_mesh=lambda timestep, zero_pose: capture.neutral)
+    still = replace(still, timesteps=tuple(range(500)))
     verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert "any of 64 frames" in verdict.reason
