@@ -17,7 +17,6 @@ from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.forward import parameters_gradient
@@ -61,10 +60,8 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
 @pytest.fixture(scope="module")
 def person(right: Made) -> tuple[Avatar, TrainingSettings]:
     """An avatar whose training saw the right meshes."""
-    capture, settings = (
-        right[0],
-        quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=()),
-    )
+    capture = right[0]
+    settings = quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
     trainer = Trainer(capture, settings, {})
     views = capture.views["train"]
     ready = {view.name: read_view(view) for view in views}
@@ -111,13 +108,10 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
     """Catches changes that go to the wrong timesteps where a budget allows only some."""
     tracking = RefinedTracking(lost[0], "stga")
     some = tracking.tracked[[0, 3]] + np.array([[1.0], [4.0]])
-    tracking.take(
-        AvatarTracking((0, 5), some, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1)),
-        TIMESTEPS[:-1],
-    )
-    np.testing.assert_allclose(
-        (tracking.parameters[:, :-3] - tracking.tracked)[:, 0], [1, 2, 3, 4, 0]
-    )
+    found = AvatarTracking((0, 5), some, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1))
+    tracking.take(found, TIMESTEPS[:-1])
+    change = tracking.parameters[:, :-3] - tracking.tracked
+    np.testing.assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
 
 
 def test_time_says_what_images_do_not(right: Made) -> None:
@@ -226,10 +220,8 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
     for on in (True, False):
         train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
-    before, after = (
-        millimeters(capture, true),
-        millimeters(with_refined_tracking(capture, tmp_path / "True"), true),
-    )
+    refined = with_refined_tracking(capture, tmp_path / "True")
+    before, after = millimeters(capture, true), millimeters(refined, true)
     assert np.median(after[:-1] / before[:-1]) < 0.6
     assert quality[True] > quality[False] + 1.0
 
@@ -325,23 +317,17 @@ def test_commands_use_the_refined_meshes(
 ) -> None:
     """Catches a command that opens a run's capture past `refined`."""
     best = max(line["psnr"] for line in read_metrics(run_folder))
-    assert main(["eval", str(run_folder)]) == 0
+    assert stga("eval", run_folder) == 0
     assert f"PSNR {best:.3f} dB" in capsys.readouterr().out
     root = read_run(run_folder).capture
     tracked = open_capture(root, root / "model.npz")
-    assert main(["eval", str(run_folder), "--split", "test"]) == 0
+    assert stga("eval", run_folder, "--split test") == 0
     before = evaluate_avatar(read_avatar(run_folder / "avatar.npz"), tracked, "test").psnr
     assert f"as tracked before: PSNR {before:.3f} dB" in capsys.readouterr().out
-    cameras = ["--cameras", str(root / "transforms_val.json")]
-    assert main(["render", str(run_folder), *cameras, "--out", str(tmp_path / "run")]) == 0
-    avatar = [
-        str(run_folder / "avatar.npz"),
-        "--capture",
-        str(root),
-        "--flame",
-        str(root / "model.npz"),
-    ]
-    assert main(["render", *avatar, *cameras, "--out", str(tmp_path / "tracked")]) == 0
+    to = "--cameras", root / "transforms_val.json", "--out"
+    assert stga("render", run_folder, *to, tmp_path / "run") == 0
+    capture = "--capture", root, "--flame", root / "model.npz"
+    assert stga("render", run_folder / "avatar.npz", *capture, *to, tmp_path / "tracked") == 0
     assert "was trained on refined meshes" in caplog.text
     ours, theirs = (read_bytes(tmp_path / name) for name in ("run", "tracked"))
     assert ours.keys() == theirs.keys()
@@ -351,14 +337,12 @@ def test_commands_use_the_refined_meshes(
     arrays = read_npz(still / "tracking.npz")
     # a motion that is played leaves the torso where the capture has it
     write_npz(still / "tracking.npz", {**arrays, "torso_shift": 0 * arrays["torso_shift"]})
-    for kind, more in (("played", ["--motion", str(still / "tracking.npz")]), ("shown", [])):
-        assert main(["render", str(still), *more, *cameras, "--out", str(tmp_path / kind)]) == 0
+    for kind, more in (("played", ("--motion", still / "tracking.npz")), ("shown", ())):
+        assert stga("render", still, *more, *to, tmp_path / kind) == 0
     for name in ours:
-        played, shown = (
-            np.asarray(Image.open(tmp_path / kind / name)).astype(int)
-            for kind in ("played", "shown")
-        )
-        assert np.abs(played - shown).max() <= 2  # the avatar's neutral mesh is float32
+        pictures = [np.asarray(Image.open(tmp_path / kind / name)) for kind in ("played", "shown")]
+        # the avatar's neutral mesh is float32
+        assert np.abs(np.diff(np.stack(pictures).astype(int), axis=0)).max() <= 2
 
 
 def read_bytes(folder: Path) -> dict[str, bytes]:

@@ -94,22 +94,11 @@ def test_memory_is_the_cpus_and_as_documented(
     longer hold."""
     monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end
     small, wide = (320, 160), (640, 160)
-    on_cpu = per_item(
-        [
-            cpu_bytes(toy, 4096, small, -1.0),
-            cpu_bytes(toy, 8192, small, -1.0),
-            cpu_bytes(toy, 4096, wide, -1.0),
-            cpu_bytes(toy, 4096, small, 1.0),
-        ]
-    )
-    on_gpu = per_item(
-        [
-            gpu_bytes(toy, 4096, small, 1 << 16),
-            gpu_bytes(toy, 8192, small, 1 << 16),
-            gpu_bytes(toy, 4096, wide, 1 << 16),
-            gpu_bytes(toy, 4096, small, 1 << 17),
-        ]
-    )
+    sizes = (4096, small), (8192, small), (4096, wide)
+    on_cpu = [cpu_bytes(toy, *size, -1.0) for size in sizes]
+    on_cpu = per_item([*on_cpu, cpu_bytes(toy, 4096, small, 1.0)])
+    on_gpu = [gpu_bytes(toy, *size, 1 << 16) for size in sizes]
+    on_gpu = per_item([*on_gpu, gpu_bytes(toy, 4096, small, 1 << 17)])
     text = (Path(__file__).parents[2] / "docs/performance.md").read_text(encoding="utf-8")
     rows = [
         re.search(rf"^\| a {name}\D*\| ([\d,]+) \| ([\d,]+) \|", text, re.M)

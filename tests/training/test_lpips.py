@@ -25,12 +25,9 @@ from stga_addon.training.run.session import train
 from .toys import quick_settings, stop_at
 
 LAYERS = (
-    (3, 64, 11, 4, 2),
-    (64, 192, 5, 1, 2),
-    (192, 384, 3, 1, 1),
-    (384, 256, 3, 1, 1),
+    (3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1),
     (256, 256, 3, 1, 1),
-)
+)  # fmt: skip
 """Of AlexNet's features, as its authors have them: channels in and out, width, stride, padding."""
 REFERENCE = {(31, 40): 0.020162, (64, 33): 0.025562, (120, 90): 0.084581}
 """(H, W) of `pair` -> what the package lpips 0.1.4 (net="alex") says of it."""
@@ -43,13 +40,10 @@ def random_weights() -> dict[str, Any]:
     for number, (before, after, width, _, _) in enumerate(LAYERS):
         kernel = rng.normal(0, (before * width**2) ** -0.5, (width, width, before, after))
         bias = rng.normal(0, 0.1, after)
-        weights["AlexNet_0"][f"Conv_{number}"] = {
-            "kernel": kernel.astype("f4"),
-            "bias": bias.astype("f4"),
-        }
-        weights[f"NetLinLayer_{number}"] = {
-            "Conv_0": {"kernel": rng.random((1, 1, after, 1)).astype("f4")}
-        }
+        convolution = {"kernel": kernel.astype("f4"), "bias": bias.astype("f4")}
+        weights["AlexNet_0"][f"Conv_{number}"] = convolution
+        linear = {"kernel": rng.random((1, 1, after, 1)).astype("f4")}
+        weights[f"NetLinLayer_{number}"] = {"Conv_0": linear}
     return weights
 
 
@@ -128,29 +122,20 @@ def test_evaluation_measures_lpips_if_weights_are_named(
     image, and images too small for the network."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     image, target = pair(47, 68)
-    quality = evaluate(lambda view: image, [evaluation_view_of(tmp_path, target)], perceptual=True)
-    stored = np.round(255 * target).astype("f4") / 255
-    assert quality.lpips == pytest.approx(
-        read_network(weights_file).distance(image, stored), rel=1e-6
-    )
-    assert (
-        "lpips"
-        not in evaluate(lambda view: image, [evaluation_view_of(tmp_path, target)]).as_json()
-    )
-
     evaluation_view = evaluation_view_of(tmp_path, target)
+    quality = evaluate(lambda view: image, [evaluation_view], perceptual=True)
+    stored, network = np.round(255 * target).astype("f4") / 255, read_network(weights_file)
+    assert quality.lpips == pytest.approx(network.distance(image, stored), rel=1e-6)
+    assert "lpips" not in evaluate(lambda view: image, [evaluation_view]).as_json()
     where = np.zeros((47, 68), bool)
     where[10:30, 10:40] = True
     partly = np.where(where, image, stored)
     masked = [EvaluationView(evaluation_view.view, evaluation_view.target, {"mask": where})]
     of_region = evaluate(lambda view: image, masked, perceptual=True).as_json()["lpips_mask"]
-    assert of_region == pytest.approx(read_network(weights_file).distance(partly, stored), rel=1e-6)
-
+    assert of_region == pytest.approx(network.distance(partly, stored), rel=1e-6)
     small, other = pair(30, 68)
-    assert (
-        evaluate(lambda view: small, [evaluation_view_of(tmp_path, other)], perceptual=True).lpips
-        is None
-    )
+    few = evaluate(lambda view: small, [evaluation_view_of(tmp_path, other)], perceptual=True)
+    assert few.lpips is None
 
 
 def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:

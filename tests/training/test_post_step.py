@@ -62,14 +62,10 @@ def splats_after_a_turn(
 
 
 def test_a_needle_beside_the_head_does_not_outlive_its_turn(toy: Capture) -> None:
-    """Catches a spike over the hair, outside of all masks, that stays."""
+    """Catches a spike over the hair, outside of all masks, that stays; white clothes or teeth taken
+    for background, where no mask says what is; and a published method that prunes."""
     before, after = splats_after_a_turn(toy, [0.0, 0.15, 0.0])
     assert after == before - 1
-
-
-def test_without_masks_nothing_is_pruned(toy: Capture) -> None:
-    """Catches white clothes or teeth taken for background, where no mask says what is, and a
-    published method that is no longer what was published."""
     views = tuple(replace(view, mask=None) for view in toy.views["train"])
     bare = replace(toy, views={**toy.views, "train": views})
     assert read_outlines(bare, 0) == []
@@ -170,11 +166,8 @@ CAMERA = 3
 @pytest.fixture(scope="module")
 def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     capture, _ = write_head(tmp_path_factory.mktemp("side"), error=0.0)
-    views = [
-        view
-        for view in capture.views["train"]
-        if view.camera_index == CAMERA and view.timestep == 0
-    ]
+    own = [view for view in capture.views["train"] if view.camera_index == CAMERA]
+    views = [view for view in own if view.timestep == 0]
     return replace(capture, views={"train": views})
 
 

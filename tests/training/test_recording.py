@@ -68,10 +68,8 @@ def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
     before = json.loads((root / "transforms_train.json").read_text())["frames"]
     found = track_recording(run, root, Helpers(1), ignore)
     after = json.loads((root / "transforms_train.json").read_text())["frames"]
-    sizes = [
-        np.linalg.norm(np.array(frame["transform_matrix"])[:3, 3])
-        for frame in (before[0], after[0])
-    ]
+    places = [np.array(frame["transform_matrix"])[:3, 3] for frame in (before[0], after[0])]
+    sizes = np.linalg.norm(places, axis=1)
     assert sizes[1] / sizes[0] == pytest.approx(1 / SCALE, abs=0.004)
     assert read_json(root / "tracking.json")["meters_per_unit"] == pytest.approx(1, abs=0.004)
     torso = read_torso_points(root)

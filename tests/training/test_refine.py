@@ -71,15 +71,8 @@ def opening(toy: Capture) -> Callable[..., Any]:
 def prepare_refinement(
     parent: Path, region: str, frames: tuple[int, int] | None = None, **changes: Any
 ) -> Prepared:
-    request = Refine(
-        parent / "unused",
-        parent,
-        region,
-        frames=frames,
-        iterations=ITERATIONS,
-        device="cpu",
-        **changes,
-    )
+    changes = {"frames": frames, "iterations": ITERATIONS, "device": "cpu", **changes}
+    request = Refine(parent / "unused", parent, region, **changes)
     return prepare(request, ignore, lambda line: None)
 
 
@@ -228,11 +221,8 @@ def test_replayed_timesteps_differ_most(toy: Capture) -> None:
         toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep]
     )
     assert distinct_timesteps(capture, list(offsets), 3) == [0, 3, 4]
-    views = [
-        replace(toy.views["train"][0], timestep=t, camera_index=c)
-        for t in range(5)
-        for c in range(16)
-    ]
+    view, pairs = toy.views["train"][0], np.ndindex(5, 16)
+    views = [replace(view, timestep=t, camera_index=c) for t, c in pairs]
     assert len(replayed_views(capture, views)) == 80
     kept = replayed_views(capture, views, 20)
     assert len(kept) == 20

@@ -26,14 +26,8 @@ from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 24
 # Everything that changes a state happens in a few iterations.
-BUSY = {
-    "density_interval": 5,
-    "density_span": (0.0, 1.0),
-    "stray_reset_interval": 4,
-    "stray_limit": 0.3,
-    "lattice": 1,
-}
-
+BUSY = {"density_interval": 5, "density_span": (0.0, 1.0), "lattice": 1}
+BUSY |= {"stray_reset_interval": 4, "stray_limit": 0.3}
 CLOCKED = ("seconds", "evaluation_s", "wall_s", "peak_memory_mb", "forecast")
 """Fields of a metrics line that depend on how fast the machine was."""
 
@@ -100,12 +94,9 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
 
         def crash(progress: Progress) -> bool:
-            patch.setattr(
-                run_module,
-                "CHECKPOINT_S",
-                0.0 if progress.figures().get("iteration", 0) == 7 else 1e9,
-            )
-            if progress.figures().get("iteration", 0) == 13:
+            iteration = progress.figures().get("iteration", 0)
+            patch.setattr(run_module, "CHECKPOINT_S", 0.0 if iteration == 7 else 1e9)
+            if iteration == 13:
                 raise Crash
             return False
 
@@ -120,13 +111,9 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path) -> None:
     """Catches evaluations twice, or missing, after going on from an older checkpoint."""
     assert_same_state(continued, unbroken)
-    ours, theirs = (
-        [
-            {k: v for k, v in line.items() if k != "loss"}
-            for line in without_times(read_metrics(folder))
-        ]
-        for folder in (continued, unbroken)
-    )
+    ours, theirs = (without_times(read_metrics(folder)) for folder in (continued, unbroken))
+    for line in (*ours, *theirs):
+        line.pop("loss", None)
     assert ours == theirs
     losses = [[line["loss"] for line in read_metrics(folder)] for folder in (continued, unbroken)]
     # Not to the last bit: the value is summed in float32 along each row, for people to look at, and
@@ -186,13 +173,11 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
     for name in ("avatar.npz", "residuals.npz"):
         (out / name).unlink()
     told: list[str] = []
-    train(
-        toy,
-        out,
-        make_run(toy),
-        resume=True,
-        report=lambda progress: bool(told.append(progress.stage)),
-    )
+
+    def note(progress: Progress) -> bool:
+        return bool(told.append(progress.stage))
+
+    train(toy, out, make_run(toy), resume=True, report=note)
     assert "Writing the missing avatar from the checkpoint" in told
     written = read_avatar(out / "avatar.npz").splats
     np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
@@ -236,11 +221,11 @@ def test_the_best_avatar_is_kept(
         run_module_write(path, avatar)
 
     run_module_write = run_module.write_avatar
-    monkeypatch.setattr(
-        evaluator,
-        "evaluate",
-        lambda *args, **kwargs: Quality(30.0, 0.5, detail_difference=next(scores)),
-    )
+
+    def evaluate(*arguments: Any) -> Quality:
+        return Quality(30.0, 0.5, detail_difference=next(scores))
+
+    monkeypatch.setattr(evaluator, "evaluate", evaluate)
     monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)

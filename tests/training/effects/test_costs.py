@@ -100,13 +100,12 @@ def test_exposure_is_taken_away(painted):
     alike, unlike = painted(), painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
         (_, expected, _), (view, image, mask) = read_view(same), read_view(other)
-        before, after = (
-            abs(i.astype(int) - expected)[mask > 0].mean()
-            for i in (image, correct(view, image, mask))
-        )
+        corrected = correct(view, image, mask)
+        pair = image.astype(int), corrected.astype(int)
+        before, after = (abs(shown - expected)[mask > 0].mean() for shown in pair)
         assert after < 1.0
         assert before > 2 * after
-        assert (correct(view, image, mask)[mask == 0] == image[mask == 0]).all()
+        assert (corrected[mask == 0] == image[mask == 0]).all()
     stranger = replace(view, camera_index=99)
     assert correct(stranger, image, mask) is image
     assert exposure_correction(make_settings(iterations=1)) is None
@@ -120,13 +119,9 @@ def test_no_splats_on_teeth(painted):
     faces = np.concatenate([capture.faces, teeth_faces(vertices)])
     masks = {"teeth": np.arange(vertices, vertices + 120)}
     flame = SimpleNamespace(model=SimpleNamespace(masks=masks))
-    toothed = replace(
-        capture,
-        faces=faces,
-        neutral=np.concatenate([capture.neutral, rows]),
-        mesh=lambda timestep: np.concatenate([capture.mesh(timestep), rows]),
-        flame=flame,
-    )
+    neutral = np.concatenate([capture.neutral, rows])
+    toothed = replace(capture, faces=faces, neutral=neutral, flame=flame)
+    toothed = replace(toothed, mesh=lambda t: np.concatenate([capture.mesh(t), rows]))
     for kept in (True, False):
         splats = initial_splats.initial_splats(
             toothed, make_settings(iterations=1, hull_points=False, lattice=2, teeth=kept)

@@ -68,10 +68,8 @@ def test_cameras_on_both_sides_mirror_nothing(painted, monkeypatch):
 def test_masks_that_show_nothing_give_gray(painted, tmp_path):
     """Catches a division by zero where no triangle is seen."""
     capture = painted()
-    views = [
-        replace(view, camera=replace(view.camera, cx=-1000.0))
-        for view in capture.views["train"][:2]
-    ]
+    two = capture.views["train"][:2]
+    views = [replace(view, camera=replace(view.camera, cx=-1000.0)) for view in two]
     np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
 
 

@@ -46,14 +46,10 @@ def growth(basis: StrainBasis, frames: FaceFrames) -> np.ndarray:
 def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
     monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, 2, growth, 1.0))
-    monkeypatch.setitem(
-        EFFECTS,
-        "toy-growth",
-        Effect("toy-growth", "Head grows", "larger", "6 numbers", offset=NAME, added_later=True),
-    )
-    monkeypatch.setitem(
-        RULES, "toy-growth", lambda facts: Verdict(facts.timesteps > 1, "the head grows")
-    )
+    effect = Effect("toy-growth", "Head grows", "larger", "6 numbers", "", {}, {}, NAME, True)
+    monkeypatch.setitem(EFFECTS, effect.name, effect)
+    reason = "the head grows"
+    monkeypatch.setitem(RULES, effect.name, lambda facts: Verdict(facts.timesteps > 1, reason))
 
 
 @pytest.fixture

@@ -41,10 +41,8 @@ def on(plan):
 
 def gains(decision):
     """In decibels, of colors in frames, and in cameras, that were left out."""
-    return [
-        float(gain)
-        for gain in re.findall(r"([+-]\d+\.\d+) dB in left-out (?:frames|cameras)", decision.reason)
-    ]
+    pattern = r"([+-]\d+\.\d+) dB in left-out (?:frames|cameras)"
+    return [float(gain) for gain in re.findall(pattern, decision.reason)]
 
 
 SETTINGS = make_settings(iterations=1)
@@ -303,10 +301,7 @@ def test_dynamic_offsets():
 
 def off_track(capture, meters, device="cpu"):
     """Facts of the ball as if it were a FLAME capture tracked so far beside its images."""
-    meshes = {
-        timestep: capture.mesh(timestep) + np.array([meters, 0, 0])
-        for timestep in capture.timesteps
-    }
+    meshes = {t: capture.mesh(t) + np.array([meters, 0, 0]) for t in capture.timesteps}
     facts = CaptureFacts(replace(capture, mesh=meshes.__getitem__), SETTINGS, device)
     facts.frames = [frame()]
     return facts
@@ -410,13 +405,10 @@ def test_hidden_triangles(painted):
     plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])
     corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)
     neutral = np.concatenate([capture.neutral, plate])
-    front = replace(
-        capture,
-        views={"train": tuple(view for view in capture.views["train"] if view.camera_index == 4)},
-        neutral=neutral,
-        faces=np.concatenate([capture.faces, corners]),
-        mesh=lambda timestep: np.concatenate([capture.mesh(timestep), plate]),
-    )
+    views = tuple(view for view in capture.views["train"] if view.camera_index == 4)
+    front = replace(capture, views={"train": views}, neutral=neutral)
+    front = replace(front, faces=np.concatenate([capture.faces, corners]))
+    front = replace(front, mesh=lambda t: np.concatenate([capture.mesh(t), plate]))
     samples = take_samples(front)
     height = front.neutral[front.faces[samples.faces]].mean(1)[:, 1]
     ball = samples.faces < len(capture.faces)
@@ -481,13 +473,9 @@ def test_lips_that_part(painted, shared_data):
     # a cut through the mouth, below its corners
     opened = closed - [0, 0.01, 0] * (closed[:, 1:2] < -0.047)
     meshes = [closed, closed @ [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], opened]
-    capture = replace(
-        painted(),
-        timesteps=(0, 1),
-        neutral=closed,
-        expression_mesh=lambda timestep, zero_pose: meshes[timestep],
-        flame=SimpleNamespace(model=model),
-    )
+    flame = SimpleNamespace(model=model)
+    capture = replace(painted(), timesteps=(0, 1), neutral=closed, flame=flame)
+    capture = replace(capture, expression_mesh=lambda timestep, zero_pose: meshes[timestep])
     settings = SETTINGS
     assert CaptureFacts(capture, settings).lip_gap_mm == pytest.approx(0, abs=1e-9)
     assert CaptureFacts(replace(capture, timesteps=(0, 2)), settings).lip_gap_mm == pytest.approx(
