@@ -139,8 +139,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#78
 
 
 def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
-    """PSNR of a run in image, head mask and moving region, its latest forecast, and the detail
-    difference, the best at the top."""
+    """PSNR in image, head mask and moving region, the latest forecast, and detail upside down."""
     fitted = " (exposure fitted)" if forecasts.is_exposure_fitted(metrics) else ""
     figure, axes = psnr_axes(f"PSNR{fitted} and detail difference on held-out views")
     keys = {"whole image": "psnr", "head mask": "psnr_mask", "moving region": "psnr_moving"}

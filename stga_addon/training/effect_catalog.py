@@ -1,5 +1,4 @@
-"""Catalog of effects: what each costs, the settings that switch it, and what was decided about it
-in a run (`effects.plan` decides)."""
+"""Catalog of effects: what each costs, its settings, and what a run decided about it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -86,8 +85,7 @@ CHOICES = ("auto", "on", "off")
 
 @dataclass(frozen=True)
 class EffectDecision:
-    """The decision about one of EFFECTS: the user's choice, whether it is on, the reason with the
-    figure that it rests on, and its cost while it is on."""
+    """About one of EFFECTS: the user's choice, whether it is on, why, and its cost while on."""
 
     effect: str
     choice: str = setting(choices=CHOICES)

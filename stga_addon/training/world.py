@@ -1,5 +1,4 @@
-"""World: splats of what stands still behind the person. They begin as blocks of clean plates, on a
-shell around the person, and are trained on these."""
+"""Splats of what stands still behind the person: blocks of clean plates on a shell, trained."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -77,8 +76,7 @@ class CleanPlate:
 
 
 def clean_plates(capture: Capture, correct: Correction | None = None) -> list[CleanPlate]:
-    """The plate of each camera that has masks, of the training views; correct: their exposure.
-    Raises StgaError where a file cannot be read."""
+    """Of each camera with masks, of training views; correct: their exposure. Raises StgaError."""
     by_camera: dict[int, list[View]] = {}
     for view in capture.views.get("train", ()):
         if view.mask is not None:

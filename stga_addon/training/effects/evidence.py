@@ -63,8 +63,7 @@ def compare(before: np.ndarray, after: np.ndarray) -> Evidence:
 
 @dataclass(frozen=True)
 class CameraColors:
-    """Cameras (C,), and their gain (C, 3) and offset (C, 3), in levels, of each channel against the
-    mean of all cameras, for which they are 1 and 0."""
+    """Cameras (C,), their gain (C, 3) and offset (C, 3) in levels, against the mean camera."""
 
     camera: np.ndarray
     gain: np.ndarray

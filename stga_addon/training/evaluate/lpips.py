@@ -57,8 +57,7 @@ class Network:
 
 
 def load_network() -> Network | None:
-    """The network that STGA_LPIPS names; None if the variable is not set. Raises StgaError as
-    `read_network` does."""
+    """That STGA_LPIPS names; None if it is not set. Raises StgaError as `read_network` does."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     return read_network(Path(named)) if named else None
 

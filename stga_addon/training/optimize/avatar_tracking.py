@@ -279,8 +279,7 @@ class _Tracker:
         renderings: int,
         first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters from `start` on, and their inverse covariance; first: `_loss` of the start
-        where it is known."""
+        """From `start` on, and their inverse covariance; first: the start's `_loss`, if known."""
         precision = self._precision()  # of the change from those that were tracked
         known = self._gauss_newton(start, timestep, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)

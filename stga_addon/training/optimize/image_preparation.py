@@ -153,8 +153,7 @@ def view_exposure(rows: Iterable[Sequence[float]]) -> ViewExposure:
 
 
 def exposure_correction(settings: TrainingSettings) -> Correction | None:
-    """The correction that inverts the settings' `exposure`, of the foreground only, in images of
-    the cameras that it lists; None if there is none."""
+    """Inverts the settings' `exposure` of the foreground, in images of cameras listed, if any."""
     if not settings.exposure:
         return None
     exposure = view_exposure(settings.exposure)

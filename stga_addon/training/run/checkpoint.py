@@ -20,7 +20,7 @@ from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
-from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run, float_array
+from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
 VERSION = 3
 TRACKING, IDENTITY = "tracking/parameters", "identity"
@@ -237,7 +237,8 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     arrays = read_npz(path)
     if not np.array_equal(arrays.get(IDENTITY, ()), identity):
         raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
-    found = float_array(path, arrays, "strain_range", (len(capture.faces), *COLOR_RANGE.shape))
+    found, shape = arrays.get("strain_range", np.zeros(0)), (len(capture.faces), *COLOR_RANGE.shape)
+    check_array(path, "strain_range", found, "float32", shape)
     if not _is_color_range(found):
         text = "is not within the range that colors are trained to follow; remove it"
         raise StgaError(f"{path}: 'strain_range' {text}")

@@ -16,7 +16,7 @@ world.ply       what stands still behind the person, in world space; only where 
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -327,15 +327,8 @@ def write_residuals(folder: Path, mean: np.ndarray) -> None:
 def read_residuals(folder: Path, faces: int) -> np.ndarray:
     """(F,) float32. Raises StgaError where there is no such file, or of another mesh."""
     path = folder / RESIDUALS
-    return float_array(path, read_npz(path), "residual", (faces,))
-
-
-def float_array(
-    path: Path, arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
-) -> np.ndarray:
-    """A float32 array of this shape among those of a file. Raises StgaError where it is not."""
-    array = arrays.get(name)
-    if array is None or array.dtype != np.float32 or array.shape != shape:
-        found = "no such array" if array is None else f"{array.dtype} {array.shape}"
-        raise StgaError(f"{path}: expected '{name}', float32 {shape}, found {found}")
-    return array
+    found = read_npz(path).get("residual", np.zeros(0))
+    if found.dtype != np.float32 or found.shape != (faces,):
+        text = f"expected 'residual', float32 {(faces,)}, found {found.dtype} {found.shape}"
+        raise StgaError(f"{path}: {text}")
+    return found

@@ -43,8 +43,7 @@ ROUNDS = 2
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]
-"""A run, when its avatar's file was written, and a capture, once it was scaled by a factor and
-tracked in a number of rounds."""
+"""A run, when its avatar was written, and a capture, once scaled and tracked in rounds."""
 Light = tuple[tuple[tuple[float, ...], ...], np.ndarray]
 """`TrainingSettings.exposure` of a capture that the avatar was not trained on, and harmonics (9, 3)
 of its light's ratio to that of the training, by the surface's normal."""
