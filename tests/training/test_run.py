@@ -40,10 +40,9 @@ def make_run(capture: Capture, strategy: str = "selective", **changes: Any) -> R
 def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Metrics without wall times; sums of float32 rows to seven digits."""
     kept = [{k: v for k, v in line.items() if k not in CLOCKED} for line in lines]
-    return [
-        {k: float(f"{v:.7g}") if k.startswith(("loss", "ssim")) else v for k, v in line.items()}
-        for line in kept
-    ]
+    for line in kept:
+        line |= {k: float(f"{v:.7g}") for k, v in line.items() if k.startswith(("loss", "ssim"))}
+    return kept
 
 
 @pytest.fixture(scope="module")

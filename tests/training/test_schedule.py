@@ -13,12 +13,8 @@ from stga_addon.training.schedule import learning_rates, sh_degree, view_order
 from stga_addon.training.settings import Rates, TrainingSettings
 
 CAMERA = Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
-# Frames of 3, 5, 1 and 4 views.
-VIEWS = [
-    View(t, c, CAMERA, f"{t}_{c}", Path())
-    for t, count in ((0, 3), (2, 5), (5, 1), (6, 4))
-    for c in range(count)
-]
+FRAMES = {0: 3, 2: 5, 5: 1, 6: 4}
+VIEWS = [View(t, c, CAMERA, f"{t}_{c}", Path()) for t, n in FRAMES.items() for c in range(n)]
 EPOCH = len(VIEWS)
 
 

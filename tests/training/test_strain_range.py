@@ -58,13 +58,8 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     """Catches an avatar that forgets expressions because only one frame was refined."""
     count = len(toy.faces)
     limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 3)).copy()
-    parent = Avatar(
-        random_splats(20, count),
-        "stga",
-        toy.neutral.astype(np.float32),
-        toy.faces,
-        strain_range=limits,
-    )
+    neutral = toy.neutral.astype(np.float32)
+    parent = Avatar(random_splats(20, count), "stga", neutral, toy.faces, strain_range=limits)
     write_avatar(tmp_path / "avatar.npz", parent)
     continuation = Continuation(tmp_path, "", 0, 0)
     alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
@@ -111,10 +106,8 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
     wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 3)).copy()
     write_avatar(path, replace(avatar, strain_range=wider if limited else None))
     before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
-    with pytest.raises(
-        StgaError,
-        match=r"avatar\.npz: colors follow strain as in an earlier version; train it anew",
-    ):
+    earlier = r"avatar\.npz: colors follow strain as in an earlier version; train it anew"
+    with pytest.raises(StgaError, match=earlier):
         train(toy, out, run, resume=True)
     assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
     write_avatar(path, avatar)
@@ -145,21 +138,15 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(
     def mesh(timestep: int) -> np.ndarray:
         return np.asarray(toy.neutral) * (0.8 if timestep in strong else 1.0)
 
-    views = {
-        **toy.views,
-        "train": tuple(view for view in toy.views["train"] if view.timestep not in strong),
-    }
+    weak = tuple(view for view in toy.views["train"] if view.timestep not in strong)
+    plain = {"iterations": 20, "lattice": 0, "sh_degree": 0, "sh_steps": (), "ema_share": 1.0}
     rates = Rates(strain_color=0.5)
-    settings = quick_settings(
-        "global", iterations=20, lattice=0, strain_color=True, sh_degree=0, sh_steps=()
-    )
-    run = Run(toy.root, None, "vhap", replace(settings, rates=rates, ema_share=1.0))
-    capture = replace(toy, mesh=mesh, views=views)
-    path = train(capture, tmp_path / "run", run)
+    settings = quick_settings("global", strain_color=True, rates=rates, **plain)
+    capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
+    path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
     best = min(read_metrics(tmp_path / "run"), key=lambda line: line["detail_difference"])
-    assert evaluate_avatar(read_avatar(path), capture, "val").psnr == pytest.approx(
-        best["psnr"], abs=1e-3
-    )
+    found = evaluate_avatar(read_avatar(path), capture, "val").psnr
+    assert found == pytest.approx(best["psnr"], abs=1e-3)
 
 
 def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:

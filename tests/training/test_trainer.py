@@ -34,13 +34,8 @@ def lower_part(capture: Capture) -> dict[int, np.ndarray]:
 
 
 def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
-    quiet = {
-        "warm_up_share": 0.0,
-        "global_interval": 2,
-        "density_interval": 0,
-        "stray_reset_interval": 0,
-        "strain_color": True,
-    }
+    quiet = {"density_interval": 0, "stray_reset_interval": 0, "strain_color": True}
+    quiet |= {"warm_up_share": 0.0, "global_interval": 2}
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 
 
@@ -57,10 +52,8 @@ def view_of(capture: Capture, timestep: int, camera: int = 1) -> View:
 def large(view: View, factor: float = 3.0) -> tuple[View, np.ndarray]:
     """In a larger image, and a noisy target: many tiles and a gradient everywhere."""
     view = replace(view, camera=view.camera.scaled(factor))
-    target = np.random.default_rng(0).integers(
-        0, 256, (view.camera.height, view.camera.width, 3), np.uint8
-    )
-    return view, target
+    size = view.camera.height, view.camera.width, 3
+    return view, np.random.default_rng(0).integers(0, 256, size, np.uint8)
 
 
 def disturb(trainer: Trainer) -> None:
@@ -145,10 +138,8 @@ def test_kinds_of_iterations(toy: Capture) -> None:
     images = [read_image(view) for view in views]
 
     def kinds(trainer: Trainer, share: float = 0.5) -> list[bool]:
-        return [
-            trainer.step(view, image, share) is not None
-            for view, image in zip(views, images, strict=True)
-        ]
+        pairs = zip(views, images, strict=True)
+        return [trainer.step(view, image, share) is not None for view, image in pairs]
 
     assert kinds(make_trainer(toy)) == [False, False, True, False, False, True, False, False]
     # Two local visits of frames with two views each, then a global visit.
@@ -178,13 +169,8 @@ def test_training_makes_the_picture_better(toy: Capture, strategy: str) -> None:
 
 def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     """Catches maintenance that never runs, or outside its span, or grows too far."""
-    options = {
-        "lattice": 2,
-        "density_interval": 2,
-        "density_span": (0.2, 0.6),
-        "growth": 0.05,
-        "stray_reset_interval": 5,
-    }
+    options = {"density_interval": 2, "density_span": (0.2, 0.6), "growth": 0.05}
+    options |= {"lattice": 2, "stray_reset_interval": 5}
     trainer = make_trainer(toy, "global", **options)
     view = view_of(toy, 1)
     image, counts = read_image(view), []
@@ -193,12 +179,8 @@ def test_stray_resets_and_density_control_come_when_due(toy: Capture) -> None:
     assert not trainer.state.unbound[7]
     for n in range(10):
         if n == 4:
-            assert (
-                np.linalg.norm(
-                    trainer.state.parameters.xyz[trainer.state.face == int(face[7])], axis=1
-                ).max()
-                > 0.9
-            )
+            own = trainer.state.parameters.xyz[trainer.state.face == int(face[7])]
+            assert np.linalg.norm(own, axis=1).max() > 0.9
         trainer.step(view, image, n / 10)
         counts.append(len(trainer.state))
     first = trainer.initial_count
@@ -259,21 +241,15 @@ def test_unseen_share(toy: Capture) -> None:
     splats.xyz[:] += np.random.default_rng(0).normal(0, 0.1, splats.xyz.shape).astype(np.float32)
     found = unseen_share(toy, "stga", splats)
     first = toy.views["train"][0].timestep
-    world = to_world(
-        splats, face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")
-    ).xyz.astype(np.float64)
+    frames = face_frames(toy.mesh(first), toy.faces, toy.neutral, "stga")
+    world = to_world(splats, frames).xyz.astype(np.float64)
     unseen = []
     for view in (view for view in toy.views["train"] if view.timestep == first):
         camera = view.camera
         x, y, z = camera.world_to_camera[:3, :3] @ world.T + camera.world_to_camera[:3, 3:]
         column, row = camera.fl_x * x / z + camera.cx, camera.fl_y * y / z + camera.cy
-        unseen.append(
-            (z < 0.01)
-            | (column < 0)
-            | (column >= camera.width)
-            | (row < 0)
-            | (row >= camera.height)
-        )
+        beside = (column < 0) | (column >= camera.width) | (row < 0) | (row >= camera.height)
+        unseen.append(beside | (z < 0.01))
     np.testing.assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)
     assert not found[1::2].any()
     assert 0.05 < found[::2].mean() < 0.95

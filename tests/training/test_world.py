@@ -125,10 +125,8 @@ def test_measured_with_the_world(
     assert stga("render", run, "--world --cameras", cameras, "--out", run / "pictures") == 0
     errors = []
     for view in open_capture(walled).views["train"]:
-        rendered, recorded = (
-            np.asarray(Image.open(path).convert("RGB")) / 255
-            for path in (run / "pictures" / Path(view.name).name, view.image)
-        )
+        paths = run / "pictures" / Path(view.name).name, view.image
+        rendered, recorded = (np.asarray(Image.open(path).convert("RGB")) / 255 for path in paths)
         errors.append(-10 * np.log10(((rendered - recorded) ** 2).mean()))
     assert found == pytest.approx(np.mean(errors), abs=0.05)
     assert found > 18

@@ -1,19 +1,5 @@
-"""Folder of a training run: its run.json, lock and smaller files, and the capture that it was
-trained on.
-
-run.json        what is trained, with which settings
-selection.npz   timestep -> selected triangles
-checkpoint.npz  the whole state of training
-avatar.npz      the sharpest avatar so far, by the evaluation views; without them, or continuing a
-                run, the latest
-strain_range.npz  strain that colors and positions follow; only where they do, and the tracking is
-                  not refined
-tracking.npz    refined FLAME parameters, those that avatar.npz was trained with
-metrics.jsonl   one line per evaluation
-residuals.npz   of a finished run: error of the avatar on each triangle
-world.ply       what stands still behind the person, in world space; only where the effect `world`
-                is on
-"""
+"""Folder of a training run (docs/formats.md#run-folder): its run.json, lock and smaller files, and
+the capture that it was trained on."""
 
 import re
 from collections.abc import Iterator

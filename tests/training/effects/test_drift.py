@@ -23,11 +23,9 @@ DRIFT = 1 + 0.12 * np.sin(np.arange(TIMESTEPS)[:, None] / 5 + PHASES)
 def recorded(folder, drift):
     """One camera; some timesteps are left out of the training."""
     capture = photograph(folder, Scene(cameras=1, timesteps=TIMESTEPS, drift=drift))
-    split = {"train": lambda t: t not in LEFT_OUT, "val": lambda t: t in LEFT_OUT}
-    views = {
-        name: tuple(v for v in capture.views["train"] if use(v.timestep))
-        for name, use in split.items()
-    }
+    views = {"train": [], "val": []}
+    for view in capture.views["train"]:
+        views["val" if view.timestep in LEFT_OUT else "train"].append(view)
     return replace(capture, views=views)
 
 

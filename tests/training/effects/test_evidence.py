@@ -29,9 +29,8 @@ def test_features_beyond_the_fitted_range_are_clipped() -> None:
     strength = np.array([0.2, -0.3, 0.5, -0.5, 0.4, -0.2, 0.3, 4.0])
     features = np.zeros((VIEWS, TRIANGLES, 3))
     features[..., 0] = strength[GROUP][:, None]
-    color = (
-        100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
-    )
+    noise = rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
+    color = 100 + 20 * np.clip(features[..., :1], -0.6, 0.6) + noise
     assert linear_evidence(color, features, FOLDS).gain == 0
     rest = np.zeros((TRIANGLES, 3))
     assert linear_evidence(color, features, FOLDS, rest=rest).gain > 5
