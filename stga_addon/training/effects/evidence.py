@@ -76,7 +76,7 @@ class CameraColors:
 
 
 def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
-    """From color (S, K, 3), NaN where not seen: least squares, cameras and triangles in turn."""
+    """From color (S, K, 3), NaN if unseen, by least squares: cameras and triangles in turn."""
     camera, row = np.unique(samples.camera, return_inverse=True)
     fitted = CameraColors(camera, np.ones((len(camera), 3)), np.zeros((len(camera), 3)))
     for _ in range(CAMERA_FIT_ITERATIONS):

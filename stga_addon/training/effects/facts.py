@@ -20,7 +20,7 @@ from .samples import Samples, take_samples
 MAX_TIMESTEPS = 64
 """Timesteps that are posed to measure motion, evenly spread."""
 MIN_WHITE_SHARE = 0.1
-"""Of the pixels beside the mesh, that are white before white: hair and shoulders leave more."""
+"""Of the pixels beside the mesh: with a white background, more of them than this are white."""
 
 
 class CaptureFacts:

@@ -23,7 +23,7 @@ MIN_CAMERAS_FOR_VIEW_COLOR = 4
 MIN_VIEW_DEPENDENCE_LEVELS = 1.0
 """Gain in levels of 255 from which color depends on the direction of view."""
 MAX_VIEW_ERROR_RATIO = 4.0
-"""Larger errors, of the median, come from lids, lips and teeth, not from the direction of view."""
+"""Errors above this multiple of the median come from lids, lips and teeth, not from the view."""
 MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
 deformation: with less, trainings with and without differ by no more than their noise

@@ -25,7 +25,7 @@ MASK_EDGE_PIXELS = 3
 TRACKING_ERROR_SHARE = 0.01
 """Foreground up to this share of the image's height beside the mesh counts as tracking error."""
 DEPTH_TOLERANCE_SHARE = 0.003
-"""How far the center of a visible triangle may lie behind the nearest one, of its distance."""
+"""How far a visible triangle's center may lie behind the nearest one, as a share of its depth."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ def plateau_start(curve: Curve) -> float | None:
 
 
 def checked_forecasts(lines: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
-    """How many forecasts of a metrics.jsonl held within their error, of how many checked."""
+    """How many forecasts of a metrics.jsonl held within their error, and how many were checked."""
     curve = curve_of(lines)
     if not curve:
         return 0, 0
@@ -111,7 +111,7 @@ def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
-    """Of the saved avatar, of those with a PSNR: the last to reach the target, or the sharpest."""
+    """The saved avatar's line, of those with a PSNR: the last at the target, or the sharpest."""
     reached = [line for line in lines if target is not None and line["psnr"] >= target]
     return reached[-1] if reached else min(lines, key=lambda line: line.get(DETAIL, np.inf))
 

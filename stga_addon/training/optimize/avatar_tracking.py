@@ -65,7 +65,7 @@ EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 FIRST_STEP = 0.01
-"""Length of the first step, of the one down a loss as steep as the points say: it is steeper."""
+"""Length of the first step, as a share of the one down a loss as steep as the points say."""
 MISS_LEVELS = 24
 """Mean over the channels, of 255, by which a pixel's color is missed that is not explained."""
 
