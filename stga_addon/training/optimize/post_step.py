@@ -112,7 +112,8 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
 
 
 def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
-    """(N,) bool: the unwanted splats (N,); of a triangle's bound ones, the most opaque stays."""
+    """(N,) bool: the unwanted splats (N,); a triangle that would lose all bound ones keeps the most
+    opaque."""
     face, bound = state.face, np.flatnonzero(~state.unbound)
     order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
     first = np.ones(len(order), bool)
