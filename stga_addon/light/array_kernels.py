@@ -14,7 +14,6 @@ CHUNK_POINTS = 1 << 13
 """Points that are computed at a time, whose arrays stay in the processor's cache."""
 SUN, SPOT, AREA = 0, 2, 3
 MIN_FACING = np.float32(0.05)
-ONE, EIGHTH, PI = np.float32(1), np.float32(0.125), np.float32(np.pi)
 
 
 def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None:
@@ -57,7 +56,12 @@ def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None
         along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)
         at = np.repeat(row * size + begin.astype(np.int64), texels) + along
         z, steepness = (np.repeat(values.astype(np.float32), texels) for values in (z, steepness))
-        _write_least(depth.reshape(-1), at, z + steepness * along.astype(np.float32))
+        z, flat = z + steepness * along.astype(np.float32), depth.reshape(-1)
+        # As `np.minimum.at`, slow in older NumPy: what is less after writing is written again.
+        while len(at):
+            less = z < flat[at]
+            at, z = at[less], z[less]
+            flat[at] = z
 
 
 def _crossed(u: np.ndarray, v: np.ndarray, i: int, j: int) -> np.ndarray:
@@ -69,14 +73,6 @@ def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     height = b[1] - a[1]
     slope = (b[0] - a[0]) / np.where(height == 0, 1, height)
     return slope, a[0] - slope * a[1]
-
-
-def _write_least(values: np.ndarray, at: np.ndarray, found: np.ndarray) -> None:
-    """As `np.minimum.at`, slow in older NumPy: what is less after writing is written again."""
-    while len(at):
-        less = found < values[at]
-        at, found = at[less], found[less]
-        values[at] = found
 
 
 def lit_shares(
@@ -146,19 +142,34 @@ def add_lights(
         place, normal = (np.ascontiguousarray(rows[part].T) for rows in (points, normals))
         view = eye[:, None] - place
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
-        facing = np.maximum(_dot(normal, view), MIN_FACING)
-        surface = normal, view, facing, roughness[part], reflectance[part]
+        toward_eye = np.maximum(_dot(normal, view), MIN_FACING)
+        alpha, share = roughness[part] ** 2, reflectance[part]
         arriving, reflected = np.zeros_like(view), np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
-            strength = strength * np.maximum(_dot(normal, toward), 0)
+            facing = np.maximum(_dot(normal, toward), 0)
+            strength = strength * facing
             if light[12] >= 0:
                 strength *= lit[int(light[12]), part]
-            if strength.any():
-                arriving += (light[13] * light[7:10])[:, None] * strength
-                if light[14] > 0:
-                    strength *= _gloss(toward, width, *surface)
-                    reflected += (light[14] * light[7:10])[:, None] * strength
+            if not strength.any():
+                continue
+            arriving += (light[13] * light[7:10])[:, None] * strength
+            if light[14] <= 0:
+                continue
+            half = toward + view  # as `raster.cpu.shade.ggx`
+            half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
+            square = np.minimum(alpha * alpha + width * width / 8, 1)
+            half_cosine = np.clip(_dot(normal, half), 0, 1)
+            spread = half_cosine * half_cosine * (square - 1) + 1
+            shadowing = facing * np.sqrt(toward_eye * toward_eye * (1 - square) + square)
+            shadowing += toward_eye * np.sqrt(facing * facing * (1 - square) + square)
+            fade = 1 - np.clip(_dot(view, half), 0, 1)
+            fade_square = fade * fade
+            fresnel = share + (1 - share) * fade_square * fade_square * fade
+            least = np.float32(1e-12)
+            gloss = square * fresnel / np.maximum(2 * np.pi * spread * spread * shadowing, least)
+            strength *= np.where(alpha > 0, gloss, 0)
+            reflected += (light[14] * light[7:10])[:, None] * strength
         irradiance[part] += arriving.T
         highlight[part] += reflected.T
 
@@ -186,24 +197,3 @@ def toward_light(
         inside = np.clip((along - light[10]) / light[11], 0, 1)
         strength = strength * inside * inside * (3 - 2 * inside)
     return toward, strength, light[15] * away
-
-
-def _gloss(
-    toward: np.ndarray, width: np.ndarray, normal: np.ndarray, view: np.ndarray,
-    toward_eye: np.ndarray, roughness: np.ndarray, reflectance: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """(N,) as `raster.cpu.shade.ggx` of lights `width` (N,) wide; 0 without roughness."""
-    half = toward + view
-    half *= 1 / np.sqrt(np.maximum(_dot(half, half), np.float32(1e-12)))
-    facing = np.maximum(_dot(normal, toward), 0)
-    alpha = roughness * roughness
-    square = np.minimum(alpha * alpha + EIGHTH * width * width, ONE)
-    half_cosine = np.clip(_dot(normal, half), 0, 1)
-    spread = half_cosine * half_cosine * (square - ONE) + ONE
-    shadowing = facing * np.sqrt(toward_eye * toward_eye * (ONE - square) + square)
-    shadowing += toward_eye * np.sqrt(facing * facing * (ONE - square) + square)
-    fade = ONE - np.clip(_dot(view, half), 0, 1)
-    fade_square = fade * fade
-    fresnel = reflectance + (ONE - reflectance) * fade_square * fade_square * fade
-    found = square * fresnel / np.maximum(2 * PI * spread * spread * shadowing, np.float32(1e-12))
-    return np.asarray(np.where(alpha > 0, found, np.float32(0)))

@@ -1,6 +1,5 @@
 """Light from a file: an environment (.hdr) as harmonics and suns, or lights as text (.toml)."""
 
-import re
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,6 @@ from ..schema import from_json, setting
 from .harmonics import basis, rotated, uniform
 from .values import KINDS, SHAPES, SKIN_ROUGHNESS, Light, Lighting
 
-MAX_PIXELS, MAX_HEADER_BYTES = 1 << 26, 1 << 16
-HEADER = re.compile(
-    rb"#\?(?:RADIANCE|RGBE)[^\n]*\n(?:[^\n]*\n){0,200}?\n-Y (\d{1,6}) \+X (\d{1,6})\n"
-)
-MIN_RUN_WIDTH, MAX_RUN_WIDTH = 8, 0x7FFF  # Widths of images whose rows may be compressed
 MAX_SUNS = 4
 SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
@@ -28,56 +22,13 @@ looks along z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
-    """(H, W, 3) float32 radiance of a .hdr picture (RGBE), flat or run-length encoded (Ward,
-    Graphics Gems II), from the top. Raises StgaError."""
-    data = read_bytes(path)
-    header = HEADER.match(data[:MAX_HEADER_BYTES])
-    if header is None:
-        raise StgaError(f"{path}: is not a Radiance picture (.hdr) with rows from the top")
-    height, width = int(header[1]), int(header[2])
-    if not 0 < height * width <= MAX_PIXELS:
-        raise StgaError(f"{path}: claims {width} x {height} pixels; at most {MAX_PIXELS} are read")
-    body = np.frombuffer(data, np.uint8)[header.end() :]
-    try:
-        pixels = _rows(body, height, width)
-    except (IndexError, ValueError) as error:
-        raise StgaError(f"{path}: ends within its pixels, or its rows are damaged") from error
-    exponent = pixels[..., 3:].astype(np.float32)
-    scale = np.where(exponent > 0, np.exp2(exponent - 136), 0)
-    return np.asarray((pixels[..., :3] + np.float32(0.5)) * scale, np.float32)
+    """(H, W, 3) float32 radiance of a .hdr picture, from the top. Raises StgaError."""
+    import cv2  # where Blender's Python, which reads its worlds itself, may have none
 
-
-def _rows(body: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(H, W, 4) uint8. Raises IndexError or ValueError where the data end early."""
-    packed = MIN_RUN_WIDTH <= width <= MAX_RUN_WIDTH and body[0] == body[1] == 2 and body[2] < 128
-    if not packed:
-        return body[: height * width * 4].reshape(height, width, 4)
-    pixels, at = np.empty((height, 4, width), np.uint8), 0
-    for row in pixels:
-        if tuple(body[at : at + 4]) != (2, 2, width >> 8, width & 255):
-            raise ValueError("not the start of a row")
-        at += 4
-        for channel in row:
-            at = _unpacked(body, at, channel)
-    return pixels.transpose(0, 2, 1)
-
-
-def _unpacked(body: np.ndarray, at: int, channel: np.ndarray) -> int:
-    """Fill a channel (W,) of a row from run-length encoded data; returns where these end."""
-    filled = 0
-    while filled < len(channel):
-        count = int(body[at])
-        if count > 128:
-            channel[filled : filled + count - 128] = body[at + 1]
-            at, filled = at + 2, filled + count - 128
-        elif count:
-            channel[filled : filled + count] = body[at + 1 : at + 1 + count]
-            at, filled = at + 1 + count, filled + count
-        else:
-            raise ValueError("a run of nothing")
-    if filled > len(channel):
-        raise ValueError("a run beyond the row")
-    return at
+    found = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.dtype != np.float32:
+        raise StgaError(f"{path}: is not a Radiance picture (.hdr), or its pixels are damaged")
+    return np.ascontiguousarray(found[..., ::-1])
 
 
 def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

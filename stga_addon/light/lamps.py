@@ -1,10 +1,10 @@
 """Lights of a scene at a posed head: shadow maps of what they see, and what they add."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,18 +23,34 @@ TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats so
 
 @dataclass(frozen=True)
 class LightView:
-    """How a light sees space, parallel or in perspective from `origin` (3,). axes (3, 3): columns
-    across, up, forward. scale: texels per meter, or per unit of slope."""
+    """How a light sees a head, parallel or in perspective from `origin` (3,), on size² texels.
+
+    axes (3, 3): columns across, up, forward. scale: texels per meter, or per unit of slope.
+    texel_m: about how wide a texel is on the head.
+    """
 
     axes: np.ndarray
     origin: np.ndarray
     scale: float
     is_parallel: bool
     size: int
+    texel_m: float
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Points (N, 3) in meters -> (N, 3) float32: x and y in texels, depth in meters; NaN where
+        a light cannot see them."""
+        local = np.asarray(points, np.float32) @ self.axes.astype(np.float32)
+        local -= (self.origin @ self.axes).astype(np.float32)
+        factor: np.ndarray | np.float32 = np.float32(self.scale)
+        if not self.is_parallel:
+            depth = local[:, 2]
+            factor = factor / np.where(depth > 1e-4, depth, np.float32(np.nan))
+        for k in range(2):
+            local[:, k] = local[:, k] * factor + np.float32(self.size / 2)
+        return np.asarray(local)
 
 
-@dataclass(frozen=True)
-class HeadBounds:
+class HeadBounds(NamedTuple):
     """Middle (3,) of a posed head's box, its diagonal, and the head's radius around the middle."""
 
     center: np.ndarray
@@ -66,34 +82,8 @@ def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightV
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    is_sun = light.kind == "sun"
-    return LightView(axes, center if is_sun else light.position, scale, is_sun, size)
-
-
-def light_projection(
-    vertices: np.ndarray, light: Light, size: int = MAP_SIZE
-) -> Callable[[np.ndarray], np.ndarray]:
-    """Points (N, 3) in meters -> (N, 3) float32: x and y in texels of what `light_view` sees, depth
-    in meters; NaN where a light cannot see them."""
-    view = light_view(head_bounds(vertices), light, size)
-    axes, shift = view.axes.astype(np.float32), (view.origin @ view.axes).astype(np.float32)
-
-    def project(points: np.ndarray) -> np.ndarray:
-        local = np.asarray(points, np.float32) @ axes - shift
-        factor: np.ndarray | np.float32 = np.float32(view.scale)
-        if not view.is_parallel:
-            depth = local[:, 2]
-            factor = factor / np.where(depth > 1e-4, depth, np.float32(np.nan))
-        for k in range(2):
-            local[:, k] = local[:, k] * factor + np.float32(size / 2)
-        return np.asarray(local)
-
-    return project
-
-
-def texel_meters(bounds: HeadBounds, size: int = MAP_SIZE) -> float:
-    """About how wide a texel of a shadow map is on the head."""
-    return bounds.diagonal / size
+    is_sun, texel_m = light.kind == "sun", bounds.diagonal / size
+    return LightView(axes, center if is_sun else light.position, scale, is_sun, size, texel_m)
 
 
 class ShadowMap:
@@ -103,12 +93,11 @@ class ShadowMap:
         self, vertices: np.ndarray, faces: np.ndarray, light: Light, casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
     ) -> None:  # fmt: skip
-        self._project = light_projection(vertices, light, size)
-        self._light, self._texel_m = light, texel_meters(head_bounds(vertices), size)
-        is_parallel = light.kind == "sun"
+        self._view = light_view(head_bounds(vertices), light, size)
+        is_parallel = self._view.is_parallel
         depth = np.full((size, size), np.inf if is_parallel else 0, np.float32)
         for mesh in (Caster(vertices, faces), *casters):
-            points = self._project(mesh.vertices)
+            points = self._view.project(mesh.vertices)
             # of a plane in perspective, not depth but 1 / depth is linear in texels
             if not is_parallel:
                 points[:, 2] = -1 / points[:, 2]
@@ -125,17 +114,17 @@ class ShadowMap:
         normals (N, 3) make `bias` larger on slopes."""
         found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
         if normals is not None:
-            if self._light.kind == "sun":
-                cosine = normals @ -self._light.direction.astype(np.float32)
+            if self._view.is_parallel:
+                cosine = normals @ -self._view.axes[:, 2].astype(np.float32)
             else:
-                away = self._light.position.astype(np.float32) - points
+                away = self._view.origin.astype(np.float32) - points
                 length = np.sqrt(np.einsum("nk,nk->n", away, away))
                 cosine = np.einsum("nk,nk->n", normals, away) / np.maximum(length, np.float32(1e-9))
             cosine = np.clip(cosine, 0.05, 1)
             slope = np.sqrt(1 - cosine**2) / cosine
-            sloped = bias + (step + 1) * self._texel_m * slope
+            sloped = bias + (step + 1) * self._view.texel_m * slope
             biases = np.asarray(np.minimum(sloped, max(bias, MAX_BIAS_M)), np.float32)
-        places = np.nan_to_num(self._project(points), nan=-1e6)  # beside the map, and so lit
+        places = np.nan_to_num(self._view.project(points), nan=-1e6)  # beside the map, and so lit
         kernels("shadow").lit_shares(self.depth, places, biases, np.float32(step), found)
         return found
 
@@ -195,7 +184,20 @@ class Lamps:
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
     """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
-    places, width = _places(light, center)
+    places, width = light.position[None], light.radius
+    if light.kind == "sun":
+        width = float(np.tan(light.angle / 2))
+    elif light.kind == "area":
+        distance = max(float(np.linalg.norm(light.position - center)), 1e-6)
+        share = max(light.size) / distance
+        side = FEW if share < 0.15 else SOME if share < 0.6 else MANY
+        grid = (np.arange(side) + 0.5) / side - 0.5
+        x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+        if light.shape == "ellipse":  # the square's points moved into the disk, of equal area each
+            x, y = x * np.sqrt(1 - 2 * y * y), y * np.sqrt(1 - 2 * x * x)
+        across = np.cross(light.direction, light.tangent)
+        offset = x[:, None] * light.size[0] * light.tangent + y[:, None] * light.size[1] * across
+        places, width = light.position + offset, float(np.mean(light.size)) / 2 / side
     kind = KINDS.index(light.kind)
     intensity = (1.0, 1 / (4 * np.pi), 1 / (4 * np.pi), 1 / np.pi)[kind]
     edge = np.cos(light.cone / 2)
@@ -203,24 +205,6 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
     color = light.color * intensity / len(places)
     rest = (*light.direction, *color, edge, fade, shadow_map, light.diffuse, light.specular, width)
     return np.array([(kind, *place, *rest) for place in places], np.float32)
-
-
-def _places(light: Light, center: np.ndarray) -> tuple[np.ndarray, float]:
-    """Positions (points, 3) that stand for a light, and the width of each."""
-    if light.kind == "sun":
-        return light.position[None], float(np.tan(light.angle / 2))
-    if light.kind != "area":
-        return light.position[None], light.radius
-    distance = max(float(np.linalg.norm(light.position - center)), 1e-6)
-    share = max(light.size) / distance
-    side = FEW if share < 0.15 else SOME if share < 0.6 else MANY
-    grid = (np.arange(side) + 0.5) / side - 0.5
-    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
-    if light.shape == "ellipse":  # the square's points moved into the disk, of equal area each
-        x, y = x * np.sqrt(1 - 2 * y * y), y * np.sqrt(1 - 2 * x * x)
-    across = np.cross(light.direction, light.tangent)
-    offset = x[:, None] * light.size[0] * light.tangent + y[:, None] * light.size[1] * across
-    return light.position + offset, float(np.mean(light.size)) / 2 / side
 
 
 def distant_light(light: Light, center: np.ndarray) -> np.ndarray:

@@ -150,13 +150,6 @@ class Relighter:
         shadowed = lighting.shadows and any(light.casts_shadow for light in lighting.lights)
         return (self.lashes.caster(mesh),) if shadowed and len(self.lashes.face) else ()
 
-    def world_in_head(self, mesh: np.ndarray, world: np.ndarray) -> np.ndarray:
-        """(9, 3) of the world in the neutral mesh's axes, for a posed `mesh` (V, 3)."""
-        # Open vertices, which the jaw moves least, say how the head is turned.
-        weights = self.light.occlusion + np.float64(1e-3)
-        mesh = np.asarray(mesh, np.float64)
-        return rotated(world, weighted_procrustes(mesh, self.avatar.neutral, weights)[0])
-
     def colors(
         self, mesh: np.ndarray, eye: np.ndarray, lighting: Lighting, casters: Sequence[Caster] = ()
     ) -> np.ndarray:
@@ -182,8 +175,12 @@ class Relighter:
         center = (mesh.max(0) + mesh.min(0)) / 2
         lamps = [distant_light(light, center) for light in lighting.lights]
         distant = lighting.world + sum(lamps, np.zeros((9, 3)))
+        # Open vertices, which the jaw moves least, say how the head is turned.
+        weights = self.light.occlusion + np.float64(1e-3)
+        mesh = np.asarray(mesh, np.float64)
+        turn, _ = weighted_procrustes(mesh, self.avatar.neutral, weights)
         # Both at once: turning them into the head's axes takes longer than the rest.
-        both = self.world_in_head(mesh, np.concatenate([lighting.world, distant], axis=1))
+        both = rotated(np.concatenate([lighting.world, distant], axis=1), turn)
         found = kept(self.recorded_light, both[:, 3:])
         # Other highlights than the capture's are asked for.
         for factor in (lighting.specular, lighting.roughness / SKIN_ROUGHNESS):

@@ -82,7 +82,7 @@ def light_irradiance(found: Relit) -> np.ndarray:
     """(BALL, 3) that arrives at the ball's vertices."""
     normals = vertex_normals(found.mesh, found.relighter.avatar.faces)
     lamps = Lamps(found.lighting, found.mesh, found.relighter.avatar.faces, found.casters)
-    world = found.relighter.world_in_head(found.mesh, found.lighting.world)
+    world = found.relighter.distant_in_head(found.mesh, found.lighting)[0][:, :3]
     arriving = np.maximum(found.relighter.light.transfer @ world, 0)
     return (lamps.irradiance(found.mesh + LIFT_M * normals, normals) + arriving)[:BALL]
 

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("numba")
 
 from stga_addon.light import array_kernels
-from stga_addon.light.lamps import light_projection, light_rows
+from stga_addon.light.lamps import head_bounds, light_rows, light_view
 from stga_addon.light.values import Light
 from stga_addon.raster.cpu import shade, shadow
 
@@ -67,7 +67,7 @@ def test_lights():
 def test_shadow_maps(light):
     """Catches texels that only one of the kernels draws, or looks up beside its place."""
     vertices, faces = ball_and_plate(3)
-    points = light_projection(vertices, light, 256)(vertices)
+    points = light_view(head_bounds(vertices), light, 256).project(vertices)
     depth = [np.full((256, 256), np.inf, np.float32) for _ in range(2)]
     for one, kernels in zip(depth, (shadow, array_kernels), strict=True):
         kernels.add_depths(points, faces, one)

@@ -13,7 +13,7 @@ from ...capture.camera import Camera
 from ...errors import StgaError
 from ...flame.quaternions import normalized, to_matrices
 from ...light.harmonics import GLOSSY
-from ...light.lamps import LightView, head_bounds, light_rows, light_view, texel_meters
+from ...light.lamps import LightView, head_bounds, light_rows, light_view
 from ...light.relight import Relighter
 from ..layers import SceneLayer, random_percentage
 
@@ -252,7 +252,7 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
                 # The map's rows to the light's axes; scale, whether parallel, meters of a texel.
                 row = np.zeros((MAP_TEXELS, 4), np.float32)
                 row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
-                row[3] = view.scale, view.is_parallel, texel_meters(bounds), 0
+                row[3] = view.scale, view.is_parallel, view.texel_m, 0
                 map_rows.append(row)
             points.append(light_rows(light, bounds.center, number))
             count += len(points[-1])
