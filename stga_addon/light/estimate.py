@@ -11,7 +11,7 @@ from ..capture.mesh_geometry import connected_parts
 from ..capture.model import Capture, View, ViewExposure, evenly_spread
 from ..errors import StgaError
 from ..progress import Progress, Report, ignore
-from .harmonics import COUNT, LAMBERT, basis, uniform
+from .harmonics import COUNT, DARK, LAMBERT, basis, least_squares, uniform
 from .lamps import ShadowMap
 from .surface import Bounce, transfer_of
 from .values import Light
@@ -70,7 +70,10 @@ def _view_colors(
     level = image.max(2)
     usable = (level < SATURATED_LEVEL) & (level > DARK_LEVEL)
     if mask is not None:
-        usable &= _inner(mask > 127)
+        # without pixels within two of the mask's border
+        inside, (height, width) = np.pad(mask > 127, 2), mask.shape
+        for y, x in ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)):
+            usable &= inside[y : y + height, x : x + width]
     corners = mesh[capture.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     to_camera = view.camera.position - corners.mean(1)
@@ -91,15 +94,6 @@ def _view_colors(
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _inner(mask: np.ndarray) -> np.ndarray:
-    """The mask (H, W) bool without pixels within two of its border."""
-    padded = np.pad(mask, 2)
-    height, width = mask.shape
-    around = (0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)
-    shifted = [padded[y : y + height, x : x + width] for y, x in around]
-    return np.asarray(np.logical_and.reduce(shifted))
-
-
 ITERATIONS = 40
 PRIOR = 0.7  # Weight of alike albedos, in observations of a triangle seen at every timestep
 POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
@@ -109,9 +103,7 @@ MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
 the light."""
 LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in medians
 RIDGE = 1e-4
-MIN_ARRIVING, DARK = 0.02, 1e-5
-"""Least irradiance that a color is divided by, as a share of the mean; and what counts as no light
-or albedo."""
+MIN_ARRIVING = 0.02  # Least irradiance that a color is divided by, as a share of the mean
 TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
 """Residuals from which on the light is too hard to be taken away, and at which albedo is damped
@@ -208,52 +200,29 @@ def fit_light(
         raise StgaError("light: too few triangles are seen in the images to estimate it")
     color, received = color[usable], received[usable].astype(np.float64)
     face = np.broadcast_to(np.arange(faces), usable.shape)[usable]
-    radiance = uniform(np.ones(3) / np.pi) if given is None else given
-    weight = np.ones_like(color)
-    for _ in range(ITERATIONS):
-        arriving = received @ radiance
-        arriving = np.maximum(arriving, np.maximum(MIN_ARRIVING * arriving.mean(0), DARK))
-        typical = np.maximum(np.median(color / arriving, axis=0), DARK)
-        albedo = _albedo(color, arriving, weight, face, typical, faces, times)
-        error = np.abs(color - albedo * arriving)
-        weight = 1 / (1 + (error / (LOSS_SCALE * np.median(error, axis=0) + 1e-9)) ** 2)
-        if given is None:
-            radiance = _solve(color, received, albedo, weight)
+    radiance = np.array(uniform(np.ones(3) / np.pi) if given is None else given)
+    typical, error = np.empty(3), np.empty_like(color)
+    for k, shown in enumerate(color.T):
+        weight = np.ones_like(shown)
+        for _ in range(ITERATIONS):
+            arriving = received @ radiance[:, k]
+            arriving = np.maximum(arriving, max(MIN_ARRIVING * arriving.mean(), DARK))
+            typical[k] = max(np.median(shown / arriving), DARK)
+            prior = PRIOR * times * (arriving**2).mean()
+            upper = np.bincount(face, weight * shown * arriving, faces) + prior * typical[k]
+            albedo = (upper / (np.bincount(face, weight * arriving**2, faces) + prior))[face]
+            error[:, k] = np.abs(shown - albedo * arriving)
+            scale = LOSS_SCALE * np.median(error[:, k]) + 1e-9
+            weight = 1 / (1 + (error[:, k] / scale) ** 2)
+            if given is None:
+                root = np.sqrt(weight)
+                rows = received * (albedo * root)[:, None]
+                radiance[:, k] = least_squares(rows, shown * root, RIDGE)
     residual = float(1.4826 * np.median(error / np.maximum(color, 1e-3)))
     if given is None:
         mean = (received @ radiance).mean(0)
         radiance = radiance / np.maximum(mean, DARK) * (typical * mean)[1] * np.pi / TYPICAL_ALBEDO
     return radiance, residual
-
-
-def _albedo(
-    color: np.ndarray, arriving: np.ndarray, weight: np.ndarray, face: np.ndarray,
-    typical: np.ndarray, faces: int, times: int,
-) -> np.ndarray:  # fmt: skip
-    """(M, 3) of each observation's triangle: color over irradiance, drawn to `typical`."""
-    prior = PRIOR * times * (arriving**2).mean(0)
-    found = np.empty_like(color)
-    for k in range(3):
-        weighted = weight[:, k] * color[:, k] * arriving[:, k]
-        upper = np.bincount(face, weighted, faces) + prior[k] * typical[k]
-        lower = np.bincount(face, weight[:, k] * arriving[:, k] ** 2, faces) + prior[k]
-        found[:, k] = (upper / lower)[face]
-    return found
-
-
-def _solve(
-    color: np.ndarray, received: np.ndarray, albedo: np.ndarray, weight: np.ndarray
-) -> np.ndarray:
-    """(9, 3) radiance with the least weighted error, slightly drawn to 0."""
-    found = np.empty((COUNT, 3))
-    for k in range(3):
-        rows = received * (albedo[:, k] * np.sqrt(weight[:, k]))[:, None]
-        matrix = rows.T @ rows
-        ridge = RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
-        ridge[np.diag_indices(COUNT)] += DARK**2  # a channel that shows nothing
-        wanted = color[:, k] * np.sqrt(weight[:, k])
-        found[:, k] = np.linalg.solve(matrix + ridge, rows.T @ wanted)
-    return found
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -264,15 +233,13 @@ def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
     used[faces] = True
     for label in np.unique(part[used]):
         members = used & (part == label)
-        if members.sum() >= MIN_VERTICES and _is_eyeball(neutral[members].astype(np.float64)):
+        if members.sum() < MIN_VERTICES:
+            continue
+        points = neutral[members].astype(np.float64)  # on a sphere with the least squared error
+        rows = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
+        *center, rest = np.linalg.lstsq(rows, (points**2).sum(1), rcond=None)[0]
+        radius = np.sqrt(max(rest + np.dot(center, center), 0))
+        deviation = np.abs(np.linalg.norm(points - center, axis=1) - radius).mean()
+        if MIN_RADIUS_M < radius < MAX_RADIUS_M and deviation < MAX_DEVIATION * radius:
             found[members] = EYE_ROUGHNESS
     return found
-
-
-def _is_eyeball(points: np.ndarray) -> bool:
-    """Whether points (M, 3) lie on a sphere of an eye's size (least squares)."""
-    rows = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
-    found = np.linalg.lstsq(rows, (points**2).sum(1), rcond=None)[0]
-    radius = np.sqrt(max(found[3] + found[:3] @ found[:3], 0))
-    deviation = np.abs(np.linalg.norm(points - found[:3], axis=1) - radius).mean()
-    return bool(MIN_RADIUS_M < radius < MAX_RADIUS_M and deviation < MAX_DEVIATION * radius)

@@ -5,6 +5,7 @@ import numpy as np
 from ..avatar.splats import SH_C0, harmonics
 
 COUNT = 9
+DARK = 1e-5  # What counts as no light
 LAMBERT = np.array([np.pi] + [2 * np.pi / 3] * 3 + [np.pi / 4] * 5)
 """Irradiance of an unoccluded surface is Σ LAMBERT · basis(normal) · radiance (Ramamoorthi and
 Hanrahan 2001)."""
@@ -46,3 +47,11 @@ def uniform(radiance: object) -> np.ndarray:
     found = np.zeros((COUNT, 3))
     found[0] = np.asarray(radiance, np.float64) / SH_C0
     return found
+
+
+def least_squares(rows: np.ndarray, values: np.ndarray, ridge: float) -> np.ndarray:
+    """(9,) light with which rows (M, 9) come nearest to values (M,), drawn to 0 by `ridge`, a share
+    of the mean of the normal equations' diagonal: some harmonics may give no light."""
+    matrix = rows.T @ rows
+    matrix[np.diag_indices(COUNT)] += ridge * np.trace(matrix) / COUNT + DARK**2
+    return np.asarray(np.linalg.solve(matrix, rows.T @ values))

@@ -12,7 +12,7 @@ from ..avatar.splats import SH_C0, no_strain_color, sh_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
 from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
-from .harmonics import COUNT, GLOSSY, LAMBERT, basis, rotated
+from .harmonics import COUNT, GLOSSY, LAMBERT, basis, least_squares, rotated
 from .lamps import LIFT_M, Lamps, distant_light
 from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_points
 from .values import SKIN_ROUGHNESS, Caster, Lighting
@@ -21,7 +21,7 @@ UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and
 from which on nothing, as a share: other objects' shadows."""
-RIDGE = 1e-6  # Of the mean of a diagonal, added to it: meshes without light in some harmonics
+RIDGE = 1e-6  # For meshes without light in some harmonics
 
 
 class Kept(NamedTuple):
@@ -33,18 +33,6 @@ class Kept(NamedTuple):
 
     share: float
     gain: np.ndarray
-
-
-def recorded_light(transfer: np.ndarray, bounce: Bounce, irradiance: np.ndarray) -> np.ndarray:
-    """(9, 3) of the light that gave the neutral mesh irradiance (V, 3); transfer (V, 9)."""
-    direct = np.repeat(transfer.T[..., None].astype(np.float64), 3, axis=2)
-    columns = np.stack([each + bounce.light(each) for each in direct], axis=1)
-    found = np.empty((COUNT, 3))
-    for k in range(3):
-        matrix = columns[..., k].T @ columns[..., k]
-        matrix += RIDGE * np.trace(matrix) / COUNT * np.eye(COUNT)
-        found[:, k] = np.linalg.solve(matrix, columns[..., k].T @ irradiance[:, k])
-    return found
 
 
 def kept(recorded: np.ndarray, distant: np.ndarray) -> Kept:
@@ -70,6 +58,12 @@ def _smooth_step(values: np.ndarray) -> np.ndarray:
     """From 0 to 1 between 0 and 1."""
     values = np.clip(values, 0, 1)
     return np.asarray(values * values * (3 - 2 * values))
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    # np.linalg.norm is slow where the last axis is short
+    length = np.sqrt(row_dot(vectors, vectors))
+    return np.asarray(vectors / np.maximum(length, np.float32(1e-12))[:, None])
 
 
 REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
@@ -132,13 +126,16 @@ class Relighter:
         sh = self.avatar.splats.sh
         means = np.repeat(VIEW_MEANS, (1, 3, 5, 7))[: sh.shape[1], None].astype(np.float32)
         normals = vertex_normals(self.avatar.neutral.astype(np.float64), self.avatar.faces)
-        inward = -self._unit(self._at_splats(normals))
+        inward = -_unit(self._at_splats(normals))
         return sh_color(means * sh, inward).astype(np.float32)
 
     @cached_property
     def recorded_light(self) -> np.ndarray:
         """(9, 3) of the capture's light in the neutral mesh's axes, mean over time."""
-        return recorded_light(self.light.transfer, self.bounce, self.light.irradiance)
+        direct = np.repeat(self.light.transfer.T[..., None].astype(np.float64), 3, axis=2)
+        columns = np.stack([each + self.bounce.light(each) for each in direct], axis=1)
+        channels = zip(np.moveaxis(columns, 2, 0), self.light.irradiance.T, strict=True)
+        return np.stack([least_squares(*each, RIDGE) for each in channels], axis=1)
 
     @cached_property
     def lashes(self) -> Lashes:
@@ -199,16 +196,15 @@ class Relighter:
         # All at once, because the places of the vertices in memory are what takes time.
         bounced = self.bounce.light(at_vertices)
         at_splats = self._at_splats(np.concatenate([mesh, vertex_normal, bounced], axis=1))
-        points, normals = np.ascontiguousarray(at_splats[:, :3]), self._unit(at_splats[:, 3:6])
+        points, normals = np.ascontiguousarray(at_splats[:, :3]), _unit(at_splats[:, 3:6])
         skin = np.float32(max(lighting.roughness, 0.05))
         roughness = np.where(self.roughness > 0, self.roughness, skin)
         lifted = points + LIFT_M * normals
         arriving, highlight = lamps.shade(lifted, normals, eye, roughness, REFLECTANCE)
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
         highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
-        albedo = self.albedo
-        if self._strained:
-            albedo = self._albedo(self.diffuse_color + self._strain_color(mesh))
+        color = self._with_strain(self.diffuse_color, mesh)
+        albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)
         lit += np.float32(lighting.specular) * highlight
         if likeness.share > 0:
@@ -223,7 +219,7 @@ class Relighter:
         """(N, 3) of the world: radiance around the mirrored direction (Karis 2014)."""
         if not np.any(world):
             return np.zeros_like(points)
-        view = self._unit(eye.astype(np.float32) - points)
+        view = _unit(eye.astype(np.float32) - points)
         cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
         glossy = (GLOSSY[:, None] * world).astype(np.float32)
         seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
@@ -246,22 +242,19 @@ class Relighter:
             albedo = albedo ** (1 - damping) * np.exp(np.log(albedo).mean(0)) ** damping
         return np.asarray(albedo.astype(np.float32))
 
-    @property
-    def _strained(self) -> bool:
-        return self.avatar.splats.strain_color.shape[1] > 0
-
-    def _strain_color(self, mesh: np.ndarray) -> np.ndarray:
+    def _with_strain(self, color: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+        """The color (N, 3) on a posed mesh, where it follows strain; else the same array."""
         splats = self.avatar.splats
+        if not splats.strain_color.shape[1]:
+            return color
         strain = self.avatar.frames(mesh).strain[splats.face]
-        return np.asarray(np.einsum("ns,nsc->nc", strain, splats.strain_color))
+        return np.asarray(color + np.einsum("ns,nsc->nc", strain, splats.strain_color))
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
         splats = self.avatar.splats
-        direction = self._unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
-        color = sh_color(splats.sh, direction)
-        if self._strained:
-            color = color + self._strain_color(mesh)
+        direction = _unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
+        color = self._with_strain(sh_color(splats.sh, direction), mesh)
         return srgb_to_linear(np.maximum(color, 0)).astype(np.float32)
 
     @cached_property
@@ -271,12 +264,6 @@ class Relighter:
 
     def _at_splats(self, values: np.ndarray) -> np.ndarray:
         return at_splats(values, self.corners, self.weights)
-
-    @staticmethod
-    def _unit(vectors: np.ndarray) -> np.ndarray:
-        # np.linalg.norm is slow where the last axis is short
-        length = np.sqrt(row_dot(vectors, vectors))
-        return np.asarray(vectors / np.maximum(length, np.float32(1e-12))[:, None])
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:

@@ -180,7 +180,13 @@ def find_lashes(
     dark = (albedo.mean(1) < MAX_ALBEDO) & (roughness == 0) & (splats.opacities() > MIN_OPACITY)
     found = np.flatnonzero(dark)
     points = points_to_world(splats.xyz[found], frames, splats.face[found])
-    found, points = (rows[_near_eyes(points, neutral, avatar)] for rows in (found, points))
+    wet = avatar.light.roughness > 0
+    part = connected_parts(len(neutral), avatar.faces[wet[avatar.faces].all(1)])
+    near = np.zeros(len(points), bool)
+    for label in np.unique(part[wet]):
+        middle = neutral[wet & (part == label)].mean(0)
+        near |= np.linalg.norm(points - middle, axis=1) < REACH_M
+    found, points = found[near], points[near]
     normal = at_splats(vertex_normals(neutral, avatar.faces), corners[found], weights[found])
     above = points - at_splats(neutral, corners[found], weights[found])
     height = (above * normal).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
@@ -193,15 +199,3 @@ def find_lashes(
     first, second = (lengths[:, k, None] * axes[splat, longest[:, k]] for k in range(2))
     offsets = np.stack([first, second, -first, -second], axis=1)
     return Lashes(avatar, splats.face[found], np.asarray(rows.xyz[:, None] + offsets, np.float32))
-
-
-def _near_eyes(points: np.ndarray, neutral: np.ndarray, avatar: Avatar) -> np.ndarray:
-    """(M,) bool: points (M, 3) of the neutral mesh within REACH_M of the middle of an eyeball."""
-    assert avatar.light is not None
-    wet = avatar.light.roughness > 0
-    part = connected_parts(len(neutral), avatar.faces[wet[avatar.faces].all(1)])
-    near = np.zeros(len(points), bool)
-    for label in np.unique(part[wet]):
-        middle = neutral[wet & (part == label)].mean(0)
-        near |= np.linalg.norm(points - middle, axis=1) < REACH_M
-    return near
