@@ -12,6 +12,7 @@ from ..schema import from_json, setting
 from .harmonics import basis, rotated, uniform
 from .values import KINDS, SHAPES, SKIN_ROUGHNESS, Light, Lighting
 
+MIN_ROWS = 128  # Of a larger environment, to which it is made smaller
 MAX_SUNS = 4
 SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
@@ -53,7 +54,10 @@ def split_environment(
     mean, at most `max_suns`; harmonics hold the rest, so that both together have the environment's
     irradiance.
     """
-    image = smaller(np.asarray(image, np.float64))
+    step = max(1, len(image) // MIN_ROWS)  # means over squares of pixels
+    rows, columns = (size // step for size in image.shape[:2])
+    squares = image[: rows * step, : columns * step].reshape(rows, step, columns, step, 3)
+    image = np.asarray(squares, np.float64).mean((1, 3))
     vectors, angle = pixel_directions(*image.shape[:2])
     vectors = vectors @ rotation.T
     rest, level = image.copy(), image.sum(2)
@@ -75,16 +79,6 @@ def split_environment(
 def harmonics_of(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> np.ndarray:
     """(9, 3) of a whole environment, see `split_environment`."""
     return split_environment(image, rotation, max_suns=0)[0]
-
-
-def smaller(image: np.ndarray, height: int = 128) -> np.ndarray:
-    """The image averaged over squares of pixels to at most about twice `height` rows."""
-    step = max(1, image.shape[0] // height)
-    rows, columns = image.shape[0] // step * step, image.shape[1] // step * step
-    if step == 1:
-        return image
-    squares = image[:rows, :columns].reshape(rows // step, step, columns // step, step, -1)
-    return np.asarray(squares.mean((1, 3)))
 
 
 MAX_LIGHTS, MAX_NUMBER = 64, 1e6

@@ -89,16 +89,11 @@ def set_modifier_input(modifier: Any, identifier: str, value: Any) -> None:
 
 
 def modifier_input(modifier: Any, identifier: str) -> Any:
-    """A geometry nodes modifier's input by identifier; a menu's is a number before 5.2."""
+    """A geometry nodes modifier's input by identifier; of a menu, the chosen item's name."""
     if MODIFIER_INPUT_PROPERTIES:
         return getattr(modifier.properties.inputs, identifier).value
-    return modifier[identifier]
-
-
-def modifier_menu(modifier: Any, identifier: str) -> str:
-    """The name of the item that is chosen in a menu input of a geometry nodes modifier."""
-    value = modifier_input(modifier, identifier)
-    if isinstance(value, str):
+    value = modifier[identifier]
+    if type(value) is not int:  # a menu's, whose item it is by number
         return value
     items = modifier.id_properties_ui(identifier).as_dict()["items"]
     return next((str(item[0]) for item in items if item[4] == value), "")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import bpy
 
-from ...avatar.embedding import MIN_AREA_RATIO, UPRIGHT_COSINE
+from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
 from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, STRAIN_GAIN
 from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
@@ -17,15 +17,42 @@ _FRAME_SIZE = "stga_frame_size"
 
 
 def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with each triangle's frame stored on its faces."""
+    """The mesh with each triangle's frame stored on its faces; size: the triangle's area, or the
+    mean of the first edge and the height over it."""
     # Sampling a stored attribute is fast; sampling a field would evaluate it once per splat.
     p0, p1, p2 = nodes.triangle_corners()
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
     edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    rotation, size = _FRAMES[convention](nodes, edge, side)
+    if convention == "stga":  # axes [n(p0−o), ·, normal], o being the centroid
+        # p0 − origin from the edges: exactly zero where the corners coincide, which a difference
+        # to a rounded mean is not.
+        first = nodes.scale(nodes.vector("ADD", edge, side), -1 / 3)
+        rotation, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
+        size = nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
+    else:  # axes [n(p1−p0), normal, ·]
+        rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
+        # Height over the edge = |edge × side| / |edge|, or the side where the edge has no length.
+        length = nodes.vector("LENGTH", edge)
+        height = nodes.math("DIVIDE", nodes.vector("LENGTH", normal), length)
+        height = nodes.switch("FLOAT", no_edge, height, nodes.vector("LENGTH", side))
+        size = nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
     mesh = nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
     mesh = nodes.store(mesh, _FRAME_ROTATION, rotation, "QUATERNION", "FACE")
     return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
+
+
+def _in_space(nodes: Nodes, frame: Callable[..., Any], vector: Any, convention: str) -> Any:
+    """A vector of a frame's own axes and unit in object space, the frame's rotation and its scale.
+    frame: name and data type -> the frame's attribute."""
+    scale, turn = frame(_FRAME_SIZE, "FLOAT"), frame(_FRAME_ROTATION, "QUATERNION")
+    if convention == "stga":  # by the triangle's area, and that of the neutral one
+        neutral = nodes.attribute(stored.NEUTRAL_AREA, "FLOAT")
+        ratio = nodes.math("SQRT", nodes.math("DIVIDE", scale, neutral))
+        # A neutral triangle without area gives no ratio: its splats keep their size.
+        has_area = nodes.compare("GREATER_THAN", neutral, 0.0)
+        scale = nodes.switch("FLOAT", has_area, 1.0, ratio)
+    local = {"Vector": nodes.scale(vector, scale), "Rotation": turn}
+    return nodes.out("FunctionNodeRotateVector", local), turn, scale
 
 
 def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any = None) -> Any:
@@ -39,10 +66,7 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
         def sample(name: str, data_type: str) -> Any:  # of each splat's triangle
             return nodes.sample(mesh, nodes.attribute(name, data_type), face, data_type)
 
-        size = _frame_scale(nodes, sample(_FRAME_SIZE, "FLOAT"), convention)
-        turn = sample(_FRAME_ROTATION, "QUATERNION")
-        local = {"Vector": nodes.scale(xyz, size), "Rotation": turn}
-        turned = nodes.out("FunctionNodeRotateVector", local)
+        turned, turn, size = _in_space(nodes, sample, xyz, convention)
         xyz = nodes.vector("ADD", turned, sample(_FRAME_ORIGIN, "FLOAT_VECTOR"))
         rotations = {"Rotation": rotation, "Rotate By": turn}
         rotation = nodes.out("FunctionNodeRotateRotation", rotations, rotation_space="GLOBAL")
@@ -50,38 +74,6 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
     splats = nodes.out("GeometryNodeSetPosition", {"Geometry": splats, "Position": xyz})
     splats = nodes.store(splats, stored.WORLD_ROTATION, rotation, "QUATERNION")
     return nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
-
-
-def _frame_scale(nodes: Nodes, size: Any, convention: str) -> Any:
-    """A frame's scale by its size, where NEUTRAL_AREA is that of its triangle."""
-    if convention != "stga":
-        return size
-    neutral = nodes.attribute(stored.NEUTRAL_AREA, "FLOAT")
-    ratio = nodes.math("SQRT", nodes.math("DIVIDE", size, neutral))
-    # A neutral triangle without area gives no ratio: its splats keep their size.
-    return nodes.switch("FLOAT", nodes.compare("GREATER_THAN", neutral, 0.0), 1.0, ratio)
-
-
-def _stga_frame(nodes: Nodes, edge: Any, side: Any) -> tuple[Any, Any]:
-    """Axes [n(p0−o), ·, normal], o being the centroid; the triangle's area."""
-    # p0 − origin from the edges: exactly zero where the corners coincide, which a difference to a
-    # rounded mean is not.
-    first = nodes.scale(nodes.vector("ADD", edge, side), -1 / 3)
-    rotation, normal, _ = _axes_to_rotation(nodes, first, edge, side, "Z")
-    return rotation, nodes.math("MULTIPLY", nodes.vector("LENGTH", normal), 0.5)
-
-
-def _gaussian_avatars_frame(nodes: Nodes, edge: Any, side: Any) -> tuple[Any, Any]:
-    """Axes [n(p1−p0), normal, ·]; mean of the first edge and the height over it."""
-    rotation, normal, no_edge = _axes_to_rotation(nodes, edge, edge, side, "Y")
-    # Height over the edge = |edge × side| / |edge|, or the side where the edge has no length.
-    length = nodes.vector("LENGTH", edge)
-    height = nodes.math("DIVIDE", nodes.vector("LENGTH", normal), length)
-    height = nodes.switch("FLOAT", no_edge, height, nodes.vector("LENGTH", side))
-    return rotation, nodes.math("MULTIPLY", nodes.math("ADD", length, height), 0.5)
-
-
-_FRAMES = {"stga": _stga_frame, "gaussian_avatars": _gaussian_avatars_frame}
 
 
 def _axes_to_rotation(
@@ -116,12 +108,12 @@ def _meshes(name: str, build: Callable[..., Any], *inputs: str) -> NodeGroup:
 
 FRAMES = {
     name: _meshes(f"Triangle Frames ({name})", partial(_stored_frames, name), "Mesh")
-    for name in _FRAMES
+    for name in CONVENTIONS
 }
 """Head mesh -> the mesh with frames, by convention."""
 PLACED: dict[str | None, NodeGroup] = {
     name: _meshes(f"Place Splats ({name})", partial(_placed_splats, name), "Splats", "Frames")
-    for name in _FRAMES
+    for name in CONVENTIONS
 }
 PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "Splats")
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
@@ -226,10 +218,8 @@ def shifted(offset: str, convention: str) -> NodeGroup:
         signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute))
         names = [stored.DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
         # In the frames' own axes and unit (`avatar.offsets.moved_frames`).
-        scale = _frame_scale(nodes, nodes.attribute(_FRAME_SIZE, "FLOAT"), convention)
-        turn = nodes.attribute(_FRAME_ROTATION, "QUATERNION")
-        local = {"Vector": nodes.scale(_weighted(nodes, names, signal), scale), "Rotation": turn}
-        moved = nodes.out("FunctionNodeRotateVector", local)
+        local = _weighted(nodes, names, signal)
+        moved, _, _ = _in_space(nodes, nodes.attribute, local, convention)
         origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN), moved)
         return nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
 

@@ -123,14 +123,13 @@ def _splat_material(name: str, build: Callable[[Nodes], Any], method: str) -> bp
 
 def _point_shader(nodes: Nodes) -> Any:
     """Emits the colors of points; cuts disks out of the octahedra around them that EEVEE draws."""
-    color, opacity = _color_and_opacity(nodes, "GEOMETRY")
     geometry = nodes.add("ShaderNodeNewGeometry").outputs
     point = nodes.add("ShaderNodePointInfo").outputs
     offset = nodes.vector("SUBTRACT", geometry["Position"], point["Position"])
     distance2 = _squared_distance(nodes, offset, geometry["Incoming"])
     limit = nodes.math("MULTIPLY", point["Radius"], DISK)
     inside = nodes.math("LESS_THAN", distance2, nodes.math("MULTIPLY", limit, limit))
-    return _emission(nodes, color, nodes.math("MULTIPLY", opacity, inside))
+    return _emission(nodes, "GEOMETRY", inside)
 
 
 def _gaussian_shader(nodes: Nodes) -> Any:
@@ -141,7 +140,6 @@ def _gaussian_shader(nodes: Nodes) -> Any:
     (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
     overlapping splats, and for EEVEE up to their order by centers.
     """
-    color, opacity = _color_and_opacity(nodes, "INSTANCER")
     geometry = nodes.add("ShaderNodeNewGeometry").outputs
     position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
     to_object = {"vector_type": "VECTOR", "convert_from": "WORLD", "convert_to": "OBJECT"}
@@ -150,8 +148,7 @@ def _gaussian_shader(nodes: Nodes) -> Any:
     density = nodes.math("EXPONENT", nodes.math("MULTIPLY", distance2, -0.5))
     # Whatever is behind a quad sees through it.
     front = nodes.math("SUBTRACT", 1.0, geometry["Backfacing"])
-    visible = nodes.math("MULTIPLY", density, front)
-    return _emission(nodes, color, nodes.math("MULTIPLY", visible, opacity))
+    return _emission(nodes, "INSTANCER", nodes.math("MULTIPLY", density, front))
 
 
 def _squared_distance(nodes: Nodes, point: Any, direction: Any) -> Any:
@@ -161,17 +158,15 @@ def _squared_distance(nodes: Nodes, point: Any, direction: Any) -> Any:
     return nodes.math("SUBTRACT", length2, nodes.math("MULTIPLY", along, along))
 
 
-def _color_and_opacity(nodes: Nodes, attribute_type: str) -> tuple[Any, Any]:
-    """What the splat nodes stored on points ("GEOMETRY") or instances ("INSTANCER")."""
+def _emission(nodes: Nodes, attribute_type: str, density: Any) -> Any:
+    """Light of the color and opacity that the splat nodes stored on points ("GEOMETRY") or
+    instances ("INSTANCER"), times the density."""
     color, opacity = nodes.add("ShaderNodeAttribute"), nodes.add("ShaderNodeAttribute")
     color.attribute_type = opacity.attribute_type = attribute_type
     color.attribute_name, opacity.attribute_name = DISPLAY_COLOR, stored.OPACITY
-    return color.outputs["Color"], opacity.outputs["Fac"]
-
-
-def _emission(nodes: Nodes, color: Any, alpha: Any) -> Any:
     shaders = [nodes.out("ShaderNodeBsdfTransparent")]
-    shaders.append(nodes.out("ShaderNodeEmission", {"Color": color}))
+    shaders.append(nodes.out("ShaderNodeEmission", {"Color": color.outputs["Color"]}))
+    alpha = nodes.math("MULTIPLY", opacity.outputs["Fac"], density)
     return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": shaders})
 
 

@@ -12,7 +12,7 @@ from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
-from ..compat import modifier_input, modifier_menu, set_modifier_input
+from ..compat import modifier_input, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_attributes as stored
 from . import splat_nodes
@@ -179,9 +179,7 @@ def input_identifier(modifier: Any, name: str) -> str | None:
 
 def display_mode(splat_object: Any) -> str:
     """The display mode that is chosen for a splat object, a name in `LIMITS`."""
-    modifier = splat_modifier(splat_object)
-    identifier = input_identifier(modifier, splat_nodes.DISPLAY)
-    return modifier_menu(modifier, identifier) if identifier else ""
+    return get_input(splat_object, splat_nodes.DISPLAY) or ""
 
 
 def display_settings(modifier: Any) -> DisplaySettings:
