@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...driving.head_map import PRODUCTS, HeadMap, features
+from ...driving.head_map import PRODUCTS, HeadMap
 from ...driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance, arkit_name
 from ...driving.shapes import JAW_OPEN
 from ...errors import StgaError
@@ -106,7 +106,7 @@ def key_motion(
     if "expression" in parts:
         values = np.stack([frame.expr for frame in frames])
         names = (expression_key(head, component) for component in range(values.shape[1]))
-        _key_values(head.data.shape_keys, dict(enumerate(map(key_value_path, names))), at, values)
+        key_values(head.data.shape_keys, dict(enumerate(map(key_value_path, names))), at, values)
         if np.abs(values).max(initial=0.0) > MAX_SLIDER:
             row, component = np.unravel_index(np.abs(values).argmax(), values.shape)
             warn(
@@ -122,7 +122,7 @@ def key_motion(
         write_curves(rig, location_path("root"), at, translations)
 
 
-def _key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:
+def key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:
     """Keyframe columns of values (T, C) at their paths; one that stays 0 once."""
     for column, path in paths.items():
         keyed = slice(None if values[:, column].any() else 1)
@@ -177,15 +177,6 @@ def key_tracked_offsets(
         write_curves(rig, path, numbers, displacement[:, joint])
 
 
-def key_zero_offsets(head: Any, rig: Any, frame: int) -> None:
-    """Keyframe tracked per-frame offsets of mesh and joints to zero from `frame` on."""
-    for key in offset_keys(head):
-        write_curves(head.data.shape_keys, key_value_path(key.name), [frame], np.zeros(1))
-    for name in map(offset_property, JOINTS):
-        if name in rig:
-            write_curves(rig, property_path(name), [frame], np.zeros((1, 3)))
-
-
 def key_current_pose(head: Any, rig: Any, frame: int) -> None:
     """Keyframe pose and expression as they are now, set by hand or not, at `frame` alone."""
     for bone in JOINTS:
@@ -201,12 +192,6 @@ def key_current_pose(head: Any, rig: Any, frame: int) -> None:
             for neighbor in (frame - 1, frame + 1):
                 curve.keyframe_points.insert(neighbor, before)
         curve.keyframe_points.insert(frame, value)
-
-
-def animated_by(head: Any, rig: Any, parts: Sequence[str]) -> list[Any]:
-    """The data-blocks in whose actions the parts are keyframed: rig, shape keys, or both."""
-    in_rig = set(parts) & set(PART_JOINTS) or ("expression" in parts and offset_keys(head))
-    return ([rig] if in_rig else []) + ([head.data.shape_keys] if "expression" in parts else [])
 
 
 ARKIT_MAP = "stga_arkit_map"
@@ -262,24 +247,6 @@ def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) 
     head[ARKIT_MAP] = rows.ravel().tolist()
 
 
-def shape_parameters(head: Any) -> np.ndarray | None:
-    """(E + 9,) expression, and axis-angles of jaw and eyes, that the sliders of `add_shapes` stand
-    for; None without them."""
-    if not has_shapes(head):
-        return None
-    keys = head.data.shape_keys.key_blocks
-    weights = np.array([[keys[name].value if name in keys else 0.0 for name in ARKIT_SHAPES]])
-    found = features(weights)[0]
-    return np.asarray(found @ np.reshape(head[ARKIT_MAP], (len(found), -1)))
-
-
-def key_shapes(head: Any, start: int, weights: np.ndarray) -> None:
-    """Add keyframes of weights (T, 52), one row per Blender frame from `start` on, to the action of
-    a head's shape keys."""
-    paths = {column: key_value_path(name) for name, column in COLUMN.items()}
-    _key_values(head.data.shape_keys, paths, np.arange(start, start + len(weights)), weights)
-
-
 def shape_key_names(head: Any) -> dict[int, str]:
     """Column of the 52 -> shape key that has its name in any spelling."""
     keys = head.data.shape_keys if head.type == "MESH" else None
@@ -300,7 +267,7 @@ def apply_weights(
     `rig.motion.apply_motion` keeps it. Raises StgaError as `check_keyable` does."""
     check_keyable(owner)
     with new_actions([owner], name, set(paths.values()).__contains__, as_strip):
-        _key_values(owner, paths, np.arange(start, start + len(weights)), weights)
+        key_values(owner, paths, np.arange(start, start + len(weights)), weights)
 
 
 def checked_shape_keys(head: Any) -> dict[int, str]:

@@ -9,14 +9,15 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...driving.head_map import features
 from ...driving.open_motion import PART_FIELDS, TrainedRange, outside
-from ...driving.performance import ARKIT_SHAPES
+from ...driving.performance import ARKIT_SHAPES, COLUMN
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
-from ..arrays import evaluated_vertices, key_points
+from ..arrays import evaluated_vertices, key_points, write_curves
 from ..objects import Warn, iterate_frames, log_warning
 from . import keyframes
 from .head import rig_of
@@ -60,18 +61,25 @@ def apply_motion(
         replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
         for each in frames
     ]
-    owners = keyframes.animated_by(head, rig, parts)
+    keys, has_expression = head.data.shape_keys, "expression" in parts
+    offsets = keyframes.offset_keys(head) if has_expression else []
+    owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
+    owners += [keys] if has_expression else []
     at = np.arange(start, start + len(frames))
     with keyframes.new_actions(owners, name, lambda p: keyframes.is_of_parts(p, parts), as_strip):
         keyframes.key_motion(head, rig, at, frames, parts, warn)
-        if "expression" in parts and keyframes.has_shapes(head):
-            still = np.zeros((1, len(ARKIT_SHAPES)))
-            keyframes.key_shapes(head, start, still if weights is None else weights)
-        if "expression" in parts and keyframes.offset_keys(head):
-            if tracked is None:
-                keyframes.key_zero_offsets(head, rig, start)
-            else:
-                keyframes.key_tracked_offsets(head, rig, *tracked)
+        if has_expression and keyframes.has_shapes(head):
+            shapes = np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights
+            paths = {column: keyframes.key_value_path(key) for key, column in COLUMN.items()}
+            keyframes.key_values(keys, paths, np.arange(start, start + len(shapes)), shapes)
+        if offsets and tracked is not None:
+            keyframes.key_tracked_offsets(head, rig, *tracked)
+        elif offsets:
+            for key in offsets:
+                write_curves(keys, keyframes.key_value_path(key.name), [start], np.zeros(1))
+            for offset in map(keyframes.offset_property, JOINTS):
+                if offset in rig:
+                    write_curves(rig, keyframes.property_path(offset), [start], np.zeros((1, 3)))
 
 
 def sample_motion(
@@ -135,15 +143,18 @@ def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
 
 
 def _with_shapes(head: Any, expr: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
-    """The expression with what ARKit's sliders add to it; turns of jaw and eyes are exchanged for
-    those with them."""
-    if (found := keyframes.shape_parameters(head)) is None:
+    """The expression with what ARKit's sliders (`keyframes.add_shapes`) add to it; turns of jaw and
+    eyes are exchanged for those with them."""
+    if not keyframes.has_shapes(head):
         return expr
+    keys = head.data.shape_keys.key_blocks
+    weights = np.array([[keys[name].value if name in keys else 0.0 for name in ARKIT_SHAPES]])
+    added = features(weights)[0]
+    added = added @ np.reshape(head[keyframes.ARKIT_MAP], (len(added), -1))
     for joint, row in zip(("jaw", "left_eye", "right_eye"), (-9, -6, -3), strict=True):
-        own = np.array([found[row : row + 3 or None], turns[joint]])
-        slider, bone = from_axis_angle(own)
+        slider, bone = from_axis_angle(np.array([added[row : row + 3 or None], turns[joint]]))
         turns[joint] = to_axis_angle(multiply(bone, slider))
-    return np.asarray(expr + found[: len(expr)])
+    return np.asarray(expr + added[: len(expr)])
 
 
 def _key_value(head: Any, name: str) -> float:
