@@ -3,12 +3,21 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import bpy
 import numpy as np
 
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, expression_mesh, neutral_mesh, sequence_mesh
+from stga_addon.scene.arrays import evaluated_vertices
+
+
+def at_frame(head, frame: float) -> np.ndarray:
+    """(V, 3) of an object's evaluated mesh."""
+    whole = int(np.floor(frame))
+    bpy.context.scene.frame_set(whole, subframe=frame - whole)
+    return evaluated_vertices(head)
 
 
 def strip(vertices: int) -> np.ndarray:

@@ -3,23 +3,21 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import bpy
 import numpy as np
 import pytest
+from flame.small_head import small_head, write_flame
+from mathutils import Euler
 
-bpy = pytest.importorskip("bpy")
-
-from flame.small_head import small_head, write_flame  # noqa: E402
-from mathutils import Euler  # noqa: E402
-
-from stga_addon.driving.head_map import head_map  # noqa: E402
-from stga_addon.driving.inverse import write_performance  # noqa: E402
-from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance  # noqa: E402
-from stga_addon.driving.read_performance import read_performance  # noqa: E402
-from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
-from stga_addon.flame.sequence import FlameSequence  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.head import rig_of  # noqa: E402
-from stga_addon.scene.rig.motion import apply_motion, sample_pose  # noqa: E402
+from stga_addon.driving.head_map import head_map
+from stga_addon.driving.inverse import write_performance
+from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
+from stga_addon.driving.read_performance import read_performance
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.sequence import FlameSequence
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.rig.head import rig_of
+from stga_addon.scene.rig.motion import apply_motion, sample_pose
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 1e-5

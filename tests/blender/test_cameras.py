@@ -1,33 +1,28 @@
-"""Imported cameras against the capture's own projection."""
+"""Imported cameras against the capture's own projection; exported ones, opened as footage."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from capture.factory import write_mesh_capture
+from mathutils import Matrix, Vector
 from PIL import Image
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.capture.camera import Camera, camera_from_gl, look_at
+from stga_addon.capture.model import Capture, View
+from stga_addon.capture.open import open_capture
+from stga_addon.errors import StgaError
+from stga_addon.scene import objects, tags
+from stga_addon.scene.cameras import central, configure_scene, import_cameras
+from stga_addon.scene.objects import capture_root, show_kind
+from stga_addon.scene.rig.head import import_head
+from stga_addon.tracking.footage.open import open_footage
 
-from capture.factory import write_mesh_capture  # noqa: E402
-from mathutils import Vector  # noqa: E402
-
-from stga_addon.capture.camera import Camera, camera_from_gl, look_at  # noqa: E402
-from stga_addon.capture.model import Capture, View  # noqa: E402
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.cameras import central, configure_scene, import_cameras  # noqa: E402
-from stga_addon.scene.objects import (  # noqa: E402
-    capture_root,
-    collection_of,
-    frames_per_second,
-    layers_of,
-    show_kind,
-)
-from stga_addon.scene.rig.head import import_head  # noqa: E402
-
-from .captures import mesh_capture  # noqa: E402
+from .captures import mesh_capture
 
 
 def pose(seed: int) -> np.ndarray:
@@ -92,16 +87,6 @@ def test_projection_equals_the_capture_s(tmp_path, width, height, fl_y):
     assert_projects(imported, one)
 
 
-@pytest.mark.parametrize("fps", [None, 60.0, 30000 / 1001, 12.5, 0.4])
-def test_the_scene_plays_at_the_rate_of_the_capture(tmp_path, fps):
-    """Catches footage of 60 frames a second played too slowly, and rounded rates."""
-    capture = replace(capture_of(tmp_path, {0: [camera(1)]}), fps=fps)
-    (imported,) = import_cameras(capture, capture_root(tmp_path))
-    bpy.context.scene.render.fps, bpy.context.scene.render.fps_base = 24, 1.0
-    configure_scene(bpy.context.scene, capture, imported)
-    assert frames_per_second(bpy.context.scene) == pytest.approx(fps or 24, rel=1e-6)
-
-
 def test_a_moving_camera_is_keyframed(tmp_path):
     """Fails when only the first pose is imported, or the camera tumbles between frames."""
     row = [camera(seed) for seed in (1, 2, 3)]
@@ -114,23 +99,6 @@ def test_a_moving_camera_is_keyframed(tmp_path):
         assert_projects(imported, one)
         turns.append(np.array(imported.rotation_quaternion))
     assert min(turns[0] @ turns[1], turns[1] @ turns[2]) > 0
-
-
-def test_studio_head_projects_into_its_masks(shared_data):
-    """Fails when meshes and cameras do not meet in Blender as in the images."""
-    capture = open_capture(shared_data / "studio_head")
-    cameras = import_cameras(capture, capture_root(capture.root))
-    assert len(cameras) == 16
-    views = [view for view in capture.views["train"] if view.timestep == 4]
-    view = next(view for view in views if view.camera_index == 7)
-    imported = next(each for each in cameras if each[tags.CAMERA_INDEX] == 7)
-    configure_scene(bpy.context.scene, capture, imported)
-    inside = pixels_in_blender(imported, capture.mesh(4))
-    mask = np.asarray(Image.open(view.mask).convert("L")) > 127
-    column, row = np.floor(inside).astype(int).T
-    seen = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
-    assert seen.mean() > 0.5
-    assert mask[row[seen], column[seen]].mean() > 0.98
 
 
 def test_background_images_follow_the_frame(tmp_path):
@@ -178,11 +146,13 @@ def test_second_import_replaces_the_first(tmp_path):
 
 
 def test_scene_is_configured_on_request_only(tmp_path):
-    """Fails when an import changes render settings, or configuring the scene misses one of them."""
+    """Fails when an import changes render settings, or configuring the scene misses one of them:
+    footage played too slowly, or at a rounded rate."""
     scene = bpy.context.scene
     scene.view_settings.view_transform = "AgX"
     before = (scene.render.resolution_x, scene.frame_start, scene.camera)
     capture = capture_of(tmp_path, {0: [camera()] * 3, 1: [camera(1, 400, 300)] * 3})
+    capture = replace(capture, fps=30000 / 1001)
     cameras = import_cameras(capture, capture_root(tmp_path))
     assert before == (scene.render.resolution_x, scene.frame_start, scene.camera)
     assert scene.view_settings.view_transform == "AgX"
@@ -190,6 +160,7 @@ def test_scene_is_configured_on_request_only(tmp_path):
     configure_scene(scene, capture, cameras[0], warn=said.append)
     assert (scene.render.resolution_x, scene.render.resolution_y) == (550, 802)
     assert (scene.frame_start, scene.frame_end) == (3, 5)
+    assert objects.frames_per_second(scene) == pytest.approx(30000 / 1001, rel=1e-6)
     assert scene.view_settings.view_transform == "Standard"
     assert scene.camera == cameras[0]
     assert len(said) == 1
@@ -200,7 +171,8 @@ def test_scene_is_configured_on_request_only(tmp_path):
 
 
 def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
-    """Catches a head covered by cameras, or hidden with them, or a hidden scene camera."""
+    """Catches a head covered by cameras, or hidden with them, a hidden scene camera, and the first
+    camera in place of the central one, before world matrices."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture", range(2), range(3)))
     head = import_head(capture)
     cameras = import_cameras(capture, capture_root(capture.root))
@@ -208,19 +180,94 @@ def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
     show_kind(head.parent, tags.CAMERA, layer, False)
     assert head.visible_get()
     assert not any(camera.visible_get() for camera in cameras)
-    assert collection_of(head.parent, tags.CAMERA).name == f"{head.parent.name} cameras"
-    assert [each.hide_viewport for each in layers_of(head.parent, tags.CAMERA, layer)] == [True]
+    assert objects.collection_of(head.parent, tags.CAMERA).name == f"{head.parent.name} cameras"
+    assert [each.hide_viewport for each in objects.layers_of(head.parent, tags.CAMERA, layer)] == [
+        True
+    ]
     again = import_cameras(capture, capture_root(capture.root))
     assert again == cameras
-    assert len(collection_of(head.parent, tags.CAMERA).objects) == len(cameras)
+    assert len(objects.collection_of(head.parent, tags.CAMERA).objects) == len(cameras)
     show_kind(head.parent, tags.CAMERA, layer, True)
     assert all(camera.visible_get() for camera in cameras)
-
-
-def test_the_central_camera_sees_the_face(tmp_path):
-    """Catches the first camera in place of the central one, before world matrices."""
     places = [(np.sin(angle), 0.0, np.cos(angle)) for angle in (0.9, -0.8, 0.1)]
     turned = {k: [look_at(p, (0, 0, 0), 40, 60, 80.0)] for k, p in enumerate(places)}
-    cameras = import_cameras(capture_of(tmp_path, turned), capture_root(tmp_path))
-    assert central(cameras) is cameras[2]
+    around = import_cameras(capture_of(tmp_path, turned), capture_root(tmp_path))
+    assert central(around) is around[2]
     assert central([]) is None
+
+
+WIDTH, HEIGHT = 64, 48
+
+
+def add_camera(name, position, **values):
+    """A camera that looks at the origin."""
+    data = bpy.data.cameras.new(name)
+    for key, value in values.items():
+        setattr(data, key, value)
+    camera = bpy.data.objects.new(name, data)
+    bpy.context.collection.objects.link(camera)
+    camera.rotation_mode = "QUATERNION"
+    turn = Vector(position).to_track_quat("Z", "Y")
+    camera.matrix_world = Matrix.LocRotScale(position, turn, None)
+    return camera
+
+
+def scene_with_cameras():
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y = 2 * WIDTH, 2 * HEIGHT
+    render.resolution_percentage = 50
+    add_camera("left", (-1, -1, 0.3), lens=45, shift_x=0.1, shift_y=-0.05)
+    add_camera("Camera.001", (0.2, -1.4, 0), lens=60, sensor_fit="VERTICAL", sensor_height=20)
+    parent = bpy.data.objects.new("rail", None)
+    bpy.context.collection.objects.link(parent)
+    parent.scale, parent.location = (2, 2, 2), (0.1, 0, 0)
+    add_camera("on rail", (0.6, -0.5, 0.1)).parent = parent
+    bpy.context.view_layer.update()
+
+
+@pytest.mark.usefixtures("extension")
+def test_points_project_as_in_blender(tmp_path):
+    """Catches lens shift, sensor fit, resolution or a scaled parent lost on the way."""
+    scene_with_cameras()
+    assert bpy.ops.stga.export_cameras(filepath=str(tmp_path / "transforms.json")) == {"FINISHED"}
+    for name in ("left", "Camera.001", "on rail"):
+        for number in (1, 2):
+            path = tmp_path / "images" / name / f"{number}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (WIDTH, HEIGHT)).save(path)
+    footage = open_footage(tmp_path)
+    assert [camera.name for camera in footage.cameras] == ["left", "Camera.001", "on rail"]
+    assert footage.timesteps == (0, 1)
+    assert footage.keeps_world
+    points = np.random.default_rng(2).normal(0, 0.1, (12, 3))
+    for camera in footage.cameras:
+        # captures are y up
+        pixels, depths = camera.camera.project(points[:, [0, 2, 1]] * [1, 1, -1])
+        scene, thing = bpy.context.scene, bpy.data.objects[camera.name]
+        seen = [world_to_camera_view(scene, thing, Vector(point)) for point in points]
+        expected = [(x * WIDTH, (1 - y) * HEIGHT) for x, y, _ in seen]
+        np.testing.assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)
+        np.testing.assert_allclose(depths, [z for _, _, z in seen], atol=1e-5)
+
+
+@pytest.mark.usefixtures("extension")
+def test_what_is_not_exported(tmp_path):
+    """Catches the option for selected cameras without an effect, an export of nothing, and a camera
+    written as another than it is."""
+    scene_with_cameras()
+    left, path = bpy.data.objects["left"], tmp_path / "cameras.json"
+    left.select_set(True)
+    bpy.ops.stga.export_cameras(filepath=str(path), selected_only=True)
+    (frame,) = json.loads(path.read_text(encoding="utf-8"))["frames"]
+    assert frame["camera_id"] == "left"
+    left.select_set(False)
+    none = {"filepath": str(tmp_path / "none.json"), "selected_only": True}
+    with pytest.raises(RuntimeError, match="No cameras to export"):
+        bpy.ops.stga.export_cameras(**none)
+    assert not (tmp_path / "none.json").exists()
+    left.scale = -1, 1, 1
+    with pytest.raises(RuntimeError, match="left: is mirrored by a negative scale"):
+        bpy.ops.stga.export_cameras(filepath=str(path))
+    left.scale, left.data.type = (1, 1, 1), "ORTHO"
+    with pytest.raises(RuntimeError, match="left: is not a perspective camera"):
+        bpy.ops.stga.export_cameras(filepath=str(path))

@@ -4,6 +4,7 @@ import json
 import re
 from types import SimpleNamespace
 
+import bpy
 import numpy as np
 import pytest
 
@@ -71,7 +72,6 @@ def test_detail_difference_is_drawn_with_the_best_at_the_top():
 def test_preview_follows_the_evaluations(extension, tmp_path):
     """Catches an image that is not updated, one of an empty curve, a panel that fails on a damaged
     file, and images that are saved in the .blend file."""
-    bpy = pytest.importorskip("bpy")
     curve, monitor = extension.ui.sidebar, extension.operators.monitor
     drawn = []
     layout = SimpleNamespace(

@@ -1,37 +1,34 @@
-"""The render engine against `render_avatar`, through files that Blender writes."""
+"""The render engine against `render_avatar`, through files that Blender writes; what it refuses,
+and leaves behind after a failure. Several objects: test_gpu_renderer.py, test_linked_display.py and
+tests/render/test_compose.py."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-pytest.importorskip("numba")
+from stga_addon.avatar.file import Avatar, AvatarLight
+from stga_addon.avatar.splats import SH_C0
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.color import linear_to_srgb
+from stga_addon.errors import DeviceError, StgaError
+from stga_addon.light.harmonics import uniform
+from stga_addon.light.relight import Relighter
+from stga_addon.light.surface import transfer_of
+from stga_addon.light.values import Light, Lighting
+from stga_addon.render.render import render_avatar
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats
+from stga_addon.scene.render import engine
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from mathutils import Matrix  # noqa: E402
-
-from stga_addon.avatar.embedding import WORLD, FaceFrames, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar, AvatarLight  # noqa: E402
-from stga_addon.avatar.splats import SH_C0  # noqa: E402
-from stga_addon.capture.camera import Camera  # noqa: E402
-from stga_addon.capture.color import linear_to_srgb  # noqa: E402
-from stga_addon.errors import DeviceError, StgaError  # noqa: E402
-from stga_addon.light.harmonics import uniform  # noqa: E402
-from stga_addon.light.relight import Relighter  # noqa: E402
-from stga_addon.light.surface import transfer_of  # noqa: E402
-from stga_addon.light.values import Light, Lighting  # noqa: E402
-from stga_addon.raster.cpu.splat_block import basis as harmonics  # noqa: E402
-from stga_addon.render.render import render as render_splats  # noqa: E402
-from stga_addon.render.render import render_avatar  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats  # noqa: E402
-from stga_addon.scene.render import engine  # noqa: E402
-
-from .exr import read_exr  # noqa: E402
-from .test_splat_object import active_camera, animated_head, avatar_of, random_splats  # noqa: E402
+from .exr import read_exr
+from .test_splat_object import active_camera, animated_head, avatar_of, random_splats
 
 WIDTH, HEIGHT = 96, 64
 TOLERANCE = 1 / 255
@@ -308,52 +305,6 @@ def test_depth_in_meters(tmp_path):
         assert depth[HEIGHT // 2, int(WIDTH / 2 + focal * x / z)] == pytest.approx(z, abs=1e-5)
 
 
-def test_objects_are_sorted_together(tmp_path):
-    """Catches objects composited one by one, and wrong directions or sizes when moved."""
-    rng = np.random.default_rng(6)
-    scans = []
-    for seed, count in ((0, 300), (1, 200)):
-        splats = random_splats(1, count, degree=2)
-        xyz = rng.normal(0, 0.1, (count, 3)).astype(np.float32)
-        sh = np.random.default_rng(seed).normal(0, 0.1, (count, 9, 3)).astype(np.float32)
-        # The rasterizer leaves out the splat that would bring a pixel's transmittance to 1e-4, the
-        # GPU draws it. Of an opacity below 0.96 that is less than 1/255.
-        opacity = np.minimum(splats.opacity, 3)
-        log_scale = np.full((count, 3), -3.5, np.float32)
-        scans.append(replace(splats, xyz=xyz, sh=sh, log_scale=log_scale, opacity=opacity))
-    place = Matrix.LocRotScale((0.02, 0.05, 0.1), Matrix.Rotation(0.8, 3, "X"), (1.2,) * 3)
-    show_world_splats(scans[0], "still")
-    show_world_splats(scans[1], "moved").matrix_world = place
-    camera = active_camera((0, 0, 1.2))
-    bpy.context.view_layer.update()
-    # By hand: splats moved to the world, harmonics evaluated in the direction that their own space
-    # sees.
-    spaces = [np.eye(4), np.array(place, np.float64)]
-    reference = _merged(scans, spaces, np.array(camera.matrix_world, np.float64)[:3, 3])
-    view = expected_camera(camera, bpy.data.objects["still"])
-    expected = render_splats(reference, view, (0.0,) * 3)
-    assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE
-
-
-def _merged(scans, spaces, eye):
-    """World splats of several sets, with constant colors for one camera position."""
-    parts = []
-    for splats, space in zip(scans, spaces, strict=True):
-        size = np.linalg.norm(space[:3, 0])
-        turn = space[:3, :3] / size
-        frame = FaceFrames(space[None, :3, 3], turn[None], np.full(1, size), WORLD.strain)
-        world = to_world(splats, frame)
-        direction = (world.xyz - eye) @ turn
-        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        basis = np.zeros((len(splats), 16), np.float32)
-        for row, (x, y, z) in zip(basis, direction.astype(np.float32), strict=True):
-            row[:] = harmonics(x, y, z)
-        color = np.einsum("nk,nkc->nc", basis[:, :9], splats.sh) / SH_C0
-        parts.append(replace(world, sh=color[:, None].astype(np.float32)))
-    arrays = {name: np.concatenate([getattr(p, name) for p in parts]) for name in vars(parts[0])}
-    return type(parts[0])(**arrays)
-
-
 def test_display_settings_apply_to_renders(tmp_path):
     """Catches settings that only affect the viewport."""
     avatar = textured(avatar_of("stga"))
@@ -455,3 +406,98 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     monkeypatch.setattr(on_gpu, "compose", lost)
     with pytest.raises(RuntimeError, match="Card 9000 was lost; try again"):
         render(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
+def test_unsupported_cameras_are_refused(kind):
+    """Catches a perspective image from a camera of another type."""
+    if kind is not None:
+        camera_at(type=kind)
+    message = "no camera" if kind is None else "camera: is not a perspective camera"
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.render.render()
+
+
+def test_heads_that_cannot_be_followed_are_named():
+    """Catches splats scattered over a subdivided mesh or one that is being edited, and a
+    traceback."""
+    shown, head = show(avatar_of("stga", 10))
+    camera_at()
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    message = "head: is in Edit Mode; head splats is drawn again when you leave it"
+    with pytest.raises(StgaError, match=message):
+        visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert len(visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())) == 1
+    head.modifiers.new("finer", "SUBSURF")
+    with pytest.raises(RuntimeError, match="head: has other triangles than head splats"):
+        bpy.ops.render.render()
+    set_input(shown, splat_nodes.HEAD, None)
+    with pytest.raises(RuntimeError, match="has no head to follow"):
+        bpy.ops.render.render()
+
+
+@pytest.mark.parametrize("stage", ["visible_layers", "combined"])
+@pytest.mark.parametrize("raised", [StgaError("head: is broken"), MemoryError("of pixels")])
+def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, monkeypatch):
+    """Catches an image without passes, and a failure saved as an image."""
+
+    def fail(*_: object) -> None:
+        raise raised
+
+    scene = bpy.context.scene
+    scene.render.filepath = str(tmp_path / "failed.png")
+    camera_at()
+    monkeypatch.setattr(engine, stage, fail)
+    message = "^Error: head: is broken$"
+    if isinstance(raised, MemoryError):
+        message = r"Unexpected error \(MemoryError: of pixels\); see the console"
+    with pytest.raises(RuntimeError, match=message) as reported:
+        bpy.ops.render.render(write_still=True)
+    assert str(reported.value).count(str(raised)) == 1
+    assert not any(tmp_path.iterdir())
+    multilayer(scene.render.image_settings)
+    bpy.data.images["Render Result"].save_render(str(tmp_path / "empty.exr"))
+    passes = read_exr(tmp_path / "empty.exr")
+    combined = [values for name, values in passes.items() if "Combined" in name]
+    assert len(combined) == 4
+    assert all(values.shape == (HEIGHT, WIDTH) and not values.any() for values in combined)
+
+
+def test_panels_drop_the_engine_on_unregister():
+    """Catches panels that still list the engine after it was unregistered."""
+
+    def panels() -> list[type]:
+        every = bpy.types.Panel.__subclasses__()
+        return [each for each in every if engine.ENGINE in getattr(each, "COMPAT_ENGINES", ())]
+
+    assert panels()
+    engine.unregister()
+    assert not panels()
+    engine.register(no_python)
+
+
+def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
+    """Catches preferences read from a render thread, and an error that is lost."""
+    monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
+    answers, callers = [StgaError("no environment"), "python"], []
+
+    def find() -> str:
+        callers.append(threading.current_thread())
+        answer = answers.pop(0)
+        if isinstance(answer, StgaError):
+            raise answer
+        return answer
+
+    environment = engine.Rasterizer(find, lambda: "cpu")
+    environment.update()
+    with pytest.raises(StgaError, match="no environment"):
+        environment.python()
+    environment.update()
+    found: list[str] = []
+    thread = threading.Thread(target=lambda: found.append(environment.python()))
+    thread.start()
+    thread.join()
+    assert found == ["python"]
+    assert callers == [threading.main_thread()] * 2

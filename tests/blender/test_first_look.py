@@ -81,8 +81,9 @@ def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved)
     assert (cube.hide_get(), cube.hide_render) == (False, False)
 
 
-def test_pose_the_jaw_and_back(head):
-    """Catches bones that stay hidden, another bone that is selected, and no way back."""
+def test_pose_the_jaw_and_back(head, tmp_path):
+    """Catches bones that stay hidden, another bone that is selected, no way back, the jaw of a head
+    whose jaw no bone moves, and a traceback where a head has no rig."""
     layer = bpy.context.view_layer
     (bones,) = layers_of(head.parent, tags.RIG, layer)
     assert bones.hide_viewport
@@ -94,16 +95,11 @@ def test_pose_the_jaw_and_back(head):
     assert rig.data.bones.active.name == "jaw"
     bpy.ops.stga.pose_head()
     assert (rig.mode, bones.hide_viewport) == ("OBJECT", True)
-
-
-def test_pose_heads_of_other_kinds(extension, tmp_path):
-    """Catches a button that selects the jaw of a head whose jaw no bone moves, and a traceback
-    where a head has no rig."""
     unpack_capture(tmp_path / "bundled")
     bpy.ops.stga.import_capture(directory=str(tmp_path / "bundled"))
     bpy.ops.stga.pose_head()
     assert bpy.context.view_layer.objects.active.data.bones.active.name == "neck"
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ball")))
     with pytest.raises(RuntimeError, match="poll"):
         bpy.ops.stga.pose_head()
 

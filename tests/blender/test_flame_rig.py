@@ -3,23 +3,22 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.model import JOINTS
+from stga_addon.flame.sequence import FlameSequence, sequence_mesh
+from stga_addon.flame.teeth import flame_model as bundled_model
+from stga_addon.flame.teeth import with_teeth
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.rig.keyframes import is_of_parts
+from stga_addon.scene.rig.motion import sample_motion
 
-from stga_addon.flame.forward import FlameFrame, flame_forward  # noqa: E402
-from stga_addon.flame.model import JOINTS  # noqa: E402
-from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh  # noqa: E402
-from stga_addon.flame.teeth import flame_model as bundled_model  # noqa: E402
-from stga_addon.flame.teeth import with_teeth  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.rig.head import import_head  # noqa: E402
-from stga_addon.scene.rig.keyframes import is_of_parts  # noqa: E402
-from stga_addon.scene.rig.motion import sample_motion  # noqa: E402
-
-from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
+from .captures import at_frame, flame_model, flame_sequence, motion_capture
 
 TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its origin
 
@@ -27,12 +26,6 @@ TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its ori
 @pytest.fixture
 def source(tmp_path):
     return tmp_path / "motion.npz"
-
-
-def at_frame(head, frame: float) -> np.ndarray:
-    whole = int(np.floor(frame))
-    bpy.context.scene.frame_set(whole, subframe=frame - whole)
-    return evaluated_vertices(head)
 
 
 def rig_of(head):
@@ -152,22 +145,9 @@ def test_all_components_have_sliders(source):
     assert_parity(head, sparse)
 
 
-def test_identity_sliders_move_the_joints(source):
-    """Fails when joints stay put, or sliders count from FLAME's mean face."""
-    sequence = flame_sequence(flame_model())
-    head = import_head(motion_capture(sequence, source))
-    rng = np.random.default_rng(8)
-    other = rng.normal(0, 2, sequence.model.n_identity)
-    for component, value in enumerate(other):
-        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
-    assert_parity(head, replace(sequence, shape=sequence.shape + other), 1e-5)
-    for component in range(len(other)):
-        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = 0
-    assert_parity(head, sequence)
-
-
 def test_the_published_topology_with_teeth(source, shared_data):
-    """Fails when parity of a hundred random vertices is lost at FLAME's own size."""
+    """Fails when parity of a hundred random vertices is lost at FLAME's own size, and when identity
+    sliders leave the joints where they are, or count from FLAME's mean face."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, identity, faces = data["v_template"], data["shapedirs"], data["faces"]
     small = flame_model(vertices=len(template), components=20, identity=0)
@@ -187,6 +167,9 @@ def test_the_published_topology_with_teeth(source, shared_data):
     for component, value in enumerate(other[:10]):
         head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
     assert_parity(head, replace(sequence, shape=sequence.shape + other), 1e-5)
+    for component in range(10):
+        head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = 0
+    assert_parity(head, sequence)
 
 
 def test_fixed_joints_have_no_helper_bones(source):
@@ -215,25 +198,12 @@ def test_what_a_rig_cannot_hold_is_reported(source):
     assert "expression 7" in second
 
 
-def test_a_flame_capture_imports_as_a_rig(tmp_path):
-    """Fails when FLAME parameters become one key a frame, or regions are lost."""
-    sequence = flame_sequence(flame_model(vertices=60))
-    capture = replace(
-        mesh_capture(tmp_path, timesteps=sequence.timesteps),
-        layout="flame",
-        faces=sequence.model.faces,
-        neutral=neutral_mesh(sequence),
-        mesh=lambda timestep: sequence_mesh(sequence, timestep),
-        flame=sequence,
-    )
-    head = import_head(capture)
-    assert rig_of(head).type == "ARMATURE"
-    assert tags.REGION_PREFIX + "mouth" in head.data.attributes
-    assert_parity(head, sequence)
-
-
 def test_importing_again_replaces_the_rig(source):
-    """Fails when a second import duplicates rig, modifier or drivers, or leaves unused actions."""
+    """Fails when a second import duplicates rig, modifier or drivers, or leaves unused actions, and
+    when making bones leaves another object active or a stray one behind."""
+    mine = bpy.data.objects.new("mine", None)
+    bpy.context.scene.collection.objects.link(mine)
+    bpy.context.view_layer.objects.active = mine
     dynamic = flame_sequence(flame_model(), dynamic=True)
     first = import_head(motion_capture(dynamic, source), warn=lambda sentence: None)
     kinds = bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes
@@ -245,28 +215,22 @@ def test_importing_again_replaces_the_rig(source):
     assert counts == [len(blocks) for blocks in kinds]
     assert [modifier.type for modifier in head.modifiers] == ["ARMATURE"]
     assert_parity(head, sequence)
-
-
-def test_adding_a_rig_keeps_the_active_object(source):
-    """Fails when making bones leaves another object active or a stray one behind."""
-    mine = bpy.data.objects.new("mine", None)
-    bpy.context.scene.collection.objects.link(mine)
-    bpy.context.view_layer.objects.active = mine
-    head = import_head(motion_capture(flame_sequence(flame_model()), source))
     assert bpy.context.view_layer.objects.active == mine
     shape = bpy.data.objects["STGA Bone"]
-    assert set(bpy.data.objects) == {mine, head, head.parent, rig_of(head), shape}
+    assert set(bpy.data.objects) == {mine, head, head.parent, rig, shape}
 
 
 def test_a_saved_rig_shows_the_same(source, tmp_path):
-    """Fails when a joint, corrective, weight, rotation or translation is not FLAME's, and when
-    drivers, keyframes or bindings do not survive saving and opening."""
+    """Fails when a joint, corrective, weight, rotation or translation is not FLAME's, regions are
+    lost, and when drivers, keyframes or bindings do not survive saving and opening."""
     sequence = flame_sequence(flame_model())
-    name = import_head(motion_capture(sequence, source)).name
+    regions = {"mouth": np.arange(len(sequence.model.faces)) % 3 == 0}
+    name = import_head(replace(motion_capture(sequence, source), regions=regions)).name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     assert_parity(bpy.data.objects[name], sequence)
+    assert tags.REGION_PREFIX + "mouth" in bpy.data.objects[name].data.attributes
 
 
 def test_the_bundled_head_has_arkits_sliders(source):

@@ -1,35 +1,32 @@
 """The GPU display without a window: what it draws, from where, and what it leaves."""
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from stga_addon.avatar.embedding import WORLD  # noqa: E402
-from stga_addon.capture.camera import look_at  # noqa: E402
-from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.splat_attributes import avatar_attributes  # noqa: E402
-from stga_addon.scene.display.splat_nodes import POINTS  # noqa: E402
-from stga_addon.scene.display.splat_object import (  # noqa: E402
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.capture.camera import look_at
+from stga_addon.scene.display.splat_attributes import avatar_attributes
+from stga_addon.scene.display.splat_nodes import POINTS
+from stga_addon.scene.display.splat_object import (
     display_mode,
-    set_input,
     show_avatar,
     show_world_splats,
     update_splats,
 )
-from stga_addon.scene.gpu.packing import (  # noqa: E402
+from stga_addon.scene.gpu.packing import (
     StaticSplats,
     View,
     drawing_order,
     frame_block,
     posed_frames,
 )
-from stga_addon.scene.layers import SceneLayer  # noqa: E402
-from stga_addon.scene.render import viewport_display  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
-from stga_addon.scene.render.viewport_display import GpuDisplay, region_view  # noqa: E402
+from stga_addon.scene.layers import SceneLayer
+from stga_addon.scene.render import viewport_display
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.scene.render.viewport_display import GpuDisplay, region_view
 
-from .test_splat_object import animated_head, avatar_of, random_splats  # noqa: E402
+from .test_splat_object import animated_head, avatar_of, random_splats
 
 
 class Region:
@@ -105,8 +102,9 @@ def test_cache_follows_new_splats_and_shapes():
     assert np.array_equal(layer(5).splats.xyz, moved)
 
 
-def test_nothing_is_drawn_by_nodes():
-    """Catches points that viewports draw over the GPU's picture."""
+def test_an_error_ends_the_display(monkeypatch, capsys):
+    """Catches points that viewports draw over the GPU's picture, an error that is raised in every
+    redraw, and splats that are gone from then on."""
     shown = show_world_splats(random_splats(1, 10), "scan")
 
     def kinds() -> set[str]:
@@ -114,13 +112,6 @@ def test_nothing_is_drawn_by_nodes():
         return {instance.object.type for instance in depsgraph.object_instances}
 
     assert "POINTCLOUD" not in kinds()
-    set_input(shown, splat_nodes.DISPLAY, POINTS)
-    assert "POINTCLOUD" in kinds()
-
-
-def test_an_error_ends_the_display(monkeypatch, capsys):
-    """Catches an error that is raised in every redraw, and splats that are gone from then on."""
-    shown = show_world_splats(random_splats(1, 10), "scan")
     display = GpuDisplay()
     monkeypatch.setattr(viewport_display, "display", display)
     monkeypatch.setattr(display, "_draw_region", lambda context: 1 / 0)
@@ -130,4 +121,5 @@ def test_an_error_ends_the_display(monkeypatch, capsys):
     assert capsys.readouterr().out.count("STGA:") == 1
     viewport_display.show_points()
     assert display_mode(shown) == POINTS
+    assert "POINTCLOUD" in kinds()
     bpy.app.timers.unregister(viewport_display.show_points)

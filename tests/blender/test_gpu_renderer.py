@@ -5,9 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("bpy")
-
 import torch
 from capture.factory import ball
 from light.scenes import lit_avatar

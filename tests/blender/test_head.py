@@ -2,25 +2,16 @@
 
 from dataclasses import replace
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.errors import StgaError
+from stga_addon.scene import tags
+from stga_addon.scene.compat import SLOTTED_ACTIONS
+from stga_addon.scene.rig.head import import_head
 
-from stga_addon.capture.open import open_capture  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.compat import SLOTTED_ACTIONS  # noqa: E402
-from stga_addon.scene.rig.head import import_head  # noqa: E402
-
-from .captures import flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
-
-
-def at_frame(head, frame: float) -> np.ndarray:
-    whole = int(np.floor(frame))
-    bpy.context.scene.frame_set(whole, subframe=frame - whole)
-    return evaluated_vertices(head)
+from .captures import at_frame, flame_model, flame_sequence, mesh_capture, motion_capture
 
 
 def block_counts() -> dict[str, int]:
@@ -46,26 +37,12 @@ def test_each_frame_evaluates_to_its_timestep(tmp_path):
         np.testing.assert_allclose(at_frame(head, frame), vertices, atol=1e-7)
 
 
-def test_single_timestep_applies_to_all_frames(tmp_path):
-    """Fails when a capture of one timestep has no keyframe that keeps its mesh."""
-    capture = mesh_capture(tmp_path, timesteps=(5,))
+def test_axes_faces_and_regions(tmp_path):
+    """Fails when y up does not become z up, or the head is mirrored on the way, when faces are
+    re-ordered or turned, regions are lost, a second capture replaces the first, and when one of a
+    single timestep has no keyframe that keeps its mesh."""
+    capture = mesh_capture(tmp_path / "anna", timesteps=(5,))
     head = import_head(capture)
-    for frame in (0, 5, 9):
-        np.testing.assert_allclose(at_frame(head, frame), capture.mesh(5), atol=1e-7)
-
-
-def test_studio_head_evaluates_to_its_tracked_meshes(shared_data):
-    """Fails when a real capture's vertex order or coordinates do not survive the import."""
-    capture = open_capture(shared_data / "studio_head")
-    head = import_head(capture)
-    assert list(head[tags.TIMESTEPS]) == list(capture.timesteps)
-    for timestep in (capture.timesteps[0], capture.timesteps[5], capture.timesteps[-1]):
-        np.testing.assert_allclose(at_frame(head, timestep), capture.mesh(timestep), atol=1e-6)
-
-
-def test_up_axis_is_z(tmp_path):
-    """Fails when y up does not become z up, or the head is mirrored on the way."""
-    head = import_head(mesh_capture(tmp_path / "anna", timesteps=(1,)))
     bpy.context.view_layer.update()
     turned = np.array(head.matrix_world)[:3, :3]
     np.testing.assert_allclose(turned @ [0, 1, 0], [0, 0, 1], atol=1e-6)
@@ -73,24 +50,32 @@ def test_up_axis_is_z(tmp_path):
     assert np.linalg.det(turned) == pytest.approx(1)
     assert head.parent.name == "anna"
     assert "anna" in bpy.data.collections
-
-
-def test_faces_and_regions_keep_their_order(tmp_path):
-    """Fails when faces are re-ordered or turned, or regions are lost."""
-    capture = mesh_capture(tmp_path)
-    mesh = import_head(capture).data
+    mesh = head.data
     assert [list(polygon.vertices) for polygon in mesh.polygons] == capture.faces.tolist()
     members = [element.value for element in mesh.attributes[tags.REGION_PREFIX + "mouth"].data]
     assert members == capture.regions["mouth"].tolist()
+    other = import_head(mesh_capture(tmp_path / "other"))
+    assert other != head
+    assert other.parent != head.parent
+    for frame in (0, 5, 9):
+        np.testing.assert_allclose(at_frame(head, frame), capture.mesh(5), atol=1e-7)
 
 
 def test_second_import_replaces_the_first(tmp_path):
-    """Fails when a second import duplicates the head, leaves data, or breaks references."""
+    """Fails when a second import duplicates the head, leaves data, or breaks references; and when
+    edit mode writes the old mesh back over the new one."""
     first = import_head(mesh_capture(tmp_path))
     first.modifiers.new("artist's own", "SMOOTH").iterations = 0
     follower = bpy.data.objects.new("follower", None)
     follower.parent = first
     counts = block_counts()
+    bpy.context.view_layer.objects.active = first
+    bpy.ops.object.mode_set(mode="EDIT")
+    same_triangles = mesh_capture(tmp_path, seed=4)
+    np.testing.assert_allclose(
+        at_frame(import_head(same_triangles), 3), same_triangles.mesh(3), atol=1e-7
+    )
+    assert first.mode == "OBJECT"
     changed = mesh_capture(tmp_path, timesteps=(1, 2), vertices=70, seed=3)
     second = import_head(changed)
     assert second == first == follower.parent
@@ -98,24 +83,6 @@ def test_second_import_replaces_the_first(tmp_path):
     assert [modifier.name for modifier in second.modifiers] == ["artist's own"]
     np.testing.assert_allclose(at_frame(second, 2), changed.mesh(2), atol=1e-7)
     assert list(second[tags.TIMESTEPS]) == [1, 2]
-
-
-def test_second_import_in_edit_mode(tmp_path):
-    """Fails when edit mode writes the old mesh back over the new one."""
-    head = import_head(mesh_capture(tmp_path))
-    bpy.context.view_layer.objects.active = head
-    bpy.ops.object.mode_set(mode="EDIT")
-    capture = mesh_capture(tmp_path, seed=4)
-    head = import_head(capture)
-    assert head.mode == "OBJECT"
-    np.testing.assert_allclose(at_frame(head, 3), capture.mesh(3), atol=1e-7)
-
-
-def test_two_captures_are_imported_separately(tmp_path):
-    """Fails when importing a second capture replaces the first."""
-    one, other = (import_head(mesh_capture(tmp_path / name)) for name in ("one", "other"))
-    assert one != other
-    assert one.parent != other.parent
 
 
 def test_rig_is_removed_with_the_capture_s_flame_parameters(tmp_path):

@@ -1,32 +1,26 @@
 """Lights, worlds and objects as an avatar sees them, against Cycles; its colors."""
 
-import sys
-from pathlib import Path
+from dataclasses import replace
 
+import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
+from light.scenes import lit_avatar
+from mathutils import Matrix, Vector
 
-bpy = pytest.importorskip("bpy")
-pytest.importorskip("numba")
-pytest.importorskip("trimesh")
+from stga_addon.avatar.file import read_avatar, write_avatar
+from stga_addon.capture.mesh_geometry import vertex_normals
+from stga_addon.light.lamps import LIFT_M, Lamps
+from stga_addon.scene.arrays import read_values, triangle_mesh
+from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display.splat_nodes import PERCENTAGE
+from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar
+from stga_addon.scene.layers import Relit
+from stga_addon.scene.light import throw_shadow, throws_shadow
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from mathutils import Matrix, Vector  # noqa: E402
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from light.scenes import lit_avatar  # noqa: E402
-
-from stga_addon.capture.mesh_geometry import vertex_normals  # noqa: E402
-from stga_addon.light.lamps import LIFT_M, Lamps  # noqa: E402
-from stga_addon.scene.arrays import read_values, triangle_mesh  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.splat_nodes import PERCENTAGE  # noqa: E402
-from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar  # noqa: E402
-from stga_addon.scene.layers import Relit  # noqa: E402
-from stga_addon.scene.light import throw_shadow, throws_shadow  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
-
-from .test_other_engines import EEVEE, EEVEE_MARKS  # noqa: E402
+from .test_other_engines import EEVEE, EEVEE_MARKS
 
 TURN = Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized())
 PLACE = Matrix.LocRotScale(Vector((0.4, -0.2, 0.3)), TURN, (1.3,) * 3)
@@ -243,15 +237,6 @@ def test_nothing_is_made_anew_while_nothing_moves():
     assert again().mesh is not brighter.mesh
 
 
-def test_light_is_kept_in_the_file():
-    """Catches an avatar's light that Blender's meshes hold otherwise than the avatar file."""
-    shown, _ = shown_head()
-    expected, found = lit_avatar().light, stored_avatar(shown).light
-    assert found.source == expected.source
-    for name in vars(expected).keys() - {"source"}:
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
-
-
 @pytest.mark.parametrize("engine", ["CYCLES", pytest.param(EEVEE, marks=EEVEE_MARKS)])
 def test_shadow_onto_the_scene(engine, tmp_path):
     """Catches a head seen where it should only throw its shadow, and no shadow."""
@@ -284,3 +269,36 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     throw_shadow(shown, False)
     assert middle() == pytest.approx(open_ground, rel=0.05)
     assert head.hide_render
+
+
+@pytest.mark.slow
+def test_estimate_light(extension, tmp_path):
+    """Catches a button whose worker is not given the run, whose light is another than training
+    finds, does not reach the splats that are shown, or reaches those of another avatar."""
+    run, scene = tmp_path / "run", bpy.context.scene
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    bpy.ops.stga.train(directory=str(run), iterations=6)
+    trained = read_avatar(run / "avatar.npz")
+    write_avatar(run / "avatar.npz", replace(trained, light=None))
+    bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
+    shown, scene.stga.run_folder = scene.stga.splats, str(run)
+    assert stored_avatar(shown).light is None
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    scene.collection.objects.link(sun)
+    scene.stga_lighting.mode = "scene"
+
+    bpy.ops.stga.estimate_light()
+    found = stored_avatar(shown).light
+    for name in vars(found).keys() - {"source"}:
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(trained.light, name), atol=1e-6, err_msg=name
+        )
+    assert found.source == "estimated"
+    assert read_avatar(run / "avatar.npz").light.source == "estimated"
+    assert [light.kind for light in relit().lighting.lights] == ["sun"]
+
+    write_avatar(tmp_path / "other.npz", replace(trained, splats=trained.splats.rows(np.arange(9))))
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "other.npz"))
+    scene.stga.run_folder = str(run)
+    with pytest.raises(RuntimeError, match="is not the one that the scene shows"):
+        bpy.ops.stga.estimate_light()

@@ -2,17 +2,16 @@
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.embedding import to_world
+from stga_addon.scene.display.splat_object import show_avatar
+from stga_addon.scene.layers import SceneLayer
+from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
-from stga_addon.avatar.embedding import to_world  # noqa: E402
-from stga_addon.scene.display.splat_object import show_avatar  # noqa: E402
-from stga_addon.scene.layers import SceneLayer  # noqa: E402
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers  # noqa: E402
-
-from .test_splat_object import FRAMES, animated_head, avatar_of  # noqa: E402
+from .test_splat_object import FRAMES, animated_head, avatar_of
 
 
 def positions(layer: SceneLayer) -> np.ndarray:

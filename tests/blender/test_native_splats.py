@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("bpy")
-
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import write_avatar
 from stga_addon.avatar.splats import SH_C0

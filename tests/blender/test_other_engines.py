@@ -3,35 +3,34 @@
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 from PIL import Image
 
-bpy = pytest.importorskip("bpy")
-
-from stga_addon.avatar.embedding import WORLD  # noqa: E402
-from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
-from stga_addon.capture.camera import Camera  # noqa: E402
-from stga_addon.capture.color import linear_to_srgb, srgb_to_linear  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.light.relight import Relighter  # noqa: E402
-from stga_addon.raster.cpu.compose import compose  # noqa: E402
-from stga_addon.raster.posed_splats import PosedSplats  # noqa: E402
-from stga_addon.scene.cameras import render_camera  # noqa: E402
-from stga_addon.scene.compat import enable_nodes  # noqa: E402
-from stga_addon.scene.display.splat_nodes import DISPLAY, QUADS  # noqa: E402
-from stga_addon.scene.display.splat_object import set_input, show_world_splats  # noqa: E402
-from stga_addon.scene.gpu.renderer import has_gpu_context  # noqa: E402
-from stga_addon.scene.render.scene_splats import (  # noqa: E402
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.capture.camera import Camera
+from stga_addon.capture.color import linear_to_srgb, srgb_to_linear
+from stga_addon.errors import StgaError
+from stga_addon.light.relight import Relighter
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import PosedSplats
+from stga_addon.scene.cameras import render_camera
+from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display.splat_nodes import DISPLAY, QUADS
+from stga_addon.scene.display.splat_object import set_input, show_world_splats
+from stga_addon.scene.gpu.renderer import has_gpu_context
+from stga_addon.scene.render.scene_splats import (
     SplatCache,
     forget_frame,
     relight_frame,
     visible_layers,
 )
 
-from .test_engine import camera_at, show, textured, with_light  # noqa: E402
-from .test_panel import draw  # noqa: E402
-from .test_splat_object import active_camera, avatar_of, displayed_colors  # noqa: E402
+from .test_engine import camera_at, show, textured, with_light
+from .test_panel import draw
+from .test_splat_object import active_camera, avatar_of, displayed_colors
 
 SIZE_PX = 64
 SAMPLES = 4

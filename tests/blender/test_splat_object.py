@@ -3,23 +3,22 @@
 from dataclasses import replace
 from itertools import product
 
+import bpy
+import mathutils
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-mathutils = pytest.importorskip("mathutils")
-
-from stga_addon.avatar.embedding import CONVENTIONS, to_world  # noqa: E402
-from stga_addon.avatar.file import Avatar  # noqa: E402
-from stga_addon.avatar.splats import SH_C0, Splats  # noqa: E402
-from stga_addon.avatar.strain import edge_neighbors, rest_strain  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices  # noqa: E402
-from stga_addon.scene.display import splat_nodes  # noqa: E402
-from stga_addon.scene.display.node_builder import find_tree  # noqa: E402
-from stga_addon.scene.display.splat_attributes import avatar_attributes  # noqa: E402
-from stga_addon.scene.display.splat_nodes import DISPLAY_COLOR, EXTENT, POINTS, QUADS  # noqa: E402  # noqa: E402
-from stga_addon.scene.display.splat_object import (  # noqa: E402
+from stga_addon.avatar.embedding import CONVENTIONS, to_world
+from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.strain import edge_neighbors, rest_strain
+from stga_addon.errors import StgaError
+from stga_addon.scene.arrays import evaluated_vertices
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.node_builder import find_tree
+from stga_addon.scene.display.splat_attributes import avatar_attributes
+from stga_addon.scene.display.splat_nodes import DISPLAY_COLOR, EXTENT, POINTS, QUADS
+from stga_addon.scene.display.splat_object import (
     can_update,
     evaluated_splats,
     get_input,
@@ -170,16 +169,6 @@ def active_camera(location=(0.0, 0.0, 0.0)):
     return camera
 
 
-def test_constant_colors_are_scene_linear():
-    """Catches sRGB shown where Blender expects scene-linear, and colors outside 0…1."""
-    sh = np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3)
-    splats = replace(random_splats(1, 300, degree=0), sh=sh)
-    expected = linear(0.5 + SH_C0 * splats.sh[:, 0])
-    assert (expected.min(), expected.max()) == (0, 1)
-    shown = show_world_splats(splats, "scan")
-    np.testing.assert_allclose(displayed_colors(shown), expected, atol=2e-6)
-
-
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colors_follow_the_active_camera(degree):
     """Catches harmonics of another order, sign or space, and colors that stay while the camera
@@ -293,6 +282,21 @@ def test_updated_splats_follow_strain_anew():
     assert not can_update(shown, second)
 
 
+def test_world_splats():
+    """Catches world-space splats that are transformed like embedded ones, sRGB shown where Blender
+    expects scene-linear, and colors outside 0…1."""
+    sh = np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3)
+    splats = replace(random_splats(1, 300, degree=0), sh=sh)
+    shown = show_world_splats(splats, "scan")
+    xyz, rotation, scale = evaluated_splats(shown)
+    np.testing.assert_allclose(xyz, splats.xyz, atol=1e-7)
+    assert same_rotation(rotation, splats.rotation) < 1e-3
+    np.testing.assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
+    expected = linear(0.5 + SH_C0 * splats.sh[:, 0])
+    assert (expected.min(), expected.max()) == (0, 1)
+    np.testing.assert_allclose(displayed_colors(shown), expected, atol=2e-6)
+
+
 def test_names_of_trees_are_told_apart():
     """Catches names that Blender shortens, and a tree found for a similar name."""
     kinds = [
@@ -310,20 +314,12 @@ def test_names_of_trees_are_told_apart():
     assert not [(a, b) for a in names for b in names if a != b and b.startswith(a)]
 
 
-def test_no_strain_nodes_without_strain():
-    """Catches strain nodes, which cost playback time, for avatars that do not follow strain."""
-    avatar = avatar_of("stga", 10)
-    show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
-    trees = bpy.data.node_groups
-    sockets = [socket for tree in trees for node in tree.nodes for socket in node.inputs]
-    names = [socket.default_value for socket in sockets if socket.type == "STRING"]
-    assert "stga_face" in names
-    assert not [name for name in names if "strain" in name]
-
-
 def test_display_inputs():
-    """Catches inputs that are not wired: threshold, percentage and quads."""
+    """Catches inputs that are not wired: threshold, percentage and quads; and splats scattered over
+    a mesh they were not trained on."""
     avatar = avatar_of("stga", 2000)
+    with pytest.raises(StgaError, match="trained on"):
+        show_avatar(avatar, animated_head(avatar.neutral, avatar.faces[::-1]))
     shown = show_avatar(avatar, animated_head(avatar.neutral, avatar.faces))
     opacity = 1 / (1 + np.exp(-avatar.splats.opacity))
     assert len(evaluated_splats(shown)[0]) == 2000
@@ -391,30 +387,14 @@ def test_selection_grays_out_frozen_splats():
     assert len(evaluated_splats(shown)[0]) == 1000
 
 
-def test_head_of_another_topology_is_refused():
-    """Catches splats scattered over a mesh they were not trained on."""
-    avatar = avatar_of("stga", 10)
-    head = animated_head(avatar.neutral, avatar.faces[::-1])
-    with pytest.raises(StgaError, match="trained on"):
-        show_avatar(avatar, head)
-
-
-def test_world_splats_keep_their_coordinates():
-    """Catches world-space splats that are transformed like embedded ones."""
-    splats = random_splats(1, 500)
-    xyz, rotation, scale = evaluated_splats(show_world_splats(splats, "scan"))
-    np.testing.assert_allclose(xyz, splats.xyz, atol=1e-7)
-    assert same_rotation(rotation, splats.rotation) < 1e-3
-    np.testing.assert_allclose(scale, np.exp(splats.log_scale), rtol=1e-5)
-
-
 TREES = [("stga", 3, True), (None, 0, False), ("gaussian_avatars", 3, True, ("strain_position",))]
 
 
 @pytest.mark.parametrize("kind", TREES)
 def test_trees_are_built_one_node_group_at_a_time(kind):
     """Catches what blocks the UI when a live preview first appears: several groups built in one
-    call, a large tree (build time is quadratic), and groups that are built again."""
+    call, a large tree (build time is quadratic), and groups that are built again; and strain nodes,
+    which cost playback time, for splats that do not follow strain."""
     built, options = [], splat_nodes.TreeOptions(*kind)
     while splat_nodes.build_next_node_group(options):
         built.append(len(bpy.data.node_groups))
@@ -423,3 +403,8 @@ def test_trees_are_built_one_node_group_at_a_time(kind):
     assert splat_nodes.splat_tree(options) == find_tree(options.tree_name)
     assert len(bpy.data.node_groups) == len(built)
     assert len(bpy.data.materials) == 2
+    nodes = [node for tree in bpy.data.node_groups for node in tree.nodes]
+    sockets = [socket for node in nodes for socket in node.inputs if socket.type == "STRING"]
+    names = [socket.default_value for socket in sockets]
+    assert splat_nodes.stored.XYZ in names
+    assert any("strain" in name for name in names) == (options.strain_color or bool(kind[3:]))

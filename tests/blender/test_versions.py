@@ -13,9 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("bpy")
-
 from capture.factory import ball, write_flame_capture
 
 from stga_addon.avatar.embedding import to_world

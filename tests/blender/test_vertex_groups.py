@@ -1,17 +1,16 @@
 """Selections written as vertex groups and read back."""
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.errors import StgaError
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values
+from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.vertex_groups import read_selection, write_selection
 
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene import tags  # noqa: E402
-from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values  # noqa: E402
-from stga_addon.scene.rig.head import import_head  # noqa: E402
-from stga_addon.scene.vertex_groups import read_selection, write_selection  # noqa: E402
-
-from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture  # noqa: E402
+from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture
 
 
 @pytest.fixture

@@ -3,19 +3,18 @@
 from dataclasses import replace
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
+from stga_addon.avatar.splats import SH_C0
+from stga_addon.scene.compat import choose_image_file
+from stga_addon.scene.display.splat_object import show_world_splats
+from stga_addon.scene.render import view_transform
+from stga_addon.scene.render.view_transform import inverse_view, measure
 
-from stga_addon.avatar.splats import SH_C0  # noqa: E402
-from stga_addon.scene.compat import choose_image_file  # noqa: E402
-from stga_addon.scene.display.splat_object import show_world_splats  # noqa: E402
-from stga_addon.scene.render import view_transform  # noqa: E402
-from stga_addon.scene.render.view_transform import inverse_view, measure  # noqa: E402
-
-from .test_engine import HEIGHT, WIDTH, _engine  # noqa: E402, F401
-from .test_splat_object import active_camera, random_splats  # noqa: E402
+from .test_engine import HEIGHT, WIDTH, _engine  # noqa: F401
+from .test_splat_object import active_camera, random_splats
 
 
 def scene_with(view: str, exposure: float = 0.0):

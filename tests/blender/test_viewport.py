@@ -6,15 +6,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
+import bpy
 import numpy as np
 import pytest
 
-bpy = pytest.importorskip("bpy")
-
-from stga_addon.capture.camera import Camera  # noqa: E402
-from stga_addon.errors import StgaError  # noqa: E402
-from stga_addon.scene.render import engine as engine_viewport  # noqa: E402
-from stga_addon.scene.render.engine import RenderRequest, ViewportRenderer  # noqa: E402
+from stga_addon.capture.camera import Camera
+from stga_addon.errors import StgaError
+from stga_addon.scene.render import engine as engine_viewport
+from stga_addon.scene.render.engine import RenderRequest, ViewportRenderer
 
 CAMERA = Camera(800, 600, 700.0, 700.0, 400.0, 300.0, np.eye(4))
 
@@ -68,32 +67,23 @@ def _stopped_timer() -> Iterator[None]:
     engine_viewport.stop_redraws()
 
 
-def test_a_resting_view_is_rendered_at_full_resolution():
-    """Catches a view that stays coarse, and one that is rendered again and again."""
-    recorder = Recorder()
-    first = request()
-    assert recorder.renderer.request(first)
-    recorder.renderer.join()
-    scales = [scale for _, scale in recorder.rendered]
-    assert scales[0] < 1
-    assert scales[-1] == 1
-    assert recorder.renderer.image is not None
-    assert recorder.renderer.image.shape == (600, 800, 4)
-    assert not recorder.renderer.request(request(layers=first.layers))
-    assert not recorder.renderer.is_busy()
-    assert len(recorder.rendered) == len(scales)
-
-
-def test_a_moving_view_is_rendered_from_its_latest_request():
-    """Catches a queue: views that have passed by must not be rendered."""
+def test_views_are_rendered_from_their_latest_request():
+    """Catches a queue of views that have passed by, a view that stays coarse, and one that is
+    rendered again and again."""
     recorder = Recorder(waits=True)
-    for x in range(20):
-        recorder.renderer.request(request(float(x)))
+    requests = [request(float(x)) for x in range(20)]
+    assert all(map(recorder.renderer.request, requests))
     recorder.go.release(10**6)
     recorder.renderer.join()
     assert len(recorder.rendered) <= 4
+    assert recorder.rendered[0][1] < 1
     last, scale = recorder.rendered[-1]
     assert (last.camera.world_to_camera[0, 3], scale) == (19, 1)
+    assert recorder.renderer.image.shape == (600, 800, 4)
+    rendered = len(recorder.rendered)
+    assert not recorder.renderer.request(request(19.0, layers=last.layers))
+    assert not recorder.renderer.is_busy()
+    assert len(recorder.rendered) == rendered
 
 
 def test_slow_images_get_coarser(monkeypatch):
@@ -121,15 +111,6 @@ def test_failures_are_reported(error):
     assert recorder.renderer.error == ""
 
 
-def poll_until_idle() -> None:
-    """Call the timer's function as Blender's main loop would."""
-    for _ in range(1000):
-        if engine_viewport._poll() is None:
-            return
-        time.sleep(0.005)
-    raise AssertionError("the timer never ends")
-
-
 def test_viewports_are_redrawn_from_the_main_thread():
     """Catches bpy in the render thread, a lost last image, and an idle timer."""
     recorder, engine = Recorder(waits=True), Engine()
@@ -145,7 +126,8 @@ def test_viewports_are_redrawn_from_the_main_thread():
             time.sleep(0.001)
         engine_viewport._poll()
         assert engine.threads == [threading.main_thread()] * images
-    poll_until_idle()
+    recorder.renderer.join()
+    assert engine_viewport._poll() is None
     assert len(engine.threads) == 2
     assert engine_viewport._active == {}
 

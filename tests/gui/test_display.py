@@ -10,9 +10,6 @@ from typing import Any
 import filelock
 import numpy as np
 import pytest
-
-pytest.importorskip("bpy")
-
 from blender.test_gpu_renderer import avatar, check_shadow_map, psnr_db
 from PIL import Image
 

@@ -6,8 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("numba")
-
 from stga_addon.light import array_kernels
 from stga_addon.light.lamps import head_bounds, light_rows, light_view
 from stga_addon.light.values import Light
