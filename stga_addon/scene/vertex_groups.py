@@ -16,9 +16,9 @@ import numpy as np
 from ..capture.meshes import SELECTED_WEIGHT
 from ..errors import StgaError
 from . import tags
-from .arrays import flat_floats, mesh_triangles, read_values
+from .arrays import flat_floats, mesh_triangles
 from .display.node_builder import Nodes, new_material, new_socket
-from .display.splat_attributes import FACE, with_alpha, write_attributes
+from .display.splat_attributes import FACE, read_attribute, with_alpha, write_attributes
 
 
 def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
@@ -111,10 +111,9 @@ def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
 
 def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:
     """(F,) splats of the object on each triangle of the head; None without an avatar."""
-    attribute = splat_object.data.attributes.get(FACE) if splat_object is not None else None
-    if attribute is None:
+    if splat_object is None or FACE not in splat_object.data.attributes:
         return None
-    face = read_values(attribute.data, "value", 1, np.int32)[:, 0]
+    face = read_attribute(splat_object.data, FACE)
     count = np.bincount(face, minlength=len(head.data.polygons))
     return count if len(count) == len(head.data.polygons) else None
 
@@ -146,13 +145,10 @@ HEAT = "stga_heat"  # on face corners: one of these as a color, relative to the 
 MODIFIER = "STGA Heat Map"
 # Linear RGB from never to most often selected.
 STOPS = (0.0, 1e-9, 0.25, 0.5, 0.75, 1.0)
-COLORS = (
-    (0.1, 0.1, 0.1),
-    (0.02, 0.03, 0.3),
-    (0.05, 0.35, 0.6),
-    (0.15, 0.6, 0.1),
-    (0.95, 0.6, 0.02),
-    (0.9, 0.05, 0.01),
+RED, GREEN, BLUE = (
+    (0.1, 0.02, 0.05, 0.15, 0.95, 0.9),
+    (0.1, 0.03, 0.35, 0.6, 0.6, 0.05),
+    (0.1, 0.3, 0.6, 0.1, 0.02, 0.01),
 )
 
 
@@ -166,7 +162,7 @@ def show_heat_map(
     hide_heat_map(head)
     whole = values.max(initial=0.0) if largest is None else largest
     scaled = np.minimum(values / max(whole, 1e-9), 1.0)
-    channels = [np.interp(scaled, STOPS, channel) for channel in zip(*COLORS, strict=True)]
+    channels = [np.interp(scaled, STOPS, channel) for channel in (RED, GREEN, BLUE)]
     colors = flat_floats(np.repeat(with_alpha(np.column_stack(channels)), 3, axis=0))
     write_attributes(head.data, {attribute: ("FLOAT", "value", flat_floats(values))}, "FACE")
     write_attributes(head.data, {HEAT: ("FLOAT_COLOR", "color", colors)}, "CORNER")

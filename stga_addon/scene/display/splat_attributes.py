@@ -131,30 +131,25 @@ def write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
 
 def read_splats(mesh: Any) -> Splats:
     """The splats in a splat object's mesh, with unit rotations, all bound to their triangles."""
-    attributes = mesh.attributes
     count = len(mesh.vertices)
 
     def coefficients(name: str) -> np.ndarray:
         found = [np.zeros((count, 0, 3), np.float32)]
-        while name.format(len(found) - 1) in attributes:
-            values = read_values(attributes[name.format(len(found) - 1)].data, "vector", 3)
-            found.append(values[:, None])
+        while (each := name.format(len(found) - 1)) in mesh.attributes:
+            found.append(read_attribute(mesh, each)[:, None])
         return np.concatenate(found, 1)
 
-    opacity = read_values(attributes[OPACITY].data, "value", 1)[:, 0].astype(np.float64)
-    scale = read_values(attributes[SCALE].data, "vector", 3).astype(np.float64)
-    face = np.zeros(count, np.int32)
-    if FACE in attributes:
-        attributes[FACE].data.foreach_get("value", face)
+    opacity = read_attribute(mesh, OPACITY).astype(np.float64)
+    face = FACE in mesh.attributes
     # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
     with np.errstate(divide="ignore"):
         return Splats(
-            xyz=read_values(attributes[XYZ].data, "vector", 3),
-            rotation=read_values(attributes[ROTATION].data, "value", 4),
-            log_scale=np.log(scale).astype(np.float32),
+            xyz=read_attribute(mesh, XYZ),
+            rotation=read_attribute(mesh, ROTATION),
+            log_scale=np.log(read_attribute(mesh, SCALE).astype(np.float64)).astype(np.float32),
             opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
             sh=coefficients(SH),
-            face=face,
+            face=read_attribute(mesh, FACE) if face else np.zeros(count, np.int32),
             unbound=np.zeros(count, bool),
             strain_color=coefficients(STRAIN_COLOR),
         )
@@ -170,17 +165,27 @@ def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     return found
 
 
+def read_attribute(mesh: Any, name: str) -> np.ndarray:
+    """(N,) of an attribute of numbers, (N, 3) of one of vectors, (N, 4) of one of rotations."""
+    attribute = mesh.attributes[name]
+    if attribute.data_type in ("FLOAT", "INT"):
+        dtype = np.int32 if attribute.data_type == "INT" else np.float32
+        return read_values(attribute.data, "value", 1, dtype)[:, 0]
+    if attribute.data_type == "QUATERNION":
+        return read_values(attribute.data, "value", 4)
+    return read_values(attribute.data, "vector", 3)
+
+
 def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:
     """(F, len(names), 3) of vector attributes; None where the mesh lacks one."""
     if not all(name in mesh.attributes for name in names):
         return None
-    return np.stack([read_values(mesh.attributes[name].data, "vector", 3) for name in names], 1)
+    return np.stack([read_attribute(mesh, name) for name in names], 1)
 
 
 PROPERTY = "stga_light"  # on the neutral mesh: JSON of what is not by vertex
 VECTORS = ("stga_transfer_0", "stga_transfer_1", "stga_transfer_2", "stga_irradiance")
 NUMBERS = ("stga_occlusion", "stga_roughness")
-REST = ("residual", "damping", "source")
 
 
 def write_light(mesh: Any, light: AvatarLight | None) -> None:
@@ -189,14 +194,13 @@ def write_light(mesh: Any, light: AvatarLight | None) -> None:
         for name in (*VECTORS, *NUMBERS):
             if name in mesh.attributes:
                 mesh.attributes.remove(mesh.attributes[name])
-        if PROPERTY in mesh:
-            del mesh[PROPERTY]
+        mesh.pop(PROPERTY, None)
         return
     vectors = *np.split(light.transfer, 3, axis=1), light.irradiance
     attributes = dict(zip(VECTORS, map(_vector, vectors), strict=True))
     numbers = map(_number, (light.occlusion, light.roughness))
     write_attributes(mesh, attributes | dict(zip(NUMBERS, numbers, strict=True)), "POINT")
-    rest: dict[str, Any] = {name: getattr(light, name) for name in REST}
+    rest = {"residual": light.residual, "damping": light.damping, "source": light.source}
     mesh[PROPERTY] = json.dumps(rest | {"radiance": light.radiance.ravel().tolist()})
 
 
@@ -206,12 +210,11 @@ def read_light(mesh: Any) -> AvatarLight | None:
     if PROPERTY not in mesh or vectors is None or any(n not in mesh.attributes for n in NUMBERS):
         return None
     rest = json.loads(mesh[PROPERTY])
-    numbers = [read_values(mesh.attributes[name].data, "value", 1)[:, 0] for name in NUMBERS]
     return AvatarLight(
-        radiance=np.array(rest["radiance"], np.float32).reshape(9, 3),
+        radiance=np.array(rest.pop("radiance"), np.float32).reshape(9, 3),
         transfer=vectors[:, :3].reshape(-1, 9),
-        occlusion=numbers[0],
+        occlusion=read_attribute(mesh, NUMBERS[0]),
         irradiance=vectors[:, 3],
-        roughness=numbers[1],
-        **{name: rest[name] for name in REST},
+        roughness=read_attribute(mesh, NUMBERS[1]),
+        **rest,
     )

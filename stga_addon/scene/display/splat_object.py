@@ -11,14 +11,14 @@ from ...avatar.file import Avatar, AvatarLight
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
-from ..arrays import has_triangles, mesh_triangles, mesh_vertices, read_values, triangle_mesh
+from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
 from ..compat import modifier_input, set_modifier_input
 from ..layers import DisplaySettings
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
 from .node_builder import find_tree, is_splat_tree
-from .splat_attributes import Attributes, SplatAttributes, avatar_attributes
+from .splat_attributes import SplatAttributes, avatar_attributes
 from .splat_nodes import AS_TRAINED, POINTS
 
 
@@ -55,14 +55,14 @@ def show_avatar(
     prepared, title = prepared or avatar_attributes(avatar), name or f"{head.name} splats"
     local = [each for each in head.users_collection if each.library is None]
     collection = [*local, bpy.context.scene.collection][0]  # the scene's where all are linked
-    splat_object = _splat_object(title, prepared.splats, collection, _tree_options(avatar))
+    splat_object = _splat_object(title, collection, _tree_options(avatar))
     splat_object[tags.CONVENTION] = avatar.convention
     splat_object[tags.ANTIALIASED] = avatar.antialiased
     set_input(splat_object, splat_nodes.HEAD, head)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
     neutral = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
-    _write_neutral(neutral, prepared)
     set_input(splat_object, splat_nodes.NEUTRAL, bpy.data.objects.new(neutral.name, neutral))
+    update_splats(splat_object, prepared)
     # A sibling of the head: both have the same object space.
     splat_object.parent = head.parent
     splat_object.matrix_parent_inverse = head.matrix_parent_inverse
@@ -73,8 +73,9 @@ def show_avatar(
 def show_world_splats(splats: Splats, name: str) -> Any:
     """Make a splat object of a world-space set, for example a standard 3DGS PLY; returns it."""
     options = splat_nodes.TreeOptions(None, splats.sh_degree)
-    attributes = stored.splat_attributes(splats)
-    return _splat_object(name, attributes, bpy.context.scene.collection, options)
+    splat_object = _splat_object(name, bpy.context.scene.collection, options)
+    stored.write_splats(splat_object.data, stored.splat_attributes(splats))
+    return splat_object
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
@@ -98,7 +99,10 @@ def _stored_neutral(splat_object: Any) -> Any:
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
     """Show other splats in the same object, which keeps its display settings, name and users.
     prepared: `avatar_attributes` of an avatar for which `can_update` is true."""
-    _write_neutral(get_input(splat_object, splat_nodes.NEUTRAL).data, prepared)
+    neutral = get_input(splat_object, splat_nodes.NEUTRAL).data
+    stored.write_attributes(neutral, prepared.neutral, "FACE")
+    stored.write_light(neutral, prepared.light)
+    neutral.update()
     stored.write_splats(splat_object.data, prepared.splats)
 
 
@@ -207,11 +211,10 @@ def stored_avatar(splat_object: Any) -> Avatar:
     )
 
 
-def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a splat object displays as points at the current frame, in its object space. Returns
-    position (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32. Splats
-    displayed as trained are posed by the GPU display: here they are evaluated as points. Raises
-    StgaError where it displays quads, which are instances and not one geometry."""
+def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, ...]:
+    """What a splat object displays as points at the current frame, in its object space: position
+    (N, 3), rotation (N, 4) wxyz and linear standard deviations (N, 3), float32; of splats displayed
+    as trained, too. Raises StgaError where it displays quads, which are instances."""
     if display_mode(splat_object) == AS_TRAINED:
         set_input(splat_object, splat_nodes.DISPLAY, POINTS)
         try:
@@ -223,22 +226,13 @@ def evaluated_splats(splat_object: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
         owner = instance.parent if instance.is_instance else instance.object
         is_own = owner is not None and owner.original == splat_object
         if is_own and instance.object.type == "POINTCLOUD":
-            attributes = instance.object.data.attributes
-            rotation = read_values(attributes[stored.WORLD_ROTATION].data, "value", 4)
-            position, scale = (
-                read_values(attributes[name].data, "vector", 3)
-                for name in ("position", stored.WORLD_SCALE)
-            )
-            return position, rotation, scale
+            names = "position", stored.WORLD_ROTATION, stored.WORLD_SCALE
+            return tuple(stored.read_attribute(instance.object.data, name) for name in names)
     raise StgaError(f"{splat_object.name}: shows quads or nothing, expected points")
 
 
-def _splat_object(
-    name: str, attributes: Attributes, collection: Any, options: splat_nodes.TreeOptions
-) -> Any:
-    mesh = bpy.data.meshes.new(name)
-    stored.write_splats(mesh, attributes)
-    splat_object = bpy.data.objects.new(name, mesh)
+def _splat_object(name: str, collection: Any, options: splat_nodes.TreeOptions) -> Any:
+    splat_object = bpy.data.objects.new(name, bpy.data.meshes.new(name))
     splat_object[tags.KIND] = tags.SPLATS
     collection.objects.link(splat_object)
     splat_object.modifiers.new("STGA Splats", "NODES").node_group = splat_nodes.splat_tree(options)
@@ -247,12 +241,6 @@ def _splat_object(
     for scene in splat_object.users_scene:
         use_transparent_bounces(scene)
     return splat_object
-
-
-def _write_neutral(mesh: Any, prepared: SplatAttributes) -> None:
-    stored.write_attributes(mesh, prepared.neutral, "FACE")
-    stored.write_light(mesh, prepared.light)
-    mesh.update()
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
