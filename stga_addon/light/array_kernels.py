@@ -1,8 +1,5 @@
-"""The kernels of `raster.cpu.shade` and `raster.cpu.shadow` in NumPy, for Pythons without Numba
-such as Blender's.
-
-Vectors are rows of their own here, (3, N): NumPy is slow where the last axis is short.
-"""
+"""The kernels of `raster.cpu.shade` and `.shadow` in NumPy, for Pythons without Numba. Vectors are
+rows of their own, (3, N): NumPy is slow where the last axis is short."""
 
 from collections.abc import Callable
 

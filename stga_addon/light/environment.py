@@ -18,8 +18,7 @@ SUN_CONTRAST = 12.0
 """How much brighter than the mean of the environment a pixel must be to belong to a sun."""
 SUN_RADIUS = np.radians(12)  # Bright pixels within this angle of the brightest one are one sun
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""From Blender's axes (z up) to those of a capture that its add-on shows upright (y up, the face
-looks along z)."""
+"""From Blender's axes (z up) to those of a capture that is shown upright (y up, face along z)."""
 
 
 def read_hdr(path: Path) -> np.ndarray:
@@ -47,13 +46,9 @@ def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def split_environment(
     image: np.ndarray, rotation: np.ndarray = UPRIGHT, max_suns: int = MAX_SUNS
 ) -> tuple[np.ndarray, tuple[Light, ...]]:
-    """Harmonics (9, 3) of an environment, and its brightest parts as suns, which throw shadows.
-
-    image: (H, W, 3) linear radiance, equirectangular as `pixel_directions`. rotation: (3, 3) from
-    Blender's axes to those of the result. Suns are what is brighter than SUN_CONTRAST times the
-    mean, at most `max_suns`; harmonics hold the rest, so that both together have the environment's
-    irradiance.
-    """
+    """Harmonics (9, 3) of an environment, image (H, W, 3) linear radiance as of `pixel_directions`,
+    and its brightest parts as at most `max_suns` suns, which throw shadows; harmonics hold the
+    rest. rotation (3, 3): from Blender's axes to those of the result."""
     step = max(1, len(image) // MIN_ROWS)  # means over squares of pixels
     rows, columns = (size // step for size in image.shape[:2])
     squares = image[: rows * step, : columns * step].reshape(rows, step, columns, step, 3)
@@ -124,8 +119,8 @@ class LightFile:
 
 
 def read_lighting(path: Path) -> Lighting:
-    """The lighting of an .hdr environment, as Blender shows it around the upright head, or of a
-    .toml `LightFile`."""
+    """The lighting of an .hdr environment, as Blender shows it around the head, or a .toml
+    `LightFile`."""
     suffix = path.suffix.lower()
     if suffix == ".hdr":
         world, suns = split_environment(read_hdr(path))

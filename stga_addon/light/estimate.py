@@ -19,8 +19,7 @@ from .values import Light
 MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
 """Views that are looked at, evenly spread, and the size that larger images are reduced to."""
 MIN_FACING = 0.35
-"""Cosine between a triangle's normal and the direction to the camera, below which its color is not
-used."""
+"""Least cosine between a triangle's normal and the direction to the camera."""
 HIDDEN_M = 0.003  # A triangle is hidden by what is nearer to the camera by as much
 POINTS = (np.eye(3) + 1 / 3) / 2
 """(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
@@ -40,11 +39,8 @@ def views_by_time(capture: Capture) -> dict[int, list[View]]:
 def observe(
     capture: Capture, exposure: ViewExposure, report: Report = ignore
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean linear color (T, F, 3) of triangles in the darker half of the cameras that face them,
-    which have the fewest highlights, NaN where none does; and how many (T, F) do.
-
-    T are the `views_by_time`, whose images are all read. exposure: as in `Known`.
-    """
+    """Mean linear color (T, F, 3) of triangles at the `views_by_time`, in the darker half of the
+    cameras that face them (fewest highlights), NaN where none does; and how many (T, F) do."""
     by_time = views_by_time(capture)
     colors, cameras = [], []
     for n, (time, views) in enumerate(by_time.items()):
@@ -99,15 +95,13 @@ PRIOR = 0.7  # Weight of alike albedos, in observations of a triangle seen at ev
 POSED_DIRECTIONS = 96  # By which the transfer of a posed mesh is found, at each timestep
 UNSEEN_WEIGHT = 1e-3  # Of a timestep at which no camera sees a vertex, where each camera counts 1
 MIN_OPEN_TRANSFER = 0.35 * np.pi * 0.28209479177387814
-"""Transfer of the constant harmonic below which a triangle counts for nothing: its own shadow hides
-the light."""
+"""Transfer of the constant harmonic below which a triangle lies in its own shadow."""
 LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in medians
 RIDGE = 1e-4
 MIN_ARRIVING = 0.02  # Least irradiance that a color is divided by, as a share of the mean
 TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
 HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
-"""Residuals from which on the light is too hard to be taken away, and at which albedo is damped
-most."""
+"""Residuals from which on the light is too hard to be taken away, and albedo is damped most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
@@ -185,15 +179,10 @@ def fit_light(
     color: np.ndarray, received: np.ndarray, given: np.ndarray | None = None
 ) -> tuple[np.ndarray, float]:
     """Radiance (9, 3) and residual, by linear colors (T, F, 3) of triangles, NaN where they are not
-    seen.
-
-    received (T, F, 9): transfer of the posed triangles. given: only the residual is new.
-
-    Minimizes Σ w (color − albedo · transfer · radiance)² over triangles and timesteps, alternating
-    between light and albedo, which is drawn to the median; weights w are those of the Cauchy loss.
-    The level is such that the median albedo is TYPICAL_ALBEDO in an even, white light: mean
-    irradiance is the same in all channels.
-    """
+    seen; received (T, F, 9): transfer of the posed triangles. given: only the residual is new.
+    Minimizes Σ w (color − albedo · transfer · radiance)², alternating between light and albedo,
+    which is drawn to the median; w are the Cauchy loss's. The median albedo is TYPICAL_ALBEDO in an
+    even, white light: mean irradiance is the same in all channels."""
     times, faces = color.shape[:2]
     usable = np.isfinite(color[..., 0]) & (received[..., 0] > MIN_OPEN_TRANSFER)
     if usable.sum() < 10 * COUNT:
@@ -226,8 +215,8 @@ def fit_light(
 
 
 def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V,) float32: EYE_ROUGHNESS on eyeballs, parts of their own that are nearly spheres of an
-    eye's size, 0 elsewhere."""
+    """(V,) float32: EYE_ROUGHNESS on eyeballs: parts that are nearly spheres of an eye's size; else
+    0."""
     part = connected_parts(len(neutral), faces)
     found, used = np.zeros(len(neutral), np.float32), np.zeros(len(neutral), bool)
     used[faces] = True

@@ -23,11 +23,9 @@ TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats so
 
 @dataclass(frozen=True)
 class LightView:
-    """How a light sees a head, parallel or in perspective from `origin` (3,), on size² texels.
-
-    axes (3, 3): columns across, up, forward. scale: texels per meter, or per unit of slope.
-    texel_m: about how wide a texel is on the head.
-    """
+    """How a light sees a head on size² texels, parallel or in perspective from `origin` (3,). axes
+    (3, 3): columns across, up, forward. scale: texels per meter, or per unit of slope. texel_m:
+    about how wide a texel is on the head."""
 
     axes: np.ndarray
     origin: np.ndarray
@@ -68,8 +66,8 @@ def head_bounds(vertices: np.ndarray) -> HeadBounds:
 
 
 def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
-    """The view of a light around a head: wide, and without what lies behind it, from inside the
-    head's sphere."""
+    """A light's view of a head: wide, and without what lies behind it, from inside the head's
+    sphere."""
     center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
         forward, distance, scale = light.direction, np.inf, size / 2 / radius

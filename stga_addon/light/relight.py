@@ -20,7 +20,7 @@ from .values import SKIN_ROUGHNESS, Caster, Lighting
 UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
 ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and
-from which on nothing, as a share: other objects' shadows."""
+from which on nothing: other objects' shadows."""
 RIDGE = 1e-6  # For meshes without light in some harmonics
 
 
@@ -69,17 +69,16 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
 MIN_IRRADIANCE = 0.15  # Least irradiance that color is divided by, as a share of its mean: noise
 HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
-"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes,
-which mirror what is in front of them; it is taken from the recorded colors, of which at least
-MIN_DIFFUSE_SHARE remains."""
+"""Part of what arrived in the capture that came back as highlights, from skin and from wet eyes; it
+is taken from recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
-"""Recorded colors are means over directions from which a splat's surface is seen, at a cosine above
-0.3: by degree, harmonics over their value straight from the front."""
+"""By degree, harmonics' mean over directions that see a surface (cosine above 0.3), over their
+value straight from the front: what recorded colors are."""
 
 
 class Relighter:
-    """An avatar with the light of its file, to be lit by a scene; made once. Properties are
-    float32, by splat. Raises StgaError where the avatar has no light."""
+    """An avatar in a scene's light; properties are float32, by splat. Raises StgaError without
+    light."""
 
     def __init__(self, avatar: Avatar) -> None:
         if avatar.light is None:
@@ -267,8 +266,8 @@ class Relighter:
 
 
 def albedo_avatar(avatar: Avatar) -> Avatar:
-    """The avatar without its light: its colors are albedo in sRGB, whatever the view and strain.
-    Raises StgaError where the avatar has no light."""
+    """The avatar whose colors are albedo in sRGB, whatever the view; without light. Raises
+    StgaError."""
     color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
     sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
     splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))

@@ -1,7 +1,5 @@
-"""How a head receives light: where splats lie on the mesh, transfer of distant light, and lashes.
-
-Lashes are dark splats around the eyes that stand off the mesh and throw their own shadows.
-"""
+"""How a head receives light: transfer of distant light, where splats lie on the mesh, and lashes:
+dark splats around the eyes that stand off the mesh and throw their own shadows."""
 
 from dataclasses import dataclass
 
@@ -22,12 +20,9 @@ MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002  # As in `lamps`, for maps of half
 def transfer_of(
     vertices: np.ndarray, faces: np.ndarray, directions: int = DIRECTIONS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Transfer (V, 9) float32 and occlusion (V,) float32 of a mesh (V, 3) meters, see
-    `avatar.light.AvatarLight`.
-
-    Σ over even directions d of visible(d) · max(0, n·d) · basis(d) · 4π / directions (Sloan, Kautz
-    and Snyder 2002); a direction's visibility at all vertices is one depth map.
-    """
+    """Transfer (V, 9) and occlusion (V,) float32 (`AvatarLight`) of a mesh (V, 3) meters: Σ over
+    even directions d of visible(d) · max(0, n·d) · basis(d) · 4π / directions (Sloan, Kautz and
+    Snyder 2002); visibility of a direction is one depth map."""
     vertices = np.asarray(vertices, np.float64)
     normals = vertex_normals(vertices, faces)
     points, sky = vertices + LIFT_M * normals, even_directions(directions)
@@ -83,11 +78,8 @@ MAX_STEPS = 6
 
 def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     """Where splats are on the neutral mesh: a triangle (N,), and weights (N, 3) of its corners.
-
     From its own triangle on, a splat walks over the edge beyond which it lies, up to MAX_STEPS
-    times; of the triangles that it comes by, the one with the nearest point counts, within it up to
-    clamping.
-    """
+    times; the nearest of the triangles on its way counts."""
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     face = avatar.splats.face.astype(np.int64)
     points = points_to_world(avatar.splats.xyz, frames, face)

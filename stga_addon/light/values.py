@@ -70,11 +70,7 @@ class Light:
 
     def transformed(self, matrix: np.ndarray) -> "Light":
         """The light in another space: matrix (4, 4) rigid, or with uniform scale, which scales
-        lengths.
-
-        A color stays as it is: scaled lengths change what arrives of a power, as in a scene that is
-        scaled.
-        """
+        lengths and leaves the color, as in a scene that is scaled."""
         scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
         return replace(
             self, position=matrix[:3, :3] @ self.position + matrix[:3, 3],

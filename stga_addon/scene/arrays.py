@@ -40,8 +40,7 @@ def has_triangles(mesh: Any, faces: np.ndarray) -> bool:
 
 
 def evaluated_vertices(obj: Any) -> np.ndarray:
-    """(V, 3) float32 vertex positions of a mesh object at the current frame, in object space. Shape
-    keys, drivers and modifiers are applied."""
+    """(V, 3) float32 vertices of a mesh object at the current frame, in object space."""
     evaluated = obj.evaluated_get(bpy.context.evaluated_depsgraph_get())
     mesh = evaluated.to_mesh()
     try:
@@ -71,8 +70,8 @@ def key_points(key: Any) -> np.ndarray:
 def write_curves(
     owner: Any, data_path: str, frames: Any, values: Any, interpolation: str = "LINEAR"
 ) -> None:
-    """Add f-curves with all their keyframes at once to the action of the data-block `owner`. frames
-    (K,): ascending; values: (K,) of a scalar, (K, C) of an array's elements."""
+    """Add f-curves with all their keyframes to the action of `owner`. frames (K,): ascending;
+    values: (K,) of a scalar, (K, C) of an array's elements."""
     curves, values = action_curves(owner), np.asarray(values)
     mode = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value
     for index, column in enumerate(values.reshape(len(values), -1).T):
@@ -94,10 +93,9 @@ def write_triangle_curves(
 def add_driver(
     owner: Any, path: str, index: int, expression: str, variables: Mapping[str, tuple[Any, str]]
 ) -> None:
-    """Drive one value of the data-block `owner` by an expression of other data-blocks' properties.
-    index: of the array element, -1 for a scalar; variables: name -> (data-block, data path).
-    Expressions of at most 255 characters with arithmetic only are evaluated without Python, so they
-    work where scripts are not trusted."""
+    """Drive one value of the data-block `owner` by an expression of others' properties. index: of
+    an array element, -1 for a scalar; variables: name -> (data-block, data path). Arithmetic of at
+    most 255 characters is evaluated without Python, also where scripts are not trusted."""
     curve = owner.driver_add(path, index)
     # A new driver has keyframes at 0 and 1, to which Blender snaps results closer than 1e-4.
     curve.keyframe_points.clear()

@@ -25,9 +25,8 @@ DISTANCE = 2.2
 
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
-    """Let the 3D viewports look at the head from the side of `camera`, or from the front where it
-    is None. They stay free to orbit. A viewport that looks through a camera stays so. The dashed
-    lines from cameras and bones to their parent are hidden."""
+    """Let 3D viewports look at the head from the side of `camera`, or from the front where it is
+    None; not those that look through a camera. The dashed lines to parents are hidden."""
     matrix = head.matrix_world
     vertices = evaluated_vertices(head)
     low, high = matrix @ Vector(vertices.min(0)), matrix @ Vector(vertices.max(0))
@@ -45,8 +44,8 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
 
 
 def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
-    """Open the sidebar of the 3D viewports at a tab; whether they show it. Blender knows a
-    sidebar's tabs only once it was drawn: call it again until it returns True."""
+    """Open the viewports' sidebar at a tab; whether they show it: Blender knows a sidebar's tabs
+    only once it was drawn, so call it until it returns True."""
     is_shown = True
     for area in _viewports(screens):
         area.spaces.active.show_region_ui = True
@@ -76,9 +75,8 @@ def set_up_head(capture: Capture) -> Any:
 
 
 def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
-    """Show the avatar in place of the mesh, with every viewport on it and a white world, the
-    background of captures without one of their own; bones and cameras are hidden. Returns the
-    splats. link: the avatar's file, relative to the .blend file; fps: of the scene."""
+    """Show the avatar in place of the mesh, with every viewport on it and a white world; bones and
+    cameras are hidden. Returns the splats. link: the avatar's file, relative to the .blend file."""
     shown, scene = show_avatar(avatar, head), bpy.context.scene
     shown[tags.AVATAR] = link
     hide_object(head, scene)
@@ -93,9 +91,8 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
 
 
 def show_world(avatar_file: Path, head: Any) -> Any:
-    """Show the splats of the world that lie beside an avatar file, where the head's capture stands:
-    hidden until they are wanted. Returns them; None where there are none, or the scene has them
-    already. Raises StgaError."""
+    """Show the splats of the world beside an avatar file, where the head stands, hidden until they
+    are wanted. Returns them; None where there are none, or the scene has them. Raises StgaError."""
     path = avatar_file.with_name(WORLD_FILE).resolve()
     scene = bpy.context.scene
     known = [thing.get(tags.WORLD) for thing in scene.objects]

@@ -36,9 +36,9 @@ def render_camera(
     height: int,
     border: tuple[int, int, int, int] | None = None,
 ) -> Camera:
-    """The scene's camera for a final image of width × height pixels. camera: the evaluated camera
-    object. border: x, y, width and height in pixels of the render region, from the bottom left;
-    None: the whole image. Raises StgaError unless it is a perspective camera."""
+    """The evaluated camera object for an image of width × height pixels. border: x, y, width,
+    height in pixels of the render region, from the bottom left. Raises StgaError unless it is
+    perspective."""
     if camera is None or camera.type != "CAMERA":
         raise StgaError("The scene has no camera to render through")
     if camera.data.type != "PERSP":
@@ -85,15 +85,11 @@ INTRINSICS_TOLERANCE = 1e-6  # pixels
 
 
 def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> list[Any]:
-    """One camera object for each of the capture's cameras, ascending by index, under `root` (from
-    `capture_root`).
-
-    Focal length, principal point and pose are the capture's; a pose that changes over time is
-    keyframed. The images are background images, one per timestep and visible on its frame
-    (Blender's image sequences number frames by a file name's last number, which in captures is the
-    camera). Importing again replaces the last import. `warn` reports missing images and cameras
-    whose intrinsics change.
-    """
+    """A camera object for each of the capture's cameras, ascending by index, under `root` (from
+    `capture_root`); one that moves is keyframed. The images are background images, each visible on
+    its frame (Blender's image sequences number frames by a file name's last number, which in
+    captures is the camera). Importing again replaces the last import. `warn` reports missing images
+    and changing intrinsics."""
     cameras = []
     old = {camera[tags.CAMERA_INDEX]: camera for camera in tags.find(tags.CAMERA, capture.root)}
     by_index: dict[int, dict[int, View]] = {}
@@ -113,7 +109,14 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
         if np.abs(intrinsics - intrinsics[0]).max() > INTRINSICS_TOLERANCE:
             used = views[0].timestep
             warn(f"{title}: its intrinsics change; those of timestep {used} are used for all")
-        _set_pose(camera, views)
+        poses = np.stack([view.camera.camera_to_world_gl for view in views])
+        camera.rotation_mode = "QUATERNION"
+        camera.matrix_basis = Matrix(poses[0].tolist())
+        if np.abs(poses - poses[0]).max() > POSE_TOLERANCE:
+            frames = [view.timestep for view in views]
+            turns = continuous(from_matrices(poses[:, :3, :3]))
+            arrays.write_curves(camera, "location", frames, poses[:, :3, 3])
+            arrays.write_curves(camera, "rotation_quaternion", frames, turns)
         _set_backgrounds(data, views, warn)
         cameras.append(camera)
     remove(old.values())
@@ -121,13 +124,9 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
 
 
 def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_warning) -> None:
-    """Make `scene` render the images of `camera`, one of `import_cameras`'.
-
-    Sets the active camera, the resolution, the pixel aspect, the frame range (the capture's
-    timesteps), the frame rate where the capture has one, and the view transform: splat colors are
-    trained in sRGB, so it has to be Standard. `warn` reports cameras whose images have another
-    size, since a Blender scene has only one.
-    """
+    """Make `scene` render the images of `camera`, one of `import_cameras`': camera, resolution,
+    pixel aspect, frames, rate, and the view transform Standard, as splats are trained in sRGB.
+    `warn` reports cameras whose images have another size."""
     if camera.get(tags.KIND) != tags.CAMERA:
         raise StgaError(f"{camera.name}: is not a camera imported from a capture")
     width, height = camera[tags.IMAGE_SIZE]
@@ -170,17 +169,6 @@ def set_intrinsics(data: Any, camera: Camera) -> None:
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
 
 
-def _set_pose(camera: Any, views: list[View]) -> None:
-    poses = np.stack([view.camera.camera_to_world_gl for view in views])
-    camera.rotation_mode = "QUATERNION"
-    camera.matrix_basis = Matrix(poses[0].tolist())
-    if np.abs(poses - poses[0]).max() <= POSE_TOLERANCE:
-        return
-    frames, turns = [view.timestep for view in views], continuous(from_matrices(poses[:, :3, :3]))
-    arrays.write_curves(camera, "location", frames, poses[:, :3, 3])
-    arrays.write_curves(camera, "rotation_quaternion", frames, turns)
-
-
 def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
     found = [view for view in views if view.image.is_file()]
     missing = [view.image for view in views if not view.image.is_file()]
@@ -202,14 +190,11 @@ def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
 
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:
-    """Write the cameras at the current frame as transforms.json with pinholes; how many.
-
-    cameras: camera objects. Each is named after its object: footage has a folder, a video or an
-    image of that name. Axes are those of captures, y up, and the file says that a capture keeps
-    this world: imported, it lies among the cameras. Image size: the scene's resolution, or that of
-    the capture that the camera was imported from. Raises StgaError for a camera that is not
-    perspective, is mirrored, or where there are none.
-    """
+    """Write the cameras at the current frame as transforms.json with pinholes; how many. Each is
+    named after its object, as are folders, videos or images of footage. Axes are captures', y up,
+    and a capture keeps this world: imported, it lies among the cameras. Image size: that of the
+    capture it was imported from, or the scene's. Raises StgaError for a camera that is not
+    perspective, is mirrored, or where there are none."""
     entries = []
     for thing in cameras:
         evaluated = thing.evaluated_get(depsgraph)
@@ -235,9 +220,8 @@ def scene_camera(depsgraph: Any) -> Camera:
 
 
 def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
-    """`count` cameras that start as the scene's and orbit the object `subject`, a head or splats.
-    angle: radians; 0: the sides that the cameras of the head's capture saw, a full turn where there
-    are none."""
+    """`count` cameras that start as the scene's and orbit a head or splats. angle: radians; 0: the
+    sides that the cameras of the capture saw, a full turn where there are none."""
     start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
     if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
         middle = np.median(arrays.mesh_vertices(subject.data), axis=0)

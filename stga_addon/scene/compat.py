@@ -21,8 +21,8 @@ PATH_OPTIONS = (
 
 
 def action_curves(owner: Any) -> Any:
-    """The f-curve collection that animates the data-block `owner`; makes its action (and slot)
-    where it has none. Call `.new(data_path, index=…)` on it, or `arrays.write_curves`."""
+    """The f-curves that animate the data-block `owner`, whose action (and slot) is made where
+    missing."""
     animation = owner.animation_data or owner.animation_data_create()
     if animation.action is None:
         animation.action = bpy.data.actions.new(f"{owner.name} action")
@@ -37,8 +37,8 @@ def action_curves(owner: Any) -> Any:
 
 
 def copy_action(owner: Any, name: str) -> Any:
-    """Give `owner` a copy of its action, or an empty one if it has none; the old one stays in the
-    file. Returns the f-curve collection of the new action, as `action_curves`."""
+    """Give `owner` a copy of its action, or an empty one; the old one stays in the file. Returns
+    the new action's f-curves."""
     animation = owner.animation_data or owner.animation_data_create()
     old = animation.action
     if old is None:
@@ -142,21 +142,11 @@ def working_space() -> str:
     return str(spaces.working_space) if spaces else REC709
 
 
-def choose_image_file(settings: Any, file_format: str, color_mode: str, color_depth: str) -> None:
-    """Choose the format of a scene's images, also where it was set to videos."""
+def choose_format(settings: Any, media_type: str, file_format: str) -> None:
+    """Choose images or videos ("IMAGE", "VIDEO") of a format in a scene's settings of images."""
     if hasattr(settings, "media_type"):  # from Blender 5.0 on
-        settings.media_type = "IMAGE"
+        settings.media_type = media_type
     settings.file_format = file_format
-    settings.color_mode, settings.color_depth = color_mode, color_depth
-
-
-def choose_video_file(render: Any) -> None:
-    """Let a scene render to an MP4 file, H.264 of high quality."""
-    if hasattr(render.image_settings, "media_type"):  # from Blender 5.0 on
-        render.image_settings.media_type = "VIDEO"
-    render.image_settings.file_format = "FFMPEG"
-    render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
-    render.ffmpeg.constant_rate_factor = "HIGH"
 
 
 def sequencer_strips(scene: Any) -> Any:
@@ -165,19 +155,10 @@ def sequencer_strips(scene: Any) -> Any:
     return editor.strips if hasattr(editor, "strips") else editor.sequences
 
 
-def light_strength(light: Any) -> np.ndarray:
-    """(3,) linear: a light's color times energy, and from 4.5 on exposure and temperature."""
-    stops = getattr(light, "exposure", 0.0)
-    color = np.array(light.color, np.float64) * light.energy * 2.0**stops
-    has_temperature = getattr(light, "use_temperature", False)
-    return color * np.array(light.temperature_color) if has_temperature else color
-
-
-def is_normalized(light: Any) -> bool:
-    """Whether a light's energy is that of its whole area, as before 4.5; else per square meter."""
-    return bool(getattr(light, "normalize", True))
-
-
-def light_nodes(light: Any) -> Any:
-    """The node tree that a light uses, None where it uses none."""
-    return light.node_tree if light.use_nodes else None
+def light_strength(light: Any, area: float) -> np.ndarray:
+    """(3,) linear: a light's color times energy, from 4.5 on also exposure, temperature, and area
+    in square meters where the energy is per square meter."""
+    color = np.array(light.color, np.float64) * light.energy * 2.0 ** getattr(light, "exposure", 0)
+    if getattr(light, "use_temperature", False):
+        color = color * np.array(light.temperature_color)
+    return color if getattr(light, "normalize", True) else color * area

@@ -46,10 +46,9 @@ class Relit:
 
 @dataclass(frozen=True)
 class SceneLayer:
-    """One visible splat object: its splats as stored, and how they are posed and displayed. frames,
-    to_world, antialiased: as in `PosedSplats`. frozen (F,) bool: triangles that the current frame
-    does not train; None where the settings do not ask for it, or where the frame has no selection.
-    relit: None where colors are as recorded."""
+    """A visible splat object: its splats, how they are posed (as `PosedSplats`) and displayed.
+    frozen (F,) bool: triangles that the frame does not train, None where nobody asks. relit: None
+    where colors are as recorded."""
 
     splats: Splats
     frames: FaceFrames

@@ -17,7 +17,7 @@ from ..light.relight import Relighter
 from ..light.values import SKIN_ROUGHNESS, Caster, Light, Lighting, no_world
 from . import tags
 from .arrays import mesh_vertices, read_values
-from .compat import is_normalized, light_nodes, light_strength, world_nodes
+from .compat import light_strength, world_nodes
 from .display import splat_nodes
 from .display.splat_object import get_input
 from .layers import Relit
@@ -101,14 +101,8 @@ def _surface_node(tree: Any) -> Any:
 
 
 def light_of(light: Any, matrix: Any) -> Light | None:
-    """A light (evaluated data of an object) at a world matrix; None for one without light. Its node
-    tree counts as far as it is one Emission node of constant color and strength."""
-    color, shader = light_strength(light), _surface_node(light_nodes(light))
-    if shader is not None and shader.type == "EMISSION":
-        emitted, strength = (shader.inputs[name] for name in ("Color", "Strength"))
-        color = color * np.array(emitted.default_value[:3]) * strength.default_value
-    if not color.any() or not np.isfinite(color).all():
-        return None
+    """A light's evaluated data at a world matrix; None without light. Its node tree counts as far
+    as it is one Emission node of constants."""
     to_world = np.array(matrix, np.float64)
     scale = np.linalg.norm(to_world[:3, :3], axis=0)
     axes = to_world[:3, :3] / np.maximum(scale, 1e-12)
@@ -125,9 +119,15 @@ def light_of(light: Any, matrix: Any) -> Light | None:
         own["radius"], area = light.shadow_soft_size, np.pi * light.shadow_soft_size**2
         if light.type == "SPOT":
             own |= {"cone": light.spot_size, "blend": light.spot_blend}
+    color, shader = light_strength(light, area), _surface_node(light.use_nodes and light.node_tree)
+    if shader is not None and shader.type == "EMISSION":
+        emitted, strength = (shader.inputs[name] for name in ("Color", "Strength"))
+        color = color * np.array(emitted.default_value[:3]) * strength.default_value
+    if not color.any() or not np.isfinite(color).all():
+        return None
     return Light(
         light.type.lower(),
-        color if is_normalized(light) else color * area,  # per square meter, as Cycles counts them
+        color,
         position=to_world[:3, 3],
         direction=-axes[:, 2],
         casts_shadow=bool(light.use_shadow),
@@ -164,9 +164,8 @@ def is_linked(light_object: Any, receivers: tuple[Any, ...]) -> bool:
 
 
 class WorldLight(NamedTuple):
-    """What a world's light depends on; equal where its light is. color: scene-linear, with
-    strength; of a texture, what its pixels are multiplied with. rotation (9,): row by row, from
-    directions of the world to those of the texture."""
+    """What a world's light depends on. color: scene-linear, times strength; of a texture, a factor.
+    rotation (9,): row by row, from directions of the world to the texture's."""
 
     color: tuple[float, ...]
     image: Any = None
@@ -225,9 +224,9 @@ class SceneLight:
         self, splat_object: Any, head: Any, avatar: Avatar, vertices: np.ndarray,
         to_world: np.ndarray, visible: Sequence[tuple[Any, Any]], depsgraph: Any,
     ) -> Relit | None:  # fmt: skip
-        """How the scene lights an avatar whose head has vertices (V, 3); None where its colors are
-        as recorded. The same object as long as all is the same, `vertices` by identity. to_world
-        (4, 4): from the avatar's space. visible: objects and their matrices."""
+        """How the scene lights a head of vertices (V, 3), None where colors are as recorded; the
+        same object while all is the same, `vertices` by identity. to_world (4, 4): from the
+        avatar's space. visible: objects and their matrices."""
         # A change of the settings of a viewport does not evaluate its scene anew.
         is_viewport = depsgraph.mode == "VIEWPORT"
         settings = lighting_settings(depsgraph.scene if is_viewport else depsgraph.scene_eval)
@@ -306,8 +305,8 @@ def _split_world(light: WorldLight) -> tuple[np.ndarray, tuple[Light, ...]]:
 
 
 def _casters(visible: Iterable[tuple[Any, Any]], depsgraph: Any) -> Iterable[tuple[Any, Caster]]:
-    """Each object that throws shadows, and its mesh in world space; a hidden head throws one where
-    its splats are visible."""
+    """Each object that throws shadows, with its mesh in world space; hidden heads of visible splats
+    do."""
     heads = set()
     for each, matrix in visible:
         if each.get(tags.KIND) == tags.SPLATS:

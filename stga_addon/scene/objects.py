@@ -17,10 +17,9 @@ log_warning: Warn = logging.getLogger(__name__).warning
 
 
 def capture_root(source: Path) -> Any:
-    """The Empty that is the parent of all imported from the folder or file `source`; created where
-    there is none. Captures are y-up and Blender is z-up: the Empty is rotated by +90° about X, so
-    that its children keep the capture's own coordinates. It is in a collection of its own; both are
-    called like the source."""
+    """The Empty that is the parent of all imported from the folder or file `source`, made where
+    missing, in a collection of its own, both called like the source. It turns captures, y up, by
+    +90° about X: its children keep the capture's coordinates."""
     existing = tags.find(tags.ROOT, source)
     if existing:
         return existing[0]
@@ -65,9 +64,8 @@ def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
 
 
 def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> Any:
-    """An object of this kind under `root`, with new `data`; returns it. An object that exists from
-    an earlier import is kept and given the new data, so that modifiers, parents and constraints
-    which refer to it go on working; its old data, keyframes and drivers are removed."""
+    """An object of this kind under `root`, with new `data`. One of an earlier import is kept, with
+    modifiers, parents and constraints that refer to it; its old data, keyframes and drivers go."""
     obj = existing
     if obj is None:
         obj, collection = bpy.data.objects.new(name, data), collection_of(root, kind)

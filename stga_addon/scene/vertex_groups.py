@@ -1,10 +1,6 @@
-"""Per-frame selections as vertex groups, which an artist can view, paint and scrub through; shares
-of selection, or errors of the avatar, by triangle as colors on the head.
-
-A vertex group holds vertices and a selection holds triangles: a triangle counts as selected when
-all three of its vertices are in the group. Writing a selection and reading it back therefore keeps
-every selected triangle and adds those whose three corners all belong to selected ones.
-"""
+"""Per-frame selections as vertex groups, to view, paint and scrub through; shares of selection, or
+errors, by triangle as colors. A triangle counts as selected when its three vertices are in the
+group: what is written and read back gains triangles whose corners all belong to selected ones."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,10 +18,9 @@ from .display.splat_attributes import FACE, read_attribute, with_alpha, write_at
 
 
 def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
-    """Replace the head's selection groups by one vertex group `stga_<timestep>` per timestep,
-    weight 1 on its vertices. selection: timestep -> (F,) bool. A timestep that selects nothing gets
-    no group. Other vertex groups stay. Raises StgaError where the head is in edit mode or a
-    selection does not have one entry per triangle."""
+    """Replace the head's selection groups by a vertex group `stga_<timestep>` per timestep, weight
+    1 on its vertices; none where nothing is selected. selection: timestep -> (F,) bool. Raises
+    StgaError in edit mode, or where a selection does not have one entry per triangle."""
     if head.mode == "EDIT":
         raise StgaError(f"{head.name}: is in edit mode; leave it before the selection is written")
     faces = mesh_triangles(head.data)
@@ -57,9 +52,8 @@ def write_selection(head: Any, selection: Mapping[int, np.ndarray]) -> None:
 
 
 def read_selection(head: Any) -> dict[int, np.ndarray]:
-    """timestep -> (F,) bool of every timestep of the head, from its current selection groups. A
-    triangle is selected where each of its vertices has a weight of at least 0.5 in the timestep's
-    group; a timestep without a group selects nothing."""
+    """timestep -> (F,) bool of every timestep of the head: triangles whose vertices have weights of
+    0.5 or more in the timestep's group; none without a group."""
     head.update_from_editmode()
     groups = {
         timestep: group.index
@@ -155,10 +149,9 @@ RED, GREEN, BLUE = (
 def show_heat_map(
     head: Any, values: np.ndarray, attribute: str = SHARE, largest: float | None = None
 ) -> None:
-    """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value). Its
-    own materials stay: a modifier assigns the heat map's. The colors are the active color
-    attribute, for solid shading, and a material, for EEVEE and Cycles. attribute: SHARE or
-    RESIDUAL, in which the values are stored."""
+    """Color the head's triangles by values (F,) from 0 to `largest` (None: the largest value),
+    stored as `attribute` (SHARE or RESIDUAL): as the active color attribute, for solid shading, and
+    by a modifier with a material, for EEVEE and Cycles; its own materials stay."""
     hide_heat_map(head)
     whole = values.max(initial=0.0) if largest is None else largest
     scaled = np.minimum(values / max(whole, 1e-9), 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stga_addon.avatar.splats import SH_C0
-from stga_addon.scene.compat import choose_image_file
+from stga_addon.scene.compat import choose_format
 from stga_addon.scene.display.splat_object import show_world_splats
 from stga_addon.scene.render import view_transform
 from stga_addon.scene.render.view_transform import inverse_view, measure
@@ -92,7 +92,9 @@ def saved_picture(folder: Path, **view: object) -> np.ndarray:
     scene.view_settings.view_transform = view["view_transform"]  # which says what looks there are
     for name, value in {"exposure": 0, "gamma": 1, **view}.items():
         setattr(scene.view_settings, name, value)
-    choose_image_file(scene.render.image_settings, "PNG", "RGBA", "16")
+    settings = scene.render.image_settings
+    choose_format(settings, "IMAGE", "PNG")
+    settings.color_mode, settings.color_depth = "RGBA", "16"
     scene.render.dither_intensity = 0
     scene.render.filepath = str(folder / "picture.png")
     bpy.ops.render.render(write_still=True)

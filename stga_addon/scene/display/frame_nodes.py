@@ -17,8 +17,7 @@ _FRAME_SIZE = "stga_frame_size"
 
 
 def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with each triangle's frame stored on its faces; size: the triangle's area, or the
-    mean of the first edge and the height over it."""
+    """The mesh with each triangle's frame stored on its faces."""
     # Sampling a stored attribute is fast; sampling a field would evaluate it once per splat.
     p0, p1, p2 = nodes.triangle_corners()
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
@@ -79,10 +78,9 @@ def _placed_splats(convention: str | None, nodes: Nodes, splats: Any, mesh: Any 
 def _axes_to_rotation(
     nodes: Nodes, first: Any, edge: Any, side: Any, normal_axis: str
 ) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Rotation whose x axis is `first` exactly, of a triangle with two edges from its first corner.
-    Where `first` or the normal is degenerate, it takes the substitutes of `avatar.embedding`; the
-    node's own differ. Returns the rotation, the normal (its length twice the area) and whether
-    `first` is degenerate."""
+    """Rotation with the x axis `first` of a triangle with two edges, its normal (its length twice
+    the area), and whether `first` is degenerate: it and the normal then take the substitutes of
+    `avatar.embedding`."""
     normal = nodes.vector("CROSS_PRODUCT", edge, side)
     edges = edge, side, nodes.vector("SUBTRACT", edge, side)
     longest = reduce(partial(nodes.math, "MAXIMUM"), [nodes.vector("LENGTH", v) for v in edges])
@@ -193,12 +191,9 @@ SMOOTHED = _meshes("Smoothed Strain", _with_smoothed_strain, "Strain")
 
 
 class SignalNodes(NamedTuple):
-    """How nodes compute the signal of a driven offset, of three components at most.
-
-    label      in names of node trees, short
-    group      the mesh from STRAIN -> the same with the signal stored on its faces
-    attribute  the vector that is stored
-    """
+    """Nodes of a driven offset's signal, of three components at most: short label in names of
+    trees, group from the mesh of STRAIN to the same with the signal stored on faces, and the
+    attribute."""
 
     label: str
     group: NodeGroup

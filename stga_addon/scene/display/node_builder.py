@@ -42,17 +42,10 @@ def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
 
 @dataclass(frozen=True)
 class NodeGroup:
-    """A node group with one output, built once per file.
-
-    Blender validates a whole tree after each edit, so building takes time quadratic in the tree's
-    nodes; small groups are fast, and can be built one at a time while the UI goes on.
-
-    name     "." is put before it, which hides the group in Blender's menus
-    inputs   name -> socket type ("Vector")
-    output   socket type
-    build    takes the Nodes to build with and the inputs' sockets, in their order; returns the
-             output's socket
-    """
+    """A node group with one output, built once per file. Blender validates a whole tree after each
+    edit: small groups are built fast, and one at a time while the UI goes on. name: "." is put
+    before it, which hides it in menus. inputs: name -> socket type ("Vector"). build: from the
+    Nodes and the inputs' sockets, in order, to the output's."""
 
     name: str
     inputs: Mapping[str, str]
@@ -93,9 +86,8 @@ class Nodes:
     def add(
         self, kind: str, inputs: Mapping[str, Any] | None = None, **properties: Any
     ) -> bpy.types.Node:
-        """New node; `inputs` maps an enabled socket's name or identifier to a value or socket.
-        Several sockets of one name take a list. Names differ between Blender versions more often
-        than identifiers. Raises ValueError where no socket has the name."""
+        """New node; `inputs`: name or identifier of enabled sockets -> value or socket, a list for
+        several of one name. Raises ValueError where no socket has the name."""
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)

@@ -1,7 +1,5 @@
-"""The geometry node tree that displays splats, without Python at playback: colors, display modes
-and their materials. For splats that follow a head it computes each triangle's frame on the head's
-*evaluated* mesh, samples the frames by the splats' face index and composes position, rotation and
-scale."""
+"""The geometry node tree that displays splats: colors, display modes and materials. For splats that
+follow a head it computes each triangle's frame on the *evaluated* mesh."""
 
 from collections.abc import Callable
 from functools import cached_property, partial
@@ -31,9 +29,8 @@ SELECTED_ONLY = "Selected Only"
 
 
 def constant_color(nodes: Nodes, strain: Any) -> Any:
-    """The part of each splat's sRGB color, not clamped, that does not depend on the view direction.
-    strain: vector from SAMPLED_STRAIN, None where colors do not follow it. Coefficients as in
-    `Splats`."""
+    """The part of each splat's sRGB color, not clamped, that does not depend on the view. strain:
+    vector from SAMPLED_STRAIN, None where colors do not follow it."""
     terms = [nodes.scale(nodes.attribute(stored.SH.format(0)), SH_C0), (0.5, 0.5, 0.5)]
     for index, factor in enumerate(() if strain is None else nodes.components(strain)):
         color = nodes.attribute(stored.STRAIN_COLOR.format(index))
@@ -134,12 +131,9 @@ def _point_shader(nodes: Nodes) -> Any:
 
 def _gaussian_shader(nodes: Nodes) -> Any:
     """Renders instances of a quad as Gaussians; the instance's scale is the standard deviation.
-
-    Along a ray with unit direction D through a point P of the quad, both in the instance's space,
-    the Gaussian is densest where the ray is nearest to the center, at the squared distance |P|² −
-    (P·D)²; its density there is taken for the whole splat. Exact for Cycles up to the order of
-    overlapping splats, and for EEVEE up to their order by centers.
-    """
+    Along a ray in unit direction D through a point P of the quad, in the instance's space, the
+    Gaussian is densest at the squared distance |P|² − (P·D)² from the center; that density is taken
+    for the whole splat. Exact but for the order of overlapping splats (EEVEE's by centers)."""
     geometry = nodes.add("ShaderNodeNewGeometry").outputs
     position = nodes.add("ShaderNodeTexCoord").outputs["Object"]
     to_object = {"vector_type": "VECTOR", "convert_from": "WORLD", "convert_to": "OBJECT"}
@@ -189,9 +183,8 @@ LIMITS = {
 
 
 def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
-    """Geometry of the splats in the display mode that the menu socket `mode` chooses. visible:
-    field, which splats; size: factor on their standard deviations; native: points from
-    NATIVE_GROUPS, None in a Blender without native splats."""
+    """The splats in the display mode of the menu socket `mode`. visible: field, which splats; size:
+    factor; native: points from NATIVE_GROUPS, None in a Blender without native splats."""
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
     # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads
     # that face the camera.
@@ -222,9 +215,9 @@ def _points(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Nod
 
 
 def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.NodeSocket:
-    """Two triangles per splat, which cover its ellipsoid as the scene's active camera sees it. In
-    the ellipsoid's own space it is a sphere, and the quad faces the camera there. Instances:
-    realizing them would take twenty times as long."""
+    """Two triangles per splat, which cover its ellipsoid as the scene's camera sees it: in its own
+    space, a sphere, the quad faces the camera. Instances: realizing them takes twenty times as
+    long."""
     sides = {"Size X": 2 * EXTENT, "Size Y": 2 * EXTENT, "Vertices X": 2, "Vertices Y": 2}
     quad = nodes.out("GeometryNodeMeshGrid", sides)
     # EEVEE sorts instances: no noise. Stochastic transparency takes hundreds of samples to come
@@ -256,9 +249,8 @@ def _native(
     degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any,
     view_dependent: Any, gray: Any,
 ) -> bpy.types.NodeSocket:  # fmt: skip
-    """Points with what native splats are drawn from: harmonics have the object's axes, in which
-    they were trained. color: constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as are
-    those that are relit."""
+    """Points with what native splats are drawn from, harmonics in the object's axes. color:
+    constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
     flat = nodes.logic("OR", gray, is_relit)
     shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
@@ -295,13 +287,8 @@ _FROZEN = "stga_frozen"
 
 
 class TreeOptions(NamedTuple):
-    """What the node tree depends on; there is one tree of each kind in a file.
-
-    convention       of the splats' embedding ("stga", "gaussian_avatars"); None for world space
-    degree           of their spherical harmonics
-    strain_color     whether colors follow the strain of triangles
-    offsets          driven offsets that move the splats, of SIGNALS, in its order
-    """
+    """What a node tree depends on: the embedding's convention (None: world space), degree of
+    harmonics, whether colors follow strain, and the driven offsets, of SIGNALS, in its order."""
 
     convention: str | None
     degree: int = 0
@@ -329,8 +316,8 @@ def splat_tree(options: TreeOptions) -> bpy.types.NodeTree:
 
 
 def build_next_node_group(options: TreeOptions) -> bool:
-    """Build one node group that `splat_tree` needs, the tree itself last; returns False if all
-    exist. Calling it from a timer until it returns False keeps the UI responsive meanwhile."""
+    """Build one node group that `splat_tree` needs, itself last; False if all exist: called from a
+    timer, it keeps the UI responsive."""
     if find_tree(options.tree_name) is not None:
         return False
     convention, degree, strain_color, offsets = options

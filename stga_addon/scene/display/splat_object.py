@@ -48,9 +48,8 @@ SETTINGS = {getattr(splat_nodes, name.upper()): name for name in DisplaySettings
 def show_avatar(
     avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None
 ) -> Any:
-    """Make a splat object that follows the evaluated mesh of the object `head`; returns it. head: a
-    mesh object with the avatar's triangles, in their order. prepared: `avatar_attributes` of the
-    avatar, computed here by default. Raises StgaError where the head has other triangles."""
+    """Make a splat object that follows the evaluated mesh of the object `head`, which has the
+    avatar's triangles, else StgaError. prepared: `avatar_attributes` of the avatar."""
     check_head(avatar, head)
     prepared, title = prepared or avatar_attributes(avatar), name or f"{head.name} splats"
     local = [each for each in head.users_collection if each.library is None]
@@ -97,8 +96,8 @@ def _stored_neutral(splat_object: Any) -> Any:
 
 
 def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
-    """Show other splats in the same object, which keeps its display settings, name and users.
-    prepared: `avatar_attributes` of an avatar for which `can_update` is true."""
+    """Show other splats in the same object. prepared: `avatar_attributes` where `can_update` is
+    true."""
     neutral = get_input(splat_object, splat_nodes.NEUTRAL).data
     stored.write_attributes(neutral, prepared.neutral, "FACE")
     stored.write_light(neutral, prepared.light)
@@ -157,8 +156,8 @@ def splat_modifier(splat_object: Any) -> Any:
 
 
 def set_input(splat_object: Any, name: str, value: Any) -> None:
-    """Set an input of the splat modifier by its displayed name, such as `splat_nodes.SIZE`. Raises
-    StgaError where the splats have no such input: those in world space follow no head."""
+    """Set an input of the splat modifier by its displayed name. Raises StgaError where it has
+    none."""
     modifier = splat_modifier(splat_object)
     identifier = input_identifier(modifier, name)
     if identifier is None:

@@ -1,5 +1,5 @@
-"""Splats, triangle frames, light and a view as the float32 arrays that the shaders read: lists of
-texels (vec4), in the order that `shaders.py` documents; numpy only."""
+"""Splats, triangle frames, light and a view as float32 texels (vec4) that the shaders read, in the
+order that `shaders.py` documents; numpy only."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,9 +40,8 @@ class View:
 
 
 class StaticSplats:
-    """What does not change while layers show the same splats. positions (3, N): in the splats'
-    triangles; face (N,) index into all layers' triangles. texels: name -> (M, 4) for the
-    textures."""
+    """What stays while layers show the same splats. positions (3, N): in their triangles; face (N,)
+    index into all layers' triangles; texels: name -> (M, 4)."""
 
     def __init__(self, layers: Sequence[SceneLayer]) -> None:
         self.key = static_key(layers)
@@ -93,8 +92,7 @@ def frame_block(frames: FaceFrames) -> np.ndarray:
 class PosedFrames(NamedTuple):
     """The triangles of all layers as a camera sees them. texels (4, F, 4) float32: three rows of
     the map to camera space, then strain and whether frozen. depth_rows (4, F) float32: the third
-    row, less `base` meters: far from the camera, float32 would round away the differences by which
-    splats are sorted."""
+    row, less `base` meters, which far away would round differences off."""
 
     texels: np.ndarray
     depth_rows: np.ndarray
@@ -126,9 +124,8 @@ def posed_frames(
 def drawing_order(
     static: StaticSplats, frames: PosedFrames, view: View, short_keys: bool = False
 ) -> np.ndarray:
-    """Indices (M,) float32 of the splats within the view's near and far ends, farthest first.
-    short_keys: whether splats that are a few micrometers apart in depth may be swapped, which takes
-    half the time."""
+    """Indices (M,) float32 of the splats within near and far ends, farthest first. short_keys:
+    those a few micrometers apart may be swapped, in half the time."""
     depth = np.take(frames.depth_rows[3], static.face, mode="clip")
     product = np.empty(len(depth), np.float32)
     for row, coordinate in zip(frames.depth_rows, static.positions, strict=False):
@@ -211,9 +208,8 @@ class ShadowView(NamedTuple):
 
 
 class RelitScene(NamedTuple):
-    """What changes with pose or light, for layers that are relit. vertices (V · VERTEX_TEXELS, 4):
-    position, normal, irradiance of the world and of skin around. lights (M, 4): as of `with_eye`.
-    maps: the shadow maps, in order."""
+    """What changes with pose or light of relit layers. vertices (V · VERTEX_TEXELS, 4): position,
+    normal, irradiance of the world and of skin around. lights (M, 4): as of `with_eye`."""
 
     vertices: np.ndarray
     lights: np.ndarray
@@ -221,8 +217,8 @@ class RelitScene(NamedTuple):
 
 
 def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
-    """Pack poses and light of all layers; those that are not relit have a share of 0, and lights
-    beyond MAX_MAPS throw no shadow."""
+    """Pack poses and light of all layers; a share of 0: not relit. Lights beyond MAX_MAPS throw no
+    shadow."""
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
     vertices, maps = [np.zeros((0, 4), np.float32)], list[ShadowView]()
     points, map_rows = list[np.ndarray](), list[np.ndarray]()
@@ -273,8 +269,7 @@ def with_eye(scene: RelitScene, layers: Sequence[SceneLayer], eye: np.ndarray) -
 
 
 def _normals(mesh: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(V, 3) as `mesh_geometry.vertex_normals`, in half the time: numpy is slow where the last axis
-    is short."""
+    """(V, 3) as `mesh_geometry.vertex_normals`, in half the time: row by row."""
     rows = [np.ascontiguousarray(row, np.float32) for row in mesh.T]
     a, b, c = ([row[corner] for row in rows] for corner in np.ascontiguousarray(faces.T))
     u, v = ([q - p for p, q in zip(a, end, strict=True)] for end in (b, c))

@@ -1,9 +1,9 @@
-"""Draws layers of splats with Blender's `gpu` module: off-screen, into a viewport, or to an image
-in memory. Needs a GPU context: a viewport's drawing, or an engine with `bl_use_gpu_context`."""
+"""Draws layers of splats with Blender's `gpu` module, off-screen, into a viewport or to memory;
+needs a GPU context."""
 
 import ctypes
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -23,10 +23,9 @@ from .shaders import EXACT, MAP_COLUMNS, PROJECTED_TEXTURES, TEXTURE_WIDTH, text
 
 @cache
 def has_gpu_context() -> bool:
-    """Whether Blender can be asked for a GPU context: it aborts where it asks in vain. With a
-    window; without one only where EGL, by which Blender then gets its context, initializes its
-    default display or, as Blender tries next, its first device (Linux; other systems were not tried
-    without a window)."""
+    """Whether Blender can be asked for a GPU context, in vain of which it aborts: with a window, or
+    on Linux where EGL initializes its default display or, as Blender tries next, its first
+    device."""
     if not bpy.app.background or sys.platform != "linux":
         return not bpy.app.background
     try:
@@ -53,9 +52,8 @@ def has_gpu_context() -> bool:
 
 
 NEAR_PER_SQUARE = 3e-4
-"""Meters from a lamp at which its map begins, over the squared distance of the head: float32 then
-tells depths there 0.2 mm apart, and less where the map begins nearer. What is nearer throws no
-shadow."""
+"""Meters from a lamp at which its map begins, which throws nothing nearer, over the head's squared
+distance: float32 then tells depths there 0.2 mm apart."""
 
 
 class RelitTextures:
@@ -139,19 +137,34 @@ WIDTH_SHARE, MARGIN_PX = 0.15, 6.0
 
 
 def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
-    """(M, 2, 4) float32: for each bone two ends in pixels (x0, y0, x1, y1), and a radius beside
-    three zeros. space, region: the SpaceView3D and RegionView3D, drawn with width × height pixels,
-    from the bottom left."""
+    """(M, 2, 4) float32: two ends of each bone in pixels (x0, y0, x1, y1), from the bottom left,
+    and a radius beside three zeros. space, region: the SpaceView3D and its RegionView3D."""
     overlay = space.overlay
     if not (overlay.show_overlays and overlay.show_bones):
         return NO_BONES
     armatures = [each for each in bpy.context.view_layer.objects if each.type == "ARMATURE"]
     rigs = [each for each in armatures if each.show_in_front and each.visible_get(viewport=space)]
-    spheres = [ends for rig in rigs for ends in _bone_ends(rig)][:MAX_SHAPES]
-    if not spheres:
+    found = list[tuple[Any, Any, float]]()  # head and tail in the world, half the width
+    for rig, bone in ((each, bone) for each in rigs for bone in each.pose.bones):
+        if bone.bone.hide or getattr(bone, "hide", False):
+            continue
+        matrix, size = rig.matrix_world, rig.matrix_world.median_scale
+        shape = bone.custom_shape if rig.data.show_bone_custom_shapes else None
+        if shape is None:
+            radius = size * bone.length * WIDTH_SHARE
+            found.append((matrix @ bone.head, matrix @ bone.tail, radius))
+            continue
+        owner = bone.custom_shape_transform or bone  # a sphere around the shape
+        center = matrix @ owner.matrix @ bone.custom_shape_translation
+        reach = size * max(Vector(corner).length for corner in shape.bound_box)
+        reach *= max(map(abs, bone.custom_shape_scale_xyz))
+        found.append(
+            (center, center, reach * (bone.length if bone.use_custom_shape_bone_size else 1))
+        )
+    if not found:
         return NO_BONES
-    ends = np.array([[(*point, 1.0) for point in pair[:2]] for pair in spheres])
-    radius = np.array([pair[2] for pair in spheres])
+    ends = np.array([[(*point, 1.0) for point in bone[:2]] for bone in found])
+    radius = np.array([bone[2] for bone in found])
     clip = ends @ np.array(region.perspective_matrix, np.float64).T
     before = (clip[..., 3] > 0).all(1)  # the camera; a bone with an end behind it is left out
     clip, radius = clip[before], radius[before]
@@ -163,25 +176,6 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
     return shapes
 
 
-def _bone_ends(rig: Any) -> Iterator[tuple[Any, Any, float]]:
-    """Head, tail and half the width in the world of visible bones; spheres around shapes."""
-    matrix = rig.matrix_world
-    size = matrix.median_scale
-    for bone in rig.pose.bones:
-        if bone.bone.hide or getattr(bone, "hide", False):
-            continue
-        shape = bone.custom_shape if rig.data.show_bone_custom_shapes else None
-        if shape is None:
-            yield matrix @ bone.head, matrix @ bone.tail, size * bone.length * WIDTH_SHARE
-            continue
-        owner = bone.custom_shape_transform or bone
-        center = matrix @ owner.matrix @ bone.custom_shape_translation
-        reach = size * max(Vector(corner).length for corner in shape.bound_box)
-        reach *= max(map(abs, bone.custom_shape_scale_xyz))
-        reach *= bone.length if bone.use_custom_shape_bone_size else 1.0
-        yield center, center, reach
-
-
 CLEAR = (0.0, 0.0, 0.0, 0.0)
 OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
 """Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
@@ -189,12 +183,6 @@ COMPACT = "RGBA16F"  # format of the color target, beside EXACT
 DEPTH_FORMAT = "RG32F"
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 """Parts of the names, in lower case, of OpenGL and Vulkan drivers that compute on the CPU."""
-
-
-def fastest_format() -> str:
-    """The format of a viewport: half the traffic on a card, but slow in software."""
-    name = gpu.platform.renderer_get().lower()
-    return EXACT if any(software in name for software in SOFTWARE_RENDERERS) else COMPACT
 
 
 class SplatRenderer:
@@ -218,9 +206,8 @@ class SplatRenderer:
         self._projected_target: Any = None
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
-        """Draw layers, sorted together, to this renderer's own targets. In two passes: the first
-        projects and colors each splat, into a texel of the projected textures; the second reads
-        these and draws the splats from far to near."""
+        """Draw layers, sorted together, to this renderer's own targets: the first pass projects and
+        colors each splat into the projected textures, the second draws them from far to near."""
         size = view.camera.width, view.camera.height
         if self._size != size:
             self._size, self._color = size, gpu.types.GPUTexture(size, format=self._color_format)

@@ -64,11 +64,8 @@ MIN_ALPHA = 1 / 255  # a splat adds nothing to a pixel where its alpha is less, 
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
-"""Splats drawn by one instance: GPUs, and software even more, are slow at instances of four
-vertices.
-
-A divisor of TEXTURE_WIDTH: the last instance then reads no further than the projected textures'
-last row."""
+"""Splats drawn by one instance: GPUs are slow at instances of four vertices. A divisor of
+TEXTURE_WIDTH: the last instance then reads no further than the last row."""
 MAP_COLUMNS = 4
 NOTHING = 1e30  # depth of a shadow map where nothing is
 
@@ -184,9 +181,8 @@ void main()
 
 
 def shadow_map_shader() -> Any:
-    """Draws triangles into a shadow map: depth in meters along the light's axis. row_x, row_y,
-    row_z: as packed by `packing`; lens: scale to normalized device coordinates, whether parallel,
-    least depth in perspective."""
+    """Draws triangles into a shadow map, depth in meters along the light's axis. rows: as packed;
+    lens: scale to device coordinates, whether parallel, least depth in perspective."""
     # In perspective, depth itself is interpolated as it should be: linear in space.
     rows = dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4")
     passed = {"distance_out": ("smooth", "FLOAT")}

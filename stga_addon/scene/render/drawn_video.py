@@ -13,7 +13,7 @@ from ...capture.camera import Camera
 from ...errors import StgaError
 from ...files import replacing
 from ...render.video import finished, is_video
-from ..compat import choose_video_file, sequencer_strips
+from ..compat import choose_format, sequencer_strips
 from ..layers import SceneLayer
 from ..objects import set_frames_per_second
 from .engine import draw_image
@@ -83,7 +83,9 @@ def _encode(images: Sequence[Path], fps: float) -> Path:
         render.resolution_percentage = 100
         set_frames_per_second(scene, fps)
         render.use_sequencer, render.use_file_extension = True, True
-        choose_video_file(render)
+        choose_format(render.image_settings, "VIDEO", "FFMPEG")
+        render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
+        render.ffmpeg.constant_rate_factor = "HIGH"
         scene.view_settings.view_transform = "Standard"
         scene.render.filepath = str(video)
         bpy.ops.render.render(animation=True, scene=scene.name)

@@ -1,6 +1,5 @@
-"""The render engine "STGA Splats": final images, animations and viewports of splats, exactly as
-trained, and nothing else; meshes are composited by its alpha and depth. The GPU draws them, or,
-where it cannot, the training rasterizer, imported with the first image."""
+"""The render engine "STGA Splats": images and viewports of splats exactly as trained, with alpha
+and depth for compositing. The GPU draws them, or, where it cannot, the training rasterizer."""
 
 import logging
 import threading
@@ -38,8 +37,8 @@ POLL_INTERVAL_S = 1 / 60
 
 
 class RenderRequest(NamedTuple):
-    """A viewport image: splats, a camera of the viewport's full size, and the scene-linear color
-    behind them, None if transparent."""
+    """A viewport image: splats, a camera of full size, and the scene-linear color behind, or
+    None."""
 
     layers: Sequence[PosedSplats]
     camera: Camera
@@ -52,14 +51,9 @@ class RenderRequest(NamedTuple):
 
 
 class ViewportRenderer:
-    """Renders the latest request in a thread, which touches nothing of Blender and ends once that
-    request has its full-resolution image.
-
-    render: (request, scale) -> image (H, W, 4) float32, scale a fraction of the camera's size.
-
-    image  the last image rendered, or None
-    error  why the last request failed, else empty
-    """
+    """Renders the latest request in a thread, which touches nothing of Blender and ends with the
+    image in full resolution. render: (request, scale of the camera's size) -> image (H, W, 4)
+    float32. image: the last one, or None; error: why the last request failed, else empty."""
 
     def __init__(self, render: Callable[[RenderRequest, float], np.ndarray]) -> None:
         self._render, self._lock = render, threading.Lock()
@@ -162,9 +156,8 @@ def _poll() -> float | None:
 
 
 class Rasterizer:
-    """A render client whose Python and device the main thread looks up, for render threads.
-    find_python: the interpreter that renders where Blender's own cannot; raises StgaError where
-    there is none. find_device: as `render.device.Composer` takes it."""
+    """A render client whose Python (`find_python`, which may raise StgaError) and device
+    (`find_device`) the main thread looks up, for render threads."""
 
     def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str]) -> None:
         self._find_python, self._find_device = find_python, find_device
@@ -303,7 +296,14 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.register_pass(scene, renderlayer, "Depth", 1, "Z", "VALUE")
 
     def render(self, depsgraph: Any) -> None:
-        message, border = "", self._border(depsgraph.scene.render)
+        # x, y, width, height in pixels of the render region, from below, rounded as by Blender
+        message, border = "", (0, 0, self.resolution_x, self.resolution_y)
+        r = depsgraph.scene.render
+        if r.use_border:
+            edges = [r.border_min_x, r.border_min_y, r.border_max_x, r.border_max_y]
+            pixels = np.array(edges, np.float32) * np.array([*border[2:]] * 2, np.float32)
+            left, low, right, high = pixels.astype(int).tolist()
+            border = left, low, right - left, high - low
         try:
             passes = self._render(depsgraph, border)
         except Exception as error:  # raised, it would not stop Blender from saving an empty image
@@ -322,16 +322,6 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.report({"ERROR"}, message)  # raised in scripts; nothing is saved
             if not bpy.app.background:
                 self.error_set(message)  # shown in place of the image
-
-    def _border(self, render: Any) -> tuple[int, int, int, int]:
-        """x, y, width, height in pixels of the render region, from below, rounded as by Blender."""
-        width, height = self.resolution_x, self.resolution_y
-        if not render.use_border:
-            return 0, 0, width, height
-        edges = render.border_min_x, render.border_min_y, render.border_max_x, render.border_max_y
-        sizes = np.array([width, height] * 2, np.float32)
-        left, low, right, high = (np.array(edges, np.float32) * sizes).astype(int).tolist()
-        return left, low, right - left, high - low
 
     def _render(self, depsgraph: Any, border: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
         """Values (H, W, channels) of each pass, top row first."""

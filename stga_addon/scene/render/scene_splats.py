@@ -29,10 +29,9 @@ from ..vertex_groups import frame_selection
 
 
 class SplatCache:
-    """Avatars and world splats as last read from Blender's meshes, avatars' frames on their heads'
-    last shapes, and the scene's light. Reading attributes takes longer than posing splats, and an
-    animated head does not change them. `write_splats` gives a mesh a new revision, so that neither
-    undo nor a loaded file brings up what another state of the mesh held."""
+    """Avatars and world splats as last read from meshes, frames of heads' last shapes, and the
+    scene's light: reading takes longer than posing. A mesh written anew has a new revision, so that
+    neither undo nor a loaded file brings up another state."""
 
     def __init__(self) -> None:
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
@@ -78,9 +77,8 @@ def visible_layers(
     view: Any = None,
     is_wanted: Callable[[Any], bool] = lambda splat_object: True,
 ) -> list[SceneLayer]:
-    """The splats of each visible object at the depsgraph's frame. view: the 3D viewport (a
-    SpaceView3D) to draw, None for a final image. is_wanted: chooses among splat objects. Raises
-    StgaError where the head of an object is gone or has other triangles than its splats."""
+    """The splats of each visible object at the depsgraph's frame. view: the SpaceView3D to draw,
+    None for a final image. Raises StgaError where a head is gone or has other triangles."""
     visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]
     if view is None:
         visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
@@ -96,15 +94,12 @@ def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
-    found = [each for each in layer.collection.objects if _is_rendered(each, depsgraph)]
+    # By evaluated objects: in animations, keyframes do not reach the originals.
+    candidates = [(each, each.evaluated_get(depsgraph)) for each in layer.collection.objects]
+    found = [each for each, evaluated in candidates if not evaluated.hide_render]
     for child in layer.children:
         found += _rendered_objects(child, depsgraph)
     return list(dict.fromkeys(found))
-
-
-def _is_rendered(candidate: Any, depsgraph: Any) -> bool:
-    """By the evaluated object: in animations, keyframes do not reach the original."""
-    return not candidate.evaluated_get(depsgraph).hide_render
 
 
 def _with_instances(
@@ -117,7 +112,7 @@ def _with_instances(
     if collection is not None:
         inside = matrix @ Matrix.Translation(-collection.instance_offset)
         for member in collection.all_objects:
-            if _is_rendered(member, depsgraph):
+            if not member.evaluated_get(depsgraph).hide_render:
                 yield from _with_instances(member, depsgraph, inside)
 
 
@@ -153,8 +148,8 @@ def _layer(
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
-    """Store the splats' scene-linear colors in the scene's light, at its frame and from its camera.
-    Raises StgaError where the lighting is as recorded, or the avatar does not know its light."""
+    """Store the splats' colors in the scene's light at its frame, from its camera. Raises
+    StgaError."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     layers = visible_layers(depsgraph, SplatCache(), is_wanted=lambda shown: shown == splat_object)
     if not layers or layers[0].relit is None:
@@ -173,8 +168,8 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
 
 
 def level_exposure(cache: SplatCache) -> float | None:
-    """Stops at which the open scene's light makes its avatars as bright as they were recorded; None
-    where it does not light any. Raises StgaError as `visible_layers` does."""
+    """Stops at which the scene's light makes its avatars as bright as recorded; None without
+    light."""
     depsgraph, recorded, lit = bpy.context.evaluated_depsgraph_get(), 0.0, 0.0
     for layer in visible_layers(depsgraph, cache):
         if (relit := layer.relit) is not None:

@@ -1,5 +1,5 @@
-"""Scene-linear colors of splats: the inverse of a scene's view transform, for which Blender's own
-color management converts a grid of colors to a picture; and what lies behind splats."""
+"""Scene-linear colors of splats: the inverse of a view transform, measured by a picture of a grid
+of colors; and what lies behind splats."""
 
 import tempfile
 import threading
@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ...capture.color import linear_to_srgb, srgb_to_linear
-from ..compat import REC709, choose_image_file, working_space
+from ..compat import REC709, choose_format, working_space
 from ..light import world_light
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
@@ -30,7 +30,7 @@ _measured: dict[tuple[Any, ...], "InverseView"] = {}
 
 class InverseView:
     """The inverse of a view transform. shown: (G, G, G, 3) sRGB 0…1 of the scene-linear colors
-    whose red, green and blue are `axis` (G,), in that order."""
+    whose red, green and blue are `axis` (G,)."""
 
     def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
         self._axis, self._shown = axis, shown
@@ -97,9 +97,8 @@ def inverse_view(scene: Any) -> InverseView | None:
 
 
 def measure(scene: Any) -> None:
-    """Find `inverse_view` if it is needed, before rendering. Blender calls this in its render
-    thread, and data may be changed by the main thread only; that is waited for. Once the render
-    engine has the GPU, it must not be: the main thread then waits for the GPU to draw."""
+    """Find `inverse_view` if it is needed, before rendering: in Blender's render thread, which
+    waits for the main thread, as only that may change data; not once the engine has the GPU."""
     key = _settings(scene)
     if key in _measured:
         _keep(key, _measured[key])
@@ -146,16 +145,18 @@ def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
     pixels = np.ones((size, size, size, 4), np.float32)
     pixels[..., :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1)
     copy = scene.copy()
+    settings = copy.render.image_settings
     images = [bpy.data.images.new("view transform", size * size, size, float_buffer=True)]
     try:
         images[0].colorspace_settings.name = working_space()
         images[0].pixels.foreach_set(pixels.ravel())
-        copy.render.image_settings.color_management = "FOLLOW_SCENE"
+        settings.color_management = "FOLLOW_SCENE"
         copy.display_settings.display_device = "sRGB"
         for name in ("view_transform", "look"):  # which the display may have changed
             with suppress(TypeError):  # there is no such one for this display
                 setattr(copy.view_settings, name, getattr(scene.view_settings, name))
-        choose_image_file(copy.render.image_settings, "PNG", "RGB", "16")
+        choose_format(settings, "IMAGE", "PNG")
+        settings.color_mode, settings.color_depth = "RGB", "16"
         copy.render.dither_intensity = 0
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "shown.png"
@@ -175,13 +176,9 @@ def combined(
     view: InverseView | None = None,
 ) -> np.ndarray:  # fmt: skip
     """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W),
-    alpha (H, W).
-
-    Splats are blended in sRGB. So `background`, scene-linear (3,), is added as the sRGB that it is
-    shown as, before the conversion. Where it is None the image stays transparent, and the color is
-    converted as if it covered its pixel.
-    view: the inverse of the view transform, None where that shows sRGB as it is.
-    """
+    alpha (H, W). Splats are blended in sRGB, so `background`, scene-linear (3,), is added as the
+    sRGB that it is shown as; None: transparent, colors as if they covered their pixels. view: None
+    where the view transform shows sRGB as it is."""
     to_linear = srgb_to_linear if view is None else view.to_linear
     image, covered = np.zeros((*alpha.shape, 4), np.float32), alpha > 0
     color, share = rgb[:, covered].T, alpha[covered][:, None]
@@ -208,8 +205,7 @@ def srgb_background(scene: Any) -> tuple[float, float, float] | None:
 
 
 def scene_background(scene: Any) -> tuple[float, ...] | None:
-    """Scene-linear color behind the splats, None where the film is transparent. From the world's
-    Background node if its inputs are constants, else its viewport color; black without a world."""
+    """Scene-linear color behind the splats: the world's; None where the film is transparent."""
     if scene.render.film_transparent:
         return None
     color = world_color(scene)

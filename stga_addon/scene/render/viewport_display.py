@@ -1,5 +1,5 @@
-"""GPU display: draws avatars whose display mode is *As Trained* in every 3D viewport, in every
-shading mode, over what Blender has drawn. Each redraw reads the evaluated head."""
+"""GPU display: draws avatars that are *As Trained* in every 3D viewport, over what Blender has
+drawn."""
 
 import traceback
 from contextlib import suppress
@@ -17,7 +17,8 @@ from ..display import splat_nodes
 from ..display.splat_nodes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
 from ..gpu.packing import NEAR_M, View
-from ..gpu.renderer import NO_BONES, SplatRenderer, fastest_format, front_bones
+from ..gpu.renderer import COMPACT, NO_BONES, SOFTWARE_RENDERERS, SplatRenderer, front_bones
+from ..gpu.shaders import EXACT
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import keeps_colors, srgb, world_color
 
@@ -26,11 +27,8 @@ POINTS_INTERVAL_S = 1.0
 
 
 class GpuDisplay:
-    """What the display keeps between redraws of all viewports.
-
-    problem  one sentence: why nothing, or something else, is shown; "" where all is well
-    failed   whether this device cannot draw; the display is off then, and points are shown
-    """
+    """What the display keeps between redraws of all viewports. problem: one sentence, why nothing
+    or something else is shown; failed: this device cannot draw, and points are shown."""
 
     def __init__(self) -> None:
         self._handlers: list[Any] = []
@@ -96,7 +94,10 @@ class GpuDisplay:
                 self._renderer = None  # frees its textures
             return
         if self._renderer is None:
-            self._renderer = SplatRenderer(fastest_format(), short_keys=True)
+            # half the traffic on a card, but slow in software
+            name = gpu.platform.renderer_get().lower()
+            is_software = any(software in name for software in SOFTWARE_RENDERERS)
+            self._renderer = SplatRenderer(EXACT if is_software else COMPACT, short_keys=True)
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
@@ -136,8 +137,8 @@ def is_engine_view(context: Any) -> bool:
 
 
 def is_drawn_by_engine(context: Any) -> bool:
-    """Whether the render engine draws the splats itself, below overlays and bones. It draws before
-    the view transform. Where that would change colors, the display draws them, after it."""
+    """Whether the render engine draws the splats, below overlays: before the view transform. Where
+    that would change colors, the display draws them, after it."""
     return is_engine_view(context) and keeps_colors(context.scene)
 
 
@@ -157,8 +158,8 @@ def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float
 
 def expected_background(context: Any) -> tuple[tuple[float, ...] | None, bool]:
     """sRGB color that the viewport shows behind everything, None where that is not one color; and
-    whether it draws that itself. Splats were trained to be blended in sRGB, and a viewport blends
-    linearly: their soft edges are right over what is known to be behind them."""
+    whether it draws that itself. Splats are blended in sRGB, viewports blend linearly: soft edges
+    are right over what is known to be behind them."""
     shading, scene = context.space_data.shading, context.scene
     theme = context.preferences.themes[0].view_3d.space.gradients
     if shading.type in ("SOLID", "WIREFRAME"):

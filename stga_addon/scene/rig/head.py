@@ -1,19 +1,12 @@
-"""The tracked head as an animated mesh, and meshes with shape keys as head models.
-
-A FLAME head is a Blender rig whose mesh equals FLAME's forward pass, on tracked frames and for any
-pose set by hand.
-
-Expression coefficients are shape keys, joint rotations are pose bones, pose correctives are shape
-keys driven by the bones, and linear blend skinning is the armature modifier. The first identity
-components are shape keys too, relative to the tracked person: with all of them at zero the head is
-that person's.
-
-FLAME regresses its joints from the *shaped* vertices, so the sliders displace a joint's center of
-rotation by d = D·sliders, which a bone's rest position cannot follow. Such a joint's bone is
-therefore the child of a hidden bone `<name>_joint`, driven to d, and the parent of a hidden bone
-`<name>_deform`, driven to -d, which the vertices follow. All drivers are arithmetic, which Blender
-evaluates without Python.
-"""
+"""The tracked head as an animated mesh, and meshes with shape keys as head models. The mesh of a
+FLAME head equals FLAME's forward pass, for any pose: expression coefficients are shape keys, joint
+rotations pose bones, pose correctives shape keys driven by the bones, skinning is the armature
+modifier. The first identity components are shape keys relative to the tracked person. FLAME
+regresses its joints from the *shaped* vertices, so sliders displace a joint's center of rotation by
+d = D·sliders, which a bone's rest position cannot follow. Such a joint's bone is therefore the
+child of a hidden bone `<name>_joint`, driven to d, and the parent of a hidden bone `<name>_deform`,
+driven to -d, which the vertices follow. All drivers are arithmetic, which Blender evaluates without
+Python."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,17 +28,13 @@ from .keyframes import MAX_SLIDER, key_value_path, location_path, property_path,
 
 
 def import_head(capture: Capture, warn: Warn = log_warning, correctives: str = "all") -> Any:
-    """The capture's head as a mesh object, animated so that Blender's frame number is the capture's
-    timestep.
-
-    A FLAME capture becomes a rig (see `add_rig`); any other gets one shape key per
-    timestep, `t00012`, with value 1 at its own frame, so that the evaluated mesh of that frame is
-    the timestep's mesh; frames between two timesteps blend them. Object coordinates are the
-    capture's (meters, y-up). Regions become boolean face attributes `stga_region_<name>`. Importing
-    the same folder or file again replaces the last import; vertex groups and materials are kept if
-    the triangles are the same. `warn` receives one sentence per problem. correctives: see
-    `add_rig`. Raises StgaError where a timestep cannot be read; the scene is then unchanged.
-    """
+    """The capture's head as a mesh object, animated so that Blender's frame is the capture's
+    timestep. A FLAME capture becomes a rig (see `add_rig`, also for `correctives`); any other gets
+    a shape key per timestep, `t00012`, which is 1 at its own frame. Object coordinates are the
+    capture's (meters, y up). Regions become boolean face attributes. Importing the same source
+    again replaces the last import; vertex groups and materials stay if the triangles are the same.
+    `warn` receives one sentence per problem. Raises StgaError where a timestep cannot be read, and
+    leaves the scene."""
     sequence = capture.flame
     if sequence is not None:
         frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
@@ -104,10 +93,9 @@ def has_shape_keys(thing: Any) -> bool:
 
 
 def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], np.ndarray]:
-    """Basis (V, 3) in meters, y up, triangles (F, 3), and names and displacements (V, 3, K) of the
-    other shape keys. In world space, turned from Blender's axes, in which a head looks along -y: z
-    up becomes y up. Modifiers, values and drivers are left out. Raises StgaError for an object
-    without shape keys."""
+    """Basis (V, 3) in meters, y up, triangles (F, 3), names and displacements (V, 3, K) of the
+    other shape keys, in world space turned from Blender's axes; without modifiers, values and
+    drivers. Raises StgaError for an object without shape keys."""
     if not has_shape_keys(thing):
         raise StgaError(f"{thing.name}: has no shape keys; a head model needs some")
     turn = Z_UP_TO_Y_UP @ np.array(thing.matrix_world)
@@ -140,14 +128,10 @@ VARIABLES = "abcdfghijklmnopqrs"
 def add_rig(
     head: Any, sequence: FlameSequence, frames: Sequence[FlameFrame], warn: Warn, correctives: str
 ) -> Any:
-    """Rig and animate `head`, the mesh object of the sequence's neutral mesh; returns the armature
-    object.
-
-    head has its "Basis" shape key; frames: the sequence's frames, one per timestep. The evaluated
-    mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by frame become one shape
-    key per timestep, which `warn` reports, as it does coefficients beyond ±10. correctives: "all",
-    or "moving" for the shape keys and drivers of those joints only that turn in the frames.
-    """
+    """Rig and animate `head`, the sequence's neutral mesh with a "Basis" key; returns the armature
+    object. The evaluated mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by
+    frame become a shape key per timestep, which `warn` reports, as it does coefficients beyond ±10.
+    correctives: "all", or "moving": of joints only that turn in the frames."""
     model = sequence.model
     no_expression = np.zeros(model.n_expression)
     basis = shaped_vertices(model, sequence.shape, no_expression, sequence.static_offset)
@@ -229,8 +213,7 @@ def _rigs(head: Any) -> list[Any]:
 def _place_armature(
     head: Any, joints: np.ndarray, parents: np.ndarray, deformed: Sequence[str]
 ) -> Any:
-    """The rig's object with bones at joints (5, 3); deformed: the bone that each one's vertices
-    follow."""
+    """The rig's object with bones at joints (5, 3); deformed: the bones that vertices follow."""
     title = f"{head.parent.name} rig"
     armature = bpy.data.armatures.new(title)
     temporary = bpy.data.objects.new(title, armature)  # edit mode needs an object that is visible
@@ -271,8 +254,8 @@ def _place_armature(
 
 
 def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.ndarray) -> None:
-    """Draw jaw and eyes from their joints to the skin in front: as bones they point up, because
-    their rest orientation is FLAME's."""
+    """Draw jaw and eyes from their joints to the skin in front; as bones they point up, FLAME's
+    rest."""
     shape = bpy.data.objects.get(BONE_SHAPE)
     if shape is None:
         mesh = bpy.data.meshes.new(BONE_SHAPE)
@@ -300,8 +283,8 @@ def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> 
 
 
 def _significant_terms(directions: np.ndarray) -> list[list[int]]:
-    """Per axis, the columns of directions (3, K) that displace the joint. The smallest are left
-    out, as long as all of them together stay negligible with the sliders at their limits."""
+    """Per axis, the columns of directions (3, K) that displace the joint, less the smallest, which
+    together stay negligible with the sliders at their limits."""
     kept = []
     for coefficients in np.abs(directions):
         order = np.argsort(coefficients)
@@ -313,9 +296,8 @@ def _significant_terms(directions: np.ndarray) -> list[list[int]]:
 def _drive_joint(
     head: Any, rig: Any, joint: str, sliders: Sequence[str], directions: np.ndarray
 ) -> None:
-    """Drive a joint's helper bones by directions (3, K) · sliders, plus the per-frame offset where
-    there is one. Blender limits an expression's length, so partial sums are driven first, in a
-    property of the rig."""
+    """Drive a joint's helper bones by directions (3, K) · sliders and the per-frame offset, by way
+    of partial sums in a property of the rig: Blender limits an expression's length."""
     parts = [
         (axis, terms[start : start + len(VARIABLES)])
         for axis, terms in enumerate(_significant_terms(directions))

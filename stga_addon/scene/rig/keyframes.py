@@ -1,5 +1,4 @@
-"""Keyframes of a FLAME head, the names and data paths of what they move, and ARKit's 52 shapes:
-shape keys of these names, which FLAME heads are given."""
+"""Keyframes of a FLAME head, names and data paths of what they move, and ARKit's 52 shapes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -100,9 +99,8 @@ def key_motion(
     parts: Sequence[str] = tuple(PARTS),
     warn: Warn = log_warning,
 ) -> None:
-    """Add keyframes of the parts (`flame.motion.PARTS`) of `frames` to the active actions of rig
-    and shape keys. at: the Blender frame of each, ascending. A slider that the motion never moves
-    gets one keyframe."""
+    """Add keyframes of the parts of `frames` to the actions of rig and shape keys. at: the Blender
+    frame of each, ascending. A slider that never moves gets one keyframe."""
     if "expression" in parts:
         values = np.stack([frame.expr for frame in frames])
         names = (expression_key(head, component) for component in range(values.shape[1]))
@@ -163,8 +161,8 @@ def new_actions(
 def key_tracked_offsets(
     head: Any, rig: Any, sequence: FlameSequence, numbers: Sequence[float]
 ) -> None:
-    """Keyframe the per-frame offsets of mesh and joints of the sequence that the head was imported
-    from; numbers: the Blender frame of each timestep, ascending."""
+    """Keyframe the per-frame offsets of the sequence that the head was imported from; numbers: the
+    Blender frame of each timestep, ascending."""
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
     paths = [key_value_path(offset_key(timestep)) for timestep in sequence.timesteps]
     write_triangle_curves(head.data.shape_keys, paths, numbers)
@@ -262,9 +260,9 @@ def apply_weights(
     name: str,
     as_strip: bool = False,
 ) -> None:
-    """Animate the values at `paths` (column -> data path) of the data-block `owner` by weights (T,
-    52), one row per Blender frame from `start` on. The previous animation is kept as
-    `rig.motion.apply_motion` keeps it. Raises StgaError as `check_keyable` does."""
+    """Animate the values at `paths` (column -> data path) of `owner` by weights (T, 52), a row per
+    frame from `start` on, and keep the previous animation as `motion.apply_motion` does. Raises
+    StgaError as `check_keyable` does."""
     check_keyable(owner)
     with new_actions([owner], name, set(paths.values()).__contains__, as_strip):
         key_values(owner, paths, np.arange(start, start + len(weights)), weights)

@@ -38,15 +38,12 @@ def apply_motion(
     weights: np.ndarray | None = None,
 ) -> None:
     """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
-
-    The previous animation is kept. As an action, the new one is a copy of the old in which the
-    parts are replaced, and the old action stays in the file. As a strip, both are in the NLA
-    editor, and the new one has effect only where it lasts. tracked: the sequence that the head was
-    imported from and the Blender frame of each of its timesteps, where its per-frame offsets are to
-    play along; without, they stay zero. weights: (T, 52) of ARKit's shapes, which play along on a
-    head that was given them; without, those stay zero. Raises StgaError where the head has no rig,
-    or one that cannot take the motion; nothing is changed then.
-    """
+    The previous animation is kept: the new action is a copy of it in which the parts are replaced,
+    or a strip in the NLA editor, with effect only where it lasts. tracked: the sequence that the
+    head was imported from and the Blender frame of each timestep, where its per-frame offsets are
+    to play along. weights: (T, 52) of ARKit's shapes, on a head that was given them. Without, both
+    stay zero. Raises StgaError, and changes nothing, where the head has no rig, or one that cannot
+    take the motion."""
     rig = rig_of(head)
     keyframes.check_keyable(rig, JOINTS)
     keyframes.check_keyable(head.data.shape_keys)
@@ -85,14 +82,10 @@ def apply_motion(
 def sample_motion(
     head: Any, sequence: FlameSequence, numbers: Iterable[int], warn: Warn = log_warning
 ) -> FlameSequence:
-    """FLAME parameters of the head as animated in the scene, in each of the frames `numbers`:
-    timesteps from 0.
-
-    sequence: the one that the head was imported from, for model and identity; identity sliders are
-    read in the first frame. `warn` reports where FLAME's parameters do not reproduce the mesh in
-    the scene: another modifier, a sculpted key, a scaled bone. Raises StgaError where the head has
-    no rig.
-    """
+    """FLAME parameters of the head as animated in the scene, in each of the frames `numbers`.
+    sequence: the one that the head was imported from; identity sliders are read in the first frame.
+    `warn` reports where FLAME's parameters do not reproduce the mesh in the scene. Raises StgaError
+    where the head has no rig."""
     frames: list[FlameFrame] = []
     shape, largest_error = sequence.shape.copy(), 0.0
     for _ in iterate_frames(numbers):
