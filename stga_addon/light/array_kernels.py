@@ -1,7 +1,7 @@
 """The kernels of `raster.cpu.shade` and `.shadow` in NumPy, for Pythons without Numba. Vectors are
 rows of their own, (3, N): NumPy is slow where the last axis is short."""
 
-from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 
@@ -77,55 +77,29 @@ def lit_shares(
 ) -> None:
     """As `raster.cpu.shadow.lit_shares`; step: a whole number."""
     size, reach = len(depth), int(step)
-    border, width = 2 * reach + 3, 2 * reach + 2
+    border = 2 * reach + 3
     # The map with a border that blocks nothing; farther places are moved onto it.
     padded = np.full((size + 2 * border,) * 2, np.inf, np.float32)
     padded[border:-border, border:-border] = depth
-    least, most = _windows(padded, width, np.minimum), _windows(padded, width, np.maximum)
+    flat, width, taps = padded.reshape(-1), len(padded), (-reach, 0, reach) if reach else (0,)
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
         x, y = (
             np.clip(points[part, k] - np.float32(0.5), -1.5 - reach, size + reach + 0.5) + border
             for k in range(2)
         )
-        z = points[part, 2] - bias[part]
-        corner = (y.astype(np.int64) - reach) * least.shape[1] + (x.astype(np.int64) - reach)
-        # Most points are nearer than all texels that are looked up, or farther.
-        found = (z <= least.reshape(-1)[corner]).astype(np.float32)
-        between = np.flatnonzero((found == 0) & (z <= most.reshape(-1)[corner]))
-        found[between] = _looked_up(padded, x[between], y[between], z[between], reach)
-        lit[part] = found
-
-
-def _windows(values: np.ndarray, width: int, reduced: Callable[..., np.ndarray]) -> np.ndarray:
-    """Least or largest of the `width` × `width` values from each place on."""
-    span = 1
-    while span < width:
-        shift = min(span, width - span)
-        values = reduced(values[:-shift], values[shift:])
-        values, span = reduced(values[:, :-shift], values[:, shift:]), span + shift
-    return values
-
-
-def _looked_up(
-    padded: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: int
-) -> np.ndarray:
-    """(N,) share of the 3 × 3 places around x, y, or of the one, that z is not farther than."""
-    flat, width = padded.reshape(-1), len(padded)
-    left, top = np.floor(x), np.floor(y)
-    right, lower = x - left, y - top
-    at = top.astype(np.int64) * width + left.astype(np.int64)
-    taps = (-step, 0, step) if step else (0,)
-    lit = np.zeros(len(z), np.float32)
-    for row in taps:
-        for below, weight in ((0, 1 - lower), (1, lower)):
+        z, left, top = points[part, 2] - bias[part], np.floor(x), np.floor(y)
+        right, lower = x - left, y - top
+        at = top.astype(np.int64) * width + left.astype(np.int64)
+        found = np.zeros(len(z), np.float32)
+        for row, (below, weight) in product(taps, ((0, 1 - lower), (1, lower))):
             open_ = np.zeros(len(z), np.float32)
             for column in taps:
                 place = at + ((row + below) * width + column)
                 open_ += np.where(z <= flat.take(place), 1 - right, 0)
                 open_ += np.where(z <= flat.take(place + 1), right, 0)
-            lit += weight * open_
-    return lit / np.float32(len(taps) ** 2)
+            found += weight * open_
+        lit[part] = found / np.float32(len(taps) ** 2)
 
 
 def add_lights(

@@ -27,24 +27,14 @@ SATURATED_LEVEL, DARK_LEVEL = 252, 4
 """Levels of 255 from which on, and up to which, a channel says nothing."""
 
 
-def views_by_time(capture: Capture) -> dict[int, list[View]]:
-    """The training views that are looked at: up to MAX_CAMERAS of each of up to MAX_TIMESTEPS."""
-    found: dict[int, list[View]] = {}
-    for view in capture.views.get("train", ()):
-        found.setdefault(view.timestep, []).append(view)
-    times = evenly_spread(sorted(found), MAX_TIMESTEPS)
-    return {time: evenly_spread(found[time], MAX_CAMERAS) for time in times}
-
-
 def observe(
-    capture: Capture, exposure: ViewExposure, report: Report = ignore
+    capture: Capture, times: dict[int, list[View]], exposure: ViewExposure, report: Report
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean linear color (T, F, 3) of triangles at the `views_by_time`, in the darker half of the
-    cameras that face them (fewest highlights), NaN where none does; and how many (T, F) do."""
-    by_time = views_by_time(capture)
+    """Mean linear color (T, F, 3) of triangles in the darker half of the cameras that face them
+    (fewest highlights), NaN where none does; and how many (T, F) do. times: the views of each."""
     colors, cameras = [], []
-    for n, (time, views) in enumerate(by_time.items()):
-        report(Progress(n / max(len(by_time), 1), "Estimating the light"))
+    for n, (time, views) in enumerate(times.items()):
+        report(Progress(n / len(times), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
         seen = np.stack([_view_colors(capture, mesh, view, exposure(view)) for view in views])
         ordered = np.sort(seen, axis=0)  # NaN comes last
@@ -133,12 +123,16 @@ def estimate_light(
     capture: Capture, known: Known = Known(), report: Report = ignore
 ) -> AvatarLight:
     """The light of the capture and how its head receives it. Raises StgaError without views."""
-    if not capture.views.get("train"):
+    by_time: dict[int, list[View]] = {}
+    for view in capture.views.get("train", ()):
+        by_time.setdefault(view.timestep, []).append(view)
+    if not by_time:
         problem = "has no training views, from which its light could be estimated"
         raise StgaError(f"{capture.root}: {problem}")
-    transfer, occlusion = transfer_of(capture.neutral, capture.faces)
-    color, cameras = observe(capture, known.exposure, report)
-    times, faces = views_by_time(capture), capture.faces
+    chosen, faces = evenly_spread(sorted(by_time), MAX_TIMESTEPS), capture.faces
+    times = {time: evenly_spread(by_time[time], MAX_CAMERAS) for time in chosen}
+    transfer, occlusion = transfer_of(capture.neutral, faces)
+    color, cameras = observe(capture, times, known.exposure, report)
     posed = np.stack([transfer_of(capture.mesh(t), faces, POSED_DIRECTIONS)[0] for t in times])
     radiance, residual = fit_light(color, posed[:, faces].mean(2), known.radiance)
     source = "estimated"

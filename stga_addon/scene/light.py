@@ -282,26 +282,22 @@ class SceneLight:
         elif outside is not None:
             outside = outside._replace(image=outside.image.original)
             if outside not in self._worlds:
-                self._worlds = {outside: _split_world(outside)}
+                image = outside.image
+                pixels = np.zeros((2, 4, 3), np.float32)  # black where a file is missing
+                width, height = image.size
+                if width and height and image.channels >= 3:
+                    pixels = np.empty((height, width, image.channels), np.float32)
+                    image.pixels.foreach_get(pixels.ravel())
+                linear = pixels[::-1, :, :3]
+                if not image.is_float and image.colorspace_settings.name == "sRGB":
+                    linear = srgb_to_linear(linear)
+                turn = np.reshape(outside.rotation, (3, 3)).T
+                self._worlds = {outside: split_environment(linear * outside.color, turn)}
             world, suns = self._worlds[outside]
             u, _, v = np.linalg.svd(to_world[:3, :3])
             world = rotated(world, (u @ v).T)
             lights += [in_avatar_space(sun, to_world) for sun in suns]
         return Lighting(world=world, lights=tuple(lights), white=(red, green, blue), **chosen)
-
-
-def _split_world(light: WorldLight) -> tuple[np.ndarray, tuple[Light, ...]]:
-    """Harmonics (9, 3) and suns of a texture in the world's axes; reads the image's pixels."""
-    image, pixels = light.image, np.zeros((2, 4, 3), np.float32)  # black where a file is missing
-    width, height = image.size
-    if width and height and image.channels >= 3:
-        pixels = np.empty((height, width, image.channels), np.float32)
-        image.pixels.foreach_get(pixels.ravel())
-    linear = pixels[::-1, :, :3]
-    if not image.is_float and image.colorspace_settings.name == "sRGB":
-        linear = srgb_to_linear(linear)
-    rotation = np.reshape(light.rotation, (3, 3)).T
-    return split_environment(linear * np.array(light.color), rotation)
 
 
 def _casters(visible: Iterable[tuple[Any, Any]], depsgraph: Any) -> Iterable[tuple[Any, Caster]]:

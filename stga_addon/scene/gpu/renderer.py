@@ -158,13 +158,12 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
         center = matrix @ owner.matrix @ bone.custom_shape_translation
         reach = size * max(Vector(corner).length for corner in shape.bound_box)
         reach *= max(map(abs, bone.custom_shape_scale_xyz))
-        found.append(
-            (center, center, reach * (bone.length if bone.use_custom_shape_bone_size else 1))
-        )
+        reach *= bone.length if bone.use_custom_shape_bone_size else 1.0
+        found.append((center, center, reach))
     if not found:
         return NO_BONES
-    ends = np.array([[(*point, 1.0) for point in bone[:2]] for bone in found])
-    radius = np.array([bone[2] for bone in found])
+    ends = np.array([[(*point, 1.0) for point in bone[:2]] for bone in found[:MAX_SHAPES]])
+    radius = np.array([bone[2] for bone in found[:MAX_SHAPES]])
     clip = ends @ np.array(region.perspective_matrix, np.float64).T
     before = (clip[..., 3] > 0).all(1)  # the camera; a bone with an end behind it is left out
     clip, radius = clip[before], radius[before]

@@ -185,10 +185,9 @@ def shadow_map_shader() -> Any:
     lens: scale to device coordinates, whether parallel, least depth in perspective."""
     # In perspective, depth itself is interpolated as it should be: linear in space.
     rows = dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4")
-    passed = {"distance_out": ("smooth", "FLOAT")}
-    attribute = "VEC3", "position"
-    outputs = {"depth_out": "FLOAT"}
-    return _shader(_MAP_VERTEX, _MAP_FRAGMENT, outputs, rows, (), "", passed, attribute)
+    outputs, passed = {"depth_out": "FLOAT"}, {"distance_out": ("smooth", "FLOAT")}
+    position = "VEC3", "position"
+    return _shader(_MAP_VERTEX, _MAP_FRAGMENT, outputs, rows, (), "", passed, position)
 
 
 def _shader(
