@@ -13,7 +13,7 @@ from ..capture.model import Capture
 from ..errors import StgaError
 from ..export.ply import read_ply
 from ..files import write_json
-from ..light.environment import harmonics_of, read_hdr
+from ..light.environment import read_hdr, split_environment
 from ..options import like, option
 from ..progress import Progress, Report, Say, Written, ignore
 from ..training.run import folder as run_folder
@@ -53,7 +53,7 @@ def relight(request: Relight, report: Report, say: Say) -> Written:
     capture = run_folder.open_refined(folder, request.capture, request.flame)
     known = Known()
     if request.light is not None:
-        known = Known(radiance=harmonics_of(read_hdr(request.light)))
+        known = Known(radiance=split_environment(read_hdr(request.light), max_suns=0)[0])
     elif request.card is not None:
         card = srgb_to_linear(np.array(request.card))
         if not card.min() > 0:

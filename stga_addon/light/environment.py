@@ -71,11 +71,6 @@ def split_environment(
     return np.asarray(basis(vectors.reshape(-1, 3)).T @ values), tuple(suns)
 
 
-def harmonics_of(image: np.ndarray, rotation: np.ndarray = UPRIGHT) -> np.ndarray:
-    """(9, 3) of a whole environment, see `split_environment`."""
-    return split_environment(image, rotation, max_suns=0)[0]
-
-
 MAX_LIGHTS, MAX_NUMBER = 64, 1e6
 
 

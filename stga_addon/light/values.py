@@ -60,8 +60,6 @@ class Light:
 
     def __post_init__(self) -> None:
         """Vectors become float64 arrays, directions unit vectors."""
-        if self.kind not in KINDS:
-            raise ValueError(f"kind of light {self.kind!r} is not one of {KINDS}")
         for name in ("color", "position"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         for name in ("direction", "tangent"):
@@ -77,11 +75,6 @@ class Light:
             direction=matrix[:3, :3] @ self.direction, tangent=matrix[:3, :3] @ self.tangent,
             radius=self.radius * scale, size=(self.size[0] * scale, self.size[1] * scale),
         )  # fmt: skip
-
-
-def no_world() -> np.ndarray:
-    """(9, 3): a black world."""
-    return np.zeros((9, 3))
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,7 @@ class Lighting:
                the head
     """
 
-    world: np.ndarray = field(default_factory=no_world)
+    world: np.ndarray = field(default_factory=lambda: np.zeros((9, 3)))
     lights: tuple[Light, ...] = ()
     mode: str = "scene"
     mix: float = 1.0
@@ -112,10 +105,6 @@ class Lighting:
     roughness: float = SKIN_ROUGHNESS
     specular: float = 1.0
     shadows: bool = True
-
-    def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ValueError(f"mode of lighting {self.mode!r} is not one of {MODES}")
 
 
 @dataclass(frozen=True)

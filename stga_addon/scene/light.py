@@ -14,7 +14,7 @@ from ..capture.color import srgb_to_linear
 from ..light.environment import split_environment
 from ..light.harmonics import rotated, uniform
 from ..light.relight import Relighter
-from ..light.values import SKIN_ROUGHNESS, Caster, Light, Lighting, no_world
+from ..light.values import SKIN_ROUGHNESS, Caster, Light, Lighting
 from . import tags
 from .arrays import mesh_vertices, read_values
 from .compat import light_strength, world_nodes
@@ -275,7 +275,7 @@ class SceneLight:
         red, green, blue = (white / white.mean()).tolist()
         names = "mode", "mix", "exposure", "roughness", "specular", "shadows"
         chosen = {name: getattr(settings, name) for name in names}
-        world = no_world()  # also for nodes that are not understood
+        world = np.zeros((9, 3))  # also for nodes that are not understood
         outside = world_light(depsgraph.scene_eval.world) if settings.world else None
         if outside is not None and outside.image is None:
             world = uniform(outside.color)

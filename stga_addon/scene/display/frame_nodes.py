@@ -150,7 +150,7 @@ def _strained(nodes: Nodes, mesh: Any) -> Any:
     """The mesh from `_deformed` with triangles' strain (`avatar.strain.face_strain`) stored."""
     # Faces to points and back: the mean over the triangles that touch a triangle.
     tensors = [nodes.attribute(half) for half in stored.TENSOR_HALVES]
-    means = [nodes.on_domain(tensor, "FLOAT_VECTOR", "POINT") for tensor in tensors]
+    means = [nodes.at_points(tensor, "FLOAT_VECTOR") for tensor in tensors]
     strains = []
     for index in range(STRAIN_COMPONENTS):
         products = []

@@ -11,21 +11,21 @@ import bpy
 from ... import __version__
 from ..compat import enable_nodes
 
-_VERSION = "stga_version"
+VERSION = "stga_version"  # property of our trees
 _COLUMN_WIDTH, _ROW_HEIGHT = 220.0, 200.0
 
 
 def new_tree(name: str) -> bpy.types.NodeTree:
     """An empty geometry node tree that `find_tree` finds again."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    tree[_VERSION] = __version__
+    tree[VERSION] = __version__
     return tree
 
 
 def find_tree(name: str) -> bpy.types.NodeTree | None:
     """The tree of this name made by this version of the add-on, or None."""
     for tree in bpy.data.node_groups:
-        if tree.name.startswith(name) and tree.get(_VERSION) == __version__:
+        if tree.name.startswith(name) and tree.get(VERSION) == __version__:
             return tree
     return None
 
@@ -33,11 +33,6 @@ def find_tree(name: str) -> bpy.types.NodeTree | None:
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:
     """Add an input or output ("INPUT", "OUTPUT") of a socket type ("Vector") to the tree."""
     return tree.interface.new_socket(name, in_out=side, socket_type=f"NodeSocket{kind}")
-
-
-def is_splat_tree(tree: bpy.types.NodeTree) -> bool:
-    """Whether `splat_nodes.splat_tree` made the tree, in this version or another."""
-    return _VERSION in tree and bool(tree.is_modifier)
 
 
 @dataclass(frozen=True)
@@ -178,10 +173,10 @@ class Nodes:
         inputs = {"Geometry": mesh, "Value": value, "Index": index}
         return self.out("GeometryNodeSampleIndex", inputs, data_type=kind, domain=domain)
 
-    def on_domain(self, value: Any, data_type: str, domain: str) -> bpy.types.NodeSocket:
-        """A field interpolated to another domain: means of the touching elements."""
-        kind = {"data_type": data_type, "domain": domain}
-        return self.out("GeometryNodeFieldOnDomain", {"Value": value}, **kind)
+    def at_points(self, value: Any, kind: str) -> bpy.types.NodeSocket:
+        """A field of faces interpolated to points: means of the touching elements."""
+        inputs = {"Value": value}
+        return self.out("GeometryNodeFieldOnDomain", inputs, data_type=kind, domain="POINT")
 
     def triangle_corners(self) -> list[bpy.types.NodeSocket]:
         """Positions of each face's three corners, in the order of its vertices."""

@@ -439,7 +439,7 @@ def _frozen_splats(nodes: Nodes, mesh: Any) -> bpy.types.NodeSocket:
     weight, exists = nodes.attribute_if_any(name, "FLOAT")
     selected = nodes.compare("GREATER_EQUAL", weight, SELECTED_WEIGHT)
     # On the points: a boolean is true on a face where it is true at all the face's points.
-    frozen = nodes.logic("NIMPLY", exists, nodes.on_domain(selected, "BOOLEAN", "POINT"))
+    frozen = nodes.logic("NIMPLY", exists, nodes.at_points(selected, "BOOLEAN"))
     return nodes.sample(mesh, frozen, nodes.attribute(stored.FACE, "INT"), "BOOLEAN")
 
 

@@ -17,7 +17,7 @@ from ..layers import DisplaySettings
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
-from .node_builder import find_tree, is_splat_tree
+from .node_builder import VERSION, find_tree
 from .splat_attributes import SplatAttributes, avatar_attributes
 from .splat_nodes import AS_TRAINED, POINTS
 
@@ -150,7 +150,7 @@ def splat_modifier(splat_object: Any) -> Any:
     """The geometry nodes modifier that shows the splats. Raises StgaError without one."""
     for modifier in splat_object.modifiers if splat_object is not None else ():
         tree = modifier.node_group if modifier.type == "NODES" else None
-        if tree is not None and is_splat_tree(tree):
+        if tree is not None and VERSION in tree and tree.is_modifier:  # of any version
             return modifier
     raise StgaError(f"{getattr(splat_object, 'name', None)}: is not an object that shows splats")
 

@@ -44,10 +44,44 @@ class DrawnVideo:
         """Write the video, or copy the PNGs to the output folder. Raises StgaError."""
         outputs = {self._output / image.name: image for image in self._images}
         if is_video(self._output):
-            outputs = {self._output: _encode(self._images, fps)}
+            outputs = {self._output: self._encoded(fps)}
         for output, made in outputs.items():
             with replacing(output) as partial:
                 shutil.copyfile(made, partial)
+
+    def _encoded(self, fps: float) -> Path:
+        """The video, encoded beside the images in a scene of its own, which is removed."""
+        size = bpy.data.images.load(str(self._images[0]))
+        width, height = size.size
+        bpy.data.images.remove(size)
+        video = self._folder / "video.mp4"
+        scene = bpy.data.scenes.new("STGA video")
+        render, settings = scene.render, scene.render.image_settings
+        try:
+            strips = sequencer_strips(scene)
+            strip = strips.new_image("images", str(self._images[0]), 1, 1)
+            for image in self._images[1:]:
+                strip.elements.append(image.name)
+            scene.frame_start, scene.frame_end = 1, len(self._images)
+            # even, as the format needs
+            render.resolution_x, render.resolution_y = width + width % 2, height + height % 2
+            render.resolution_percentage = 100
+            set_frames_per_second(scene, fps)
+            render.use_sequencer, render.use_file_extension = True, True
+            choose_format(settings, "VIDEO", "FFMPEG")
+            render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
+            render.ffmpeg.constant_rate_factor = "HIGH"
+            scene.view_settings.view_transform = "Standard"
+            render.filepath = str(video)
+            bpy.ops.render.render(animation=True, scene=scene.name)
+        except RuntimeError as error:
+            problem = f"Blender could not encode the video ({str(error).strip()})"
+            raise StgaError(problem) from error
+        finally:
+            bpy.data.scenes.remove(scene)
+        if not video.is_file():
+            raise StgaError("Blender could not encode the video; see the console")
+        return video
 
 
 def png_bytes(pixels: np.ndarray) -> bytes:
@@ -63,36 +97,3 @@ def png_bytes(pixels: np.ndarray) -> bytes:
         packed += struct.pack(">I", len(data)) + kind + data
         packed += struct.pack(">I", zlib.crc32(kind + data))
     return packed
-
-
-def _encode(images: Sequence[Path], fps: float) -> Path:
-    """Encode in a scene of its own, which is removed; the file beside the images."""
-    size = bpy.data.images.load(str(images[0]))
-    width, height = size.size
-    bpy.data.images.remove(size)
-    video = images[0].with_name("video.mp4")
-    scene = bpy.data.scenes.new("STGA video")
-    try:
-        strip = sequencer_strips(scene).new_image("images", str(images[0]), 1, 1)
-        for image in images[1:]:
-            strip.elements.append(image.name)
-        scene.frame_start, scene.frame_end = 1, len(images)
-        render = scene.render
-        # even, as the format needs
-        render.resolution_x, render.resolution_y = width + width % 2, height + height % 2
-        render.resolution_percentage = 100
-        set_frames_per_second(scene, fps)
-        render.use_sequencer, render.use_file_extension = True, True
-        choose_format(render.image_settings, "VIDEO", "FFMPEG")
-        render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
-        render.ffmpeg.constant_rate_factor = "HIGH"
-        scene.view_settings.view_transform = "Standard"
-        scene.render.filepath = str(video)
-        bpy.ops.render.render(animation=True, scene=scene.name)
-    except RuntimeError as error:
-        raise StgaError(f"Blender could not encode the video ({str(error).strip()})") from error
-    finally:
-        bpy.data.scenes.remove(scene)
-    if not video.is_file():
-        raise StgaError("Blender could not encode the video; see the console")
-    return video
