@@ -4,20 +4,12 @@ from pathlib import Path
 
 from . import lamps, relight
 
-SHADING_DEFINES = f"""
-#define MAP_SIZE {lamps.MAP_SIZE}
-#define LIFT {lamps.LIFT_M!r}
-#define BIAS {lamps.BIAS_M!r}
-#define MAX_BIAS {lamps.MAX_BIAS_M!r}
-#define TAP_STEP {lamps.TAP_STEP!r}
-#define REFLECTANCE {relight.REFLECTANCE!r}
-#define HIGHLIGHT_SHARE {relight.HIGHLIGHT_SHARE!r}
-#define WET_HIGHLIGHT_SHARE {relight.WET_HIGHLIGHT_SHARE!r}
-#define MIN_DIFFUSE_SHARE {relight.MIN_DIFFUSE_SHARE!r}
-#define ALIKE_AT_SPLAT {relight.ALIKE_AT_SPLAT!r}
-#define UNLIKE_AT_SPLAT {relight.UNLIKE_AT_SPLAT!r}
-#define PI 3.14159265358979
-"""
+_CONSTANTS = {"MAP_SIZE": lamps.MAP_SIZE, "LIFT": lamps.LIFT_M, "BIAS": lamps.BIAS_M}
+_CONSTANTS |= {"MAX_BIAS": lamps.MAX_BIAS_M, "TAP_STEP": lamps.TAP_STEP, "PI": 3.14159265358979}
+_SHARES = "HIGHLIGHT_SHARE", "WET_HIGHLIGHT_SHARE", "MIN_DIFFUSE_SHARE"
+for _name in ("REFLECTANCE", *_SHARES, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
+    _CONSTANTS[_name] = getattr(relight, _name)
+SHADING_DEFINES = "".join(f"#define {name} {value!r}\n" for name, value in _CONSTANTS.items())
 SRGB_FUNCTIONS = """
 vec3 srgb_to_linear(vec3 srgb)
 {

@@ -1,14 +1,10 @@
-"""Lights and lighting as plain values, in Blender's units.
+"""Lights and lighting as plain values, in Blender's units, in the space of the avatar's meshes
+(meters of its capture, or of the head object in Blender); colors are linear, sRGB's primaries.
 
-Space: that of the avatar's meshes (world meters of its capture, or of the head object in Blender).
-Axes are any, as long as lights, world and mesh share them. Colors are linear, with sRGB's
-primaries.
-
-Units: a sun's color is irradiance in W/m² on a surface that faces it; that of other lights is power
-in W, of which a surface that faces a point at distance d gets power / (4 π d²), and one that faces
-the middle of a small area light power / (π d²): Blender's strength times its color. The world's
-radiance is in W/m²/sr, Blender's strength times its
-color: radiance 1 from everywhere is irradiance π. A surface of albedo ρ under irradiance E has
+A sun's color is irradiance in W/m² on a surface that faces it; that of others is power in W, of
+which a surface that faces a point at distance d gets power / (4 π d²), and one that faces the
+middle of a small area light power / (π d²): Blender's strength times its color. The world's is
+radiance in W/m²/sr: 1 from everywhere is irradiance π. A surface of albedo ρ under irradiance E has
 radiance ρ E / π, which is the display's white (sRGB 1) where it is 1.
 """
 
@@ -18,7 +14,6 @@ import numpy as np
 
 KINDS = "sun", "point", "spot", "area"
 SHAPES = "rectangle", "ellipse"
-MODES = "recorded", "scene", "mix"
 SKIN_ROUGHNESS = 0.45  # Of the highlight on skin (GGX, Blender's Principled BSDF)
 
 
@@ -29,8 +24,7 @@ class Light:
     kind       one of KINDS
     color      (3,) linear red, green, blue: irradiance in W/m² of a sun, else power in W
     position   (3,) meters; of a sun it counts for nothing
-    direction  (3,) in which it shines: a sun's rays, a spot's axis, the normal of an area light's
-               bright side; of a point it counts for nothing
+    direction  (3,) in which it shines: a sun's rays, a spot's axis, an area light's normal
     radius     meters, of a point or spot: how soft its shadows are
     angle      radians, of a sun: the angle that it takes in the sky
     size       (width, height) meters of an area light
@@ -39,8 +33,7 @@ class Light:
     cone       radians, of a spot: full angle, as Blender's `spot_size`
     blend      0…1, of a spot: share of the cone that fades out, as Blender's `spot_blend`
     casts_shadow  whether it is blocked by head and casters
-    diffuse, specular  factors of what it adds to the skin's diffuse color and to highlights, as
-                       Blender's
+    diffuse, specular  factors of what it adds to diffuse color and to highlights, as Blender's
     """
 
     kind: str
@@ -81,19 +74,16 @@ class Light:
 class Lighting:
     """The light of a scene, and how an avatar answers to it.
 
-    world      (9, 3) spherical harmonics of the world's radiance by direction of sight
-               (`harmonics.basis`)
+    world      (9, 3) harmonics (`harmonics.basis`) of the world's radiance by direction of sight
     lights     see `Light`; an environment's sun is one of them (`environment.split_environment`)
-    mode       "recorded": the colors as trained, unchanged to the bit; "scene": relit; "mix":
-               between the two
+    mode       "recorded": colors as trained, to the bit; "scene": relit; "mix": between both
     mix        share of "scene" in "mix", 0…1, in linear light
     exposure   stops (powers of two) by which relit colors are made brighter
     white      (3,) linear color that the capture shows of what is white under its own light,
                relative to the estimate: relit colors are divided by it (the eyedropper)
     roughness  of highlights on skin; 0.05…1. Eyeballs have their own (`AvatarLight.roughness`)
     specular   factor of highlights; 0: none
-    shadows    whether lights are blocked by the head and casters; world light is always occluded by
-               the head
+    shadows    whether lights are blocked by head and casters; the head always occludes the world
     """
 
     world: np.ndarray = field(default_factory=lambda: np.zeros((9, 3)))

@@ -8,24 +8,19 @@ import bpy
 # Custom properties on objects.
 KIND = "stga_kind"  # one of the kinds below
 CAPTURE = "stga_capture"  # the capture's folder (or a motion's file), absolute
-# on the head: the FLAME model file the capture was opened with, or ""
-FLAME_MODEL = "stga_flame_model"
+FLAME_MODEL = "stga_flame_model"  # on the head: the file that the capture was opened with, or ""
 PRINCIPAL_POINT = "stga_principal_point"  # on the head: how cx and cy of the capture were read
 TIMESTEPS = "stga_timesteps"  # on the head: ints, ascending
-# on the head: names of the regions selected as a whole, one per line
-KEY_REGIONS = "stga_key_regions"
-# on the head: its capture can be solved again (`tracking.folder.is_tracked`)
-TRACKED = "stga_tracked"
-# on the head: JSON, timestep -> parameters of the head posed by hand
-TRACKING_KEYS = "stga_tracking_keys"
+KEY_REGIONS = "stga_key_regions"  # on the head: regions selected as a whole, one per line
+TRACKED = "stga_tracked"  # on the head: `tracking.folder.is_tracked`
+TRACKING_KEYS = "stga_tracking_keys"  # on the head: JSON, timestep -> parameters posed by hand
 CAMERA_INDEX = "stga_camera_index"  # on a camera
 IMAGE_SIZE = "stga_image_size"  # on a camera: width, height in pixels
 PIXEL_ASPECT = "stga_pixel_aspect"  # on a camera: fl_x / fl_y, the height of a pixel over its width
 CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.convention`
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
-# on a splat object's mesh: the frame in whose light EEVEE and Cycles show it
-RELIT_FRAME = "stga_relit_frame"
+RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
 AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file
@@ -36,8 +31,7 @@ ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"
 # Boolean face attributes of the head mesh, one per region.
 REGION_PREFIX = "stga_region_"
 
-# Vertex groups of the head, one per timestep; a vertex is selected from a weight of
-# `region.SELECTED_WEIGHT` on.
+# Vertex groups of the head, one per timestep.
 GROUP_PREFIX = "stga_"
 
 

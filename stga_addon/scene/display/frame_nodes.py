@@ -172,8 +172,7 @@ def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
     strain, rest = nodes.attribute(_STRAIN), _in_range(nodes, (0, 0, 0))
     change = nodes.vector("SUBTRACT", strain, rest)
-    # On faces, each iteration is the mean of a face and, with weight 1, those that share an edge
-    # with it.
+    # On faces, an iteration is the mean of a face and, by weight 1, those that share an edge.
     inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
     smoothed = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
     return nodes.store(mesh, SMOOTHED_STRAIN, smoothed, "FLOAT_VECTOR", "FACE")

@@ -23,15 +23,12 @@ XYZ = "stga_xyz"
 ROTATION = "stga_rotation"
 SCALE = "stga_scale"  # standard deviations, linear
 OPACITY = "stga_opacity"  # 0 to 1
-# constant part, scene-linear: all the nodes need for splats of SH degree 0 without strain
-COLOR = "stga_color"
-# scene-linear, of one frame (`render.scene_splats`): where it is there, it counts
-RELIT_COLOR = "stga_relit_color"
+COLOR = "stga_color"  # constant part, scene-linear
+RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame: where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
 STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
-# of the splat's triangle, m²; also on the faces that have driven offsets
-NEUTRAL_AREA = "stga_neutral_area"
+NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
 WORLD_ROTATION, WORLD_SCALE = "rotation", "scale"
 """As posed by the nodes, by the names that Blender's native splats have."""

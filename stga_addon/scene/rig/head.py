@@ -111,8 +111,7 @@ def shape_key_model(thing: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]
 
 BONE_SHAPE = "STGA Bone"
 BONE_LENGTH = 0.03  # meters; only how long the bones are displayed
-# meters along an axis that a joint may be off when all sliders are at their limits
-NEGLIGIBLE_DISPLACEMENT = 1e-6
+NEGLIGIBLE_DISPLACEMENT = 1e-6  # meters along an axis, with all sliders at their limits
 SQUARED_NORM = "(w*w+x*x+y*y+z*z)"  # keyed quaternions are interpolated without normalization
 # (rotation - identity) / 2 as quadratic forms of the quaternion, row by row.
 ROTATION_MINUS_IDENTITY = (
@@ -120,9 +119,7 @@ ROTATION_MINUS_IDENTITY = (
     ("x*y+w*z", "-x*x-z*z", "y*z-w*x"),
     ("x*z-w*y", "y*z+w*x", "-x*x-y*y"),
 )
-# A driver's variables, one per term: few enough for Blender's limit of 255 characters per
-# expression.
-VARIABLES = "abcdfghijklmnopqrs"
+VARIABLES = "abcdfghijklmnopqrs"  # of a driver, whose expression has at most 255 characters
 
 
 def add_rig(

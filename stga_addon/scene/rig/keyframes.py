@@ -29,11 +29,9 @@ EXPRESSION_NAMES = "stga_expressions"
 EYES = ("left_eye", "right_eye")
 PART_JOINTS = {"jaw": ("jaw",), "eyes": EYES, "neck": ("neck",), "head": ("root",)}
 offset_key = f"{OFFSET_KEY}{{:05d}}".format
-# The hidden bones of a joint whose position depends on the sliders: that moves its bone, and that
-# its vertices follow.
+# The hidden bones of a displaced joint: that moves its bone, and that its vertices follow.
 parent_bone, deform_bone = "{}_joint".format, "{}_deform".format
-# Properties of the rig: partial sums of the joint's displacement by the sliders, and that by
-# tracked vertex offsets.
+# Properties of the rig: partial sums of a displacement by sliders, and that by tracked offsets.
 sum_property, offset_property = "stga_{}_sums".format, "stga_{}_offset".format
 # Data paths of a property, of bones, and of a shape key.
 property_path, key_value_path = '["{}"]'.format, 'key_blocks["{}"].value'.format
