@@ -132,46 +132,25 @@ def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT) -> 
 
 def strained() -> Avatar:
     """An avatar with every part that strain moves or colors."""
-    avatar, rng = textured(avatar_of("stga"), -8.5), np.random.default_rng(4)
+    avatar, rng = textured(avatar_of("stga"), -6.5), np.random.default_rng(4)
     colors = rng.normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
     positions = rng.normal(0, 0.004, (len(avatar.faces), 3, 3)).astype(np.float32)
     avatar = replace(avatar, splats=replace(avatar.splats, strain_color=colors), antialiased=True)
     return replace(avatar, driven_offsets={"strain_position": positions})
 
 
-def moved_by_strain() -> Avatar:
-    """An avatar whose splats follow strain without strain colors."""
-    avatar = textured(avatar_of("gaussian_avatars"))
-    positions = np.random.default_rng(5).normal(0, 0.4, (len(avatar.faces), 3, 3))
-    return replace(avatar, driven_offsets={"strain_position": positions.astype(np.float32)})
-
-
-def without(avatar: Avatar, part: str) -> Avatar:
-    if part == "strain_color":
-        return replace(avatar, splats=replace(avatar.splats, strain_color=None))
-    return replace(avatar, **{part: {"driven_offsets": {}, "antialiased": False}[part]})
-
-
 @pytest.mark.parametrize(
-    ("make", "background", "losses"),
-    [
-        (lambda: textured(avatar_of("stga")), 0.0, ()),
-        (lambda: textured(avatar_of("gaussian_avatars"), -1), 1.0, ()),
-        (strained, 1.0, ("strain_color", "driven_offsets", "antialiased")),
-        (moved_by_strain, 1.0, ("driven_offsets",)),
-    ],
+    ("make", "background"),
+    [(strained, 1.0), (lambda: textured(avatar_of("gaussian_avatars"), -1), 0.0)],
 )
-def test_image_equals_render_avatar(make, background, losses, tmp_path):
+def test_image_equals_render_avatar(make, background, tmp_path):
     """Catches another camera, color, order or pose than `stga render`'s, alpha that does not match
-    the color, and parts of an avatar that are lost when it is stored in Blender and read back."""
+    the color, and parts of an avatar that the engine leaves out."""
     avatar = make()
     shown, head = show(avatar)
     camera, mesh = expected_camera(camera_at(), shown), evaluated_vertices(head)
     expected = render_avatar(avatar, mesh, camera, (background,) * 3)
-    assert losses or np.abs(expected - background).max(0).mean() > 0.1, "nothing to compare"
-    for lost in losses:
-        other = render_avatar(without(avatar, lost), mesh, camera, (background,) * 3)
-        assert np.abs(expected - other).max() > 2 * TOLERANCE
+    assert np.abs(expected - background).max(0).mean() > 0.02, "nothing to compare"
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
 
 

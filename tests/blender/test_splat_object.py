@@ -232,7 +232,7 @@ def test_splats_follow_strain(convention, has_colors, has_positions, tmp_path):
     avatar = avatar if has_positions else replace(avatar, driven_offsets={})
     colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3 * has_colors, 3)).astype(np.float32)
     splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
-    avatar = replace(avatar, splats=splats)
+    avatar = replace(avatar, splats=splats, antialiased=has_colors)
     # at a boundary, inside, an edge of three
     assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())
     head = animated_head(avatar.neutral, avatar.faces)
@@ -242,6 +242,8 @@ def test_splats_follow_strain(convention, has_colors, has_positions, tmp_path):
     shown, head = bpy.data.objects["head splats"], bpy.data.objects["head"]
     stored = stored_avatar(shown)
     assert set(stored.driven_offsets) == set(avatar.driven_offsets)
+    assert stored.antialiased == avatar.antialiased == has_colors
+    np.testing.assert_array_equal(stored.splats.strain_color, avatar.splats.strain_color)
     np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     unmoved = replace(avatar, driven_offsets={})
