@@ -201,7 +201,16 @@ class Relighter:
         lifted = points + LIFT_M * normals
         arriving, highlight = lamps.shade(lifted, normals, eye, roughness, REFLECTANCE)
         arriving += np.maximum(self.transfer @ world, 0) + at_splats[:, 6:]
-        highlight += self._sky_highlight(points, normals, eye, lighting.world, roughness)
+        if np.any(lighting.world):  # its radiance around the mirrored direction (Karis 2014)
+            view = _unit(eye.astype(np.float32) - points)
+            cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
+            glossy = (GLOSSY[:, None] * lighting.world).astype(np.float32)
+            seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
+            x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
+            z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
+            part = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
+            reflected = REFLECTANCE * (z - 1.04 * part) + 1.04 * part + w
+            highlight += np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
         color = self._with_strain(self.diffuse_color, mesh)
         albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)
@@ -210,23 +219,6 @@ class Relighter:
             same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
             lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
         return np.asarray(lit)
-
-    def _sky_highlight(
-        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, world: np.ndarray,
-        roughness: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """(N, 3) of the world: radiance around the mirrored direction (Karis 2014)."""
-        if not np.any(world):
-            return np.zeros_like(points)
-        view = _unit(eye.astype(np.float32) - points)
-        cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
-        glossy = (GLOSSY[:, None] * world).astype(np.float32)
-        seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
-        x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
-        z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
-        share = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
-        reflected = REFLECTANCE * (z - 1.04 * share) + 1.04 * share + w
-        return np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""

@@ -117,7 +117,23 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
             turns = continuous(from_matrices(poses[:, :3, :3]))
             arrays.write_curves(camera, "location", frames, poses[:, :3, 3])
             arrays.write_curves(camera, "rotation_quaternion", frames, turns)
-        _set_backgrounds(data, views, warn)
+        found = [view for view in views if view.image.is_file()]
+        missing = [view.image for view in views if not view.image.is_file()]
+        if missing:
+            warn(f"{missing[0]}: is missing, and {len(missing) - 1} other images of {data.name}")
+        for row, view in enumerate(found):
+            background = data.background_images.new()
+            try:
+                background.image = bpy.data.images.load(str(view.image))
+            except RuntimeError as error:
+                raise StgaError(f"{view.image}: cannot be read as an image") from error
+            background.show_background_image = row == 0
+        # Each is visible from its frame to the next one's; the first also before, the last after.
+        paths = [f"background_images[{row}].show_background_image" for row in range(len(found))]
+        if found:
+            timesteps = [view.timestep for view in found]
+            arrays.write_triangle_curves(data, paths, timesteps, "CONSTANT")
+            data.show_background_images = True
         cameras.append(camera)
     remove(old.values())
     return cameras
@@ -167,26 +183,6 @@ def set_intrinsics(data: Any, camera: Camera) -> None:
     data.lens = camera.fl_x * SENSOR_WIDTH_MM / camera.width
     data.shift_x = (camera.width / 2 - camera.cx) / camera.width
     data.shift_y = (camera.cy - camera.height / 2) / camera.width * camera.fl_x / camera.fl_y
-
-
-def _set_backgrounds(data: Any, views: list[View], warn: Warn) -> None:
-    found = [view for view in views if view.image.is_file()]
-    missing = [view.image for view in views if not view.image.is_file()]
-    if missing:
-        warn(f"{missing[0]}: is missing, and {len(missing) - 1} other images of {data.name}")
-    if not found:
-        return
-    for row, view in enumerate(found):
-        background = data.background_images.new()
-        try:
-            background.image = bpy.data.images.load(str(view.image))
-        except RuntimeError as error:
-            raise StgaError(f"{view.image}: cannot be read as an image") from error
-        background.show_background_image = row == 0
-    # Each is visible from its frame until the next one's; the first also before, the last after.
-    paths = [f"background_images[{row}].show_background_image" for row in range(len(found))]
-    arrays.write_triangle_curves(data, paths, [view.timestep for view in found], "CONSTANT")
-    data.show_background_images = True
 
 
 def export_cameras(path: Path, cameras: Iterable[Any], depsgraph: Any) -> int:

@@ -1,6 +1,6 @@
 """A scene's visible splats, posed, and their relit colors stored for EEVEE and Cycles."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -83,11 +83,36 @@ def visible_layers(
     if view is None:
         visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
     shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
-    return [
-        _layer(each, matrix, depsgraph, cache, shown)
-        for each, matrix in shown
-        if each.get(tags.KIND) == tags.SPLATS and is_wanted(each)
-    ]
+    layers = []
+    for each, matrix in shown:
+        if each.get(tags.KIND) != tags.SPLATS or not is_wanted(each):
+            continue
+        stored, to_world = cache.get(each), np.array(matrix, np.float64)
+        # From the evaluated object: its settings may be animated.
+        settings = display_settings(splat_modifier(each.evaluated_get(depsgraph)))
+        if isinstance(stored, Splats):
+            layers.append(SceneLayer(stored, WORLD, to_world, settings=settings))
+            continue
+        head = get_input(each, splat_nodes.HEAD)
+        if head is None:
+            raise StgaError(f"{each.name}: has no head to follow; choose one in its modifier")
+        posed = head.evaluated_get(depsgraph)
+        if posed.type != "MESH" or len(posed.data.loops) != stored.faces.size:
+            reason = f"has other triangles than {each.name}, which follows it; check its modifiers"
+            if head.mode == "EDIT":
+                reason = f"is in Edit Mode; {each.name} is drawn again when you leave it"
+            raise StgaError(f"{head.name}: {reason}")
+        placed = each.evaluated_get(depsgraph).matrix_world
+        to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
+        vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
+        vertices, frames = cache.frames(each, stored, vertices)
+        relit = cache.light.relit(each, head, stored, vertices, to_world, shown, depsgraph)
+        asks = settings.show_selection or settings.selected_only
+        selected = frame_selection(head, depsgraph.scene.frame_current) if asks else None
+        frozen = None if selected is None else ~selected
+        how = stored.antialiased, settings, frozen, relit
+        layers.append(SceneLayer(stored.splats, frames, to_world, *how))
+    return layers
 
 
 def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
@@ -114,37 +139,6 @@ def _with_instances(
         for member in collection.all_objects:
             if not member.evaluated_get(depsgraph).hide_render:
                 yield from _with_instances(member, depsgraph, inside)
-
-
-def _layer(
-    splat_object: Any, matrix: Matrix, depsgraph: Any, cache: SplatCache,
-    shown: Sequence[tuple[Any, Matrix]],
-) -> SceneLayer:  # fmt: skip
-    stored = cache.get(splat_object)
-    to_world = np.array(matrix, np.float64)
-    # From the evaluated object: its settings may be animated.
-    settings = display_settings(splat_modifier(splat_object.evaluated_get(depsgraph)))
-    if isinstance(stored, Splats):
-        return SceneLayer(stored, WORLD, to_world, settings=settings)
-    head = get_input(splat_object, splat_nodes.HEAD)
-    if head is None:
-        raise StgaError(f"{splat_object.name}: has no head to follow; choose one in its modifier")
-    posed = head.evaluated_get(depsgraph)
-    if posed.type != "MESH" or len(posed.data.loops) != stored.faces.size:
-        name = splat_object.name
-        reason = f"has other triangles than {name}, which follows it; check its modifiers"
-        if head.mode == "EDIT":
-            reason = f"is in Edit Mode; {name} is drawn again when you leave it"
-        raise StgaError(f"{head.name}: {reason}")
-    placed = splat_object.evaluated_get(depsgraph).matrix_world
-    to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
-    vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
-    vertices, frames = cache.frames(splat_object, stored, vertices)
-    relit = cache.light.relit(splat_object, head, stored, vertices, to_world, shown, depsgraph)
-    asks = settings.show_selection or settings.selected_only
-    selected = frame_selection(head, depsgraph.scene.frame_current) if asks else None
-    frozen = None if selected is None else ~selected
-    return SceneLayer(stored.splats, frames, to_world, stored.antialiased, settings, frozen, relit)
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:
