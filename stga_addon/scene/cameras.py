@@ -30,12 +30,9 @@ def image_size(render: Any) -> tuple[int, int]:
 
 
 def render_camera(
-    camera: Any,
-    depsgraph: Any,
-    width: int,
-    height: int,
+    camera: Any, depsgraph: Any, width: int, height: int,
     border: tuple[int, int, int, int] | None = None,
-) -> Camera:
+) -> Camera:  # fmt: skip
     """The evaluated camera object for an image of width × height pixels. border: x, y, width,
     height in pixels of the render region, from the bottom left. Raises StgaError unless it is
     perspective."""

@@ -72,20 +72,21 @@ NOTHING = 1e30  # depth of a shadow map where nothing is
 _CONSTANTS = {name: value for name, value in vars(packing).items() if name.endswith("_TEXELS")}
 _CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS, "MIN_ALPHA": MIN_ALPHA}
 _CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES, "FROZEN_COLOR": f"vec3{FROZEN_COLOR_SRGB}"}
+_CONSTANTS["TEXEL(image, k)"] = "texelFetch(image, ivec2((k) % WIDTH, (k) / WIDTH), 0)"
 _DEFINES = "".join(f"#define {name} {value}\n" for name, value in _CONSTANTS.items())
 RELIT_DEFINES = f"""
 #define RELIT
 #define MAP_COLUMNS {MAP_COLUMNS}
 #define SHADOW_DEPTH(cell) texelFetch(shadows, cell, 0).r
-#define WORLD(first, k) texelFetch(lights, at(first + k), 0).rgb
+#define WORLD(first, k) TEXEL(lights, first + k).rgb
 {SHADING_DEFINES}"""
 RELIT_FUNCTIONS = """
 float lit_share_of(int map_index, int first, vec3 point, float cosine)
 {
   int row = first + MAP_TEXELS * map_index;
-  vec4 p = vec4(point, 1.0), lens = texelFetch(lights, at(row + 3), 0);
-  vec4 x = texelFetch(lights, at(row), 0), y = texelFetch(lights, at(row + 1), 0);
-  vec3 local = vec3(dot(x, p), dot(y, p), dot(texelFetch(lights, at(row + 2), 0), p));
+  vec4 p = vec4(point, 1.0), lens = TEXEL(lights, row + 3);
+  vec4 x = TEXEL(lights, row), y = TEXEL(lights, row + 1);
+  vec3 local = vec3(dot(x, p), dot(y, p), dot(TEXEL(lights, row + 2), p));
   vec2 place = local.xy;
   if (lens.y < 0.5) {
     if (local.z <= 1e-4) {
@@ -101,27 +102,27 @@ float lit_share_of(int map_index, int first, vec3 point, float cosine)
 vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
 {
   int row = RELIT_TEXELS * layer;
-  vec4 factor = texelFetch(lights, at(row), 0), settings = texelFetch(lights, at(row + 1), 0);
-  vec4 eye = texelFetch(lights, at(row + 2), 0), typical = texelFetch(lights, at(row + 3), 0);
+  vec4 factor = TEXEL(lights, row), settings = TEXEL(lights, row + 1);
+  vec4 eye = TEXEL(lights, row + 2), typical = TEXEL(lights, row + 3);
   if (factor.x <= 0.0) {
     return recorded;
   }
   int first = SURFACE_TEXELS * splat;
-  vec4 color = texelFetch(surface, at(first), 0), old = texelFetch(surface, at(first + 1), 0);
-  ivec3 corners = VERTEX_TEXELS * ivec3(texelFetch(surface, at(first + 2), 0).xyz + 0.5);
-  vec3 weights = texelFetch(surface, at(first + 3), 0).xyz, means[3];
+  vec4 color = TEXEL(surface, first), old = TEXEL(surface, first + 1);
+  ivec3 corners = VERTEX_TEXELS * ivec3(TEXEL(surface, first + 2).xyz + 0.5);
+  vec3 weights = TEXEL(surface, first + 3).xyz, means[3];
   for (int k = 0; k < 3; k++) {
-    means[k] = weights.x * texelFetch(vertices, at(corners.x + k), 0).xyz
-             + weights.y * texelFetch(vertices, at(corners.y + k), 0).xyz
-             + weights.z * texelFetch(vertices, at(corners.z + k), 0).xyz;
+    means[k] = weights.x * TEXEL(vertices, corners.x + k).xyz
+             + weights.y * TEXEL(vertices, corners.y + k).xyz
+             + weights.z * TEXEL(vertices, corners.z + k).xyz;
   }
   vec3 normal = means[1] / max(length(means[1]), 1e-12), point = means[0] + LIFT * normal;
   vec3 arriving = means[2], highlight = vec3(0.0), view = normalize(eye.xyz - point);
   float roughness = color.a > 0.0 ? color.a : settings.x, alpha = roughness * roughness;
   for (int n = 0; n < int(settings.w); n++) {
     int texel = int(settings.z) + LIGHT_TEXELS * n;
-    vec4 a = texelFetch(lights, at(texel), 0), b = texelFetch(lights, at(texel + 1), 0);
-    vec4 c = texelFetch(lights, at(texel + 2), 0), d = texelFetch(lights, at(texel + 3), 0);
+    vec4 a = TEXEL(lights, texel), b = TEXEL(lights, texel + 1);
+    vec4 c = TEXEL(lights, texel + 2), d = TEXEL(lights, texel + 3);
     vec3 shining = b.xyz, light_color = vec3(b.w, c.xy), toward = -shining;
     float strength = 1.0, width = d.w;
     int kind = int(a.x + 0.5);
@@ -155,7 +156,7 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
   highlight += sky_highlight(row + 4, normal, normalize(eye.xyz - means[0]), roughness, old.a);
   color.rgb += strain_color;
   typical.a = eye.w;
-  vec4 kept = texelFetch(lights, at(row + 13), 0);
+  vec4 kept = TEXEL(lights, row + 13);
   vec3 lit = lit_color(color, old.rgb, arriving, settings.y * highlight, recorded, typical, kept);
   return linear_to_srgb(mix(srgb_to_linear(max(recorded, vec3(0.0))), lit * factor.yzw, factor.x));
 }
@@ -217,13 +218,8 @@ def _shader(
     return gpu.shader.create_from_info(info)
 
 
-_TEXEL_FUNCTION = """
-ivec2 at(int texel) { return ivec2(texel % WIDTH, texel / WIDTH); }
-"""
-
 _TERMS = "\n".join(
-    f"  if (degree >= {math.isqrt(k)})\n"
-    f"    color += {term} * texelFetch(colors, at(first + {k}), 0).rgb;"
+    f"  if (degree >= {math.isqrt(k)})\n    color += {term} * TEXEL(colors, first + {k}).rgb;"
     for k, term in enumerate(harmonics_text())
 )
 _HARMONICS = f"""
@@ -247,27 +243,23 @@ void main()
     return;
   }
   int splat = int(texelFetch(orders, texel, 0).r);
-  vec4 center = texelFetch(centers, at(splat), 0);
-  vec4 axis0 = texelFetch(axes, at(3 * splat), 0);
-  vec4 axis1 = texelFetch(axes, at(3 * splat + 1), 0);
-  vec4 axis2 = texelFetch(axes, at(3 * splat + 2), 0);
+  vec4 center = TEXEL(centers, splat), axis0 = TEXEL(axes, 3 * splat);
+  vec4 axis1 = TEXEL(axes, 3 * splat + 1), axis2 = TEXEL(axes, 3 * splat + 2);
   int face = int(center.w), row = VIEW_TEXELS + LAYER_TEXELS * int(axis2.w);
-  vec4 color_rows = texelFetch(table, at(row), 0), display = texelFetch(table, at(row + 1), 0);
-  vec4 turn0 = texelFetch(table, at(row + 2), 0), turn1 = texelFetch(table, at(row + 3), 0);
-  vec4 turn2 = texelFetch(table, at(row + 4), 0);
-  vec4 strain = texelFetch(frames, at(3 * faces + face), 0);
+  vec4 color_rows = TEXEL(table, row), display = TEXEL(table, row + 1);
+  vec4 turn0 = TEXEL(table, row + 2), turn1 = TEXEL(table, row + 3);
+  vec4 turn2 = TEXEL(table, row + 4), strain = TEXEL(frames, 3 * faces + face);
   float opacity = axis0.w;
   bool frozen = strain.w > 0.5;
   if (opacity < display.w || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
     return;
   }
-  vec4 r0 = texelFetch(frames, at(face), 0), r1 = texelFetch(frames, at(faces + face), 0);
-  vec4 r2 = texelFetch(frames, at(2 * faces + face), 0);
-  vec4 local = vec4(center.xyz, 1.0);
+  vec4 r0 = TEXEL(frames, face), r1 = TEXEL(frames, faces + face);
+  vec4 r2 = TEXEL(frames, 2 * faces + face), local = vec4(center.xyz, 1.0);
   vec3 p = vec3(dot(r0, local), dot(r1, local), dot(r2, local));
-  vec4 lens = texelFetch(table, at(0), 0), image = texelFetch(table, at(1), 0);
+  vec4 lens = TEXEL(table, 0), image = TEXEL(table, 1);
   for (int plane = 0; plane < CLIP_PLANES; plane++) {
-    if (plane < int(image.z) && dot(texelFetch(table, at(2 + plane), 0), vec4(p, 1.0)) < 0.0) {
+    if (plane < int(image.z) && dot(TEXEL(table, 2 + plane), vec4(p, 1.0)) < 0.0) {
       return;
     }
   }
@@ -295,7 +287,7 @@ void main()
   if (display.y > 0.5) {
     int last = first + int(color_rows.z); /* the strain colors are the last three */
     for (int k = 0; k < 3; k++) {
-      by_strain += strain[k] * texelFetch(colors, at(last - 3 + k), 0).rgb;
+      by_strain += strain[k] * TEXEL(colors, last - 3 + k).rgb;
     }
     color += by_strain;
   }
@@ -408,7 +400,7 @@ def projection_shader(relit: bool = False) -> Any:
         functions += SHADING_FUNCTIONS + RELIT_FUNCTIONS
         samplers += "surface", "vertices", "lights", "shadows"
     outputs = dict.fromkeys(("place_out", "sides_out", "shade_out"), "VEC4")
-    fragment = _TEXEL_FUNCTION + functions + _PROJECTION_FRAGMENT
+    fragment = functions + _PROJECTION_FRAGMENT
     constants = {"faces": "INT", "count": "INT"}
     return _shader(_SCREEN_VERTEX, fragment, outputs, constants, samplers, defines)
 

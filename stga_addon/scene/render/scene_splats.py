@@ -72,11 +72,9 @@ def _key(mesh: Any) -> tuple[Any, ...]:
 
 
 def visible_layers(
-    depsgraph: Any,
-    cache: SplatCache,
-    view: Any = None,
+    depsgraph: Any, cache: SplatCache, view: Any = None,
     is_wanted: Callable[[Any], bool] = lambda splat_object: True,
-) -> list[SceneLayer]:
+) -> list[SceneLayer]:  # fmt: skip
     """The splats of each visible object at the depsgraph's frame. view: the SpaceView3D to draw,
     None for a final image. Raises StgaError where a head is gone or has other triangles."""
     visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]

@@ -90,13 +90,9 @@ MAX_SLIDER = 10.0  # the widest range that Blender allows a shape key's value: -
 
 
 def key_motion(
-    head: Any,
-    rig: Any,
-    at: np.ndarray,
-    frames: Sequence[FlameFrame],
-    parts: Sequence[str] = tuple(PARTS),
-    warn: Warn = log_warning,
-) -> None:
+    head: Any, rig: Any, at: np.ndarray, frames: Sequence[FlameFrame],
+    parts: Sequence[str] = tuple(PARTS), warn: Warn = log_warning,
+) -> None:  # fmt: skip
     """Add keyframes of the parts of `frames` to the actions of rig and shape keys. at: the Blender
     frame of each, ascending. A slider that never moves gets one keyframe."""
     if "expression" in parts:
@@ -251,13 +247,9 @@ def shape_key_names(head: Any) -> dict[int, str]:
 
 
 def apply_weights(
-    owner: Any,
-    paths: dict[int, str],
-    weights: np.ndarray,
-    start: int,
-    name: str,
+    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str,
     as_strip: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Animate the values at `paths` (column -> data path) of `owner` by weights (T, 52), a row per
     frame from `start` on, and keep the previous animation as `motion.apply_motion` does. Raises
     StgaError as `check_keyable` does."""

@@ -27,16 +27,11 @@ MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sam
 
 
 def apply_motion(
-    head: Any,
-    frames: Sequence[FlameFrame],
-    start: int,
-    name: str,
-    parts: Sequence[str] = tuple(PARTS),
-    as_strip: bool = False,
-    warn: Warn = log_warning,
+    head: Any, frames: Sequence[FlameFrame], start: int, name: str,
+    parts: Sequence[str] = tuple(PARTS), as_strip: bool = False, warn: Warn = log_warning,
     tracked: tuple[FlameSequence, Sequence[float]] | None = None,
     weights: np.ndarray | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
     The previous animation is kept: the new action is a copy of it in which the parts are replaced,
     or a strip in the NLA editor, with effect only where it lasts. tracked: the sequence that the
@@ -117,15 +112,13 @@ def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
         vectors[name] = to_axis_angle(np.array((above @ rotations[name]).to_quaternion()))
     root, above = bones["root"], bones.get(keyframes.parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
-    names = [keyframes.expression_key(head, k) for k in range(model.n_expression)]
-    expr = np.array([_key_value(head, name) for name in names])
     offsets = [
         value * (key_points(key) - key_points(key.relative_key))
         for key in keyframes.offset_keys(head)
         if (value := _key_value(head, key.name))
     ]
     return FlameFrame(
-        expr=_with_shapes(head, expr, vectors),
+        expr=_expression(head, model.n_expression, vectors),
         rotation=vectors["root"],
         neck_pose=vectors["neck"],
         jaw_pose=vectors["jaw"],
@@ -135,9 +128,11 @@ def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
     )
 
 
-def _with_shapes(head: Any, expr: np.ndarray, turns: dict[str, np.ndarray]) -> np.ndarray:
-    """The expression with what ARKit's sliders (`keyframes.add_shapes`) add to it; turns of jaw and
-    eyes are exchanged for those with them."""
+def _expression(head: Any, count: int, turns: dict[str, np.ndarray]) -> np.ndarray:
+    """(count,) of the head's sliders, with what ARKit's (`keyframes.add_shapes`) add; turns of jaw
+    and eyes are exchanged for those with them."""
+    names = [keyframes.expression_key(head, component) for component in range(count)]
+    expr = np.array([_key_value(head, name) for name in names])
     if not keyframes.has_shapes(head):
         return expr
     keys = head.data.shape_keys.key_blocks
@@ -147,7 +142,7 @@ def _with_shapes(head: Any, expr: np.ndarray, turns: dict[str, np.ndarray]) -> n
     for joint, row in zip(("jaw", "left_eye", "right_eye"), (-9, -6, -3), strict=True):
         slider, bone = from_axis_angle(np.array([added[row : row + 3 or None], turns[joint]]))
         turns[joint] = to_axis_angle(multiply(bone, slider))
-    return np.asarray(expr + added[: len(expr)])
+    return np.asarray(expr + added[:count])
 
 
 def _key_value(head: Any, name: str) -> float:
@@ -254,14 +249,11 @@ def stored_range(head: Any) -> TrainedRange | None:
 
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
     """Part -> how far outside the range the head is as it is posed now (`transfer.outside`)."""
-    keys, bones = head.data.shape_keys.key_blocks, rig.pose.bones
-    names = [keyframes.expression_key(head, k) for k in range(len(trained.middle["face"]))]
-    expr = np.array([keys[name].value if name in keys else 0.0 for name in names])
     turns = {
-        bone: to_axis_angle(np.array(bones[bone].rotation_quaternion))
+        bone: to_axis_angle(np.array(rig.pose.bones[bone].rotation_quaternion))
         for bone in ("jaw", "left_eye", "right_eye")
     }
-    expr, zero = _with_shapes(head, expr, turns), np.zeros(3)
+    expr, zero = _expression(head, len(trained.middle["face"]), turns), np.zeros(3)
     eyes = np.concatenate([turns["left_eye"], turns["right_eye"]])
     frame = FlameFrame(expr, zero, zero, turns["jaw"], zero, eyes)
     return {part: float(values[0]) for part, values in outside([frame], trained).items()}
