@@ -23,9 +23,13 @@ UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def read_hdr(path: Path) -> np.ndarray:
     """(H, W, 3) float32 radiance of a .hdr picture, from the top. Raises StgaError."""
-    import cv2  # where Blender's Python, which reads its worlds itself, may have none
+    import cv2  # Blender, which reads the pictures of its worlds itself, may have none
 
-    found = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    data, flags = np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+    try:
+        found = cv2.imdecode(data, flags)
+    except (cv2.error, MemoryError):  # empty, or claims too many pixels
+        found = None
     if found is None or found.dtype != np.float32:
         raise StgaError(f"{path}: is not a Radiance picture (.hdr), or its pixels are damaged")
     return np.ascontiguousarray(found[..., ::-1])

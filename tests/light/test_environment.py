@@ -55,9 +55,10 @@ def test_hdr_pixels(tmp_path, packed):
     assert found.dtype == np.float32
     scale = np.exp2(np.floor(np.log2(pixels.max(-1, keepdims=True))) + 1) / 256
     assert (np.abs(found - pixels) <= scale).all()
-    for cut in (-1, 40, 10):
-        damaged = tmp_path / "b.hdr"
-        damaged.write_bytes(path.read_bytes()[:cut])
+    whole, damaged = path.read_bytes(), tmp_path / "b.hdr"
+    huge = whole.replace(b"-Y 5 +X 200", b"-Y 999999 +X 999999")
+    for data in (whole[:-1], whole[:40], whole[:10], b"", huge):
+        damaged.write_bytes(data)
         with pytest.raises(StgaError, match=r"b\.hdr"):
             read_hdr(damaged)
 
