@@ -28,7 +28,7 @@ from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
 from stga_addon.light.estimate import Known, estimate_light
-from stga_addon.light.harmonics import even_directions, project, uniform
+from stga_addon.light.harmonics import basis, even_directions, uniform
 from stga_addon.light.lamps import Lamps
 from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Light, Lighting
@@ -73,7 +73,8 @@ def lighting(spec: dict, **options: object) -> Lighting:
             )
         )
     sky = even_directions(600)
-    return Lighting(project(world_radiance(spec, sky), sky), tuple(lights), **options)  # type: ignore[arg-type]
+    world = basis(sky).T @ world_radiance(spec, sky) * (4 * np.pi / len(sky))
+    return Lighting(world, tuple(lights), **options)  # type: ignore[arg-type]
 
 
 def world_radiance(spec: dict, directions: np.ndarray) -> np.ndarray:

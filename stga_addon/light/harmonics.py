@@ -27,11 +27,6 @@ def even_directions(count: int) -> np.ndarray:
     return np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], axis=-1)
 
 
-def project(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(9, C) harmonics of radiance (N, C) seen in evenly spread directions (N, 3)."""
-    return np.asarray(basis(directions).T @ radiance * (4 * np.pi / len(directions)))
-
-
 _SAMPLES = even_directions(64)
 
 
