@@ -14,8 +14,7 @@ def register() -> None:
 
     with ExitStack() as done:
         for part in (properties, preferences, operators, panel, command_line):
-            part.register()
-            done.callback(part.unregister)
+            part.register(done.callback)
         _registered.enter_context(done.pop_all())
 
 

@@ -6,12 +6,9 @@ import bpy
 
 from . import (
     apply_motion,
-    avatar_from_video,
     drive,
-    drop,
     export,
     import_capture,
-    live_session,
     monitor,
     pose,
     render_video,
@@ -22,12 +19,10 @@ from . import (
     train,
     training_python,
 )
-from .common import register_classes, unregister_classes
+from .common import AtEnd, register_classes
 
-MODULES = (avatar_from_video, track, import_capture, select, train, request, training_python, pose)
-MODULES += (show, render_video, apply_motion, drive, export, drop)
-PARTS = (training_python, monitor, pose, render_video)
-"""With handlers, timers or an engine."""
+MODULES = (track, import_capture, select, train, request, training_python, pose, show)
+MODULES += (render_video, apply_motion, drive, export)
 KEYS = (("Pose", "EMPTY", "stga.turn_jaw", "R"), ("3D View", "VIEW_3D", "stga.stop_live", "ESC"))
 """Keymap, its space, operator and key: R turns a jaw about its hinge, Esc over a 3D viewport stops
 the live session."""
@@ -52,8 +47,6 @@ EXPORTS = (
     ("stga.export_head_model", "Head Model for Tracking (STGA)"),
 )
 
-_keymap_items: list[tuple[Any, Any]] = []
-
 
 def _import_menu(menu: Any, context: Any) -> None:
     for operator, text in IMPORTS:
@@ -65,26 +58,18 @@ def _export_menu(menu: Any, context: Any) -> None:
         menu.layout.operator(operator, text=text)
 
 
-def register() -> None:
-    register_classes(CLASSES)
-    bpy.types.TOPBAR_MT_file_import.append(_import_menu)
-    bpy.types.TOPBAR_MT_file_export.append(_export_menu)
+def register(at_end: AtEnd) -> None:
+    register_classes(CLASSES, at_end)
+    for menu, draw in (
+        (bpy.types.TOPBAR_MT_file_import, _import_menu),
+        (bpy.types.TOPBAR_MT_file_export, _export_menu),
+    ):
+        menu.append(draw)
+        at_end(menu.remove, draw)
     keys = bpy.context.window_manager.keyconfigs.addon
     for name, space, operator, key in KEYS if keys is not None else ():  # none without a window
-        keymap = keys.keymaps.new(name=name, space_type=space)
-        _keymap_items.append((keymap, keymap.keymap_items.new(operator, key, "PRESS")))
-    for part in PARTS:
-        part.register()
-
-
-def unregister() -> None:
-    if (running := live_session.session()) is not None:
-        running.stop()
-    for part in reversed(PARTS):
-        part.unregister()
-    for keymap, item in _keymap_items:
-        keymap.keymap_items.remove(item)
-    _keymap_items.clear()
-    bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
-    bpy.types.TOPBAR_MT_file_import.remove(_import_menu)
-    unregister_classes(CLASSES)
+        items = keys.keymaps.new(name=name, space_type=space).keymap_items
+        at_end(items.remove, items.new(operator, key, "PRESS"))
+    for part in (training_python, monitor, pose, render_video):
+        part.register(at_end)
+    at_end(drive.stop_session)

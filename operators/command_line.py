@@ -20,7 +20,7 @@ from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
-from .common import capture_source, file_path, is_head, scene_frames
+from .common import AtEnd, capture_source, file_path, is_head, scene_frames
 from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")
@@ -30,8 +30,6 @@ kernels are compiled."""
 
 if TYPE_CHECKING:
     from ..stga_addon.jobs.avatar_source import OpenHead
-
-_commands: list[Any] = []
 
 
 def _run(arguments: list[str]) -> int:
@@ -118,9 +116,5 @@ def _played(head: Any) -> Played:
     return Played(meshes, motion, training_selection(head))
 
 
-def register() -> None:
-    _commands.append(bpy.utils.register_cli_command("stga", _run))
-
-
-def unregister() -> None:
-    bpy.utils.unregister_cli_command(_commands.pop())
+def register(at_end: AtEnd) -> None:
+    at_end(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("stga", _run))

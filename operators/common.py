@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -15,6 +14,7 @@ from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import FlameSequence
+from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import shape_key_names
@@ -28,30 +28,9 @@ MAX_REPORT_CHARACTERS = 90
 PARENT_FOLDERS = re.compile(r"(?:[A-Za-z]:)?[\\/](?:[^\\/:;,()]+[\\/])+")
 
 Poll = Callable[[Any, Any], bool]
-
-
-def reporting(execute: Callable[[Any, Any], set[str] | None]) -> Callable[[Any, Any], set[str]]:
-    """Decorator: a StgaError becomes the operator's error report, without a traceback, and nothing
-    that is returned becomes FINISHED; the pointer says that Blender is busy, and how far it is
-    (`show_progress`)."""
-
-    def guarded(self: Any, context: Any) -> set[str]:
-        manager, window = context.window_manager, context.window
-        manager.stga_message = ""
-        if window is not None:
-            manager.progress_begin(0, 1)
-            window.cursor_modal_set("WAIT")
-        try:
-            return execute(self, context) or {"FINISHED"}
-        except StgaError as error:
-            self.tell("ERROR", str(error))
-            return {"CANCELLED"}
-        finally:
-            if window is not None:
-                manager.progress_end()
-                window.cursor_modal_restore()
-
-    return guarded
+AtEnd = Callable[..., Any]
+"""`ExitStack.callback` of the extension: takes a function, with its arguments, that undoes what was
+just registered."""
 
 
 class Action:
@@ -72,9 +51,27 @@ class Action:
     def poll(cls, context: Any) -> bool:
         return all(need(cls, context) for need in cls.needs)
 
-    @reporting
-    def execute(self, context: Any) -> set[str] | None:
-        return self.run(context)
+    def execute(self, context: Any) -> set[str]:
+        return self.perform(context, self.run)
+
+    def perform(self, context: Any, work: Callable[[Any], set[str] | None]) -> set[str]:
+        """Do `work(context)`: a StgaError becomes an error report, without a traceback, and nothing
+        that is returned FINISHED; the pointer says that Blender is busy, and how far it is
+        (`show_progress`)."""
+        manager, window = context.window_manager, context.window
+        manager.stga_message = ""
+        if window is not None:
+            manager.progress_begin(0, 1)
+            window.cursor_modal_set("WAIT")
+        try:
+            return work(context) or {"FINISHED"}
+        except (StgaError, Cancelled) as error:
+            self.tell("ERROR", str(error))
+            return {"CANCELLED"}
+        finally:
+            if window is not None:
+                manager.progress_end()
+                window.cursor_modal_restore()
 
     def inform(self: Any, sentence: str) -> None:
         self.report({"INFO"}, sentence)
@@ -96,6 +93,49 @@ class Edit(Action):
     """Mixin of operators that change the file: a step to undo."""
 
     bl_options = frozenset({"REGISTER", "UNDO"})
+
+
+class Stepwise(Action):
+    """Mixin of operators that work beside the interface, a step each timer event, until Esc or the
+    window's end.
+
+    others: what becomes of other events meanwhile
+    """
+
+    others = "RUNNING_MODAL"
+    _steps: Any = None
+
+    def begin(self, context: Any, steps: Iterator[Any], interval_s: float) -> set[str]:
+        """Do the steps, each one until the iterator yields. Closed before its end, it cleans up."""
+        manager = context.window_manager
+        self._steps, self._timer = steps, manager.event_timer_add(interval_s, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: Any, event: Any) -> set[str]:
+        if event.type not in ("ESC", "TIMER"):
+            return {self.others}
+        is_running = False
+        try:
+            if event.type == "ESC":
+                self._steps.close()
+            is_running = next(self._steps, self) is not self
+        except Cancelled:
+            return {"CANCELLED"}
+        except StgaError as error:
+            self.tell("ERROR", str(error))
+            return {"CANCELLED"}
+        finally:
+            if not is_running:
+                context.window_manager.event_timer_remove(self._timer)
+        if is_running:
+            return {"RUNNING_MODAL"}
+        return {"FINISHED" if event.type == "TIMER" else "CANCELLED"}
+
+    def cancel(self, context: Any) -> None:
+        if self._steps is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._steps.close()
 
 
 def call(operator: Any, *arguments: Any, **options: Any) -> set[str]:
@@ -221,9 +261,9 @@ def needs_rig(operator: Any, context: Any) -> bool:
 
 def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
     """Poll: whether there is a head with a FLAME rig or with shape keys of ARKit's names."""
-    if not needs_own_head(operator, context):
-        return False
-    return bool(shape_key_names(context.scene.stga.head)) or needs_rig(operator, context)
+    head = context.scene.stga.head
+    has_shapes = is_head(head) and shape_key_names(head)
+    return (needs_own_head if has_shapes else needs_rig)(operator, context)
 
 
 # Files
@@ -273,15 +313,17 @@ def given_values(operator: Any, kind: Any, *names: str) -> dict[str, Any]:
     return found
 
 
-def register_classes(classes: tuple[type, ...]) -> None:
-    """Register all classes or none."""
-    with ExitStack() as registered:
-        for cls in classes:
-            bpy.utils.register_class(cls)
-            registered.callback(bpy.utils.unregister_class, cls)
-        registered.pop_all()
+# Registration
 
 
-def unregister_classes(classes: tuple[type, ...]) -> None:
-    for cls in reversed(classes):
-        bpy.utils.unregister_class(cls)
+def register_classes(classes: Iterable[type], at_end: AtEnd) -> None:
+    for cls in classes:
+        bpy.utils.register_class(cls)
+        at_end(bpy.utils.unregister_class, cls)
+
+
+def register_handlers(at_end: AtEnd, *handlers: tuple[list[Any], Callable[..., None]]) -> None:
+    """handlers: lists of `bpy.app.handlers`, and what is called from each."""
+    for called, handler in handlers:
+        called.append(handler)
+        at_end(called.remove, handler)

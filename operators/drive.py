@@ -1,20 +1,23 @@
-"""Driving the head: live by a phone or program, with calibration and recording, and by a video of a
-face."""
+"""Driving the head: live by a phone or program, at most one in this Blender, with calibration and
+recording; and by a video of a face."""
 
+import gc
+from collections import deque
 from itertools import count
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import bpy
+from bpy.app.handlers import persistent
 
-from ..stga_addon.driving.head_map import head_map
-from ..stga_addon.driving.live.sources import (
-    LOOPBACK,
-    SOURCES,
-    Receiver,
-    leaves_this_machine,
-)
-from ..stga_addon.driving.open_motion import MAX_SMOOTHING_S, MotionOptions
+from ..stga_addon.driving import open_motion
+from ..stga_addon.driving.head_map import HeadMap, head_map
+from ..stga_addon.driving.inverse import write_performance
+from ..stga_addon.driving.live import sources
+from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
+from ..stga_addon.driving.open_motion import MotionOptions
+from ..stga_addon.driving.performance import FacePacket, Performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
@@ -23,28 +26,20 @@ from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
 from ..stga_addon.training.run.folder import has_run, read_run
-from . import live_session, options
-from .apply_motion import exchange_property, own_range, stay_trained_property
-from .common import (
-    Action,
-    Edit,
-    FileImport,
-    call,
-    file_path,
-    given_values,
-    head_of,
-    need,
-    needs_rig,
-    needs_rig_or_shapes,
-    own_motion,
-    rig_or_none,
-)
-from .live_session import LiveSession, Target, live_options
+from . import common, monitor, options
+from .apply_motion import exchange_property, exchanged_pairs, own_range, stay_trained_property
+from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
 from .options import ONCE
 from .request import idle, start
 from .training_python import training_python
 
 MAX_PORT = 65535
+TICK_S = 1 / 60
+MIN_WAIT_S = 0.001
+PANEL_INTERVAL_S = 0.2
+"""At which the panel's figures are drawn anew."""
+SLOWEST_TICKS = 600
+"""Those of the last ten seconds."""
 
 
 class DriveOptions:
@@ -69,7 +64,7 @@ class DriveOptions:
         "Time constant in seconds; the head follows later by as much",
         min=0.0,
         soft_max=0.2,
-        max=MAX_SMOOTHING_S,
+        max=open_motion.MAX_SMOOTHING_S,
     )
     stay_trained: stay_trained_property()
     mirror: options.field(MotionOptions, "mirror")
@@ -88,7 +83,7 @@ class MeasureRange(Edit, bpy.types.Operator):
     on"""
 
     bl_label = "Measure Trained Range"
-    needs = (needs_rig,)
+    needs = (common.needs_rig,)
 
     def run(self, context: Any) -> None:
         head = head_of(context)
@@ -98,17 +93,146 @@ class MeasureRange(Edit, bpy.types.Operator):
 # Live
 
 
+class LiveSession:
+    """Receives packets, poses the head and records. `monitor`'s timer calls `tick`.
+
+    found, trained: the head's map and the range that its avatar was trained on; None where shape
+    keys of ARKit's names are posed.
+    """
+
+    def __init__(
+        self, scene: str, pose: LivePose, found: HeadMap | None,
+        trained: open_motion.TrainedRange | None, receiver: sources.Receiver,
+    ) -> None:  # fmt: skip
+        self.scene, self.receiver, self.stream = scene, receiver, sources.Stream(receiver.source)
+        self.rest: Performance | None = None
+        self.recording: sources.Recording | None = None
+        self._head, self._map, self._trained = pose, found, trained
+        self._recent: deque[FacePacket] = deque(maxlen=sources.RESTING_PACKETS)
+        self._shown: Performance | None = None
+        self._shown_at = self._drawn_at = float("-inf")
+        self.ticks_s: deque[float] = deque(maxlen=SLOWEST_TICKS)
+
+    def tick(self) -> float | None:
+        """Read what has arrived and pose the head; seconds until the next call, None where the head
+        is gone."""
+        begin = monotonic()
+        if not self._head.is_there or self.scene not in bpy.data.scenes:
+            self.close()
+            return None
+        silent = self.stream.silent_s(begin)
+        if silent is None or silent > sources.REQUEST_INTERVAL_S:
+            self.receiver.ask(begin)
+        newest = None
+        for address, data in self.receiver.read():
+            packet = self.stream.receive(address, data, begin)
+            if packet is None:
+                continue
+            newest = packet
+            self._recent.append(packet)
+            if self.recording is not None:
+                self.recording.add(packet, begin)
+        # Blender crashes where a mesh changes while it renders.
+        if newest is not None and not bpy.app.is_job_running("RENDER"):
+            options, since = self.options(), begin - self._shown_at
+            row = open_motion.corrected(sources.row_of(newest), options, self.rest)
+            self._shown = sources.eased(self._shown, row, since, options.smoothing)
+            self._shown_at = begin
+            self.show_again()
+        if begin - self._drawn_at >= PANEL_INTERVAL_S:
+            self._drawn_at = begin
+            monitor.redraw()
+        took = monotonic() - begin
+        self.ticks_s.append(took)
+        return max(MIN_WAIT_S, TICK_S - took)
+
+    def calibrate(self) -> None:
+        """The performer's face of now is the resting one. Raises StgaError before the first
+        face."""
+        if not self._recent:
+            raise StgaError("Drive: no face has been received yet")
+        self.rest = sources.row_of(*self._recent)
+
+    def show_again(self) -> None:
+        """Pose the head as it was shown last, after an animation has posed it."""
+        if self._shown is None or not self._head.is_there:
+            return
+        options = self.options()
+        if self._map is None:
+            self._head.set_weights(open_motion.at_strength(self._shown, options).weights[0])
+        else:
+            frames = self._map.frames(self._shown)
+            frames, _ = open_motion.finished(frames, options, self._trained)
+            self._head.set_frame(frames[0])
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type == "VIEW_3D":
+                    area.tag_redraw()
+
+    def options(self) -> MotionOptions:
+        """The panel's; the resting face is taken off where it is calibrated."""
+        settings = bpy.data.scenes[self.scene].stga.drive
+        names = ("strength", "smoothing", "mirror", "stay_trained")
+        chosen = {name: getattr(settings, name) for name in names}
+        neutral = "none" if self.rest is None else "calibrated"
+        return MotionOptions(neutral=neutral, exchange=exchanged_pairs(settings), **chosen)
+
+    def close(self) -> None:
+        """Stop listening; the head stays as it is."""
+        global _session
+        self.receiver.close()
+        monitor.unwatch(self)
+        if _session is self:
+            _session = None
+            gc.unfreeze()
+        if _show_again in bpy.app.handlers.frame_change_post:
+            bpy.app.handlers.frame_change_post.remove(_show_again)
+
+    def stop(self) -> None:
+        """Stop listening and give the head back to its own animation."""
+        self.close()
+        if self._head.is_there:
+            self._head.restore()
+            scene = bpy.data.scenes.get(self.scene)
+            if scene is not None:
+                scene.frame_set(scene.frame_current)
+
+
+_session: LiveSession | None = None
+
+
+def session() -> LiveSession | None:
+    """The session that is running, if any."""
+    return _session
+
+
+def stop_session() -> None:
+    if _session is not None:
+        _session.stop()
+
+
+@persistent
+def _show_again(scene: Any, depsgraph: Any) -> None:
+    """The scene's own animation posed the head: pose it live again, so that it does not flicker
+    between two packets.
+
+    Rendered animations keep their own pose.
+    """
+    if _session is not None and scene.name == _session.scene and depsgraph.mode == "VIEWPORT":
+        _session.show_again()
+
+
 class DriveLive(Action, bpy.types.Operator):
     """Let a phone or program move the head; Esc over the viewport stops it. Keyframes are only made
     by Record"""
 
-    needs = (needs_rig_or_shapes,)
+    needs = (common.needs_rig_or_shapes,)
 
     def run(self, context: Any) -> None:
+        global _session
         head, settings = head_of(context), context.scene.stga.drive
-        source = SOURCES[settings.source]
-        leaves = leaves_this_machine(source, settings.address, settings.phone)
-        if leaves and not bpy.app.online_access:
+        source, where = SOURCES[settings.source], (settings.address, settings.phone)
+        if sources.leaves_this_machine(source, *where) and not bpy.app.online_access:
             raise StgaError(
                 f"{source.label}: receives from other devices, but online access is off in "
                 f"Blender's preferences (System > Network); allow it, or listen on {LOOPBACK}"
@@ -121,21 +245,18 @@ class DriveLive(Action, bpy.types.Operator):
             found = head_map(own, head.name)
             show_progress(0.9)
             trained = stored_range(head) or own_range(head, own)
-        receiver = Receiver(source, settings.address, settings.port, settings.phone)
-        live_session.start(Target(context.scene.name, pose, found, trained), receiver)
+        receiver = sources.Receiver(source, settings.address, settings.port, settings.phone)
+        stop_session()
+        _session = LiveSession(context.scene.name, pose, found, trained, receiver)
+        bpy.app.handlers.frame_change_post.append(_show_again)
+        gc.freeze()  # a collection of all that Blender's add-ons hold takes longer than a frame
+        monitor.watch(_session)
 
 
 class _OfSession(Action):
     """Mixin of operators on the session that is running."""
 
-    needs = (
-        need(lambda _: live_session.session(), "No source is listened to; choose Drive Live first"),
-    )
-
-    def run(self, context: Any) -> None:
-        running = live_session.session()
-        assert running is not None
-        self.act(context, running)
+    needs = (need(lambda _: _session, "No source is listened to; choose Drive Live first"),)
 
     def keep_recording(self: Any, context: Any, running: LiveSession, min_faces: int) -> None:
         """End the recording: write the take and apply it. Raises StgaError."""
@@ -145,12 +266,17 @@ class _OfSession(Action):
         folder, warning = takes_folder(context)
         if warning:
             self.warn(warning)
-        path = live_session.write_take(recording, folder)
-        options = live_options(context.scene.stga.drive, recording.rest is not None)
-        names = ("strength", "neutral", "smoothing", "mirror")
+        performance = recording.performance()
+        if performance is None:
+            raise StgaError("Record: fewer than two faces were received; nothing was recorded")
+        names = (f"take_{number:03d}.csv" for number in count(1))
+        path = next(folder / name for name in names if not (folder / name).exists())
+        write_performance(path, performance)
+        options, rested = context.scene.stga.drive, recording.rest is not None
+        names = ("strength", "smoothing", "mirror", "stay_trained")
         chosen = {name: getattr(options, name) for name in names}
-        chosen |= {"start": recording.start, "stay_trained": options.stay_trained or 0.0}
-        call(bpy.ops.stga.apply_motion, filepath=str(path), **chosen)
+        chosen |= {"start": recording.start, "neutral": "calibrated" if rested else "none"}
+        common.call(bpy.ops.stga.apply_motion, filepath=str(path), **chosen)
         self.inform(f"Recorded {len(recording)} faces: {path}")
 
 
@@ -159,7 +285,8 @@ class StopLive(_OfSession, bpy.types.Operator):
 
     bl_label = "Stop"
 
-    def act(self, context: Any, running: LiveSession) -> None:
+    def run(self, context: Any) -> None:
+        running = _session
         running.stop()
         self.keep_recording(context, running, min_faces=2)
 
@@ -170,8 +297,8 @@ class CalibrateLive(_OfSession, bpy.types.Operator):
 
     bl_label = "Set Neutral"
 
-    def act(self, context: Any, running: LiveSession) -> None:
-        running.calibrate()
+    def run(self, context: Any) -> None:
+        _session.calibrate()
 
 
 class RecordLive(_OfSession, Edit, bpy.types.Operator):
@@ -180,9 +307,11 @@ class RecordLive(_OfSession, Edit, bpy.types.Operator):
 
     bl_label = "Record"
 
-    def act(self, context: Any, running: LiveSession) -> None:
+    def run(self, context: Any) -> None:
+        running = _session
         if running.recording is None:
-            running.start_recording(context.scene.frame_current)
+            frame, exchange = context.scene.frame_current, running.options().exchange
+            running.recording = sources.Recording(frame, running.rest, exchange)
             return
         self.keep_recording(context, running, min_faces=0)
         running.show_again()
@@ -196,8 +325,8 @@ class FollowLive(_OfSession, bpy.types.Operator):
     address: options.text("Address", "IP address of the sender")
     subject: options.text("Subject", "Its name for itself")
 
-    def act(self, context: Any, running: LiveSession) -> None:
-        running.stream.follow((self.address, self.subject))
+    def run(self, context: Any) -> None:
+        _session.stream.follow((self.address, self.subject))
 
 
 def takes_folder(context: Any) -> tuple[Path, str]:
@@ -225,7 +354,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
     the head"""
 
     bl_label = "Drive from Video"
-    needs = (idle(Kind.PERFORMANCE), needs_rig_or_shapes)
+    needs = (idle(Kind.PERFORMANCE), common.needs_rig_or_shapes)
 
     avatar: options.field(
         ConvertMotion, "avatar", "Track with Avatar", subtype="DIR_PATH", options=ONCE
@@ -243,7 +372,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         if not is_video(video):
             raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
         folder, _ = takes_folder(context)
-        given, suffix = given_values(self, ConvertMotion, "avatar"), SHAPES_SUFFIX
+        given, suffix = common.given_values(self, ConvertMotion, "avatar"), SHAPES_SUFFIX
         is_trained_on = bool(given) and rig_or_none(head) is not None
         if is_trained_on and read_run(given["avatar"]).capture == Path(head[tags.CAPTURE]):
             suffix, render = ".npz", context.scene.render  # exact, a timestep for each frame

@@ -1,7 +1,7 @@
 """Exports an avatar to the files of other viewers and tools; what the head plays, the cameras and a
 head model for tracking."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -39,19 +39,8 @@ from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
-from . import options
-from .common import (
-    Action,
-    file_path,
-    head_of,
-    need,
-    needs_head,
-    needs_rig,
-    own_motion,
-    reporting,
-    rig_or_none,
-    scene_frames,
-)
+from . import common, options
+from .common import Action, Stepwise, file_path, head_of, need, needs_head, own_motion, scene_frames
 from .options import ONCE
 
 STEP_INTERVAL_S = 0.005
@@ -59,7 +48,7 @@ MAX_WAITING_MESHES = 2
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
-class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
+class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
     """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian
     splats"""
 
@@ -78,7 +67,6 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
     )
     filter_glob: options.file_filter(*SUFFIXES)
     motion_only: options.field(Export, "motion_only")
-    _range: "RangeExport | None" = None
     _is_invoked = False
 
     @property
@@ -126,10 +114,8 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
         if FORMATS[self.format].source != "range":
             frames = range(scene.frame_current, scene.frame_current + 1)
         if self._is_invoked:
-            self._range, manager = RangeExport(head, frames, write), context.window_manager
-            self._timer = manager.event_timer_add(STEP_INTERVAL_S, window=context.window)
-            manager.modal_handler_add(self)
-            return {"RUNNING_MODAL"}
+            steps = self.export(context, path, head, frames, write)
+            return self.begin(context, steps, STEP_INTERVAL_S)
         write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         self.inform(f"Exported to {path}")
         return None
@@ -160,83 +146,49 @@ class ExportAvatar(Action, bpy.types.Operator, ExportHelper):
 
         return path, write
 
-    def modal(self, context: Any, event: Any) -> set[str]:
-        """Export one frame a timer event; Esc cancels."""
-        job = self._range
-        assert job is not None
-        if event.type in ("ESC", "TIMER"):
-            is_running = event.type == "TIMER" and job.step()
-            posed = f" frame {job.done} of {job.total}" if job.total > 1 else ""
-            context.workspace.status_text_set(f"Exporting{posed}   Esc: Cancel")
-            if not is_running:
-                return self._end(context)
-        return {"RUNNING_MODAL"}
+    def export(
+        self, context: Any, path: Path, head: Any, frames: range, write: Callable[[Meshes], Any]
+    ) -> Iterator[None]:
+        """Pose the head, a frame a step, for `write`, which takes the numbered meshes in a thread;
+        restore the scene's frame at the end, and say what has become of the export."""
+        waiting: Queue[Any] = Queue(MAX_WAITING_MESHES)
 
-    def cancel(self, context: Any) -> None:
-        """Blender closes, or the file dialog is left."""
-        if self._range is not None:
-            self._end(context)
+        def meshes() -> Meshes:
+            while (item := waiting.get()) is not None:
+                if isinstance(item, Cancelled):
+                    raise item
+                yield item
 
-    @reporting
-    def _end(self, context: Any) -> set[str]:
-        job = self._range
-        assert job is not None
-        context.window_manager.event_timer_remove(self._timer)
-        context.workspace.status_text_set(None)
-        if job.finish():
-            self.inform(f"Exported to {self.filepath}")
-            return {"FINISHED"}
-        self.report({"WARNING"}, f"Export cancelled after {job.done} of {job.total} frames")
-        return {"CANCELLED"}
-
-
-class RangeExport:
-    """An export of a range of frames beside the user interface: Blender poses the head, a frame
-    whenever `step` is called, and a thread writes the files.
-
-    head: what plays; frames: of the scene; write: takes the numbered meshes, and raises StgaError
-    where it fails.
-    done, total: frames posed so far, and all.
-    """
-
-    def __init__(self, head: Any, frames: range, write: Callable[[Meshes], Any]) -> None:
-        self.done, self.total = 0, len(frames)
-        self._head, self._frames = head, iterate_frames(frames)
-        self._queue: Queue[Any] = Queue(MAX_WAITING_MESHES)
-        self._is_fed = False
+        posing, is_fed, done = iterate_frames(frames), False, 0
         pool = ThreadPoolExecutor(1, "stga export")
-        self._written = pool.submit(write, self._meshes())
+        written = pool.submit(write, meshes())
         pool.shutdown(wait=False)
-
-    def step(self) -> bool:
-        """Pose the next frame if the thread has room for it; whether the thread is still at
-        work."""
-        if not self._is_fed and not self._queue.full():
-            frame = next(self._frames, None)
-            self._is_fed = frame is None
-            self._queue.put(None if frame is None else (frame, evaluated_vertices(self._head)))
-            self.done += frame is not None
-        return not self._written.done()
-
-    def finish(self) -> bool:
-        """End the export, restore the scene's frame; whether it is whole. Raises what the thread
-        failed with."""
-        self._frames.close()
-        if not self._is_fed:
+        try:
+            while not written.done():
+                if not is_fed and not waiting.full():
+                    frame = next(posing, None)
+                    is_fed = frame is None
+                    waiting.put(None if is_fed else (frame, evaluated_vertices(head)))
+                    done += not is_fed
+                posed = f" frame {done} of {len(frames)}" if len(frames) > 1 else ""
+                context.workspace.status_text_set(f"Exporting{posed}   Esc: Cancel")
+                yield
+        except GeneratorExit:  # what is posed as a whole is written as a whole
+            pass
+        finally:
+            posing.close()
+            context.workspace.status_text_set(None)
+        if not is_fed:
             with suppress(Empty):
                 while True:
-                    self._queue.get_nowait()
-            self._queue.put(Cancelled())
-        with suppress(Cancelled):
-            self._written.result()
-            return True
-        return False
-
-    def _meshes(self) -> Meshes:
-        while (item := self._queue.get()) is not None:
-            if isinstance(item, Cancelled):
-                raise item
-            yield item
+                    waiting.get_nowait()
+            waiting.put(Cancelled())
+        try:
+            written.result()
+            self.inform(f"Exported to {path}")
+        except Cancelled:
+            sentence = f"Export cancelled after {done} of {len(frames)} frames"
+            self.report({"WARNING"}, sentence)
 
 
 @lru_cache(maxsize=8)
@@ -270,7 +222,7 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
 def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
     """FLAME parameters of what the head plays; None without a rig, or, after saying why, where they
     would not give the scene's meshes."""
-    if rig_or_none(head) is None:
+    if common.rig_or_none(head) is None:
         return None
     reasons: list[str] = []
     motion = None
@@ -305,7 +257,7 @@ class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
     ARKit's 52 shapes"""
 
     bl_label = "Export ARKit Curves"
-    needs = (needs_rig,)
+    needs = (common.needs_rig,)
 
     filepath: options.path("File", "CSV file in Live Link Face's layout", options=ONCE)
     filename_ext = ".csv"

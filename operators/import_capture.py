@@ -1,7 +1,9 @@
 """The Capture step: imports captures, FLAME motions and mesh sequences as animated heads, and opens
-the capture of a generated person that the complete edition brings."""
+the capture of a generated person that the complete edition brings; files dropped into the 3D
+viewport."""
 
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
 from ..stga_addon.errors import StgaError
+from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
@@ -23,9 +26,10 @@ from ..stga_addon.scene.objects import (
 )
 from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.run.folder import has_run
 from . import monitor, options
-from .common import Edit, FileImport, file_path, flame_model_path, is_head, need, package
+from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package
 from .options import ONCE
 from .pose import begin_sliders
 from .training_python import begin_preparing
@@ -35,6 +39,7 @@ FOLDERS_ABOVE_FILE = 3
 DEMO = Path(__file__).parents[1] / "demo_capture"
 """In the complete edition; the others have none."""
 DEMO_MINUTES = 1.0
+MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
 
 class ImportCapture(Edit, bpy.types.Operator, FileImport):
@@ -137,14 +142,10 @@ class OpenDemo(Edit, bpy.types.Operator):
 
 
 def bring_in(
-    operator: Any,
-    context: Any,
-    source: Path,
-    flame: str = "",
-    principal_point: str = DEFAULT_PRINCIPAL_POINT,
-    set_up_scene: bool = False,
+    operator: Any, context: Any, source: Path, flame: str = "",
+    principal_point: str = DEFAULT_PRINCIPAL_POINT, set_up_scene: bool = False,
     correctives: str = "all",
-) -> None:
+) -> None:  # fmt: skip
     """Import what `open_capture` reads from `source`, and make it the scene's head. Raises
     StgaError."""
     warn, scene, objects = operator.warn, context.scene, context.view_layer.objects
@@ -168,8 +169,14 @@ def bring_in(
     if objects.get(head.name) is head:
         head.select_set(True)
         objects.active = head
-    if is_first:  # later on, a cube that is shown was shown by the user
-        _hide_start_up_cube(context)
+    cube = objects.get("Cube") if is_first else None  # later on, the user shows it
+    if cube is not None and not cube.library and cube.type == "MESH":
+        # hidden where it is as it came with Blender: 2 m wide, it would enclose the head
+        is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
+        is_whole = len(cube.data.vertices) == 8 and tuple(cube.dimensions) == (2.0, 2.0, 2.0)
+        if is_whole and not is_moved:
+            cube.hide_set(True)
+            cube.hide_render = True
     middle = central(cameras)
     for kind in COLLECTIONS:
         show_kind(head.parent, kind, context.view_layer, False)
@@ -186,13 +193,54 @@ def bring_in(
     begin_preparing()
 
 
-def _hide_start_up_cube(context: Any) -> None:
-    """Hide the cube of Blender's start-up scene where it is as it came: 2 m wide, it would enclose
-    the head."""
-    cube = context.view_layer.objects.get("Cube")
-    if cube is None or cube.library or cube.type != "MESH" or len(cube.data.vertices) != 8:
-        return
-    is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
-    if not is_moved and tuple(cube.dimensions) == (2.0, 2.0, 2.0):
-        cube.hide_set(True)
-        cube.hide_render = True
+# Files that are dropped
+
+
+class OpenNpz(Edit, bpy.types.Operator):
+    """Open an .npz file by its content: show an avatar, apply a FLAME motion to the head, or import
+    it as a new one"""
+
+    bl_label = "Open Avatar or Motion"
+    bl_options = Edit.bl_options | {"INTERNAL"}
+
+    filepath: options.path("File", "Avatar file or FLAME parameters (.npz)", options=ONCE)
+
+    def run(self, context: Any) -> set[str]:
+        path = file_path(self.filepath, "avatar or motion")
+        try:
+            with zipfile.ZipFile(path) as archive:
+                names = {name.removesuffix(".npy") for name in archive.namelist()}
+        except (OSError, zipfile.BadZipFile) as error:
+            problem = getattr(error, "strerror", None) or error
+            raise StgaError(f"{path}: cannot be read as an .npz file ({problem})") from error
+        is_avatar = {"header", "xyz"} <= names
+        if not is_avatar and not names & MOTION_FIELDS:
+            neither = (
+                f"an avatar (no header) nor a FLAME motion (none of {', '.join(FRAME_FIELDS)})"
+            )
+            raise StgaError(f"{path}: is neither {neither}")
+        if is_avatar and not is_head(context.scene.stga.head):
+            raise StgaError(f"{path}: is an avatar, which needs a head; import a capture first")
+        applies = not is_avatar and bpy.ops.stga.apply_motion.poll()
+        motion = bpy.ops.stga.apply_motion if applies else bpy.ops.stga.import_motion
+        return call(bpy.ops.stga.show_avatar if is_avatar else motion, filepath=str(path))
+
+
+def _handler(name: str, label: str, operator: str, *suffixes: str) -> type:
+    """A file handler that gives files which are dropped into the 3D viewport to an operator."""
+
+    def poll_drop(cls: type, context: Any) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+    about = {"bl_idname": f"STGA_FH_{name}", "bl_label": f"{label} (STGA)"}
+    about |= {"bl_import_operator": f"stga.{operator}", "bl_file_extensions": ";".join(suffixes)}
+    about |= {"poll_drop": classmethod(poll_drop), "__module__": __name__}
+    return type(f"{name.title()}Drop", (bpy.types.FileHandler,), about)
+
+
+# Blender asks which handler to use for .json files, which captures have too.
+VideoDrop = _handler("video", "Avatar from Video", "avatar_from_video", *VIDEO_SUFFIXES)
+CaptureDrop = _handler("capture", "Head Capture", "import_capture", ".json")
+NpzDrop = _handler("npz", "Avatar or FLAME Motion", "open_npz", ".npz")
+PlyDrop = _handler("ply", "Gaussian Splats", "import_ply", ".ply")
+MotionDrop = _handler("performance", "Face Performance", "apply_motion", ".csv", ".json", ".txt")

@@ -10,7 +10,6 @@ import shutil
 import traceback
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from subprocess import Popen
@@ -47,7 +46,7 @@ from ..stga_addon.worker.status import (
     refuse_running_worker,
     request_cancel,
 )
-from .common import TAB, is_head
+from .common import TAB, AtEnd, is_head, register_handlers
 from .results import CHANGED, PLACES, SHOW, load_avatar, stop_loading
 
 MAX_SIDEBAR_ATTEMPTS = 10
@@ -58,8 +57,8 @@ tracking's picture."""
 
 _states: dict[tuple[int, Kind], RequestState] = {}
 """Session id of a scene and kind -> its request."""
-_curves: dict[Path, Curve | None] = {}
-"""Run or capture folder -> its curve as last read."""
+curves: dict[Path, Curve | None] = {}
+"""Run or capture folder -> its curve as last read, or the picture of a tracking."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
 _watched: list[Any] = []
@@ -89,22 +88,16 @@ def unwatch(thing: Any) -> None:
 def state_of(scene: Any, kind: Kind) -> RequestState:
     """The scene's request as the timer last saw it; without a window, where no timer runs, as it
     is."""
-    state = _states.get((scene.session_uid, kind))
     if has_timer():
+        state = _states.get((scene.session_uid, kind))
         if state is None:
             _start_timer()
         return state or RequestState(kind)
-    state = state or _stored_state(scene, kind)
+    state = _last_state(scene, kind)
     if state.folder is None:
         return state
     folder = _locate(scene, state)
     return replace(state, folder=folder, snapshot=inspect_status(folder))
-
-
-def curve(run: Path) -> Curve | None:
-    """The curve of a run as the timer last read it, or the picture of a tracking; None before there
-    is one."""
-    return _curves.get(run)
 
 
 def follow(
@@ -115,40 +108,29 @@ def follow(
     _processes.pop(folder, None)
     if process is not None:
         _processes[folder] = process
-    _handle(scene, kind, states.Started(subject, folder))
+    handle(scene, kind, states.Started(subject, folder))
 
 
 def finish(scene: Any, kind: Kind) -> RequestState:
     """Bring the result of a request that was waited for into the scene; what `Train` made is
     stored, not shown."""
     state = _states[scene.session_uid, kind]
-    state = _handle(scene, kind, _read_status(scene, state, kind != Kind.TRAINING))
+    shows = kind != Kind.TRAINING
+    state = handle(scene, kind, replace(_read_status(scene, state), show_result=shows))
     while state.loading is not None:
-        state = _handle(scene, kind, states.SceneFree())
+        state = handle(scene, kind, states.SceneFree())
         if state.loading is not None:
             sleep(SLICE_INTERVAL_S)
         elif state.has_result:
-            state = _handle(scene, kind, _read_status(scene, state, True))
+            state = handle(scene, kind, replace(_read_status(scene, state), show_result=True))
     return state
-
-
-def cancel(scene: Any, kind: Kind) -> None:
-    """Raises StgaError where the request's folder cannot be written."""
-    _handle(scene, kind, states.CancelAsked())
-    check_now(scene, kind)
-
-
-def dismiss(scene: Any, kind: Kind) -> None:
-    """Forget the request and remove its files. Raises StgaError where its worker is running, or
-    they cannot be."""
-    _handle(scene, kind, states.Dismissed())
 
 
 def check_now(scene: Any, kind: Kind) -> None:
     """Read the status of a request at once, and again as long as something is expected."""
     state = _read_scene(scene, kind)
     if state.folder is not None:
-        _handle(scene, kind, _read_status(scene, state))
+        handle(scene, kind, _read_status(scene, state))
     _start_timer()
 
 
@@ -199,16 +181,16 @@ def _check(scene: Any, kind: Kind) -> float | None:
         if state.folder is None or state.stopped:
             return None
         if not state.building:
-            state = _handle(scene, kind, _read_status(scene, state))
+            state = handle(scene, kind, _read_status(scene, state))
         if state.loading is not None and not bpy.app.is_job_running("RENDER"):
             changed = CHANGED[kind](scene, state) if kind in CHANGED else None
             # Blender crashes where a mesh changes while it renders, or in Edit Mode.
             if changed is None or changed.mode != "EDIT":
-                state = _handle(scene, kind, states.SceneFree())
+                state = handle(scene, kind, states.SceneFree())
         return state.interval_s
     except Exception as error:
         sentence = f"Monitoring stopped after an unexpected {_describe(error)}"
-        _handle(scene, kind, states.Failed(sentence, stops=True))
+        handle(scene, kind, states.Failed(sentence, stops=True))
         return None
 
 
@@ -226,18 +208,27 @@ def _start_timer() -> None:
 # What is read
 
 
-def _stored_state(scene: Any, kind: Kind) -> RequestState:
-    """A request that was not seen yet, as it is stored."""
-    state = RequestState(kind)
-    if kind in STORED:
-        subject, result_shown = _read_stored(scene, kind)
-        state = replace(state, subject=subject, result_shown=result_shown)
-    return replace(state, folder=_locate(scene, state))
+def _last_state(scene: Any, kind: Kind) -> RequestState:
+    """A request as it was last seen, at first as it is stored."""
+    state = _states.get((scene.session_uid, kind))
+    if state is None:
+        state = RequestState(kind)
+        if kind in STORED:
+            stored = _read_stored(scene, kind)
+            state = replace(state, subject=stored.subject, result_shown=stored.result_shown)
+        state = replace(state, folder=_locate(scene, state))
+    return state
 
 
-def _read_stored(scene: Any, kind: Kind) -> tuple[Path | None, bool]:
+def _read_stored(scene: Any, kind: Kind) -> states.SceneRead:
     path, result_shown = (getattr(scene.stga, name) for name in PLACES[kind])
-    return Path(path) if path else None, result_shown
+    return states.SceneRead(Path(path) if path else None, result_shown)
+
+
+def _read_scene(scene: Any, kind: Kind) -> RequestState:
+    """Compare the request's state with what is stored in the scene."""
+    stored = kind in STORED
+    return handle(scene, kind, _read_stored(scene, kind)) if stored else _last_state(scene, kind)
 
 
 def _locate(scene: Any, state: RequestState) -> Path | None:
@@ -252,29 +243,16 @@ def _locate(scene: Any, state: RequestState) -> Path | None:
     return named
 
 
-def _read_scene(scene: Any, kind: Kind) -> RequestState:
-    """Compare the request's state with what is stored in the scene."""
-    key = scene.session_uid, kind
-    if key not in _states:
-        _states[key] = _stored_state(scene, kind)
-    elif kind in STORED:
-        return _handle(scene, kind, states.SceneRead(*_read_stored(scene, kind)))
-    return _states[key]
-
-
-def _read_status(
-    scene: Any, state: RequestState, show_result: bool | None = None
-) -> states.StatusRead:
-    folder = _locate(scene, state)
-    assert folder is not None
+def _read_status(scene: Any, state: RequestState) -> states.StatusRead:
+    folder, settings = _locate(scene, state), scene.stga
+    snapshot = inspect_status(folder)
     if state.kind not in STORED:
-        return states.StatusRead(folder, inspect_status(folder))
-    settings, run = scene.stga, replace(state, folder=folder).run
+        return states.StatusRead(folder, snapshot)
+    run = replace(state, folder=folder).run
     tracked = folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0]
     made = (folder / PICTURE, folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)
     files = RunFiles(_stamp(tracked) if state.kind == Kind.AVATAR else None, *map(_stamp, made))
-    shown = settings.show_result if show_result is None else show_result
-    return states.StatusRead(folder, inspect_status(folder), files, settings.live_preview, shown)
+    return states.StatusRead(folder, snapshot, files, settings.live_preview, settings.show_result)
 
 
 def _stamp(path: Path) -> states.Stamp | None:
@@ -303,18 +281,18 @@ def _read_curve(run: Path, folder: Path | None) -> Curve | None:
 # Effects
 
 
-def _handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
+def handle(scene: Any, kind: Kind, event: states.Event) -> RequestState:
     """Feed the event to the request's state, carry out the effects, and feed their answers in turn.
 
-    Raises StgaError where files cannot be written or removed; the state is that of before then.
+    Raises StgaError where files cannot be written or removed, or a worker is still at work in those
+    to remove; the state is that of before then.
     """
-    key = scene.session_uid, kind
-    state, effects = transition(_states.get(key) or _stored_state(scene, kind), event)
+    state, effects = transition(_last_state(scene, kind), event)
     answers = [_carry_out(scene, state, effect) for effect in effects]
-    _states[key] = state
+    _states[scene.session_uid, kind] = state
     for answer in answers:
         if answer is not None:
-            state = _handle(scene, kind, answer)
+            state = handle(scene, kind, answer)
     return state
 
 
@@ -337,7 +315,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             except Exception as error:
                 return states.Failed(f"Unexpected {_describe(error)}")
         case states.ReadCurve(run):
-            _curves[run] = _read_curve(run, state.folder)
+            curves[run] = _read_curve(run, state.folder)
         case states.StopWorker(folder):
             request_cancel(folder)
         case states.KillWorker(folder):
@@ -363,7 +341,7 @@ def _remove(kind: Kind, folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     _processes.pop(folder, None)
     for drawn in (folder.parent, folder.parent / RUN_FOLDER):
-        _curves.pop(drawn, None)
+        curves.pop(drawn, None)
 
 
 def push_undo() -> None:
@@ -384,15 +362,15 @@ def redraw() -> None:
 def show_panel() -> None:
     """Open the sidebar at the add-on's tab, from a timer and for a few seconds at most, where there
     is a window."""
+    attempts = count(1)
+
+    def attempt() -> float | None:
+        screens = [window.screen for window in bpy.context.window_manager.windows]
+        is_over = open_sidebar(TAB, screens) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
+        return None if is_over else CHECK_INTERVAL_S
+
     if has_timer():
-        attempt = partial(_open_sidebar, count(1))
         bpy.app.timers.register(attempt, first_interval=CHECK_INTERVAL_S)
-
-
-def _open_sidebar(attempts: Any) -> float | None:
-    screens = [window.screen for window in bpy.context.window_manager.windows]
-    is_over = open_sidebar(TAB, screens) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
-    return None if is_over else CHECK_INTERVAL_S
 
 
 # Files that are opened and saved
@@ -439,13 +417,6 @@ def _rebase(old: str, new: str) -> None:
 
 
 @persistent
-def _after_append(_: Any) -> None:
-    for scene in bpy.data.scenes:
-        if scene.library is None:
-            _adopt(scene)
-
-
-@persistent
 def _after_load(_: Any) -> None:
     _close()
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
@@ -454,20 +425,22 @@ def _after_load(_: Any) -> None:
     _start_timer()
 
 
-def _adopt(scene: Any) -> None:
+@persistent
+def _after_append(_: Any) -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
     `stga demo` does, or into which an avatar was appended."""
-    settings = scene.stga
-    heads = [thing for thing in scene.objects if is_head(thing)]
-    shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
-    if settings.head is None and len(heads) == 1:
-        settings.head = heads[0]
-        show_panel()
-        if settings.splats is None and len(shown) == 1:
-            settings.splats = shown[0]
-            settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
-    if not has_run(Path(bpy.path.abspath(settings.run_folder))):
-        settings.run_folder = run_of(settings.avatar) or settings.run_folder
+    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+        settings = scene.stga
+        heads = [thing for thing in scene.objects if is_head(thing)]
+        shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
+        if settings.head is None and len(heads) == 1:
+            settings.head = heads[0]
+            show_panel()
+            if settings.splats is None and len(shown) == 1:
+                settings.splats = shown[0]
+                settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
+        if not has_run(Path(bpy.path.abspath(settings.run_folder))):
+            settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
 
 def run_of(avatar: str) -> str:
@@ -486,24 +459,16 @@ def _after_update(scene: Any, *_: Any) -> None:
             setattr(scene.stga, name, None)
 
 
-HANDLERS = (
-    (bpy.app.handlers.load_post, _after_load),
-    (bpy.app.handlers.save_pre, _before_save),
-    (bpy.app.handlers.save_post, _after_save),
-    (bpy.app.handlers.depsgraph_update_post, _after_update),
-    (APPENDED, _after_append),
-)
-
-
-def register() -> None:
-    for handlers, handler in HANDLERS:
-        handlers.append(handler)
+def register(at_end: AtEnd) -> None:
+    handlers = bpy.app.handlers
+    files = (handlers.load_post, _after_load), (APPENDED, _after_append)
+    saving = (handlers.save_pre, _before_save), (handlers.save_post, _after_save)
+    register_handlers(at_end, *files, *saving, (handlers.depsgraph_update_post, _after_update))
+    at_end(_end)
     _start_timer()
 
 
-def unregister() -> None:
-    for handlers, handler in HANDLERS:
-        handlers.remove(handler)
+def _end() -> None:
     for timer in (tick, push_undo):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
@@ -512,5 +477,5 @@ def unregister() -> None:
         if kind == Kind.VIDEO and state.folder is not None:
             with suppress(StgaError):  # its worker is running
                 _remove(kind, state.folder)
-    for known in (_states, _curves, _processes):
+    for known in (_states, curves, _processes):
         known.clear()

@@ -21,8 +21,18 @@ from ..stga_addon.scene.rig.keyframes import (
     head_shapes,
     posing_bone,
 )
-from . import live_session, monitor
-from .common import Edit, capture_source, flame_motion, head_of, needs_rig, polled, rig_or_none
+from . import drive, monitor
+from .common import (
+    AtEnd,
+    Edit,
+    capture_source,
+    flame_motion,
+    head_of,
+    need,
+    needs_rig,
+    register_handlers,
+    rig_or_none,
+)
 
 POLL_INTERVAL_S = 0.3
 Shapes = tuple[HeadMap, np.ndarray, np.ndarray]
@@ -89,10 +99,13 @@ class AddArkitControls(Edit, bpy.types.Operator):
 
     bl_label = "Add Face Sliders"
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        has_names = EXPRESSION_NAMES in (context.scene.stga.head or {})
-        return needs_rig(cls, context) and polled(cls, not has_names, "The head has its sliders")
+    needs = (
+        needs_rig,
+        need(
+            lambda context: EXPRESSION_NAMES not in context.scene.stga.head,
+            "The head has its sliders",
+        ),
+    )
 
     def run(self, context: Any) -> None:
         head = head_of(context)
@@ -142,7 +155,7 @@ class _Sliders:
                 head_map(flame_motion(self._head, *source), self._head)
 
     def tick(self) -> float | None:
-        is_driven = live_session.session() is not None  # which further sliders would end
+        is_driven = drive.session() is not None  # which further sliders would end
         if self._thread.is_alive() or is_driven or bpy.app.is_job_running("RENDER"):
             return POLL_INTERVAL_S
         preparing.discard(self._head)
@@ -166,9 +179,5 @@ def _after_load(_: Any) -> None:
             begin_sliders(scene.stga.head)
 
 
-def register() -> None:
-    bpy.app.handlers.load_post.append(_after_load)
-
-
-def unregister() -> None:
-    bpy.app.handlers.load_post.remove(_after_load)
+def register(at_end: AtEnd) -> None:
+    register_handlers(at_end, (bpy.app.handlers.load_post, _after_load))

@@ -5,7 +5,7 @@ import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +13,10 @@ import bpy
 
 from ..stga_addon import __version__
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.perform import (
-    check_request,
-    perform_in_folder,
-    request_folder,
-    worker_arguments,
-    write_request,
-)
-from ..stga_addon.jobs.table import (
-    DISMISSIBLE,
-    JOBS,
-    KINDS,
-    STORED,
-    TRAINS,
-    TRANSIENT,
-    Kind,
-    Request,
-)
+from ..stga_addon.jobs import perform, table
+from ..stga_addon.jobs.monitor_state import CancelAsked, Dismissed
+from ..stga_addon.jobs.table import KINDS, Kind
+from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerState, failure_report
 from ..stga_addon.worker.training_python import missing_packages
@@ -40,7 +27,11 @@ from .training_python import training_python
 
 
 def start(
-    scene: Any, request: Request, python: str | None, folder: Path | None = None, wait: bool = False
+    scene: Any,
+    request: table.Request,
+    python: str | None,
+    folder: Path | None = None,
+    wait: bool = False,
 ) -> bool:
     """Start a worker for a request about the scene, whose result the monitor brings into the scene.
 
@@ -50,24 +41,23 @@ def start(
     to fail, while a worker is there, and where the interpreter cannot be started; where it was
     waited for, also with the error of the worker or of its result.
     """
-    job = JOBS[type(request)]
+    job = table.JOBS[type(request)]
     kind, subject = job.kind, getattr(request, job.subject)
-    assert kind is not None
-    if folder is None and kind in STORED:
-        folder = request_folder(subject)
+    if folder is None and kind in table.STORED:
+        folder = perform.request_folder(subject)
     folder = folder or Path(tempfile.mkdtemp(prefix="stga_"))
     try:
-        check_request(request)
-        write_request(folder, request)
-        arguments = worker_arguments(folder)
+        perform.check_request(request)
+        perform.write_request(folder, request)
+        arguments = perform.worker_arguments(folder)
         process = None if python is None else start_worker(folder, python, arguments)
     except StgaError:
-        if kind in TRANSIENT:
+        if kind in table.TRANSIENT:
             shutil.rmtree(folder, ignore_errors=True)
         raise
     monitor.follow(scene, kind, subject, folder, process)
     if process is None:
-        _perform_here(folder)
+        perform.perform_in_folder(folder, also=_show)
     elif not wait and monitor.has_timer():
         monitor.check_now(scene, kind)
         return False
@@ -79,24 +69,17 @@ def start(
     shown = monitor.finish(scene, kind)
     if last.state.failed or shown.error:
         raise StgaError(shown.error or last.status.error)
-    if last.state == WorkerState.CANCELLED and kind not in TRAINS:  # which keep the avatar so far
+    if (
+        last.state == WorkerState.CANCELLED and kind not in table.TRAINS
+    ):  # which keep the avatar so far
         raise StgaError("The worker was cancelled")
     return True
 
 
-def _perform_here(folder: Path) -> None:
-    """Carry out the request in Blender's own Python, with Blender's progress at the pointer."""
-    manager = bpy.context.window_manager
-
-    def show(progress: Any) -> bool:
-        manager.progress_update(100 * progress.share)
-        return False
-
-    manager.progress_begin(0, 100)
-    try:
-        perform_in_folder(folder, also=show)
-    finally:
-        manager.progress_end()
+def _show(progress: Any) -> bool:
+    """Show at the pointer how far a request is that Blender's own Python carries out."""
+    show_progress(progress.share)
+    return False
 
 
 def python_of(operator: Any, context: Any) -> str | None:
@@ -110,21 +93,17 @@ def python_of(operator: Any, context: Any) -> str | None:
     return training_python(context, operator.python)
 
 
-def _running(context: Any) -> Callable[[Kind], bool]:
-    return lambda kind: monitor.state_of(context.scene, kind).is_running
-
-
-def _ended(context: Any) -> Callable[[Kind], bool]:
-    return lambda kind: monitor.state_of(context.scene, kind).can_be_dismissed
+def _states(context: Any, kinds: Iterable[Kind] = Kind) -> list[Any]:
+    return [monitor.state_of(context.scene, kind) for kind in kinds]
 
 
 def idle(*kinds: Kind) -> Poll:
     """Poll: whether no request of these kinds is running."""
 
     def poll(operator: Any, context: Any) -> bool:
-        kind = next(filter(_running(context), kinds), None)
-        message = "" if kind is None else f"{KINDS[kind].label} is running; wait, or cancel it"
-        return polled(operator, kind is None, message)
+        running = [each.kind for each in _states(context, kinds) if each.is_running]
+        message = f"{KINDS[running[0]].label} is running; wait, or cancel it" if running else ""
+        return polled(operator, not running, message)
 
     return poll
 
@@ -143,30 +122,38 @@ class Cancel(Action, bpy.types.Operator):
     def description(cls, context: Any, properties: Any) -> str:
         return KINDS[Kind(properties.request)].cancel
 
-    needs = (need(lambda context: any(map(_running(context), Kind)), "Nothing is running"),)
+    needs = (
+        need(
+            lambda context: any(each.is_running for each in _states(context)), "Nothing is running"
+        ),
+    )
 
     def run(self, context: Any) -> None:
         kind = Kind(self.request)
-        if not _running(context)(kind):
+        if not monitor.state_of(context.scene, kind).is_running:
             raise StgaError(f"{KINDS[kind].label} is not running")
-        monitor.cancel(context.scene, kind)
+        monitor.handle(context.scene, kind, CancelAsked())
+        monitor.check_now(context.scene, kind)
 
 
 class Dismiss(Action, bpy.types.Operator):
     """Remove status and log of a request that has ended; what it made stays, such as a run with its
     checkpoints"""
 
-    request: _kind_property(DISMISSIBLE)
+    request: _kind_property(table.DISMISSIBLE)
 
     needs = (
-        need(lambda context: any(map(_ended(context), DISMISSIBLE)), "Nothing has ended here"),
+        need(
+            lambda context: any(each.can_be_dismissed for each in _states(context)),
+            "Nothing has ended here",
+        ),
     )
 
     def run(self, context: Any) -> None:
         kind = Kind(self.request)
-        if not _ended(context)(kind):
+        if not monitor.state_of(context.scene, kind).can_be_dismissed:
             raise StgaError(f"{KINDS[kind].label} is running, or was never asked for in this scene")
-        monitor.dismiss(context.scene, kind)
+        monitor.handle(context.scene, kind, Dismissed())
 
 
 class CopyReport(Action, bpy.types.Operator):

@@ -35,10 +35,6 @@ Answer = SliceBuilt | Shown | None
 """What a function of `SHOW` returns; None: the result is still being read."""
 
 
-def _head(scene: Any, state: RequestState) -> Any:
-    return scene.stga.head
-
-
 def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
     """Call an operator, which reports in the window that shows the scene, if there is one; undo
     takes it back there."""
@@ -60,12 +56,12 @@ _loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
 
 def load_avatar(scene: Any, path: Path) -> None:
     """Read an avatar file in a thread, for `SHOW`."""
+    _loading[scene.session_uid] = _pool.submit(_read, path)
 
-    def load() -> tuple[Avatar, SplatAttributes]:
-        avatar = read_avatar(path)
-        return avatar, avatar_attributes(avatar)
 
-    _loading[scene.session_uid] = _pool.submit(load)
+def _read(path: Path) -> tuple[Avatar, SplatAttributes]:
+    avatar = read_avatar(path)
+    return avatar, avatar_attributes(avatar)
 
 
 def stop_loading() -> None:
@@ -76,7 +72,6 @@ def stop_loading() -> None:
 
 def _run(state: RequestState) -> Path:
     """The run that is trained, as the scene names it."""
-    assert state.subject is not None
     return state.subject / RUN_FOLDER if state.kind == Kind.AVATAR else state.subject
 
 
@@ -125,15 +120,11 @@ def _present(
 def _show_made(scene: Any, state: RequestState) -> Answer:
     """Import the capture once it is tracked; then show the previews and the avatar, at last on the
     head that training refined."""
-    assert state.folder is not None
-    assert state.loading is not None
     head = scene.stga.head
     if state.loading.name == CAPTURE_FOLDER:
         scene.stga.run_folder = str(_run(state))
-        if is_head(head) and Path(head[tags.CAPTURE]) == state.loading:
-            return Shown()
-        request: Any = read_request(state.folder)
-        return _import(scene, state.loading, request.track.model)
+        is_there = is_head(head) and Path(head[tags.CAPTURE]) == state.loading
+        return Shown() if is_there else _import(scene, state)
     answer = _show_avatar(scene, state)
     is_refined = state.loading.name == AVATAR and state.files.tracking is not None
     if isinstance(answer, Shown) and is_refined:
@@ -144,7 +135,6 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
 
 def _store_light(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats the light that is now in the avatar of the run."""
-    assert state.subject is not None
     shown = scene.stga.splats
     if shown is None or not store_light(shown, read_avatar(state.subject / AVATAR)):
         problem = "its avatar is not the one that the scene shows; show it again"
@@ -155,19 +145,16 @@ def _store_light(scene: Any, state: RequestState) -> Answer:
 # Captures
 
 
-def _import_tracked(scene: Any, state: RequestState) -> Answer:
-    assert state.folder is not None
-    return _import(scene, state.place, getattr(read_request(state.folder), "model", None))
-
-
-def _import(scene: Any, capture: Path, model: Path | None) -> Shown:
-    """model: what it was tracked with; None: what lies in the capture."""
+def _import(scene: Any, state: RequestState) -> Shown:
+    """Import the capture with the model that it was tracked with, or that which lies in it."""
+    request: Any = read_request(state.folder)
+    capture = state.loading if state.kind == Kind.AVATAR else state.place
+    model = getattr(getattr(request, "track", request), "model", None)
     flame = str(model) if model is not None and is_flame(capture) else ""
     return _operate(scene, bpy.ops.stga.import_capture, directory=str(capture), flame=flame)
 
 
 def _fill_effects(scene: Any, state: RequestState) -> Answer:
-    assert state.folder is not None
     settings = scene.stga
     found: Any = read_result(state.folder)
     settings.preset_timing = json.dumps(dict(found.seconds))
@@ -182,7 +169,6 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
 
 def _select_for_take(scene: Any, state: RequestState) -> Answer:
     """Select what extending the run by the head's take would train."""
-    assert state.folder is not None
     head = scene.stga.head
     found: Any = read_result(state.folder)
     if not is_head(head) or Path(head[tags.CAPTURE]) != state.subject:
@@ -200,15 +186,14 @@ def _apply_performance(scene: Any, state: RequestState) -> Answer:
 
 
 SHOW = {
-    Kind.TRAINING: _show_avatar, Kind.TRACKING: _import_tracked, Kind.AVATAR: _show_made,
+    Kind.TRAINING: _show_avatar, Kind.TRACKING: _import, Kind.AVATAR: _show_made,
     Kind.ANALYSIS: _fill_effects, Kind.SELECTION: _select_for_take,
     Kind.PERFORMANCE: _apply_performance, Kind.LIGHT: _store_light,
 }  # fmt: skip
 """Puts the result of a kind of request into the scene. Raises StgaError or RuntimeError."""
-CHANGED = {
-    Kind.TRAINING: _run_object, Kind.TRACKING: _head, Kind.AVATAR: _run_object,
-    Kind.SELECTION: _head, Kind.PERFORMANCE: _head,
-}  # fmt: skip
+CHANGED = dict.fromkeys((Kind.TRAINING, Kind.AVATAR), _run_object) | dict.fromkeys(
+    (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE), lambda scene, state: scene.stga.head
+)
 """The object that this changes, which has to leave Edit Mode before."""
 PLACES = {
     Kind.TRAINING: ("training_run", "result_shown"),

@@ -1,7 +1,10 @@
 """The Track step: tracking a head through footage in a worker process beside Blender, looking at
-what it found, and solving it again around frames that were posed by hand."""
+what it found, and solving it again around frames that were posed by hand; an avatar made from a
+video, tracked and trained at once."""
 
 import json
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,27 +12,19 @@ import bpy
 import numpy as np
 
 from ..stga_addon.errors import StgaError
-from ..stga_addon.jobs.table import Kind
-from ..stga_addon.jobs.track import MATTES, Track
-from ..stga_addon.jobs.track import SolveAgain as SolveAgainRequest
+from ..stga_addon.jobs import track as jobs
+from ..stga_addon.jobs.table import TRAINS, Kind
+from ..stga_addon.jobs.track import CAPTURE_FOLDER, Track
+from ..stga_addon.jobs.train import Train
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
-from . import options
-from .common import (
-    Action,
-    Edit,
-    file_path,
-    given_values,
-    head_of,
-    is_head,
-    needs_head,
-    needs_rig,
-    own_motion,
-    polled,
-)
+from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
+from ..stga_addon.training.settings import make_settings
+from . import common, monitor, options
+from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig
 from .options import ONCE
 from .request import idle, start
 from .training_python import training_python
@@ -37,6 +32,9 @@ from .training_python import training_python
 XRAY_ALPHA = 0.4
 TRACK_FIELDS = ("footage", "start", "step", "cameras", "model", "avatar", "landmarks", "stop")
 """Of the request, beside its focal length, that are properties of the operator as well."""
+MAX_FOLDERS = 1000
+DIGITS = 3
+"""Of numbers that Blender keeps in single precision, which continue only as they began."""
 
 
 class TrackOptions:
@@ -54,7 +52,7 @@ class TrackOptions:
     mattes: options.choice(
         "Mattes",
         "Masks that tell the person from the background",
-        *((name, name.title(), text.capitalize()) for name, text in MATTES.items()),
+        *((name, name.title(), text.capitalize()) for name, text in jobs.MATTES.items()),
         ("folder", "Folder", "Those of a folder, named as the images"),
     )
     matte_folder: options.path(
@@ -72,7 +70,7 @@ class TrackFootage(Action, bpy.types.Operator, TrackOptions):
     python: options.python("tracks")
 
     def run(self, context: Any) -> None:
-        given = {"model": None, **given_values(self, Track, *TRACK_FIELDS, "focal")}
+        given = {"model": None, **common.given_values(self, Track, *TRACK_FIELDS, "focal")}
         out, mattes = file_path(self.directory, "capture").resolve(), self.mattes
         if mattes == "folder":
             mattes = str(file_path(self.matte_folder, "mattes").resolve())
@@ -86,15 +84,17 @@ class ViewFootage(Edit, bpy.types.Operator):
     to the free view"""
 
     bl_label = "Look Through Camera"
+    needs = (
+        need(
+            lambda context: getattr(context.space_data, "type", "") == "VIEW_3D",
+            "Needs a 3D viewport",
+        ),
+        common.needs_head,
+    )
 
     step: options.integer(
         "Step", "1: the next camera, -1: the one before, 0: enter and leave", options=ONCE
     )
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        in_viewport = context.space_data is not None and context.space_data.type == "VIEW_3D"
-        return polled(cls, in_viewport, "Needs a 3D viewport") and needs_head(cls, context)
 
     def run(self, context: Any) -> None:
         head, space, scene = head_of(context), context.space_data, context.scene
@@ -120,13 +120,13 @@ class MarkKey(Edit, bpy.types.Operator):
     no longer"""
 
     bl_label = "Mark as Key"
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if not needs_rig(cls, context):
-            return False
-        has_timestep = context.scene.frame_current in context.scene.stga.head[tags.TIMESTEPS]
-        return polled(cls, has_timestep, "The capture has no timestep at this frame")
+    needs = (
+        needs_rig,
+        need(
+            lambda context: context.scene.frame_current in context.scene.stga.head[tags.TIMESTEPS],
+            "The capture has no timestep at this frame",
+        ),
+    )
 
     def run(self, context: Any) -> None:
         head, frame = head_of(context), context.scene.frame_current
@@ -134,7 +134,7 @@ class MarkKey(Edit, bpy.types.Operator):
         if frame in keys:
             del keys[frame]
         else:
-            keys[frame] = sample_pose(head, own_motion(head).model).parameters
+            keys[frame] = sample_pose(head, common.own_motion(head).model).parameters
             key_current_pose(head, rig_of(head), frame)
         stored = {str(timestep): keys[timestep].tolist() for timestep in sorted(keys)}
         head[tags.TRACKING_KEYS] = json.dumps(stored)
@@ -144,17 +144,19 @@ class SolveAgain(Action, bpy.types.Operator):
     """Solve the tracked capture again around the keys, in a process beside Blender, and import
     it"""
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        if not needs_rig(cls, context) or not idle(Kind.TRACKING)(cls, context):
-            return False
-        is_tracked = bool(context.scene.stga.head.get(tags.TRACKED))
-        return polled(cls, is_tracked, "This capture was not tracked here")
+    needs = (
+        needs_rig,
+        idle(Kind.TRACKING),
+        need(
+            lambda context: context.scene.stga.head.get(tags.TRACKED),
+            "This capture was not tracked here",
+        ),
+    )
 
     def run(self, context: Any) -> None:
         head = head_of(context)
         capture, model = Path(head[tags.CAPTURE]), Path(head[tags.FLAME_MODEL])
-        request = SolveAgainRequest(capture, model, tracking_keys(head))
+        request = jobs.SolveAgain(capture, model, tracking_keys(head))
         if start(context.scene, request, training_python(context)):
             self.inform(f"Tracked {capture}")
 
@@ -169,3 +171,77 @@ def capture_cameras(head: Any) -> list[Any]:
     """The head's cameras, by index."""
     cameras = tags.find(tags.CAMERA, Path(head[tags.CAPTURE]))
     return sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
+
+
+# An avatar from a video
+
+
+class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
+    """Make an avatar from a video of a face: track the head, train, and show the avatar on it. What
+    was begun with the same video is continued"""
+
+    bl_label = "Avatar from Video"
+    needs = (idle(*TRAINS),)
+
+    filepath: options.path("Video", "Video of a face", options=ONCE)
+    folder: options.path(  # not `directory`, which Blender's file browser sets to that of the file
+        "Folder",
+        "Folder for capture and avatar; empty: one beside the .blend file, else beside the video",
+        "DIR_PATH",
+        options=ONCE,
+    )
+    minutes: options.number("Minutes", "Training time", default=5.0, min=0.01)
+    focal: options.field(Track, "focal", "Focal Length", options=ONCE)
+    python: options.python("tracks and trains", options={*ONCE, "HIDDEN"})
+    filter_glob: options.file_filter(*VIDEO_SUFFIXES)
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        if not self.filepath:
+            return self.execute(context) if self.folder else super().invoke(context, event)
+        video = file_path(self.filepath, "video").resolve()  # dropped
+        self.folder = str(proposed_folder(self._tracking(video, Path())).parent)
+        return context.window_manager.invoke_props_dialog(
+            self, width=480, title=self.bl_label, confirm_text="Make"
+        )
+
+    def draw(self, context: Any) -> None:
+        self.layout.use_property_split = True
+        for name in ("folder", "minutes", "focal"):
+            self.layout.prop(self, name)
+
+    def run(self, context: Any) -> None:
+        if self.folder and not self.filepath:  # continues
+            began_with = jobs.read_inputs(file_path(self.folder, "folder"))
+            self.filepath = str(began_with.get("footage", ""))
+            self.focal = began_with.get("focal") or 0.0
+        video = file_path(self.filepath, "video").resolve()
+        if not video.is_file():
+            raise StgaError(f"{video}: is not a file; expected a video")
+        python = training_python(context, self.python)
+        if self.folder:
+            capture = file_path(self.folder, "folder").resolve() / CAPTURE_FOLDER
+        else:
+            capture = proposed_folder(self._tracking(video, Path()))
+        settings = make_settings("global", seconds=round(60 * self.minutes, DIGITS), effects={})
+        train = Train(capture.parent / jobs.RUN_FOLDER, capture, settings)
+        request = jobs.MakeAvatar(self._tracking(video, capture), train)
+        monitor.show_panel()  # where it can be watched and cancelled, also after a drop
+        if start(context.scene, request, python):
+            self.inform(f"Made {request.out}")
+
+    def _tracking(self, video: Path, capture: Path) -> Track:
+        return Track(video, None, capture, focal=round(self.focal, DIGITS) or None)
+
+
+def proposed_folder(track: Track) -> Path:
+    """The folder of the capture in the first folder beside the .blend file, else beside the video,
+    that is free or in which this video's avatar was begun."""
+    beside = Path(bpy.data.filepath).parent if bpy.data.filepath else track.footage.parent
+    name = f"{track.footage.stem} avatar"
+    for each in (name, *(f"{name} {number}" for number in range(2, MAX_FOLDERS))):
+        capture = beside / each / CAPTURE_FOLDER
+        with suppress(StgaError):
+            jobs.check_inputs(replace(track, out=capture))
+            return capture
+    problem = f"holds {MAX_FOLDERS} avatars of {track.footage.name}; choose a folder"
+    raise StgaError(f"{beside}: {problem}")

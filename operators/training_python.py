@@ -16,7 +16,7 @@ from ..stga_addon.raster.kernel_cache import has_kernels
 from ..stga_addon.worker.launch import CACHE_VARIABLE, KERNELS, cache_folder, start_in_background
 from ..stga_addon.worker.training_python import find_training_python
 from . import monitor, options
-from .common import Action, need, package, preferences
+from .common import Action, AtEnd, need, package, preferences
 
 POLL_INTERVAL_S = 0.3
 PREPARATION = "stga_addon.jobs.perform"
@@ -56,39 +56,33 @@ def _preferred(context: Any) -> str:
 class _Test:
     """The last test of an interpreter: running, or with what it found."""
 
-    def __init__(self) -> None:
-        self.python, self.error = "", ""
-        self.found: Checked | None = None
-        self._process: Any = None
-        self._begun_s = 0.0
-
-    @property
-    def is_running(self) -> bool:
-        return self._process is not None
+    python = error = ""
+    found: Checked | None = None
+    process: "Popen[bytes] | None" = None
 
     def begin(self, python: str) -> None:
         """Raises StgaError where the interpreter cannot be started."""
-        self._process, self._begun_s = start_check(python), monotonic()
+        self.process, self._begun_s = start_check(python), monotonic()
         self.python, self.found, self.error = python, None, ""
 
     def end(self, timeout_s: float = 1.0) -> None:
         """Wait for what the test finds."""
         try:
-            self.found = finish_check(self.python, self._process, timeout_s)
+            self.found = finish_check(self.python, self.process, timeout_s)
         except StgaError as error:
             self.error = str(error)
-        self._process = None
+        self.process = None
 
     def tick(self) -> float | None:
-        if self._process.poll() is None and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
+        if self.process.poll() is None and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
             return POLL_INTERVAL_S
         self.end()
         monitor.redraw()
         return None
 
     def close(self) -> None:
-        if self._process is not None:
-            self._process.kill()
+        if self.process is not None:
+            self.process.kill()
             self.end()
 
 
@@ -100,7 +94,7 @@ class TestPython(Action, bpy.types.Operator):
     device, or what it lacks"""
 
     bl_label = "Test"
-    needs = (need(lambda _: not test.is_running, "A test is running"),)
+    needs = (need(lambda _: test.process is None, "A test is running"),)
 
     python: options.text(
         "Python", "The interpreter to test; empty: the one that trains", subtype="FILE_PATH"
@@ -123,8 +117,9 @@ class TestPython(Action, bpy.types.Operator):
 def begin_preparing() -> None:
     """Compile in the background what the first training would wait for; nothing without a window,
     without a Python that trains, or where it is compiled or is being compiled."""
-    is_needed = not bpy.app.background and CACHE_VARIABLE in os.environ
-    if not is_needed or has_kernels(cache_folder() / KERNELS):
+    if bpy.app.background or CACHE_VARIABLE not in os.environ:
+        return
+    if has_kernels(cache_folder() / KERNELS):
         return
     if all(process.poll() is not None for process in _preparations):
         with suppress(StgaError):  # training says what is missing
@@ -132,15 +127,17 @@ def begin_preparing() -> None:
             _preparations.append(start_in_background(python, [PREPARATION]))
 
 
-def register() -> None:
+def register(at_end: AtEnd) -> None:
     with suppress(ValueError):  # a checkout, which is no extension
         cache = bpy.utils.extension_path_user(package(), path="cache")
-        os.environ.setdefault(CACHE_VARIABLE, cache)
+        if os.environ.setdefault(CACHE_VARIABLE, cache) == cache:
+            at_end(os.environ.pop, CACHE_VARIABLE, None)
+    at_end(_end_preparing)
     if not bpy.app.background:
         bpy.app.timers.register(begin_preparing, first_interval=START_DELAY_S)
 
 
-def unregister() -> None:
+def _end_preparing() -> None:
     """End what is compiling, which would write into a folder that is being removed."""
     if bpy.app.timers.is_registered(begin_preparing):
         bpy.app.timers.unregister(begin_preparing)
@@ -148,6 +145,3 @@ def unregister() -> None:
         process.kill()
         process.wait()
     _preparations.clear()
-    with suppress(ValueError):
-        if os.environ.get(CACHE_VARIABLE) == bpy.utils.extension_path_user(package(), path="cache"):
-            del os.environ[CACHE_VARIABLE]

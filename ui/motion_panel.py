@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from ..operators import live_session
+from ..operators import drive
 from ..operators.common import is_head, rig_or_none
 from ..operators.pose import needs_sliders, preparing
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
@@ -48,14 +48,9 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
         if needs_sliders(head):
             self.layout.operator("stga.add_arkit_controls", icon="ADD")
             return
-        keys = head.data.shape_keys.key_blocks
-        _draw_keys(self.layout, [keys[name] for name in ARKIT_SHAPES if name in keys])
-
-
-def _draw_keys(layout: Any, keys: list[Any]) -> None:
-    column = layout.column(align=True)
-    for key in keys:
-        column.prop(key, "value", text=key.name, slider=True)
+        keys, column = head.data.shape_keys.key_blocks, self.layout.column(align=True)
+        for name in [name for name in ARKIT_SHAPES if name in keys]:
+            column.prop(keys[name], "value", text=name, slider=True)
 
 
 class TrainedPanel(ClosedPanel, bpy.types.Panel):
@@ -88,7 +83,9 @@ class CoefficientsPanel(ClosedPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         for keys in _coefficients(context.scene.stga.head):
-            _draw_keys(self.layout, keys[:MAX_SLIDERS])
+            column = self.layout.column(align=True)
+            for key in keys[:MAX_SLIDERS]:
+                column.prop(key, "value", text=key.name, slider=True)
 
 
 def _coefficients(head: Any) -> list[list[Any]]:
@@ -106,9 +103,18 @@ class DrivePanel(ClosedPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, context.scene.stga.drive
-        running = live_session.session()
+        running = drive.session()
         if running is None:
-            _draw_source(layout, context, settings)
+            source = SOURCES[settings.source]
+            layout.prop(settings, "source")
+            if source.request:
+                layout.prop(settings, "phone")
+            layout.prop(settings, "address")
+            layout.prop(settings, "port", text=f"Port (0: {source.port})")
+            draw_text(layout, context, source.hint)
+            if settings.address == LOOPBACK:
+                hint = "Only programs on this computer are heard; for a phone, listen on 0.0.0.0"
+                draw_text(layout, context, hint)
             layout.operator("stga.drive_live", icon="PLAY")
         else:
             layout.operator("stga.stop_live", icon="PAUSE")
@@ -129,22 +135,9 @@ class DrivePanel(ClosedPanel, bpy.types.Panel):
             layout.operator("stga.drive_video", text="Drive from Video…", icon="FILE_MOVIE")
 
 
-def _draw_source(layout: Any, context: Any, settings: Any) -> None:
-    source = SOURCES[settings.source]
-    layout.prop(settings, "source")
-    if source.request:
-        layout.prop(settings, "phone")
-    layout.prop(settings, "address")
-    layout.prop(settings, "port", text=f"Port (0: {source.port})")
-    draw_text(layout, context, source.hint)
-    if settings.address == LOOPBACK:
-        hint = "Only programs on this computer are heard; for a phone, listen on 0.0.0.0"
-        draw_text(layout, context, hint)
-
-
 def _draw_status(column: Any, running: Any) -> None:
     now, stream = monotonic(), running.stream
-    silent, health = stream.silent_s(now), stream.health(now)
+    silent, delay_s = stream.silent_s(now), stream.delay_s()
     if silent is None:
         column.label(text=f"Waiting on port {running.receiver.port}", icon="INFO")
     elif silent > SILENT_S:
@@ -152,14 +145,13 @@ def _draw_status(column: Any, running: Any) -> None:
     elif not stream.has_face:
         column.label(text="No face in the picture", icon="ERROR")
     else:
-        column.label(text=f"{health.rate:.0f} packets per second", icon="CHECKMARK")
-    lost = "not numbered" if health.lost is None else str(health.lost)
-    column.label(text=f"Lost: {lost}   Late: {health.late}   Foreign: {health.foreign}")
-    delay = "no clock" if health.delay_s is None else f"+{1000 * health.delay_s:.0f} ms"
-    column.label(text=f"Network: {delay}   Slowest pose: {1000 * running.slowest_tick_s:.0f} ms")
-    if len(stream.senders) < 2:
-        return
-    for sender in sorted(stream.senders):
+        column.label(text=f"{stream.rate(now):.0f} packets per second", icon="CHECKMARK")
+    lost = "not numbered" if delay_s is None else str(stream.lost)
+    column.label(text=f"Lost: {lost}   Late: {stream.late}   Foreign: {stream.foreign}")
+    delay = "no clock" if delay_s is None else f"+{1000 * delay_s:.0f} ms"
+    slowest_ms = 1000 * max(running.ticks_s, default=0.0)
+    column.label(text=f"Network: {delay}   Slowest pose: {slowest_ms:.0f} ms")
+    for sender in sorted(stream.senders) if len(stream.senders) > 1 else ():
         row = column.row()
         row.label(text=" ".join(filter(None, sender)))
         button = row.operator("stga.follow_live", depress=sender == stream.followed)

@@ -1,6 +1,6 @@
 """The sidebar tab: Track → Capture → Select → Train → Show → Motion."""
 
-from ..operators.common import register_classes, unregister_classes
+from ..operators.common import AtEnd, register_classes
 from . import motion_panel, next_step, select_panel, show_panel, sidebar, track_panel, train_panel
 
 CLASSES = (
@@ -26,13 +26,7 @@ CLASSES = (
 )
 
 
-def register() -> None:
-    sidebar.register()
-    register_classes(CLASSES)
-    show_panel.register()
-
-
-def unregister() -> None:
-    show_panel.unregister()
-    unregister_classes(CLASSES)
-    sidebar.unregister()
+def register(at_end: AtEnd) -> None:
+    sidebar.register(at_end)
+    register_classes(CLASSES, at_end)
+    show_panel.register(at_end)

@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ..operators import options
-from ..operators.common import package, register_classes, unregister_classes
+from ..operators.common import AtEnd, package, register_classes
 from ..operators.training_python import has_training_python, test
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .sidebar import draw_text
@@ -42,7 +42,7 @@ class Preferences(bpy.types.AddonPreferences):
         row = box.split(factor=0.8, align=True)
         row.prop(self, "training_python")
         row.operator("stga.test_python")
-        if test.is_running:
+        if test.process is not None:
             box.label(text=f"Testing {test.python}", icon="TIME")
         elif test.error:
             draw_text(box, context, test.error, "ERROR")
@@ -53,9 +53,5 @@ class Preferences(bpy.types.AddonPreferences):
             draw_text(box, context, f"Blender's Python lacks packages: {remedy}", "INFO")
 
 
-def register() -> None:
-    register_classes((Preferences,))
-
-
-def unregister() -> None:
-    unregister_classes((Preferences,))
+def register(at_end: AtEnd) -> None:
+    register_classes((Preferences,), at_end)

@@ -6,7 +6,7 @@ from typing import Any
 import bpy
 
 from ..operators import options
-from ..operators.common import register_classes, unregister_classes
+from ..operators.common import AtEnd, register_classes
 from ..operators.drive import DriveOptions
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
@@ -151,14 +151,10 @@ CLASSES = (
 )
 
 
-def register() -> None:
-    register_classes(CLASSES)
+def register(at_end: AtEnd) -> None:
+    register_classes(CLASSES, at_end)
     bpy.types.Scene.stga = bpy.props.PointerProperty(type=SceneSettings)
+    at_end(delattr, bpy.types.Scene, "stga")
     # what the last operator could not do
     bpy.types.WindowManager.stga_message = bpy.props.StringProperty()
-
-
-def unregister() -> None:
-    del bpy.types.WindowManager.stga_message
-    del bpy.types.Scene.stga
-    unregister_classes(CLASSES)
+    at_end(delattr, bpy.types.WindowManager, "stga_message")

@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 from bpy.app.handlers import persistent
 
+from ..operators.common import AtEnd, register_handlers
 from ..operators.show import GRAY
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
@@ -194,13 +195,7 @@ class RenderPanel(bpy.types.Panel):
             layout.label(text=f"{renderer}: {lacks}", icon="INFO")
 
 
-def register() -> None:
-    MODE_CHANGED.append(_begin_exposure)
-    bpy.app.handlers.render_init.append(_before_job)
-    bpy.app.handlers.render_pre.append(_before_image)
-
-
-def unregister() -> None:
-    MODE_CHANGED.remove(_begin_exposure)
-    bpy.app.handlers.render_init.remove(_before_job)
-    bpy.app.handlers.render_pre.remove(_before_image)
+def register(at_end: AtEnd) -> None:
+    handlers = bpy.app.handlers
+    rendering = (handlers.render_init, _before_job), (handlers.render_pre, _before_image)
+    register_handlers(at_end, (MODE_CHANGED, _begin_exposure), *rendering)

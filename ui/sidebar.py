@@ -10,7 +10,7 @@ import bpy.utils.previews
 import numpy as np
 
 from ..operators import monitor
-from ..operators.common import TAB
+from ..operators.common import TAB, AtEnd
 from ..stga_addon.format import describe_figures
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import KINDS, STORED, Kind
@@ -123,7 +123,7 @@ def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
 def draw_curve(layout: Any, folder: Path) -> None:
     """Draw the curve of the run in this folder, or the head over the footage that is tracked;
     nothing before then."""
-    curve = monitor.curve(folder)
+    curve = monitor.curves.get(folder)
     if curve is None:
         return
     name = str(folder)
@@ -139,11 +139,8 @@ def draw_curve(layout: Any, folder: Path) -> None:
         column.label(text=text)
 
 
-def register() -> None:
+def register(at_end: AtEnd) -> None:
     global _previews
     _previews = bpy.utils.previews.new()
-
-
-def unregister() -> None:
-    bpy.utils.previews.remove(_previews)
-    _shown.clear()
+    at_end(bpy.utils.previews.remove, _previews)
+    at_end(_shown.clear)

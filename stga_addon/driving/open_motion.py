@@ -15,7 +15,7 @@ from ..flame.model import FlameModel
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..flame.teeth import flame_model
 from ..options import option
-from .head_map import HeadMap, head_map, person_of
+from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
     EXCHANGEABLE,
@@ -264,9 +264,9 @@ def performed(
     trained: TrainedRange | None = None, fps: float | None = None,
 ) -> Motion:  # fmt: skip
     """A performance on a person's head, a timestep per 1/fps seconds; `name` is for errors."""
-    # `frames_of` applies it
+    # `finished` applies it
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
-    frames, beyond = frames_of(head_map(person, name), prepared, options, trained)
+    frames, beyond = finished(head_map(person, name).frames(prepared), options, trained)
     timesteps = tuple(range(len(frames)))
     return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
 
@@ -279,7 +279,7 @@ def adapted(
     theirs = {"quiet": frames, "first": frames[:1]}.get(options.neutral)
     if theirs is not None:
         frames = exchanged_neutral(frames, quiet_neutral(theirs))
-    return _finished(frames, options, trained)
+    return finished(frames, options, trained)
 
 
 def prepared_performance(
@@ -318,18 +318,7 @@ def at_strength(performance: Performance, options: MotionOptions) -> Performance
     return amplified(performance, dict.fromkeys((*PARTS, "head"), options.strength))
 
 
-def frames_of(
-    found: HeadMap,
-    performance: Performance,
-    options: MotionOptions,
-    trained: TrainedRange | None = None,
-) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
-    """Frames of a `corrected` performance at the strength on a map's head; and how far they were
-    `outside`."""
-    return _finished(found.frames(performance), options, trained)
-
-
-def _finished(
+def finished(
     frames: list[FlameFrame], options: MotionOptions, trained: TrainedRange | None
 ) -> tuple[list[FlameFrame], dict[str, np.ndarray]]:
     """The frames on the head's neutral, at the strength, led back; how far they were outside."""

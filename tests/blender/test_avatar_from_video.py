@@ -28,7 +28,7 @@ def asked(extension, monkeypatch):
     """The requests that the operator starts, which are not carried out."""
     requests: list[object] = []
     monkeypatch.setattr(
-        extension.operators.avatar_from_video,
+        extension.operators.track,
         "start",
         lambda scene, request, python: requests.append(request),
     )
@@ -117,7 +117,7 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     assert settings.head.hide_get()
     with np.load(out / "job/picture.npz") as stored:
         assert stored["rgb"].std() > 10
-    pixels, *_ = extension.operators.monitor.curve(out / "run")
+    pixels, *_ = extension.operators.monitor.curves[out / "run"]
     assert pixels.shape == (256, 256, 4)
     # Again: nothing is left to do but to show it
     bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable)

@@ -42,7 +42,7 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
     own = FlameSequence(model, shape, None, (), {}.__getitem__)
     recorded = read_motion(tmp_path / "own.npz", model)
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sessions = extension.operators.live_session
+    sessions = extension.operators.drive
 
     def send(weights, frame, **options):
         sender.sendto(wire.live_link_face(weights, frame, **options), ("127.0.0.1", settings.port))

@@ -1,6 +1,5 @@
 """The operators, called as a script calls them, from the checkout registered as an extension."""
 
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -95,7 +94,7 @@ def test_registration_is_all_or_nothing(extension, monkeypatch):
     menu, all_of_them = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs), operators()
     assert len(all_of_them) > 40
     extension.unregister()
-    monkeypatch.setattr(extension.operators.command_line, "register", lambda: 1 / 0)
+    monkeypatch.setattr(extension.operators.command_line, "register", lambda at_end: 1 / 0)
     for _ in range(2):
         assert not operators()
         assert not hasattr(bpy.types.Scene, "stga")
@@ -230,23 +229,22 @@ def test_export_of_a_web_page(shown, tmp_path):
 def range_export(extension, write, frames: range, stop_after: int | None = None) -> Any:
     """What a range exported step by step ends with, as the dialog does; cancelled after some
     steps."""
-    module, said = sys.modules[f"{extension.__name__}.operators.export"], []
-    operator = module.ExportAvatar
+    operator, said, shown = extension.operators.export.ExportAvatar, [], []
     context = SimpleNamespace(
-        window_manager=SimpleNamespace(event_timer_remove=said.append, stga_message=""),
-        workspace=SimpleNamespace(status_text_set=said.append),
-        window=None,
+        window_manager=SimpleNamespace(event_timer_remove=shown.append),
+        workspace=SimpleNamespace(status_text_set=shown.append),
     )
-    job = module.RangeExport(bpy.context.scene.stga.head, frames, write)
-    dialog = SimpleNamespace(_range=job, _timer="timer", filepath="", inform=said.append)
+    dialog = SimpleNamespace(_timer="timer", others="", inform=said.append)
     dialog.report = dialog.tell = lambda kind, text: said.append(text)
-    dialog._end = lambda context: operator._end(dialog, context)
+    head = bpy.context.scene.stga.head
+    dialog._steps = operator.export(dialog, context, Path(), head, frames, write)
     result = {"RUNNING_MODAL"}
     while result == {"RUNNING_MODAL"}:
-        key = "TIMER" if stop_after is None or job.done < stop_after else "ESC"
-        result = operator.modal(dialog, context, SimpleNamespace(type=key))
+        is_over = stop_after is not None and any(f" {stop_after} of" in text for text in shown)
+        event = SimpleNamespace(type="ESC" if is_over else "TIMER")
+        result = operator.modal(dialog, context, event)
         time.sleep(0.001)
-    assert said[-3:-1] == ["timer", None]
+    assert shown[-2:] == [None, "timer"]
     return result, said[-1]
 
 
@@ -268,8 +266,8 @@ def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
     assert [path.name for path in files] == [f"{frame:05d}.ply" for frame in range(4)]
     expected = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(files[3]).xyz, expected, atol=1e-5)
-    result, _ = range_export(extension, to(tmp_path / "cut"), range(4), stop_after=2)
-    assert result == {"CANCELLED"}
+    result, said = range_export(extension, to(tmp_path / "cut"), range(4), stop_after=2)
+    assert (result, said) == ({"CANCELLED"}, "Export cancelled after 2 of 4 frames")
     assert len([*(tmp_path / "cut").glob("*")]) <= 2
     assert range_export(extension, fail, range(50)) == ({"CANCELLED"}, "no room")
     assert bpy.context.scene.frame_current == 1

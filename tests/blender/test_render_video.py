@@ -157,23 +157,26 @@ def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     operator.Recorder(folder / operator.RECORDING).close()
     monitor = extension.operators.monitor
     monitor.follow(bpy.context.scene, Kind.VIDEO, shown / "turn.mp4", folder)
-    monitor.unregister()
-    monitor.register()
+    extension.unregister()
+    extension.register()
     assert not folder.exists()
 
 
 def around_each_image(monkeypatch, before, after) -> None:
     """Call `before()` and `after()` around the recording of every image."""
-    recording = sys.modules["stga_checkout.operators.render_video"]._Recording
-    record_next = recording.record_next
+    operator = sys.modules["stga_checkout.operators.render_video"].RenderVideo
+    own = operator.record
 
-    def record(self) -> bool:
+    def record(*arguments):
+        steps = own(*arguments)
+        yield next(steps)
         before()
-        more = record_next(self)
-        after()
-        return more
+        for _ in steps:
+            after()
+            yield
+            before()
 
-    monkeypatch.setattr(recording, "record_next", record)
+    monkeypatch.setattr(operator, "record", record)
 
 
 def test_a_recording_follows_its_own_scene(shown, monkeypatch):

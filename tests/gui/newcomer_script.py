@@ -270,9 +270,9 @@ def drive(head: str) -> Iterator[Any]:
 
     chosen().drive.port = PORT
     click(f"Drive Live, {head}", bpy.ops.stga.drive_live)
-    session, space = module("operators.live_session").session(), bpy.types.SpaceView3D
-    show = session._show
-    session._show = lambda *packet: (count("poses"), show(*packet))
+    session, space = module("operators.drive").session(), bpy.types.SpaceView3D
+    show = session.show_again
+    session.show_again = lambda: (count("poses"), show())
     handle = space.draw_handler_add(count, ("draws",), "WINDOW", "POST_PIXEL")
     threading.Thread(target=send, daemon=True).start()
     begin = time.monotonic()
@@ -288,7 +288,7 @@ def drive(head: str) -> Iterator[Any]:
     subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
     yield 0.5
     subprocess.run(["xdotool", "key", "Escape"], check=True)
-    yield lambda: module("operators.live_session").session() is None
+    yield lambda: module("operators.drive").session() is None
     left = float(np.abs(corners() - resting).max())
     seen.setdefault("driven", {})[head] = [moved, left, *rates]
 

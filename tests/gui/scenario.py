@@ -57,7 +57,7 @@ def first() -> Iterator[Callable[[], bool]]:
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_python()
-    yield lambda: not test.is_running
+    yield lambda: test.process is None
     seen["tested"] = test.found.line if test.found else test.error
     with in_viewport():
         bpy.ops.stga.import_capture(directory=CAPTURE)

@@ -141,26 +141,6 @@ STEPS, ARRIVALS = 31, 240  # Steps of the source's clock, and arrivals, that are
 RATE_WINDOW_S = 2.0
 
 
-@dataclass(frozen=True)
-class Health:
-    """How well packets arrive.
-
-    rate     packets per second of the last seconds
-    lost     packets that never came, by the source's clock; None: it sends no clock
-    late     packets that came after later ones, or twice
-    foreign  datagrams that are none of this source's
-    delay_s  seconds that the last packet came later, by the source's clock, than the quickest of
-             the last seconds: what the network adds to its shortest time, which cannot be measured
-             from one side; None without a clock
-    """
-
-    rate: float = 0.0
-    lost: int | None = None
-    late: int = 0
-    foreign: int = 0
-    delay_s: float | None = None
-
-
 @dataclass
 class Stream:
     """What has arrived from a source. Times are seconds of this machine's clock.
@@ -168,15 +148,16 @@ class Stream:
     chosen    sender to follow; None: the first that is heard, until it falls silent
     followed  sender whose packets count now
     senders   all that were heard lately, and when
-    latest    the last packet with a face that counted
     has_face  whether the last packet that counted had one
+    lost      packets that never came, by the source's clock
+    late      packets that came after later ones, or twice
+    foreign   datagrams that are none of this source's
     """
 
     source: Source
     chosen: Sender | None = None
     followed: Sender | None = None
     senders: OrderedDict[Sender, float] = field(default_factory=OrderedDict)
-    latest: FacePacket | None = None
     has_face: bool = False
     lost: int = 0
     late: int = 0
@@ -206,10 +187,7 @@ class Stream:
             return None
         self._arrivals.append((now, packet.time))
         self.has_face = packet.weights is not None
-        if not self.has_face:
-            return None
-        self.latest = packet
-        return packet
+        return packet if self.has_face else None
 
     def follow(self, sender: Sender) -> None:
         """Follow a sender from now on, also while it is silent."""
@@ -220,13 +198,18 @@ class Stream:
         """Seconds since the last packet that counted; None before the first."""
         return now - self._arrivals[-1][0] if self._arrivals else None
 
-    def health(self, now: float) -> Health:
-        recent = [arrival for arrival in self._arrivals if now - arrival[0] <= RATE_WINDOW_S]
-        span = recent[-1][0] - recent[0][0] if len(recent) > 1 else 0.0
-        rate = (len(recent) - 1) / span if span > 0 else 0.0
+    def rate(self, now: float) -> float:
+        """Packets per second of the last seconds."""
+        recent = [arrived for arrived, _ in self._arrivals if now - arrived <= RATE_WINDOW_S]
+        span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+        return (len(recent) - 1) / span if span > 0 else 0.0
+
+    def delay_s(self) -> float | None:
+        """Seconds that the last packet came later, by the source's clock, than the quickest of the
+        last seconds: what the network adds to its shortest time, which cannot be measured from one
+        side. None without a clock, where no packet counts as lost, either."""
         offsets = [arrived - time for arrived, time in self._arrivals if time is not None]
-        delay = offsets[-1] - min(offsets) if offsets else None
-        return Health(rate, self.lost if offsets else None, self.late, self.foreign, delay)
+        return offsets[-1] - min(offsets) if offsets else None
 
     def _start(self, sender: Sender) -> None:
         if sender != self.followed:

@@ -31,41 +31,48 @@ def jaw(frame: int, value: float, **options) -> bytes:
     return wire.live_link_face({"jawOpen": value}, frame, **options)
 
 
-def shown(stream: Stream) -> float:
-    return float(stream.latest.weights[COLUMN["jawOpen"]])
+class Watched(Stream):
+    """Notes what a head that follows it shows."""
+
+    shown = 0.0
+
+    def receive(self, *arguments):
+        packet = super().receive(*arguments)
+        if packet is not None:
+            self.shown = float(packet.weights[COLUMN["jawOpen"]])
+        return packet
 
 
 def test_late_doubled_and_lost_packets_and_a_clock_that_starts_anew():
     """Catches a head that jumps back in time, or stands still after midnight, packets that count
     twice, and losses that are not counted: rows of half the rate of the clock are no losses."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     order = [0, 2, 4, 8, 6, 8, 10, 16]
     for number, frame in enumerate(order):
         stream.receive("10.0.0.5", jaw(frame, frame / 100), number / 30)
-        assert shown(stream) == pytest.approx(max(order[: number + 1]) / 100)
-    health = stream.health(8 / 30)
-    assert (health.lost, health.late, health.foreign) == (3, 2, 0)  # 6 came, but too late
+        assert stream.shown == pytest.approx(max(order[: number + 1]) / 100)
+    assert (stream.lost, stream.late, stream.foreign) == (3, 2, 0)  # 6 came, but too late
     stream.receive("10.0.0.5", b"hello", 1.0)
-    assert stream.health(1.0).foreign == 1
+    assert stream.foreign == 1
     assert stream.receive("10.0.0.5", jaw(0, 0.9), 2.0) is None  # a third of a second back: late
-    assert Stream(LINK).health(0.0).rate == 0
+    assert (Watched(LINK).rate(0.0), Watched(LINK).delay_s()) == (0, None)
     # after midnight, or after the app was started again
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     day = 24 * 3600 * 60
     for number, frame in enumerate([day - 2, day - 1, 0, 1]):
         stream.receive("a", jaw(frame, frame % 1000 / 1000), number / 60)
-    assert shown(stream) == pytest.approx(0.001)
+    assert stream.shown == pytest.approx(0.001)
     assert stream.lost == 0
 
 
 def test_a_face_that_leaves_the_picture():
     """Catches a face that falls to zero, or counts as silence, while it is out of the picture."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     stream.receive("a", jaw(0, 0.5), 0.0)
     assert stream.has_face
     assert stream.receive("a", jaw(1, 0.0, count=0), 1 / 60) is None
     assert not stream.has_face
-    assert shown(stream) == 0.5
+    assert stream.shown == 0.5
     assert stream.silent_s(1 / 60) == 0
     stream.receive("a", jaw(2, 0.7), 2 / 60)
     assert stream.has_face
@@ -74,36 +81,35 @@ def test_a_face_that_leaves_the_picture():
 def test_two_phones_on_one_port():
     """Catches a head that trembles between two faces, one that cannot be handed over, and one that
     waits for a phone that is gone."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     for frame in range(60):
         stream.receive("10.0.0.5", jaw(frame, 0.1, subject="A"), frame / 60)
         stream.receive("10.0.0.6", jaw(frame + 5000, 0.9, subject="B"), frame / 60)
-        assert shown(stream) == pytest.approx(0.1)
+        assert stream.shown == pytest.approx(0.1)
     assert set(stream.senders) == {("10.0.0.5", "A"), ("10.0.0.6", "B")}
     stream.receive("10.0.0.6", jaw(5100, 0.9, subject="B"), 10.0)  # A is silent
-    assert shown(stream) == pytest.approx(0.9)
+    assert stream.shown == pytest.approx(0.9)
     stream.follow(("10.0.0.5", "A"))
     stream.receive("10.0.0.6", jaw(5200, 0.8, subject="B"), 20.0)
-    assert shown(stream) == pytest.approx(0.9)
+    assert stream.shown == pytest.approx(0.9)
     stream.receive("10.0.0.5", jaw(61, 0.2, subject="A"), 20.0)
-    assert shown(stream) == pytest.approx(0.2)
+    assert stream.shown == pytest.approx(0.2)
 
 
 def test_rate_and_delay():
     """Catches a rate that is not that of the last seconds, and a delay that grows with the clocks'
     difference."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     for frame in range(300):
         late = 0.05 if frame == 299 else 0.0
         stream.receive("a", jaw(1_000_000 + frame, 0.5), frame / 60 + late)
-    health = stream.health(5.0)
-    assert health.rate == pytest.approx(60, rel=0.03)
-    assert health.delay_s == pytest.approx(0.05, abs=1e-3)
+    assert stream.rate(5.0) == pytest.approx(60, rel=0.03)
+    assert stream.delay_s() == pytest.approx(0.05, abs=1e-3)
 
 
 def test_nothing_grows():
     """Catches memory that grows with packets, senders or noise."""
-    stream, rng = Stream(LINK), np.random.default_rng(0)
+    stream, rng = Watched(LINK), np.random.default_rng(0)
     for number in range(5000):
         stream.receive(f"10.0.{number % 50}.1", jaw(number, 0.5, subject=str(number)), number / 60)
         stream.receive(f"10.1.{number % 200}.1", rng.bytes(20), number / 60)
@@ -158,9 +164,9 @@ def test_the_request_to_a_phone():
 
 
 def shown_by(source: str, data: bytes) -> float:
-    stream = Stream(SOURCES[source])
+    stream = Watched(SOURCES[source])
     stream.receive("a", data, 0.0)
-    return shown(stream)
+    return stream.shown
 
 
 def test_addresses():
@@ -179,7 +185,7 @@ def test_addresses():
 def test_recording():
     """Catches a take that has arrival times, a resting face that is not taken off, and sides
     exchanged twice."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     data = wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0))
     first = stream.receive("a", data, 0.0)
     recording = Recording(7, row_of(first), ("mouth",))
@@ -201,7 +207,7 @@ def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
     """Catches packets that are left out, a take as long as two clocks are apart, and a CSV that
     cannot be read back. Packets arrive two at once, and those around the jump while Blender is
     busy."""
-    stream, recording = Stream(LINK), Recording(1, None)
+    stream, recording = Watched(LINK), Recording(1, None)
     day = 24 * 3600 * 60
     change = {"app restarted": -500_000, "midnight": -day}.get(jump, 79_001 * 60)
     for number in range(60):
@@ -221,13 +227,13 @@ def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
 @pytest.mark.parametrize("sent", ["every frame", "once"])
 def test_vmc_whose_clock_stands_still(sent):
     """Catches a head that freezes with the sender's clock, and a take of one packet."""
-    stream, recording = Stream(SOURCES["vmc"]), Recording(1, None)
+    stream, recording = Watched(SOURCES["vmc"]), Recording(1, None)
     clock = osc_text("/VMC/Ext/T") + osc_text(",f") + struct.pack(">f", 12.5)
     for number in range(60):
         time = [clock] if sent == "every frame" or number == 0 else []
         data = bundle(*time, blend("jawOpen", number / 100), APPLY)
         packet = stream.receive("a", data, number / 60)
-        assert shown(stream) == pytest.approx(number / 100)
+        assert stream.shown == pytest.approx(number / 100)
         recording.add(packet, number / 60)
     np.testing.assert_allclose(recording.performance().times, np.arange(60) / 60, atol=1e-6)
 
@@ -235,7 +241,7 @@ def test_vmc_whose_clock_stands_still(sent):
 def test_smoothing():
     """Catches a filter that depends on the rate of the packets: a step is 63 % done after its time
     constant."""
-    stream = Stream(LINK)
+    stream = Watched(LINK)
     low, high = (row_of(stream.receive("a", jaw(frame, frame), 0.0)) for frame in (0, 1))
     for rate in (30, 120):
         row = low
