@@ -7,48 +7,25 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ..stga_addon.driving import open_motion
 from ..stga_addon.driving.head_map import head_turns
-from ..stga_addon.driving.open_motion import (
-    MotionOptions,
-    TrainedRange,
-    adapted,
-    parsed_gain,
-    performed,
-    prepared_performance,
-    trained_range,
-)
-from ..stga_addon.driving.performance import EXCHANGEABLE, parts_kept
+from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange
+from ..stga_addon.driving.performance import EXCHANGEABLE, amplified
 from ..stga_addon.driving.read_performance import is_performance, read_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.rig import motion as rig_motion
 from ..stga_addon.scene.rig.keyframes import apply_weights, checked_shape_keys, has_shapes
-from ..stga_addon.scene.rig.motion import (
-    WEIGHT_RANGE,
-    apply_motion,
-    sample_motion,
-    store_range,
-    stored_range,
-)
-from . import options
-from .common import (
-    Edit,
-    FileImport,
-    file_path,
-    flame_model_path,
-    flame_motion,
-    head_of,
-    is_head,
-    needs_rig_or_shapes,
-    own_motion,
-    rig_or_none,
-    scene_frames,
-)
+from . import common, options
+from .common import Edit, FileImport, file_path, head_of, is_head, own_motion, rig_or_none
 from .options import ONCE
 
 LAST_FRAME = 1_048_574
 """Blender's maximum frame number."""
+PART_OF_SHAPES = {"face": "expression", "jaw": "jaw", "eyes": "eyes", "head": "neck"}
+"""Part of a face performance -> that of the head which it moves."""
 NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First Frame"}
 
 
@@ -81,8 +58,8 @@ def exchanged_pairs(options: Any) -> tuple[str, ...]:
 
 def own_range(head: Any, own: FlameSequence) -> TrainedRange:
     """Measure and store the range of the recording that a head was trained on, its own motion."""
-    trained = trained_range([own.frame(timestep) for timestep in own.timesteps])
-    store_range(head, trained)
+    trained = open_motion.trained_range([own.frame(timestep) for timestep in own.timesteps])
+    rig_motion.store_range(head, trained)
     return trained
 
 
@@ -90,7 +67,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     """Animate this head with the expressions and pose of another person; its earlier animation is
     kept"""
 
-    needs = (needs_rig_or_shapes,)
+    needs = (common.needs_rig_or_shapes,)
 
     filepath: options.path(
         "File",
@@ -112,8 +89,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     strength: options.field(MotionOptions, "strength", soft_max=2.0, options=ONCE)
     own_offsets: options.boolean(
         "Own Offsets",
-        "The motion is this head's own, refined by training: keep its tracked per-frame offsets, "
-        "if any",
+        "The motion is this head's own, refined by training: keep its tracked "
+        "per-frame offsets, if any",
         options=ONCE,
     )
     start: options.integer(
@@ -129,22 +106,23 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     head_gain: _gain_property("Head", "the head's rotation, which turns the neck")
     shape_gains: options.text(
         "Shape Gains",
-        "Of a face performance: factors of single shapes, which take the place of their part's, "
-        "such as jawOpen=0.8 cheekPuff=0",
+        "Of a face performance: factors of single shapes, which take the place of "
+        "their part's, such as jawOpen=0.8 cheekPuff=0",
         options=ONCE,
     )
     exchange_jaw: exchange_property("jaw", options=ONCE)
     exchange_mouth: exchange_property("mouth", options=ONCE)
     sliders: options.boolean(
         "Face Sliders",
-        "Of a face performance: keyframe the sliders that are named as its shapes, where the head "
-        "has them, in place of expressions, jaw and eyes; easier to edit, and a little less exact",
+        "Of a face performance: keyframe the sliders that are named as its shapes, "
+        "where the head has them, in place of expressions, jaw and eyes; easier to edit, and a "
+        "little less exact",
         options=ONCE,
     )
     fps: options.number(
         "Recorded At",
-        "Frames per second of the recording; 0: one timestep for each frame of the scene. A face "
-        "performance has its own times",
+        "Frames per second of the recording; 0: one timestep for each frame of the "
+        "scene. A face performance has its own times",
         min=0.0,
         max=1000.0,
         options=ONCE,
@@ -203,15 +181,15 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         """Name and motion: of the file, read with this head's model, because expressions mean the
         same in both, or of another head."""
         if path is not None:
-            model = flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
-            return path.stem, flame_motion(str(path), path, model)
+            model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
+            return path.stem, common.flame_motion(str(path), path, model)
         other = bpy.data.objects.get(self.source)
         if not is_head(other):
             raise StgaError(f"{self.source}: is not an imported head")
         if other == head:
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
-        frames = scene_frames(context.scene)
-        return other.name, sample_motion(other, own_motion(other), frames, self.warn)
+        frames = common.scene_frames(context.scene)
+        return other.name, rig_motion.sample_motion(other, own_motion(other), frames, self.warn)
 
     def _apply_frames(
         self, scene: Any, head: Any, motion: FlameSequence, name: str, parts: list[str]
@@ -221,15 +199,14 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         step = float(self.speed * rate)  # timesteps of the recording in a frame of the scene
         frames = retimed(motion, step)
         self._check_end(len(frames))
-        frames, beyond = adapted(frames, self._options(), self._trained(head))
+        frames, beyond = open_motion.adapted(frames, self._options(), self._trained(head))
         self._report_range(beyond)
         tracked = None
         if self.own_offsets:  # what the head was imported from, and where its timesteps come to lie
             own = own_motion(head)
             first = own.timesteps[0]
             tracked = own, [self.start + (each - first) / step for each in own.timesteps]
-        as_strip = self.place == "strip"
-        apply_motion(head, frames, self.start, name, parts, as_strip, self.warn, tracked)
+        self._apply(head, frames, name, parts, tracked=tracked)
         return len(frames)
 
     def _apply_performance(self, scene: Any, head: Any, path: Path, parts: list[str]) -> int:
@@ -240,35 +217,36 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         self._check_end(int(performance.times[-1] * rate) + 1)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
-        rig, as_strip, weights = rig_or_none(head), self.place == "strip", None
+        rig = rig_or_none(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
             own, trained = own_motion(head), self._trained(head)
-            motion = performed(performance, own, head.name, options, trained, rate)
+            motion = open_motion.performed(performance, own, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
-        else:
-            of_part = {"face": "expression", "jaw": "jaw", "eyes": "eyes", "head": "neck"}
-            kept = parts_kept(performance, tuple(p for p, own in of_part.items() if own in parts))
-            prepared = prepared_performance(kept, options, rate)
-            weights = np.clip(prepared.weights, *WEIGHT_RANGE)
-            if rig is None:
-                paths = checked_shape_keys(head)
-                apply_weights(head.data.shape_keys, paths, weights, self.start, path.stem, as_strip)
-                return len(weights)
-            still, turns = np.zeros(3), np.zeros((len(weights), 3))
-            turns = turns if prepared.head is None else head_turns(prepared.head)
-            frames = [
-                FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns
-            ]
-            parts = list({*parts, "expression"})  # on which the sliders would act
-        apply_motion(
-            head, frames, self.start, path.stem, parts, as_strip, self.warn, weights=weights
-        )
+            self._apply(head, frames, path.stem, parts)
+            return len(frames)
+        kept = {part: float(own in parts) for part, own in PART_OF_SHAPES.items()}
+        performance = open_motion.prepared_performance(amplified(performance, kept), options, rate)
+        weights = np.clip(performance.weights, *rig_motion.WEIGHT_RANGE)
+        if rig is None:
+            where = self.start, path.stem, self.place == "strip"
+            apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, *where)
+            return len(weights)
+        still, turns = np.zeros(3), np.zeros((len(weights), 3))
+        turns = turns if performance.head is None else head_turns(performance.head)
+        frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
+        # on the expression the sliders would act
+        self._apply(head, frames, path.stem, list({*parts, "expression"}), weights=weights)
         return len(frames)
 
+    def _apply(self, head: Any, frames: Any, name: str, parts: list[str], **more: Any) -> None:
+        as_strip = self.place == "strip"
+        rig_motion.apply_motion(head, frames, self.start, name, parts, as_strip, self.warn, **more)
+
     def _options(self) -> MotionOptions:
-        gains = {part: getattr(self, f"{part}_gain") for part in ("face", "jaw", "eyes", "head")}
-        gains |= dict(parsed_gain(text) for text in self.shape_gains.replace(",", " ").split())
+        gains = {part: getattr(self, f"{part}_gain") for part in PART_OF_SHAPES}
+        given = self.shape_gains.replace(",", " ").split()
+        gains |= dict(map(open_motion.parsed_gain, given))
         shared = (self.strength, self.neutral, self.smoothing, self.mirror)
         return MotionOptions(*shared, gains, self.stay_trained, exchanged_pairs(self))
 
@@ -283,7 +261,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
                 raise
             remedy = "the motion is put on the head without expression, not on its quiet face"
             self.warn(f"{error}; {remedy}")
-            return stored_range(head)
+            return rig_motion.stored_range(head)
 
     def _check_end(self, count: int) -> None:
         end = self.start + count - 1

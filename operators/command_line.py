@@ -4,7 +4,7 @@ file's head."""
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.sequence import motion_arrays
-from ..stga_addon.jobs.avatar_source import Played
+from ..stga_addon.jobs.avatar_source import FOLDER, OpenHead, Played, write_head
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.objects import frames_per_second, iterate_frames
@@ -28,9 +28,6 @@ IN_BLENDER = ("select", "export", "demo")
 all others run in the Python that trains, also where that is Blender's own: as `stga_addon`, whose
 kernels are compiled."""
 
-if TYPE_CHECKING:
-    from ..stga_addon.jobs.avatar_source import OpenHead
-
 
 def _run(arguments: list[str]) -> int:
     # loaded when a command is given, not when Blender starts
@@ -39,29 +36,23 @@ def _run(arguments: list[str]) -> int:
     try:
         head = _open_head()
         options = make_parser(head).parse_args(arguments)
-        command = options.command
-        if command in IN_BLENDER:
+        if options.command in IN_BLENDER:
             return main(arguments, head)
-        if command == "avatar":
+        if options.command == "avatar":
             return _make_avatar(arguments, options)
-        return _delegate(arguments, head, played=command == "render")
+        return _delegate(arguments, head, played=options.command == "render")
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2
 
 
-def _open_head() -> "OpenHead | None":
-    from ..stga_addon.jobs.avatar_source import OpenHead
-
+def _open_head() -> OpenHead | None:
     head = bpy.context.scene.stga.head
     if not is_head(head):
         return None
     avatar = bpy.context.scene.stga.avatar
-    capture, flame, principal_point = capture_source(head)
     return OpenHead(
-        capture=capture,
-        flame=flame,
-        principal_point=principal_point,
+        *capture_source(head),
         avatar=file_path(avatar, "avatar") if avatar else None,
         fps=frames_per_second(bpy.context.scene),
         selection=lambda: training_selection(head),
@@ -69,11 +60,9 @@ def _open_head() -> "OpenHead | None":
     )
 
 
-def _delegate(arguments: list[str], head: "OpenHead | None", played: bool) -> int:
+def _delegate(arguments: list[str], head: OpenHead | None, played: bool) -> int:
     """Run the command in the Python that trains; returns its exit code. Raises StgaError where
     there is none."""
-    from ..stga_addon.jobs.avatar_source import FOLDER, write_head
-
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:
         environment = {}

@@ -42,8 +42,8 @@ SLOWEST_TICKS = 600
 """Those of the last ten seconds."""
 
 
-class DriveOptions:
-    """What the panel stores about driving live; annotations of `ui.properties.DriveSettings`."""
+class DriveSettings(bpy.types.PropertyGroup):
+    """What the panel stores about driving live."""
 
     source: options.choice(
         "Source",

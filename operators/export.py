@@ -19,13 +19,8 @@ from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.driving.inverse import captured_performance, write_performance
 from ..stga_addon.errors import StgaError
-from ..stga_addon.export.formats import (
-    FORMATS,
-    Meshes,
-    check_free_space,
-    check_suffix,
-    export_avatar,
-)
+from ..stga_addon.export import formats
+from ..stga_addon.export.formats import FORMATS, Meshes
 from ..stga_addon.export.playback import Playback
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
@@ -108,10 +103,27 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         return super().invoke(context, event)
 
     def run(self, context: Any) -> set[str] | None:
-        head, scene = head_of(context), context.scene
-        frames = scene_frames(scene)
-        path, write = self._writer(context, head, frames)
-        if FORMATS[self.format].source != "range":
+        head, scene, path = head_of(context), context.scene, file_path(self.filepath, "export")
+        format, frames, fps = FORMATS[self.format], scene_frames(scene), frames_per_second(scene)
+        if format.suffixes and not path.suffix:
+            path = path.with_suffix(self.filename_ext)
+        formats.check_suffix(path, self.format)
+        avatar = read_avatar(self._source(context))
+        check_head(avatar, head)
+        motion, playback = None, Playback(fps=fps)
+        if self.format == "web":
+            motion = None if self.motion_only else exact_motion(head, frames, self.warn)
+            playback = scene_playback(context, head, frames, self.motion_only)
+            playback = replace(playback, controls=page_controls(motion))
+        if format.source == "range":
+            formats.check_free_space(path, format.size(avatar, len(frames)))
+        elif format.source == "motion":
+            motion = sample_motion(head, own_motion(head), frames, self.warn)
+
+        def write(meshes: Meshes) -> None:
+            formats.export_avatar(path, avatar, self.format, meshes, motion, playback)
+
+        if format.source != "range":
             frames = range(scene.frame_current, scene.frame_current + 1)
         if self._is_invoked:
             steps = self.export(context, path, head, frames, write)
@@ -119,32 +131,6 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         self.inform(f"Exported to {path}")
         return None
-
-    def _writer(
-        self, context: Any, head: Any, frames: range
-    ) -> tuple[Path, Callable[[Meshes], Any]]:
-        """Where the file comes to lie, and what writes it. Raises StgaError for what can be known
-        before."""
-        format, path = FORMATS[self.format], file_path(self.filepath, "export")
-        if format.suffixes and not path.suffix:
-            path = path.with_suffix(self.filename_ext)
-        check_suffix(path, self.format)
-        avatar = read_avatar(self._source(context))
-        check_head(avatar, head)
-        motion, playback = None, Playback(fps=frames_per_second(context.scene))
-        if self.format == "web":
-            motion = None if self.motion_only else exact_motion(head, frames, self.warn)
-            playback = scene_playback(context, head, frames, self.motion_only)
-            playback = replace(playback, controls=page_controls(motion))
-        if format.source == "range":
-            check_free_space(path, format.size(avatar, len(frames)))
-        elif format.source == "motion":
-            motion = sample_motion(head, own_motion(head), frames, self.warn)
-
-        def write(meshes: Meshes) -> None:
-            export_avatar(path, avatar, self.format, meshes, motion, playback)
-
-        return path, write
 
     def export(
         self, context: Any, path: Path, head: Any, frames: range, write: Callable[[Meshes], Any]
@@ -203,16 +189,24 @@ def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
 
 def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) -> Playback:
     """The scene's frame rate, camera, selection groups and upward direction, in the head's
-    space."""
+    space; without a camera where it has no perspective one."""
     to_head = np.linalg.inv(np.array(head.matrix_world, np.float64))
     up = to_head[:3, :3] @ [0.0, 0.0, 1.0]
     up /= np.linalg.norm(up)
+    views: dict[str, Camera] = {}
+    with suppress(StgaError):
+        found = scene_camera(context.evaluated_depsgraph_get())
+        pose = to_head @ found.camera_to_world_gl
+        pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
+        lens = (found.fl_x, found.fl_y, found.cx, found.cy)
+        name = bpy.path.display_name(context.scene.camera.name, has_ext=False)
+        views[name] = camera_from_gl(pose, found.width, found.height, *lens)
     selection = training_selection(head)
     everything = np.ones(len(head.data.polygons), bool)
     return Playback(
         title=head.name,
         fps=frames_per_second(context.scene),
-        views=_scene_camera(context, to_head),
+        views=views,
         up=(float(up[0]), float(up[1]), float(up[2])),
         selection=[selection.get(frame, everything) for frame in frames] if selection else None,
         motion_only=motion_only,
@@ -232,21 +226,7 @@ def exact_motion(head: Any, frames: range, warn: Warn) -> FlameSequence | None:
         reasons.append(str(error))
     if reasons:
         warn(f"No sliders in the page: {reasons[0]}")
-        return None
-    return motion
-
-
-def _scene_camera(context: Any, to_head: np.ndarray) -> dict[str, Camera]:
-    """The scene's camera as the head sees it; none where the scene has no perspective camera."""
-    try:
-        found = scene_camera(context.evaluated_depsgraph_get())
-    except StgaError:
-        return {}
-    pose = to_head @ found.camera_to_world_gl
-    pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
-    lens = (found.fl_x, found.fl_y, found.cx, found.cy)
-    seen = camera_from_gl(pose, found.width, found.height, *lens)
-    return {bpy.path.display_name(context.scene.camera.name, has_ext=False): seen}
+    return None if reasons else motion
 
 
 # Other files

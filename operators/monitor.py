@@ -23,13 +23,7 @@ from bpy.app.handlers import persistent
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
-from ..stga_addon.jobs.monitor_state import (
-    CHECK_INTERVAL_S,
-    SLICE_INTERVAL_S,
-    RequestState,
-    RunFiles,
-    transition,
-)
+from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, RequestState, transition
 from ..stga_addon.jobs.perform import PICTURE, PREVIEW, remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
@@ -40,12 +34,7 @@ from ..stga_addon.scene.compat import APPENDED
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
-from ..stga_addon.worker.status import (
-    WorkerSnapshot,
-    inspect_worker,
-    refuse_running_worker,
-    request_cancel,
-)
+from ..stga_addon.worker import status
 from .common import TAB, AtEnd, is_head, register_handlers
 from .results import CHANGED, PLACES, SHOW, load_avatar, stop_loading
 
@@ -120,7 +109,7 @@ def finish(scene: Any, kind: Kind) -> RequestState:
     while state.loading is not None:
         state = handle(scene, kind, states.SceneFree())
         if state.loading is not None:
-            sleep(SLICE_INTERVAL_S)
+            sleep(states.SLICE_INTERVAL_S)
         elif state.has_result:
             state = handle(scene, kind, replace(_read_status(scene, state), show_result=True))
     return state
@@ -134,9 +123,9 @@ def check_now(scene: Any, kind: Kind) -> None:
     _start_timer()
 
 
-def inspect_status(folder: Path) -> WorkerSnapshot:
+def inspect_status(folder: Path) -> status.WorkerSnapshot:
     """Status of a worker as it is now, with its exit code where this Blender started it."""
-    return inspect_worker(folder, _processes.get(folder))
+    return status.inspect_worker(folder, _processes.get(folder))
 
 
 def has_timer() -> bool:
@@ -250,8 +239,9 @@ def _read_status(scene: Any, state: RequestState) -> states.StatusRead:
         return states.StatusRead(folder, snapshot)
     run = replace(state, folder=folder).run
     tracked = folder.parent / CAPTURE_FOLDER / SPLIT_FILES[0]
+    capture = _stamp(tracked) if state.kind == Kind.AVATAR else None
     made = (folder / PICTURE, folder / PREVIEW, run / AVATAR, run / METRICS, run / TRACKING)
-    files = RunFiles(_stamp(tracked) if state.kind == Kind.AVATAR else None, *map(_stamp, made))
+    files = states.RunFiles(capture, *map(_stamp, made))
     return states.StatusRead(folder, snapshot, files, settings.live_preview, settings.show_result)
 
 
@@ -317,7 +307,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
         case states.ReadCurve(run):
             curves[run] = _read_curve(run, state.folder)
         case states.StopWorker(folder):
-            request_cancel(folder)
+            status.request_cancel(folder)
         case states.KillWorker(folder):
             _processes[folder].kill()
             _processes[folder].wait()
@@ -325,7 +315,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             _remove(state.kind, folder)
         case states.PushUndo():
             if has_timer():  # later: saving the scene's state takes as long as a slice
-                bpy.app.timers.register(push_undo, first_interval=SLICE_INTERVAL_S)
+                bpy.app.timers.register(push_undo, first_interval=states.SLICE_INTERVAL_S)
         case states.Redraw():
             redraw()
     return None
@@ -337,7 +327,7 @@ def _remove(kind: Kind, folder: Path) -> None:
         remove_request(folder)
     else:
         if kind not in TRANSIENT:  # whose worker has ended, or was killed
-            refuse_running_worker(folder)
+            status.refuse_running_worker(folder)
         shutil.rmtree(folder, ignore_errors=True)
     _processes.pop(folder, None)
     for drawn in (folder.parent, folder.parent / RUN_FOLDER):

@@ -5,37 +5,19 @@ from threading import Thread
 from typing import Any
 
 import bpy
-import numpy as np
 from bpy.app.handlers import persistent
 
-from ..stga_addon.driving.head_map import HeadMap, head_map
+from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import leave_edit_mode, show_kind
+from ..stga_addon.scene.rig import keyframes
 from ..stga_addon.scene.rig.head import rig_of
-from ..stga_addon.scene.rig.keyframes import (
-    EXPRESSION_NAMES,
-    add_shapes,
-    has_shapes,
-    head_shapes,
-    posing_bone,
-)
-from . import drive, monitor
-from .common import (
-    AtEnd,
-    Edit,
-    capture_source,
-    flame_motion,
-    head_of,
-    need,
-    needs_rig,
-    register_handlers,
-    rig_or_none,
-)
+from . import common, drive, monitor
+from .common import AtEnd, Edit, head_of, need, needs_rig, rig_or_none
 
 POLL_INTERVAL_S = 0.3
-Shapes = tuple[HeadMap, np.ndarray, np.ndarray]
 
 
 class PoseHead(Edit, bpy.types.Operator):
@@ -61,7 +43,7 @@ class PoseHead(Edit, bpy.types.Operator):
         rig.select_set(True)
         objects.active = rig
         bpy.ops.object.mode_set(mode="POSE")
-        bone = posing_bone(head)
+        bone = keyframes.posing_bone(head)
         select_bones(rig, {bone})
         rig.data.bones.active = rig.data.bones[bone]
         if context.area is not None and context.area.type == "VIEW_3D":
@@ -102,27 +84,29 @@ class AddArkitControls(Edit, bpy.types.Operator):
     needs = (
         needs_rig,
         need(
-            lambda context: EXPRESSION_NAMES not in context.scene.stga.head,
+            lambda context: keyframes.EXPRESSION_NAMES not in context.scene.stga.head,
             "The head has its sliders",
         ),
     )
 
     def run(self, context: Any) -> None:
         head = head_of(context)
-        add_shapes(head, *_compute_shapes(capture_source(head), head.name))
+        keyframes.add_shapes(head, *_compute_shapes(common.capture_source(head), head.name))
 
 
-def _compute_shapes(source: tuple[Any, ...], name: str) -> Shapes:
-    """Seconds of work. Raises StgaError for a head whose face ARKit's shapes do not fit."""
-    sequence = flame_motion(name, *source)
+def _compute_shapes(source: tuple[Any, ...], name: str) -> tuple[Any, ...]:
+    """What `add_shapes` takes: seconds of work. Raises StgaError for a head whose face ARKit's
+    shapes do not fit."""
+    sequence = common.flame_motion(name, *source)
     found = head_map(sequence, name)
-    return found, *head_shapes(sequence, found)
+    return found, *keyframes.head_shapes(sequence, found)
 
 
 def needs_sliders(head: Any) -> bool:
     """Whether a head has neither expressions with ARKit's names nor the sliders."""
-    rig = rig_or_none(head)
-    return rig is not None and EXPRESSION_NAMES not in head and not has_shapes(head)
+    if rig_or_none(head) is None:
+        return False
+    return keyframes.EXPRESSION_NAMES not in head and not keyframes.has_shapes(head)
 
 
 def begin_sliders(head: Any) -> None:
@@ -140,8 +124,8 @@ class _Sliders:
     """What a thread computes for a head, which is looked up by its name: undo moves it."""
 
     def __init__(self, head: Any) -> None:
-        self._head, self._made = head.name, list[Shapes]()
-        arguments = capture_source(head), needs_sliders(head)
+        self._head, self._made = head.name, list[Any]()
+        arguments = common.capture_source(head), needs_sliders(head)
         self._thread = Thread(target=self._make, args=arguments, daemon=True)
         self._thread.start()
         if needs_sliders(head):
@@ -152,7 +136,7 @@ class _Sliders:
             if has_none:
                 self._made.append(_compute_shapes(source, self._head))
             else:
-                head_map(flame_motion(self._head, *source), self._head)
+                head_map(common.flame_motion(self._head, *source), self._head)
 
     def tick(self) -> float | None:
         is_driven = drive.session() is not None  # which further sliders would end
@@ -163,7 +147,7 @@ class _Sliders:
         if self._made and needs_sliders(head):
             if head.mode == "EDIT":
                 return POLL_INTERVAL_S
-            add_shapes(head, *self._made[0])
+            keyframes.add_shapes(head, *self._made[0])
             monitor.push_undo()
             monitor.redraw()
         return None
@@ -180,4 +164,4 @@ def _after_load(_: Any) -> None:
 
 
 def register(at_end: AtEnd) -> None:
-    register_handlers(at_end, (bpy.app.handlers.load_post, _after_load))
+    common.register_handlers(at_end, (bpy.app.handlers.load_post, _after_load))

@@ -19,11 +19,9 @@ from ..stga_addon.jobs.table import KINDS, Kind
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerState, failure_report
-from ..stga_addon.worker.training_python import missing_packages
 from . import monitor, options
 from .common import Action, Poll, file_path, need, polled
 from .options import ONCE
-from .training_python import training_python
 
 
 def start(
@@ -80,17 +78,6 @@ def _show(progress: Any) -> bool:
     """Show at the pointer how far a request is that Blender's own Python carries out."""
     show_progress(progress.share)
     return False
-
-
-def python_of(operator: Any, context: Any) -> str | None:
-    """The interpreter that is to carry out a request; None: that of Blender, where it waits and has
-    the packages.
-
-    Raises StgaError where there is none.
-    """
-    if (operator.wait or bpy.app.background) and not operator.python and not missing_packages():
-        return None
-    return training_python(context, operator.python)
 
 
 def _states(context: Any, kinds: Iterable[Kind] = Kind) -> list[Any]:

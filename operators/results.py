@@ -15,16 +15,8 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
+from ..stga_addon.scene.display import splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.display.splat_object import (
-    build_next_node_group,
-    can_update,
-    check_head,
-    hide_object,
-    show_avatar,
-    store_light,
-    update_splats,
-)
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING
@@ -102,17 +94,17 @@ def _present(
     head, shown, run = scene.stga.head, _run_object(scene, state), _run(state)
     if not is_head(head):
         raise StgaError("No head in the scene to show the avatar on; import the capture")
-    check_head(avatar, head)
-    if shown is not None and can_update(shown, avatar):
-        update_splats(shown, attributes)
+    splat_object.check_head(avatar, head)
+    if shown is not None and splat_object.can_update(shown, avatar):
+        splat_object.update_splats(shown, attributes)
         return Shown()
-    if build_next_node_group(avatar):
+    if splat_object.build_next_node_group(avatar):
         return SliceBuilt()
     if shown is not None:
         bpy.data.objects.remove(shown)
-    shown = show_avatar(avatar, head, f"{head.name} {run.name}", attributes)
+    shown = splat_object.show_avatar(avatar, head, f"{head.name} {run.name}", attributes)
     shown[tags.RUN] = str(run)
-    hide_object(head, scene)
+    splat_object.hide_object(head, scene)
     scene.stga.splats = shown
     return Shown(undoable=True)
 
@@ -136,7 +128,7 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
 def _store_light(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats the light that is now in the avatar of the run."""
     shown = scene.stga.splats
-    if shown is None or not store_light(shown, read_avatar(state.subject / AVATAR)):
+    if shown is None or not splat_object.store_light(shown, read_avatar(state.subject / AVATAR)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
     return Shown(undoable=True)

@@ -6,22 +6,11 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..stga_addon.capture.model import Capture
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
+from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.scene.objects import show_progress
-from ..stga_addon.scene.vertex_groups import (
-    RESIDUAL,
-    has_heat_map,
-    hide_heat_map,
-    read_regions,
-    read_selection,
-    show_heat_map,
-    shows_residuals,
-    splats_per_face,
-    write_selection,
-)
 from ..stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture
 from ..stga_addon.training.run.folder import read_residuals
 from ..stga_addon.training.settings import TrainingSettings
@@ -58,16 +47,25 @@ class Select(Edit, bpy.types.Operator):
         head = head_of(context)
         given = [name.strip() for name in self.regions.split(",") if name.strip()]
         names = given or key_regions(head)
-        capture = _with_painted(open_capture(*capture_source(head)), head, names)
-        options = SelectionOptions(self.threshold, self.zero_pose, tuple(names))
+        capture = open_capture(*capture_source(head))
+        # a painted group replaces a region of the same name
+        painted = groups.read_regions(head, [name for name in names if name in head.vertex_groups])
+        for name in names:
+            if name not in painted and name not in capture.regions:
+                raise StgaError(f"{head.name}: has no region and no vertex group '{name}'")
+            if name in painted and not painted[name].any():
+                problem = f"no triangle has all its corners in the vertex group '{name}'"
+                raise StgaError(f"{head.name}: {problem}")
+        capture = replace(capture, regions={**capture.regions, **painted})
         show_progress(0.3)
-        selection = select_capture(capture, options)
+        rule = SelectionOptions(self.threshold, self.zero_pose, tuple(names))
+        selection = select_capture(capture, rule)
         show_progress(0.6)
-        write_selection(head, selection)
+        groups.write_selection(head, selection)
         head[tags.KEY_REGIONS] = "\n".join(names)
         count_selected(context.scene, head)
-        if has_heat_map(head) and not shows_residuals(head):
-            show_heat_map(head, _shares(head))
+        if groups.has_heat_map(head) and not groups.shows_residuals(head):
+            groups.show_heat_map(head, _shares(head))
         moving = [faces.mean() for faces in selection.values() if faces.any()]
         share = 100 * sum(moving) / len(moving) if moving else 0.0
         counted = f"{len(moving)} of {len(selection)} frames select triangles"
@@ -128,11 +126,22 @@ class HeatMap(Edit, bpy.types.Operator):
     def run(self, context: Any) -> None:
         head, splats = head_of(context), context.scene.stga.splats
         if not self.show:
-            hide_heat_map(head)
+            groups.hide_heat_map(head)
         elif self.of == "RESIDUAL":
-            self._show_residuals(head)
+            folder = file_path(self.directory, "run folder")
+            residual = np.nan_to_num(read_residuals(folder, len(head.data.polygons)))
+            seen = residual[residual > 0]
+            largest = float(np.quantile(seen, LARGEST_RESIDUAL_QUANTILE)) if seen.size else 1.0
+            groups.show_heat_map(head, residual, groups.RESIDUAL, largest)
+            self.inform(f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
         else:
-            self._show_shares(head)
+            share = _shares(head)
+            if not share.any():
+                problem = "no frame selects a triangle yet; select moving triangles first"
+                raise StgaError(f"{head.name}: {problem}")
+            groups.show_heat_map(head, share)
+            often = f"{share.max():.0%} of the frames"
+            self.inform(f"The most selected triangle is selected in {often}")
         in_view = context.view_layer.objects
         if splats is not None and all(in_view.get(each.name) is each for each in (splats, head)):
             # Only one of the two: each covers the other.
@@ -143,22 +152,6 @@ class HeatMap(Edit, bpy.types.Operator):
                 shading = area.spaces.active.shading
                 shading.color_type = "VERTEX" if self.show else "MATERIAL"
 
-    def _show_shares(self, head: Any) -> None:
-        share = _shares(head)
-        if not share.any():
-            problem = "no frame selects a triangle yet; select moving triangles first"
-            raise StgaError(f"{head.name}: {problem}")
-        show_heat_map(head, share)
-        self.inform(f"The most selected triangle is selected in {share.max():.0%} of the frames")
-
-    def _show_residuals(self, head: Any) -> None:
-        folder = file_path(self.directory, "run folder")
-        residual = np.nan_to_num(read_residuals(folder, len(head.data.polygons)))
-        seen = residual[residual > 0]
-        largest = float(np.quantile(seen, LARGEST_RESIDUAL_QUANTILE)) if seen.size else 1.0
-        show_heat_map(head, residual, RESIDUAL, largest)
-        self.inform(f"Red: a mean error of {100 * largest:.1f} % of full brightness or more")
-
 
 def possible_regions(head: Any) -> list[str]:
     """What can be selected as a whole: regions of the capture, and vertex groups of neither
@@ -166,9 +159,11 @@ def possible_regions(head: Any) -> list[str]:
     names = [name for name in head.data.attributes.keys() if name.startswith(tags.REGION_PREFIX)]  # noqa: SIM118
     rigs = [each.object for each in head.modifiers if each.type == "ARMATURE" and each.object]
     bones = {bone.name for rig in rigs for bone in rig.data.bones}
-    groups = [group.name for group in head.vertex_groups if tags.group_timestep(group.name) is None]
     own = [name.removeprefix(tags.REGION_PREFIX) for name in names]
-    return list(dict.fromkeys([*own, *(name for name in groups if name not in bones)]))
+    for group in head.vertex_groups:
+        if tags.group_timestep(group.name) is None and group.name not in bones:
+            own.append(group.name)
+    return list(dict.fromkeys(own))
 
 
 def key_regions(head: Any) -> list[str]:
@@ -178,27 +173,14 @@ def key_regions(head: Any) -> list[str]:
     return [name for name in ticked if name in possible]
 
 
-def _with_painted(capture: Capture, head: Any, names: list[str]) -> Capture:
-    """The capture with the named vertex groups as regions; a painted group replaces a region of the
-    same name."""
-    painted = read_regions(head, [name for name in names if name in head.vertex_groups])
-    for name in names:
-        if name not in painted and name not in capture.regions:
-            raise StgaError(f"{head.name}: has no region and no vertex group '{name}'")
-        if name in painted and not painted[name].any():
-            problem = f"no triangle has all its corners in the vertex group '{name}'"
-            raise StgaError(f"{head.name}: {problem}")
-    return replace(capture, regions={**capture.regions, **painted})
-
-
 def count_selected(scene: Any, head: Any) -> None:
     """Fill the panel's table of selected triangles."""
     settings = scene.stga
-    per_face = splats_per_face(settings.splats, head)
+    per_face = groups.splats_per_face(settings.splats, head)
     order = TrainingSettings().lattice_order(len(head.data.polygons))
     every = (order + 1) * (order + 2) // 2  # at the start of a training
     settings.selected_frames.clear()
-    for timestep, selected in read_selection(head).items():
+    for timestep, selected in groups.read_selection(head).items():
         row = settings.selected_frames.add()
         row.frame, row.triangles = timestep, int(selected.sum())
         counted = row.triangles * every if per_face is None else per_face[selected].sum()
@@ -207,4 +189,4 @@ def count_selected(scene: Any, head: Any) -> None:
 
 def _shares(head: Any) -> np.ndarray:
     """(F,) share of the frames that select each triangle."""
-    return np.mean(list(read_selection(head).values()), axis=0)
+    return np.mean(list(groups.read_selection(head).values()), axis=0)

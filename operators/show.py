@@ -13,33 +13,14 @@ from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.compat import NATIVE_SPLATS
-from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
-from ..stga_addon.scene.display.splat_object import (
-    get_input,
-    hide_object,
-    set_input,
-    show_avatar,
-    show_world_splats,
-    shows_nodes,
-    use_transparent_bounces,
-    view_transform_hint,
-)
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
 from ..stga_addon.scene.objects import show_progress
 from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
-from . import options
-from .common import (
-    Action,
-    Edit,
-    FileImport,
-    file_path,
-    flame_model_path,
-    head_of,
-    need,
-    needs_head,
-)
+from . import common, options
+from .common import Action, Edit, FileImport, file_path, head_of, need
 from .monitor import run_of
 from .options import ONCE
 from .request import idle, start
@@ -55,7 +36,7 @@ UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
 class ShowAvatar(Edit, bpy.types.Operator, FileImport):
     """Show a trained avatar: splats that follow the animated head"""
 
-    needs = (needs_head,)
+    needs = (common.needs_head,)
 
     hide_head: options.boolean(
         "Hide Head",
@@ -69,9 +50,9 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         settings = context.scene.stga
         avatar = read_avatar(path)
         show_progress(0.3)
-        settings.splats = show_avatar(avatar, head, f"{head.name} {path.stem}")
+        settings.splats = splat_object.show_avatar(avatar, head, f"{head.name} {path.stem}")
         if self.hide_head:
-            hide_object(head, context.scene)
+            splat_object.hide_object(head, context.scene)
         show_world(path, head)
         settings.avatar = self.filepath
         settings.run_folder = run_of(self.filepath) or settings.run_folder
@@ -98,7 +79,7 @@ class ImportPly(Edit, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> None:
         path = file_path(self.filepath, "PLY")
         splats = read_ply(path)
-        shown = context.scene.stga.splats = show_world_splats(splats, path.stem)
+        shown = context.scene.stga.splats = splat_object.show_world_splats(splats, path.stem)
         shown.rotation_euler = (radians(UP_ROTATION_DEG[self.up]), 0.0, 0.0)
         self.inform(f"{len(splats)} splats")
 
@@ -106,23 +87,23 @@ class ImportPly(Edit, bpy.types.Operator, FileImport):
 # Display
 
 
-def _has_own_splats(context: Any) -> bool:
-    splats = context.scene.stga.splats
-    return splats is not None and splats.library is None
-
-
 class ChooseDisplay(Edit, bpy.types.Operator):
     """Choose how the splats are displayed, in a shading that shows their colors"""
 
     bl_label = "Display"
-    needs = (need(_has_own_splats, "Show an avatar first"),)
+    needs = (
+        need(
+            lambda context: getattr(context.scene.stga.splats, "library", "") is None,
+            "Show an avatar first",
+        ),
+    )
 
     display: options.choice(
         "Display", "How splats are displayed", *((mode, mode, LIMITS[mode]) for mode in OFFERED)
     )
 
     def run(self, context: Any) -> None:
-        set_input(context.scene.stga.splats, splat_nodes.DISPLAY, self.display)
+        splat_object.set_input(context.scene.stga.splats, splat_nodes.DISPLAY, self.display)
         space = context.space_data
         is_viewport = getattr(space, "type", "") == "VIEW_3D"  # a script has none
         if is_viewport and self.display != AS_TRAINED and space.shading.type in GRAY:
@@ -141,21 +122,20 @@ class PreviewImages(Edit, bpy.types.Operator):
     that face it, without one as points"""
 
     bl_label = "Preview for EEVEE/Cycles"
-
     needs = (need(_own_as_trained, "No splats are displayed as trained"),)
 
     def run(self, context: Any) -> None:
         scene, space = context.scene, context.space_data
         mode = QUADS if scene.camera is not None else POINTS
         for thing in _own_as_trained(context):
-            set_input(thing, splat_nodes.DISPLAY, mode)
-        use_transparent_bounces(scene)
+            splat_object.set_input(thing, splat_nodes.DISPLAY, mode)
+        splat_object.use_transparent_bounces(scene)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
-            space.shading.type = "RENDERED" if shows_nodes(scene) else "MATERIAL"
+            space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
             if scene.camera is not None:
                 space.region_3d.view_perspective = "CAMERA"
-        if hint := view_transform_hint(scene):
+        if hint := splat_object.view_transform_hint(scene):
             self.warn(hint)
         else:
             self.inform(f"{mode}: {LIMITS[mode]}")
@@ -174,14 +154,12 @@ class StandardView(Edit, bpy.types.Operator):
 # Light
 
 
-def _follows_head(context: Any) -> bool:
+def _needs_splats(operator: Any, context: Any) -> bool:
+    """Poll: whether there are splats that follow a head."""
     splats, head = context.scene.stga.splats, None
     with suppress(StgaError):
-        head = None if splats is None else get_input(splats, splat_nodes.HEAD)
-    return head is not None
-
-
-_needs_splats = need(_follows_head, "Show an avatar first")
+        head = None if splats is None else splat_object.get_input(splats, splat_nodes.HEAD)
+    return common.polled(operator, head is not None, "Show an avatar first")
 
 
 class EstimateLight(Action, bpy.types.Operator):
@@ -194,7 +172,7 @@ class EstimateLight(Action, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         run = file_path(self.directory or context.scene.stga.run_folder, "run folder")
-        request = Relight(run, flame=flame_model_path(context))
+        request = Relight(run, flame=common.flame_model_path(context))
         start(context.scene, request, training_python(context))
 
 
@@ -203,15 +181,13 @@ class RelightFrame(Edit, bpy.types.Operator):
     frames keep them"""
 
     needs = (_needs_splats,)
-
     clear: options.boolean("Clear", "Show recorded colors again", options=ONCE)
 
     def run(self, context: Any) -> None:
-        splats = context.scene.stga.splats
         if self.clear:
-            forget_frame(splats)
+            forget_frame(context.scene.stga.splats)
         else:
-            relight_frame(splats, context.scene)
+            relight_frame(context.scene.stga.splats, context.scene)
 
 
 class HeadShadow(Edit, bpy.types.Operator):

@@ -8,25 +8,19 @@ import numpy as np
 
 from ..stga_addon.capture.meshes import SELECTED_WEIGHT
 from ..stga_addon.errors import StgaError
+from ..stga_addon.jobs import train as jobs
 from ..stga_addon.jobs.analyze import Analyze
 from ..stga_addon.jobs.table import TRAINS, Kind
-from ..stga_addon.jobs.train import Extend as ExtendRequest
-from ..stga_addon.jobs.train import Refine as RefineRequest
-from ..stga_addon.jobs.train import Resume, SelectForTake
-from ..stga_addon.jobs.train import Train as TrainRequest
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.vertex_groups import (
-    read_triangle_weights,
-    selected_triangles,
-    training_selection,
-)
+from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.training.effect_catalog import parse_choice
 from ..stga_addon.training.run.folder import AVATAR, next_folder, read_run
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
+from ..stga_addon.worker.training_python import missing_packages
 from . import options
 from .common import Action, Edit, capture_source, file_path, head_of, needs_head, needs_own_head
 from .options import ONCE
-from .request import idle, python_of, start
+from .request import idle, start
 from .training_python import test, training_python
 
 ALL_FRAMES = {"default": -1, "min": -1, "options": ONCE}
@@ -105,9 +99,9 @@ class RefineOptions:
         "selected triangles are refined instead",
     )
     seconds: options.field(
-        RefineRequest, "seconds", description="Training time", default=20.0, min=0.1
+        jobs.Refine, "seconds", description="Training time", default=20.0, min=0.1
     )
-    growth: options.field(RefineRequest, "growth", "More Splats", soft_max=2.0, subtype="FACTOR")
+    growth: options.field(jobs.Refine, "growth", "More Splats", soft_max=2.0, subtype="FACTOR")
 
 
 class ExtendOptions:
@@ -115,7 +109,7 @@ class ExtendOptions:
 
     take: options.path("Take", "Folder of a further capture of the same head", "DIR_PATH")
     seconds: options.field(
-        ExtendRequest, "seconds", description="Training time", default=60.0, min=0.1
+        jobs.Extend, "seconds", description="Training time", default=60.0, min=0.1
     )
 
 
@@ -134,8 +128,13 @@ class TrainingOperator(Action):
     )
 
     def start(self: Any, context: Any, request: Any) -> None:
-        """Start the training, or wait for it. Raises StgaError."""
-        if start(context.scene, request, python_of(self, context), wait=self.wait):
+        """Start the training, or wait for it; Blender's own Python trains where it waits and has
+        the packages. Raises StgaError."""
+        waits = self.wait or bpy.app.background
+        python = None
+        if not waits or self.python or missing_packages():
+            python = training_python(context, self.python)
+        if start(context.scene, request, python, wait=self.wait):
             self.inform(f"Trained {request.run}")
 
     @property
@@ -173,11 +172,11 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         if not capture.is_dir():
             expected = "expected the capture that the head was imported from"
             raise StgaError(f"{capture}: is not a folder; {expected}")
-        how = {"device": self.chosen_device, "selection": training_selection(head)}
+        how = {"device": self.chosen_device, "selection": groups.training_selection(head)}
         if self.resume:
             # with takes, the head may be that of any of them
             moved = None if read_run(run).takes else capture
-            self.start(context, Resume(run, moved, *source, **how))
+            self.start(context, jobs.Resume(run, moved, *source, **how))
             return
         preset, effects = None if self.preset == "none" else self.preset, None
         if self.strategy != "gaussian-avatars":
@@ -186,30 +185,25 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         settings = make_settings(
             self.strategy, preset=preset, seed=self.seed, effects=effects, **budget
         )
-        self.start(context, TrainRequest(run, capture, settings, *source, **how))
+        self.start(context, jobs.Train(run, capture, settings, *source, **how))
 
 
 class ContinueOperator(TrainingOperator, Edit):
     """Mixin of operators that train a run further, in a new folder."""
 
-    def parent_run(self: Any) -> Any:
-        """The run's folder. Raises StgaError where it holds no avatar."""
+    def go_on(self: Any, context: Any, make: Any, *what: Any, **more: Any) -> None:
+        """Start the training of the request `make(run, parent, *what, …)`; the splats that show the
+        run before show the new one, so that its preview changes them. Raises StgaError where there
+        is no avatar to go on with."""
         parent = file_path(self.directory, "run folder").resolve()
         if not (parent / AVATAR).is_file():
             raise StgaError(f"{parent}: holds no trained avatar; train one first")
-        return parent
-
-    def how(self: Any, head: Any) -> dict[str, Any]:
-        """What both requests have: budget, FLAME model and device."""
-        source = {"flame": capture_source(head)[1], "device": self.chosen_device}
-        return self.budget(self.seconds) | source
-
-    def start(self, context: Any, request: Any) -> None:
-        """Start the training; the splats that show the run before show the new one, so that its
-        preview changes them."""
-        super().start(context, request)
-        settings, parent = context.scene.stga, str(request.parent)
-        shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == parent]
+        source = {"flame": capture_source(head_of(context))[1], "device": self.chosen_device}
+        how = {**more, **self.budget(self.seconds), **source}
+        request = make(next_folder(parent), parent, *what, **how)
+        self.start(context, request)
+        settings = context.scene.stga
+        shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(parent)]
         if not shown and settings.splats is not None:
             shown = [settings.splats]
         for thing in shown:
@@ -231,12 +225,27 @@ class Refine(ContinueOperator, RefineOptions, DeviceOptions, bpy.types.Operator)
     last: options.integer("Last Frame", "Last frame to train on; -1: all", **ALL_FRAMES)
 
     def run(self, context: Any) -> None:
-        head = head_of(context)
-        weights = None if self.region else _painted_region(head, self.group)
+        weights = None if self.region else self._painted_region(head_of(context))
         frames = None if self.last < 0 else (max(self.first, 0), self.last)
-        parent, more = self.parent_run(), {"growth": self.growth, **self.how(head)}
-        place = next_folder(parent), parent
-        self.start(context, RefineRequest(*place, self.region, weights, frames, **more))
+        self.go_on(context, jobs.Refine, self.region, weights, frames, growth=self.growth)
+
+    def _painted_region(self, head: Any) -> np.ndarray:
+        """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises
+        StgaError for none."""
+        if head.mode == "EDIT":
+            weights = groups.selected_triangles(head).astype(np.float32)
+            where = "no triangle is selected in Edit Mode"
+        else:
+            named = head.vertex_groups
+            found = named.get(self.group) if self.group else named.active
+            if found is None:
+                problem = f"has no vertex group '{self.group}' to refine"
+                raise StgaError(f"{head.name}: {problem}; paint one, or select in Edit Mode")
+            weights = groups.read_triangle_weights(head, found.name)
+            where = f"no triangle has all its corners in the vertex group '{found.name}'"
+        if not (weights >= SELECTED_WEIGHT).any():
+            raise StgaError(f"{head.name}: {where}")
+        return weights
 
 
 class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator):
@@ -250,26 +259,7 @@ class Extend(ContinueOperator, ExtendOptions, DeviceOptions, bpy.types.Operator)
         take = file_path(self.take, "take").resolve()
         if not take.is_dir():
             raise StgaError(f"{take}: is not a folder; expected a further capture of the same head")
-        parent, more = self.parent_run(), self.how(head_of(context))
-        self.start(context, ExtendRequest(next_folder(parent), parent, (take,), **more))
-
-
-def _painted_region(head: Any, group: str) -> np.ndarray:
-    """(F,) weights of the triangles selected in Edit Mode, or of a vertex group. Raises StgaError
-    for none."""
-    if head.mode == "EDIT":
-        weights = selected_triangles(head).astype(np.float32)
-        where = "no triangle is selected in Edit Mode"
-    else:
-        found = head.vertex_groups.get(group) if group else head.vertex_groups.active
-        if found is None:
-            problem = f"has no vertex group '{group}' to refine"
-            raise StgaError(f"{head.name}: {problem}; paint one, or select in Edit Mode")
-        weights = read_triangle_weights(head, found.name)
-        where = f"no triangle has all its corners in the vertex group '{found.name}'"
-    if not (weights >= SELECTED_WEIGHT).any():
-        raise StgaError(f"{head.name}: {where}")
-    return weights
+        self.go_on(context, jobs.Extend, (take,))
 
 
 class SelectExtension(Action, bpy.types.Operator):
@@ -284,4 +274,4 @@ class SelectExtension(Action, bpy.types.Operator):
     def run(self, context: Any) -> None:
         run = file_path(self.directory, "run folder")
         take, flame, _ = capture_source(head_of(context))
-        start(context.scene, SelectForTake(run, take, flame), training_python(context))
+        start(context.scene, jobs.SelectForTake(run, take, flame), training_python(context))

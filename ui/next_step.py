@@ -91,7 +91,7 @@ def _draw_message(layout: Any, context: Any) -> None:
 
 
 def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
-    """Buttons that bring a shown avatar to life."""
+    """Buttons that bring a shown avatar to life, and what the last video has come to."""
     layout.label(text="Orbit the avatar, or try", icon="INFO")
     column = layout.column(align=True)
     is_playing = context.screen.is_animation_playing
@@ -114,18 +114,13 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
             toggle = {"icon": "RESTRICT_SELECT_OFF", "toggle": True}
             modifier = splat_modifier(settings.splats)
             draw_input(column, modifier, splat_nodes.SHOW_SELECTION, **toggle)
-    draw_video(column, context)
-
-
-def draw_video(layout: Any, context: Any) -> None:
-    """Draw the button Render Video, or what the last video has come to."""
-    if draw_running(layout, context, Kind.VIDEO):
+    if draw_running(column, context, Kind.VIDEO):
         return
     video = monitor.state_of(context.scene, Kind.VIDEO)
     if video.subject is None:
-        layout.operator("stga.render_video", text="Render Video…", icon="RENDER_ANIMATION")
+        column.operator("stga.render_video", text="Render Video…", icon="RENDER_ANIMATION")
         return
-    box = draw_end(layout, context, video)
+    box = draw_end(column, context, video)
     if video.snapshot.state == WorkerState.FINISHED:
         opened = box.operator("wm.path_open", text=f"Open {video.subject.name}", icon="PLAY")
         opened.filepath = str(video.subject)

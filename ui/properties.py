@@ -7,7 +7,7 @@ import bpy
 
 from ..operators import options
 from ..operators.common import AtEnd, register_classes
-from ..operators.drive import DriveOptions
+from ..operators.drive import DriveSettings
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
 
@@ -94,10 +94,6 @@ class ExtendSettings(ExtendOptions, bpy.types.PropertyGroup):
     """The panel's options of Extend with Take."""
 
 
-class DriveSettings(DriveOptions, bpy.types.PropertyGroup):
-    """The panel's options of driving live."""
-
-
 class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     """Settings of the panel, one group for each scene; passed to operators as arguments, but for
     head and splats."""
@@ -141,14 +137,9 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
 
 
 CLASSES = (
-    SelectedFrame,
-    EffectRow,
-    TrackSettings,
-    RefineSettings,
-    ExtendSettings,
-    DriveSettings,
+    SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings,
     SceneSettings,
-)
+)  # fmt: skip
 
 
 def register(at_end: AtEnd) -> None:

@@ -60,7 +60,14 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
         layout.operator("stga.select", icon="GROUP_VERTEX")
         if not is_head(head):
             return
-        _draw_regions(layout, head)
+        possible, ticked = possible_regions(head), key_regions(head)
+        if possible:
+            layout.label(text="Whole Regions")
+            grid = layout.grid_flow(columns=2, align=True, row_major=True)
+        for name in possible:
+            is_on = name in ticked
+            how = {"icon": "CHECKBOX_HLT" if is_on else "CHECKBOX_DEHLT", "depress": is_on}
+            grid.operator("stga.toggle_region", text=name.replace("_", " "), **how).name = name
         if settings.selected_frames:
             heading = layout.row()
             for text in ("Frame", "Triangles", "Splats"):
@@ -80,15 +87,3 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
 def has_selection(head: Any) -> bool:
     """Whether a head has a vertex group that is the selection of a frame."""
     return any(tags.group_timestep(group.name) is not None for group in head.vertex_groups)
-
-
-def _draw_regions(layout: Any, head: Any) -> None:
-    possible, ticked = possible_regions(head), key_regions(head)
-    if not possible:
-        return
-    layout.label(text="Whole Regions")
-    grid = layout.grid_flow(columns=2, align=True, row_major=True)
-    for name in possible:
-        is_on = name in ticked
-        how = {"icon": "CHECKBOX_HLT" if is_on else "CHECKBOX_DEHLT", "depress": is_on}
-        grid.operator("stga.toggle_region", text=name.replace("_", " "), **how).name = name

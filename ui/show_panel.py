@@ -15,16 +15,9 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages
 from ..stga_addon.scene.compat import modifier_input_owner
-from ..stga_addon.scene.display import splat_nodes
+from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
-from ..stga_addon.scene.display.splat_object import (
-    display_mode,
-    input_identifier,
-    shows_nodes,
-    splat_modifier,
-    stored_light,
-    view_transform_hint,
-)
+from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
 from ..stga_addon.scene.render import viewport_display
@@ -33,13 +26,9 @@ from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from .sidebar import SidebarPanel, draw_running, draw_text
 
 DISPLAY_INPUTS = (
-    splat_nodes.SIZE,
-    splat_nodes.OPACITY_THRESHOLD,
-    splat_nodes.PERCENTAGE,
-    splat_nodes.VIEW_DEPENDENT,
-    splat_nodes.SHOW_SELECTION,
-    splat_nodes.SELECTED_ONLY,
-)
+    splat_nodes.SIZE, splat_nodes.OPACITY_THRESHOLD, splat_nodes.PERCENTAGE,
+    splat_nodes.VIEW_DEPENDENT, splat_nodes.SHOW_SELECTION, splat_nodes.SELECTED_ONLY,
+)  # fmt: skip
 _is_told = False
 """Whether the render job in progress has said that it does not show the scene's light."""
 
@@ -53,16 +42,14 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
         layout.operator("stga.export_avatar", icon="EXPORT").avatar = settings.avatar
         layout.prop(settings, "splats")
-        if settings.splats is not None:
-            self._draw_display(layout, context, settings.splats)
-
-    def _draw_display(self, layout: Any, context: Any, splats: Any) -> None:
+        if settings.splats is None:
+            return
         try:
-            modifier = splat_modifier(splats)
+            modifier = splat_object.splat_modifier(settings.splats)
         except StgaError as error:
             layout.label(text=str(error), icon="ERROR")
             return
-        mode = display_mode(splats)
+        mode = splat_object.display_mode(settings.splats)
         layout.operator_menu_enum("stga.choose_display", "display", text=f"Display: {mode}")
         column = layout.column(align=True)
         for name in DISPLAY_INPUTS:
@@ -79,14 +66,14 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
             choose = "stga.choose_display"
             show = layout.operator(choose, text="Show Colors", icon="SHADING_TEXTURE")
             show.display = mode
-        elif view_transform_hint(context.scene):
+        elif splat_object.view_transform_hint(context.scene):
             layout.label(text="View transform changes the colors", icon="ERROR")
             layout.operator("stga.standard_view")
 
 
 def draw_input(layout: Any, modifier: Any, name: str, **how: Any) -> None:
     """Draw an input of the splats' node tree, where this display has it."""
-    identifier = input_identifier(modifier, name)
+    identifier = splat_object.input_identifier(modifier, name)
     if identifier is not None:
         owner, prop = modifier_input_owner(modifier, identifier)
         layout.prop(owner, prop, text=name, **how)
@@ -102,7 +89,7 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, lighting_settings(context.scene)
-        light = stored_light(context.scene.stga.splats)
+        light = splat_object.stored_light(context.scene.stga.splats)
         if light is None:
             draw_text(layout, context, "The avatar does not know the light of its capture", "INFO")
             if not draw_running(layout, context, Kind.LIGHT):
@@ -114,7 +101,16 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         if hint:
             draw_text(layout, context, hint, "ERROR" if shows_nodes(context.scene) else "INFO")
         if settings.mode != "recorded":
-            self._draw_settings(layout, context, settings)
+            column = layout.column()
+            column.use_property_split = True
+            if settings.mode == "mix":
+                column.prop(settings, "mix")
+            shown = ("exposure", "white", "roughness", "specular", "shadows", "world", "lights")
+            for name in shown:
+                column.prop(settings, name)
+            if settings.world and world_light(context.scene.world) is None:
+                hint = "Of worlds, colors and environment textures count"
+                draw_text(layout, context, hint, "ERROR")
         if light.damping:
             text = f"The capture's light was hard: albedo is evened out by {light.damping:.0%}"
             draw_text(layout, context, text, "INFO")
@@ -122,16 +118,6 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         row.operator("stga.relight_frame")
         row.operator("stga.relight_frame", text="", icon="X").clear = True
         layout.operator("stga.head_shadow")
-
-    def _draw_settings(self, layout: Any, context: Any, settings: Any) -> None:
-        column = layout.column()
-        column.use_property_split = True
-        if settings.mode == "mix":
-            column.prop(settings, "mix")
-        for name in ("exposure", "white", "roughness", "specular", "shadows", "world", "lights"):
-            column.prop(settings, name)
-        if settings.world and world_light(context.scene.world) is None:
-            draw_text(layout, context, "Of worlds, colors and environment textures count", "ERROR")
 
 
 def _begin_exposure(scene: Any) -> None:

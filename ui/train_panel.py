@@ -5,18 +5,10 @@ from typing import Any
 
 import bpy
 
-from ..operators import monitor
+from ..operators import monitor, train
 from ..operators.common import is_head, package
-from ..operators.train import (
-    DeviceOptions,
-    ExtendOptions,
-    RefineOptions,
-    TrainOptions,
-    chosen_effects,
-)
 from ..operators.training_python import has_training_python
 from ..stga_addon.format import describe_figures, format_duration
-from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.vertex_groups import shows_residuals
@@ -44,7 +36,20 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
             return
         training = monitor.state_of(context.scene, Kind.TRAINING)
         if training.subject is not None:
-            _draw_end(layout, context, training)
+            box, run = draw_end(layout, context, training), training.place
+            state = training.snapshot.state
+            if state == WorkerState.NONE:
+                remedy = "choose its new folder and press Resume"
+                draw_text(box, context, f"{run}: does not exist; {remedy}")
+            elif not state.failed:
+                for line in describe_figures(training.snapshot.status.figures)[1:]:
+                    draw_text(box, context, line)
+                draw_curve(box, run)
+                if training.files.tracking is not None:  # the splats were trained with it
+                    head, text = context.scene.stga.head, "Apply Refined Tracking"
+                    apply = box.operator("stga.apply_motion", text=text, icon="CON_FOLLOWTRACK")
+                    apply.filepath, apply.own_offsets = str(run / TRACKING), True
+                    apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1
         layout.prop(settings, "run_folder", text="Folder")
         layout.prop(settings, "preset")
         times = [f"{name} {format_duration(s)}" for name, s in preset_times(settings).items()]
@@ -57,29 +62,13 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
         draw_missing_python(layout, context)
 
 
-def _draw_end(layout: Any, context: Any, training: RequestState) -> None:
-    box, state, run = draw_end(layout, context, training), training.snapshot.state, training.place
-    if state == WorkerState.NONE:
-        remedy = "choose its new folder and press Resume"
-        draw_text(box, context, f"{run}: does not exist; {remedy}")
-    elif not state.failed:
-        for line in describe_figures(training.snapshot.status.figures)[1:]:
-            draw_text(box, context, line)
-        draw_curve(box, run)
-        if training.files.tracking is not None:  # the splats were trained with it
-            head, text = context.scene.stga.head, "Apply Refined Tracking"
-            apply = box.operator("stga.apply_motion", text=text, icon="CON_FOLLOWTRACK")
-            apply.filepath, apply.own_offsets = str(run / TRACKING), True
-            apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1
-
-
 def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     """Draw the button that starts, or resumes, training with the panel's settings."""
     text, icon = ("Resume", "FRAME_NEXT") if resume else ("Train", "MOD_PARTICLES")
-    train = layout.operator("stga.train", text=text, icon=icon)
-    set_options(train, settings, TrainOptions)
-    train.directory, train.resume = settings.run_folder, resume
-    train.effects = " ".join(chosen_effects(settings))
+    button = layout.operator("stga.train", text=text, icon=icon)
+    set_options(button, settings, train.TrainOptions)
+    button.directory, button.resume = settings.run_folder, resume
+    button.effects = " ".join(train.chosen_effects(settings))
 
 
 def draw_missing_python(layout: Any, context: Any) -> None:
@@ -115,19 +104,6 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings = context.scene.stga
-        self._draw_refine(settings)
-        column = self.layout.column()
-        column.prop(settings.extend, "take")
-        column.prop(settings.extend, "seconds")
-        extend = column.operator("stga.extend", icon="ADD")
-        set_options(extend, settings, DeviceOptions)
-        set_options(extend, settings.extend, ExtendOptions)
-        extend.directory = settings.run_folder
-        if not draw_running(column, context, Kind.SELECTION):
-            select = column.operator("stga.select_extension", icon="GROUP_VERTEX")
-            select.directory = settings.run_folder
-
-    def _draw_refine(self, settings: Any) -> None:
         column, head, options = self.layout.column(), settings.head, settings.refine
         shown, editing = shows_residuals(head), head.mode == "EDIT"
         text = "Hide Residuals" if shown else "Show Residuals"
@@ -146,11 +122,21 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
         fields.prop(options, "growth")
         text = "Refine Selected Faces" if editing else "Refine Vertex Group"
         refine = column.operator("stga.refine", text=text, icon="SCULPTMODE_HLT")
-        set_options(refine, settings, DeviceOptions)
-        set_options(refine, options, RefineOptions)
+        set_options(refine, settings, train.DeviceOptions)
+        set_options(refine, options, train.RefineOptions)
         refine.directory = residuals.directory = settings.run_folder
         if not options.all_frames:
             refine.first, refine.last = options.first, max(options.first, options.last)
+        column = self.layout.column()
+        column.prop(settings.extend, "take")
+        column.prop(settings.extend, "seconds")
+        extend = column.operator("stga.extend", icon="ADD")
+        set_options(extend, settings, train.DeviceOptions)
+        set_options(extend, settings.extend, train.ExtendOptions)
+        extend.directory = settings.run_folder
+        if not draw_running(column, context, Kind.SELECTION):
+            select = column.operator("stga.select_extension", icon="GROUP_VERTEX")
+            select.directory = settings.run_folder
 
 
 class EffectsPanel(ClosedPanel, bpy.types.Panel):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.mesh_geometry import similarity
 from ..errors import StgaError
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..progress import Cancelled, Progress, Report
@@ -63,6 +64,4 @@ def head_rotation(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     distance = focal + points[:, 2] - points[:, 2].mean()
     offset = (points[:, :2] - [width / 2, height / 2]) * (distance / focal)[:, None]
     seen = np.column_stack([offset * [1, -1], -distance])[shapes.reliable]
-    face = shapes.points[shapes.reliable]
-    left, _, right = np.linalg.svd((seen - seen.mean(0)).T @ (face - face.mean(0)))
-    return np.asarray(left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right)
+    return similarity(shapes.points[shapes.reliable], seen).rotation

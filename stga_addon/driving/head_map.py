@@ -1,7 +1,6 @@
 """ARKit's 52 weights as parameters of one FLAME head: fitted, or exact for the bundled head."""
 
 import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +35,7 @@ JAW_POSES = (
 COMBINATIONS = 60  # Random combinations of the other shapes at each of the poses of the jaw
 ACTIVE_SHARE = 0.35  # Of the shapes in a combination
 CACHED_MAPS = 8
-_cache: OrderedDict[bytes, "HeadMap"] = OrderedDict()
+_cache: dict[bytes, "HeadMap"] = {}
 
 
 @dataclass(frozen=True)
@@ -105,8 +104,8 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
         places, used = face_points(sequence.model, name)
         points = SurfacePoints(places.face[used], places.barycentric[used])
         _cache[key] = (_named if person.expression_names else _fitted)(person, points, used)
-        while len(_cache) > CACHED_MAPS:
-            _cache.popitem(last=False)
+        if len(_cache) > CACHED_MAPS:
+            del _cache[next(iter(_cache))]
     return _cache[key]
 
 

@@ -65,6 +65,14 @@ def _by_part(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
     return {part: np.stack([getattr(frame, name) for frame in frames]) for part, name in fields}
 
 
+def _with_parts(frames: Sequence[FlameFrame], parts: Mapping[str, np.ndarray]) -> list[FlameFrame]:
+    """The frames with the parameters of parts (T, K) in place of their own."""
+    return [
+        replace(frame, **{name: parts[part][row] for part, name in PART_FIELDS.items()})
+        for row, frame in enumerate(frames)
+    ]
+
+
 def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
     """The range of the frames that an avatar was trained on."""
     middle, width = {}, {}
@@ -106,11 +114,8 @@ def exchanged_neutral(
     small angles.
     """
     own, theirs = own or dict.fromkeys(PART_FIELDS, 0.0), theirs or dict.fromkeys(PART_FIELDS, 0.0)
-    change = {name: own[part] - theirs[part] for part, name in PART_FIELDS.items()}
-    return [
-        replace(f, **{name: getattr(f, name) + value for name, value in change.items()})
-        for f in frames
-    ]
+    parts = _by_part(frames).items()
+    return _with_parts(frames, {part: each + (own[part] - theirs[part]) for part, each in parts})
 
 
 def outside(frames: Sequence[FlameFrame], trained: TrainedRange) -> dict[str, np.ndarray]:
@@ -132,17 +137,14 @@ def led_back(
     Inside the range nothing changes; beyond it, a distance of d half widths becomes 1 − exp(−d)
     quarters of one, so that motion goes on softly. Between 0 and 1 the result lies between both.
     """
-    changed = []
-    for frame in frames:
-        values = {}
-        for part, name in PART_FIELDS.items():
-            middle, width = trained.middle[part], trained.width[part]
-            offset = (getattr(frame, name) - middle) / width
-            beyond = np.maximum(np.abs(offset) - 1, 0)
-            soft = np.sign(offset) * (np.minimum(np.abs(offset), 1) + 0.25 * (1 - np.exp(-beyond)))
-            values[name] = middle + width * ((1 - strength) * offset + strength * soft)
-        changed.append(replace(frame, **values))
-    return changed
+    changed = {}
+    for part, values in _by_part(frames).items():
+        middle, width = trained.middle[part], trained.width[part]
+        offset = (values - middle) / width
+        beyond = np.maximum(np.abs(offset) - 1, 0)
+        soft = np.sign(offset) * (np.minimum(np.abs(offset), 1) + 0.25 * (1 - np.exp(-beyond)))
+        changed[part] = middle + width * ((1 - strength) * offset + strength * soft)
+    return _with_parts(frames, changed)
 
 
 MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
@@ -164,16 +166,9 @@ def parsed_gain(text: str) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """What is done to a motion on its way to a head; smoothing, mirror, gains and exchange to
-    performances alone.
-
-    strength   of expression, jaw, eyes and neck about the neutral face; of the head's motion about
-               its first pose
-    neutral    whose resting face the motion is put on the head's own from (`NEUTRALS`)
-    smoothing  standard deviation in seconds
-    gains      factor of a part ("face", "jaw", "eyes", "head") or of one shape
-    stay_trained  0 to 1; None: how far the motion is outside that range is not asked for
-    """
+    """What is done to a motion on its way to a head; smoothing (seconds), mirror, gains and
+    exchange to performances alone. stay_trained None: how far the motion is outside that range is
+    not asked for."""
 
     strength: float = option(
         "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first "
@@ -236,9 +231,6 @@ def open_motion(
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     options = options or MotionOptions()
-    if options.neutral not in NEUTRALS:
-        known = ", ".join(NEUTRALS)
-        raise StgaError(f"{path}: neutral is {options.neutral!r}, expected one of {known}")
     if is_performance(path):
         model = flame_model(flame)
         if flame is None and len(model.faces) != len(faces):

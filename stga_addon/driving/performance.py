@@ -164,11 +164,6 @@ def relative_to(performance: Performance, rest: Performance) -> Performance:
     return replace(performance, weights=(performance.weights - neutral) / room, head=head)
 
 
-def parts_kept(performance: Performance, parts: tuple[str, ...]) -> Performance:
-    """The performance with the weights of other parts at zero."""
-    return amplified(performance, {part: float(part in parts) for part in (*PARTS, "head")})
-
-
 @dataclass(frozen=True)
 class FacePacket:
     """One frame of a live source.

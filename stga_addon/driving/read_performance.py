@@ -3,6 +3,7 @@
 import csv
 import math
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,11 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
         fields.append((*map(int, clock), int(frame), float(f"0.{part or 0}"), separator == ";"))
     hours, minutes, whole, frames, parts, dropping = np.array(fields, np.float64).T
     second = 3600 * hours + 60 * minutes + whole
-    base = _base(second, frames + parts)
+    # the frame rate for which the rows come most evenly
+    possible = [base for base in BASES if base > (frames + parts).max()] or [int(frames.max()) + 1]
+    base = USUAL_BASE if USUAL_BASE in possible else possible[0]
+    if len(np.unique(second)) > 1:
+        base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
     if dropping.any():
         minute = 60 * hours + minutes
         left_out = round(base / 15) * (minute - np.floor(minute / 10))
@@ -42,14 +47,6 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
         elapsed = second + (frames + parts) / base
     days = np.concatenate([[0], np.cumsum(np.diff(elapsed) < -DAY_S / 2)])
     return np.asarray(elapsed + DAY_S * days - elapsed[0])
-
-
-def _base(second: np.ndarray, frames: np.ndarray) -> int:
-    """The frame rate for which the rows come most evenly."""
-    possible = [base for base in BASES if base > frames.max()] or [int(frames.max()) + 1]
-    if len(np.unique(second)) < 2:
-        return USUAL_BASE if USUAL_BASE in possible else possible[0]
-    return min(possible, key=lambda base: (_unevenness(second + frames / base), base))
 
 
 def _unevenness(times: np.ndarray) -> float:
@@ -82,19 +79,14 @@ def parse_packet(data: bytes) -> FacePacket | None:
                 weights[COLUMN[name]] = float(value[2]) / 100
                 names.append(name)
         elif field.lstrip("=").startswith("head#"):
-            head = _head(field.partition("#")[2])
+            with suppress(ValueError):  # degrees
+                angles = [float(part) for part in field.partition("#")[2].split(",")[:3]]
+                pitch, yaw, roll = map(math.radians, angles)
+                if all(map(math.isfinite, angles)):
+                    head = (yaw, pitch, roll)
     if not names or not (np.abs(weights) <= MAX_WEIGHT).all():
         return None
     return FacePacket(tuple(names), weights, head)
-
-
-def _head(text: str) -> tuple[float, float, float] | None:
-    """Yaw, pitch and roll in radians of `rx,ry,rz,…` in degrees."""
-    try:
-        pitch, yaw, roll = (math.radians(float(part)) for part in text.split(",")[:3])
-    except ValueError:
-        return None
-    return (yaw, pitch, roll) if all(map(math.isfinite, (yaw, pitch, roll))) else None
 
 
 MAX_TEXT_BYTES = 256 << 20
@@ -233,23 +225,17 @@ def _read_json(path: Path) -> Performance:
     times = None
     if all(isinstance(frame, dict) and _is_number(frame.get("time")) for frame in frames):
         times = np.array([float(frame["time"]) for frame in frames])
-    return _performance(path, times, weights, None, _json_rate(path, outer))
-
-
-def _json_rate(path: Path, outer: dict[str, Any]) -> float | None:
     inner = outer.get("metadata")
-    for source in (outer, inner if isinstance(inner, dict) else {}):
-        for key in ("exportFps", "fps"):
-            if key in source:
-                return _number(f"{path}: {key}", source[key])
-    return None
+    about = {**(inner if isinstance(inner, dict) else {}), **outer}
+    key = next((key for key in ("exportFps", "fps") if key in about), "")
+    fps = _number(f"{path}: {key}", about[key]) if key else None
+    return _performance(path, times, weights, None, fps)
 
 
 def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
     """Name -> weight of one frame in any of the forms that `read_performance` takes."""
-    where, found = f"{path}: frame {number + 1}", frame
-    if isinstance(frame, dict):
-        found = _first(frame, WEIGHT_KEYS, frame)
+    where = f"{path}: frame {number + 1}"
+    found = _first(frame, WEIGHT_KEYS, frame) if isinstance(frame, dict) else frame
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
         found = {str(_first(entry, NAMED, None)): _first(entry, SCORED, 0) for entry in found}
     if isinstance(found, list):

@@ -83,7 +83,7 @@ def test_preview_follows_the_evaluations(extension, tmp_path):
     def draw() -> list[str]:
         """Read evaluations as the training monitor does, and draw; the texts below."""
         drawn.clear()
-        monitor._curves[tmp_path] = monitor._read_curve(tmp_path, None)
+        monitor.curves[tmp_path] = monitor._read_curve(tmp_path, None)
         curve.draw_curve(layout, tmp_path)
         return list(drawn)
 

@@ -49,7 +49,7 @@ def worker(extension, head, tmp_path):
 def ask_only(monkeypatch, extension) -> list:
     """Let the operators that train do nothing but ask; what they ask."""
     asked = []
-    monkeypatch.setattr(extension.operators.request, "missing_packages", list)
+    monkeypatch.setattr(extension.operators.train, "missing_packages", list)
     monkeypatch.setattr(
         extension.operators.train, "start", lambda scene, wanted, *_, **__: asked.append(wanted)
     )
@@ -147,7 +147,7 @@ def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypat
         with pytest.raises(RuntimeError, match=f"^Error: .*{sentence}"):
             bpy.ops.stga.train(**{"directory": run, "iterations": 2, **arguments})
     monkeypatch.setattr(extension.stga_addon.worker.training_python, "find_spec", lambda name: None)
-    monkeypatch.setattr(extension.operators.request, "missing_packages", lambda: ["torch"])
+    monkeypatch.setattr(extension.operators.train, "missing_packages", lambda: ["torch"])
     expected = r"^Error: .* \(Python .*\) lacks numpy, torch, numba, scipy, pillow, "
     with pytest.raises(RuntimeError, match=expected):
         bpy.ops.stga.train(directory=str(tmp_path / "new"), minutes=0.1)

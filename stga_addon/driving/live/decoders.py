@@ -75,28 +75,15 @@ def decode_live_link_face(data: bytes) -> FacePacket | None:
 
 Value = int | float | str | bytes | bool | None
 Message = tuple[str, tuple[Value, ...]]
-MAX_MESSAGES, MAX_DEPTH = 4096, 4
+MAX_DEPTH = 4  # Of bundles in bundles
 _BUNDLE = b"#bundle\0"
 _NUMBERS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d", "t": ">Q", "c": ">i", "r": ">I", "m": ">I"}
 _CONSTANTS: dict[str, Value] = {"T": True, "F": False, "N": None, "I": math.inf}
 
 
-def osc_messages(data: bytes) -> list[Message] | None:
-    """Address and arguments of a datagram's messages (Open Sound Control 1.0), in order; None for
-    other bytes."""
-    found: list[Message] = []
-    try:
-        for message in _messages(data, 0):
-            found.append(message)
-            if len(found) > MAX_MESSAGES:
-                return None
-    except (struct.error, ValueError):
-        return None
-    return found
-
-
-def _messages(data: bytes, depth: int) -> Iterator[Message]:
-    """What a packet holds. Raises struct.error or ValueError where it is malformed."""
+def osc_messages(data: bytes, depth: int = 0) -> Iterator[Message]:
+    """Address and arguments of a datagram's messages (Open Sound Control 1.0), in order. Raises
+    struct.error or ValueError where it is malformed."""
     if data.startswith(_BUNDLE):
         if depth >= MAX_DEPTH or len(data) < 16:
             raise ValueError("too deep, or cut off")
@@ -105,7 +92,7 @@ def _messages(data: bytes, depth: int) -> Iterator[Message]:
             part, at = _blob(data, at)
             if not part:
                 raise ValueError("an empty packet")
-            yield from _messages(part, depth + 1)
+            yield from osc_messages(part, depth + 1)
         return
     address, at = _text(data, 0)
     types, at = _text(data, at)
@@ -170,8 +157,11 @@ def decode_vmc(data: bytes, before: Received) -> tuple[FacePacket | None, Receiv
     spelling; VRM's own expressions (A, Joy, …) are left out. Source: the protocol's specification
     (protocol.vmc.info).
     """
-    found = osc_messages(data)
-    if found is None or not any(address.startswith("/VMC/") for address, _ in found):
+    try:
+        found = [*osc_messages(data)]
+    except (struct.error, ValueError):
+        return None
+    if not any(address.startswith("/VMC/") for address, _ in found):
         return None
     known, packet = before, None
     for address, values in found:  # of malformed messages nothing is taken

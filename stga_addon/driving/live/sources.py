@@ -2,7 +2,7 @@
 
 import ipaddress
 import socket
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -157,12 +157,12 @@ class Stream:
     source: Source
     chosen: Sender | None = None
     followed: Sender | None = None
-    senders: OrderedDict[Sender, float] = field(default_factory=OrderedDict)
+    senders: dict[Sender, float] = field(default_factory=dict)
     has_face: bool = False
     lost: int = 0
     late: int = 0
     foreign: int = 0
-    _known: OrderedDict[str, Any] = field(default_factory=OrderedDict)
+    _known: dict[str, Any] = field(default_factory=dict)
     _time: float | None = None
     _steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
     _arrivals: deque[Any] = field(default_factory=lambda: deque(maxlen=ARRIVALS))
@@ -241,12 +241,12 @@ class Stream:
         return True
 
 
-def _remember(table: OrderedDict[Any, Any], key: Any, value: Any) -> None:
+def _remember(table: dict[Any, Any], key: Any, value: Any) -> None:
     """Store the value as the newest of at most MAX_SENDERS."""
+    table.pop(key, None)
     table[key] = value
-    table.move_to_end(key)
-    while len(table) > MAX_SENDERS:
-        table.popitem(last=False)
+    if len(table) > MAX_SENDERS:
+        del table[next(iter(table))]
 
 
 RESTING_PACKETS = 15  # Whose mean is the resting face: a quarter of a second
