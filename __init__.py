@@ -10,10 +10,10 @@ def register() -> None:
     Blender, too."""
     from . import operators
     from .operators import command_line
-    from .ui import panel, preferences, properties
+    from .ui import panel, properties
 
     with ExitStack() as done:
-        for part in (properties, preferences, operators, panel, command_line):
+        for part in (properties, operators, panel, command_line):
             part.register(done.callback)
         _registered.enter_context(done.pop_all())
 

@@ -17,12 +17,11 @@ from . import (
     show,
     track,
     train,
-    training_python,
 )
 from .common import AtEnd, register_classes
 
-MODULES = (track, import_capture, select, train, request, training_python, pose, show)
-MODULES += (render_video, apply_motion, drive, export)
+MODULES = (track, import_capture, select, train, request, pose, show, render_video, apply_motion)
+MODULES += (drive, export)
 KEYS = (("Pose", "EMPTY", "stga.turn_jaw", "R"), ("3D View", "VIEW_3D", "stga.stop_live", "ESC"))
 """Keymap, its space, operator and key: R turns a jaw about its hinge, Esc over a 3D viewport stops
 the live session."""
@@ -70,6 +69,6 @@ def register(at_end: AtEnd) -> None:
     for name, space, operator, key in KEYS if keys is not None else ():  # none without a window
         items = keys.keymaps.new(name=name, space_type=space).keymap_items
         at_end(items.remove, items.new(operator, key, "PRESS"))
-    for part in (training_python, monitor, pose, render_video):
+    for part in (request, monitor, pose, render_video):
         part.register(at_end)
     at_end(drive.stop_session)

@@ -166,36 +166,32 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             chosen = "choose expression, jaw, eyes, neck or head"
             raise StgaError(f"Apply Motion: no part is chosen; {chosen}")
         path = None if self.source else file_path(self.filepath, "motion")
-        if path is not None and is_performance(path):
-            name, count = path.stem, self._apply_performance(scene, head, path, parts)
-        else:
-            name, motion = self._motion(context, head, path)
-            count = self._apply_frames(scene, head, motion, name, parts)
+        is_face = path is not None and is_performance(path)
+        apply = self._apply_performance if is_face else self._apply_frames
+        name, count = apply(context, head, path, parts)
         end = self.start + count - 1
         if self.fit_range:
             scene.frame_end = max(scene.frame_end, end)
         scene.frame_set(scene.frame_current)
         self.inform(f"{name}: frames {self.start} to {end}")
 
-    def _motion(self, context: Any, head: Any, path: Path | None) -> tuple[str, FlameSequence]:
-        """Name and motion: of the file, read with this head's model, because expressions mean the
-        same in both, or of another head."""
+    def _apply_frames(
+        self, context: Any, head: Any, path: Path | None, parts: list[str]
+    ) -> tuple[str, int]:
+        """Apply a FLAME motion: of the file, read with this head's model, because expressions mean
+        the same in both, or of another head. Returns its name and the number of frames."""
+        render, other = context.scene.render, bpy.data.objects.get(self.source)
         if path is not None:
             model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
-            return path.stem, common.flame_motion(str(path), path, model)
-        other = bpy.data.objects.get(self.source)
-        if not is_head(other):
+            name, motion = path.stem, common.flame_motion(str(path), path, model)
+        elif not is_head(other):
             raise StgaError(f"{self.source}: is not an imported head")
-        if other == head:
+        elif other == head:
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
-        frames = common.scene_frames(context.scene)
-        return other.name, rig_motion.sample_motion(other, own_motion(other), frames, self.warn)
-
-    def _apply_frames(
-        self, scene: Any, head: Any, motion: FlameSequence, name: str, parts: list[str]
-    ) -> int:
-        """Apply a FLAME motion; returns the number of frames."""
-        rate = self.fps * scene.render.fps_base / scene.render.fps if self.fps else 1.0
+        else:
+            name, frames = other.name, common.scene_frames(context.scene)
+            motion = rig_motion.sample_motion(other, own_motion(other), frames, self.warn)
+        rate = self.fps * render.fps_base / render.fps if self.fps else 1.0
         step = float(self.speed * rate)  # timesteps of the recording in a frame of the scene
         frames = retimed(motion, step)
         self._check_end(len(frames))
@@ -207,13 +203,15 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             first = own.timesteps[0]
             tracked = own, [self.start + (each - first) / step for each in own.timesteps]
         self._apply(head, frames, name, parts, tracked=tracked)
-        return len(frames)
+        return name, len(frames)
 
-    def _apply_performance(self, scene: Any, head: Any, path: Path, parts: list[str]) -> int:
-        """Apply a face performance to expressions and bones, or to shape keys of its names; returns
-        the number of frames."""
-        performance, options = read_performance(path), self._options()
-        rate = scene.render.fps / scene.render.fps_base / self.speed
+    def _apply_performance(
+        self, context: Any, head: Any, path: Path, parts: list[str]
+    ) -> tuple[str, int]:
+        """Apply a face performance to expressions and bones, or to shape keys of its names. Returns
+        its name and the number of frames."""
+        performance, options, name = read_performance(path), self._options(), path.stem
+        rate = context.scene.render.fps / context.scene.render.fps_base / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
@@ -223,21 +221,21 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             motion = open_motion.performed(performance, own, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
-            self._apply(head, frames, path.stem, parts)
-            return len(frames)
+            self._apply(head, frames, name, parts)
+            return name, len(frames)
         kept = {part: float(own in parts) for part, own in PART_OF_SHAPES.items()}
         performance = open_motion.prepared_performance(amplified(performance, kept), options, rate)
         weights = np.clip(performance.weights, *rig_motion.WEIGHT_RANGE)
         if rig is None:
-            where = self.start, path.stem, self.place == "strip"
+            where = self.start, name, self.place == "strip"
             apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, *where)
-            return len(weights)
+            return name, len(weights)
         still, turns = np.zeros(3), np.zeros((len(weights), 3))
         turns = turns if performance.head is None else head_turns(performance.head)
         frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
         # on the expression the sliders would act
-        self._apply(head, frames, path.stem, list({*parts, "expression"}), weights=weights)
-        return len(frames)
+        self._apply(head, frames, name, list({*parts, "expression"}), weights=weights)
+        return name, len(frames)
 
     def _apply(self, head: Any, frames: Any, name: str, parts: list[str], **more: Any) -> None:
         as_strip = self.place == "strip"

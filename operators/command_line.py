@@ -21,7 +21,7 @@ from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
 from .common import AtEnd, capture_source, file_path, is_head, scene_frames
-from .training_python import training_python
+from .request import training_python
 
 IN_BLENDER = ("select", "export", "demo")
 """Commands that need none of the packages that Blender's Python may lack, or need Blender itself;
@@ -61,8 +61,7 @@ def _open_head() -> OpenHead | None:
 
 
 def _delegate(arguments: list[str], head: OpenHead | None, played: bool) -> int:
-    """Run the command in the Python that trains; returns its exit code. Raises StgaError where
-    there is none."""
+    """Run the command in the Python that trains; its exit code. Raises StgaError without one."""
     python = training_python(bpy.context)
     with TemporaryDirectory() as folder:
         environment = {}

@@ -158,8 +158,7 @@ def short_sentence(sentence: str) -> str:
 
 
 def preferences(context: Any) -> Any:
-    """The extension's preferences (`ui.preferences.Preferences`); None while it runs from a
-    checkout."""
+    """The extension's preferences (`ui.properties`); None while it runs from a checkout."""
     addon = context.preferences.addons.get(package())
     return addon.preferences if addon else None
 
@@ -206,8 +205,7 @@ def capture_source(head: Any) -> tuple[Path, Path | None, str]:
 
 
 def own_motion(head: Any) -> FlameSequence:
-    """The FLAME parameters of the capture that a head was imported from. Raises StgaError where it
-    has moved or changed, or has none."""
+    """`flame_motion` of the capture that a head was imported from."""
     return flame_motion(head.name, *capture_source(head))
 
 
@@ -224,8 +222,7 @@ def flame_motion(name: str, source: Path, flame: Path | None, *point: str) -> Fl
 
 
 def polled(operator: Any, is_possible: bool, message: str) -> bool:
-    """Poll: whether an operator can be called; where not, Blender shows the message, which says
-    what to do."""
+    """Poll: whether an operator can be called; where not, Blender shows the message."""
     if not is_possible:
         operator.poll_message_set(message)
     return is_possible
@@ -270,8 +267,7 @@ def needs_rig_or_shapes(operator: Any, context: Any) -> bool:
 
 
 class FileImport(ImportHelper):
-    """Mixin of operators that import a file: asks for it, unless called with one, as when a file is
-    dropped."""
+    """Mixin of operators that import a file: asks for it, unless it was dropped or is given."""
 
     filepath: options.path("File", "File to import", options=ONCE)
 
@@ -291,8 +287,7 @@ def flame_model_path(context: Any, given: str = "") -> Path | None:
 
 
 def file_path(value: str, what: str) -> Path:
-    """Absolute path of a path property. Raises StgaError where it is empty, or relative to a file
-    never saved."""
+    """Absolute path of a property. Raises StgaError where it is empty, or relative to no file."""
     if not value:
         raise StgaError(f"{what}: no path given")
     if value.startswith("//") and not bpy.data.filepath:

@@ -30,8 +30,7 @@ from . import common, monitor, options
 from .apply_motion import exchange_property, exchanged_pairs, own_range, stay_trained_property
 from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
 from .options import ONCE
-from .request import idle, start
-from .training_python import training_python
+from .request import idle, start, training_python
 
 MAX_PORT = 65535
 TICK_S = 1 / 60
@@ -330,8 +329,7 @@ class FollowLive(_OfSession, bpy.types.Operator):
 
 
 def takes_folder(context: Any) -> tuple[Path, str]:
-    """The folder of takes, which is made, and a warning where it does not last, or "". Raises
-    StgaError."""
+    """The folder of takes, made here, and a warning where it does not last, or ""."""
     folder, warning = context.scene.stga.drive.takes, ""
     if folder.startswith("//") and not bpy.data.filepath:
         path = Path(bpy.app.tempdir)

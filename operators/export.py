@@ -179,8 +179,7 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
 
 @lru_cache(maxsize=8)
 def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
-    """`Format.size` of an avatar file last modified at this time. Raises StgaError where it cannot
-    be read."""
+    """`Format.size` of an avatar file last modified at this time. Raises StgaError."""
     return FORMATS[format].size(read_avatar(avatar), frames)
 
 

@@ -32,7 +32,7 @@ from . import monitor, options
 from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package
 from .options import ONCE
 from .pose import begin_sliders
-from .training_python import begin_preparing
+from .request import begin_preparing
 
 FOLDERS_ABOVE_FILE = 3
 """In which the capture of an image, mask, mesh or parameter file is looked for."""
@@ -146,8 +146,7 @@ def bring_in(
     principal_point: str = DEFAULT_PRINCIPAL_POINT, set_up_scene: bool = False,
     correctives: str = "all",
 ) -> None:  # fmt: skip
-    """Import what `open_capture` reads from `source`, and make it the scene's head. Raises
-    StgaError."""
+    """Import what `open_capture` reads, and make it the scene's head. Raises StgaError."""
     warn, scene, objects = operator.warn, context.scene, context.view_layer.objects
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)

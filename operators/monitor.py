@@ -75,8 +75,7 @@ def unwatch(thing: Any) -> None:
 
 
 def state_of(scene: Any, kind: Kind) -> RequestState:
-    """The scene's request as the timer last saw it; without a window, where no timer runs, as it
-    is."""
+    """The scene's request as the timer last saw it; as it is, without a window and so a timer."""
     if has_timer():
         state = _states.get((scene.session_uid, kind))
         if state is None:
@@ -101,8 +100,7 @@ def follow(
 
 
 def finish(scene: Any, kind: Kind) -> RequestState:
-    """Bring the result of a request that was waited for into the scene; what `Train` made is
-    stored, not shown."""
+    """Bring the result of a request that was waited for into the scene, but that of `Train`."""
     state = _states[scene.session_uid, kind]
     shows = kind != Kind.TRAINING
     state = handle(scene, kind, replace(_read_status(scene, state), show_result=shows))
@@ -350,8 +348,7 @@ def redraw() -> None:
 
 
 def show_panel() -> None:
-    """Open the sidebar at the add-on's tab, from a timer and for a few seconds at most, where there
-    is a window."""
+    """Open the sidebar at the add-on's tab, from a timer and for a few seconds at most."""
     attempts = count(1)
 
     def attempt() -> float | None:
@@ -367,8 +364,7 @@ def show_panel() -> None:
 
 
 def _close() -> None:
-    """Stop what belongs to the open file, and the workers whose result only its scenes were to
-    have."""
+    """Stop what belongs to the open file, and workers whose result only its scenes were to have."""
     stop_loading()
     for thing in list(_watched):
         thing.close()
@@ -441,8 +437,7 @@ def run_of(avatar: str) -> str:
 
 @persistent
 def _after_update(scene: Any, *_: Any) -> None:
-    """Let the panel work on no head, and no splats, that were deleted: its pointers keep these in
-    the file."""
+    """Let the panel work on no head, and no splats, that were deleted: its pointers keep them."""
     for name in ("head", "splats"):
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:

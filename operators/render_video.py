@@ -33,8 +33,7 @@ from ..stga_addon.worker.status import status_writer
 from . import monitor, options
 from .common import AtEnd, Stepwise, file_path, is_head, need, preferences, scene_frames
 from .options import ONCE
-from .request import idle, start
-from .training_python import has_training_python, training_python
+from .request import has_training_python, idle, start, training_python
 
 RECORDING = "recording.bin"
 RECORDING_INTERVAL_S = 0.001

@@ -73,40 +73,30 @@ def _run_object(scene: Any, state: RequestState) -> Any:
 
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
-    """Show the avatar that was loaded, in the object that shows this run or in a new one, a slice
-    at a time."""
-    if not _loading[scene.session_uid].done():
+    """Show the avatar that was loaded, in the run's object or in a new one, a slice at a time."""
+    loading, run = _loading[scene.session_uid], _run(state)
+    if not loading.done():
         return None
-    answer: Answer = None
-    try:
-        answer = _present(scene, state, *_loading[scene.session_uid].result())
-    finally:
-        if answer != SliceBuilt():
-            _loading.pop(scene.session_uid, None)
-    if answer != SliceBuilt():
-        show_world(_run(state) / AVATAR, scene.stga.head)
-    return answer
-
-
-def _present(
-    scene: Any, state: RequestState, avatar: Avatar, attributes: SplatAttributes
-) -> Answer:
-    head, shown, run = scene.stga.head, _run_object(scene, state), _run(state)
+    head, shown = scene.stga.head, _run_object(scene, state)
     if not is_head(head):
         raise StgaError("No head in the scene to show the avatar on; import the capture")
+    avatar, attributes = loading.result()
     splat_object.check_head(avatar, head)
-    if shown is not None and splat_object.can_update(shown, avatar):
-        splat_object.update_splats(shown, attributes)
-        return Shown()
-    if splat_object.build_next_node_group(avatar):
+    is_update = shown is not None and splat_object.can_update(shown, avatar)
+    if not is_update and splat_object.build_next_node_group(avatar):
         return SliceBuilt()
-    if shown is not None:
-        bpy.data.objects.remove(shown)
-    shown = splat_object.show_avatar(avatar, head, f"{head.name} {run.name}", attributes)
-    shown[tags.RUN] = str(run)
-    splat_object.hide_object(head, scene)
-    scene.stga.splats = shown
-    return Shown(undoable=True)
+    del _loading[scene.session_uid]
+    if is_update:
+        splat_object.update_splats(shown, attributes)
+    else:
+        if shown is not None:
+            bpy.data.objects.remove(shown)
+        shown = splat_object.show_avatar(avatar, head, f"{head.name} {run.name}", attributes)
+        shown[tags.RUN] = str(run)
+        splat_object.hide_object(head, scene)
+        scene.stga.splats = shown
+    show_world(run / AVATAR, head)
+    return Shown(undoable=not is_update)
 
 
 def _show_made(scene: Any, state: RequestState) -> Answer:

@@ -23,8 +23,7 @@ from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, need
 from .monitor import run_of
 from .options import ONCE
-from .request import idle, start
-from .training_python import training_python
+from .request import idle, start, training_python
 
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""
@@ -111,8 +110,7 @@ class ChooseDisplay(Edit, bpy.types.Operator):
 
 
 def _own_as_trained(context: Any) -> list[Any]:
-    """The splat objects that are displayed as trained, but linked ones, whose display cannot be
-    changed."""
+    """The splat objects displayed as trained, whose display can be changed: no linked ones."""
     own = [thing for thing in context.view_layer.objects if thing.library is None]
     return [thing for thing in own if is_shown_as_trained(thing)]
 

@@ -26,8 +26,7 @@ from ..stga_addon.training.settings import make_settings
 from . import common, monitor, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig
 from .options import ONCE
-from .request import idle, start
-from .training_python import training_python
+from .request import idle, start, training_python
 
 XRAY_ALPHA = 0.4
 TRACK_FIELDS = ("footage", "start", "step", "cameras", "model", "avatar", "landmarks", "stop")
@@ -98,7 +97,8 @@ class ViewFootage(Edit, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         head, space, scene = head_of(context), context.space_data, context.scene
-        cameras = capture_cameras(head)
+        cameras = tags.find(tags.CAMERA, Path(head[tags.CAPTURE]))
+        cameras = sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
         if not cameras:
             raise StgaError("The capture has no cameras in this scene; import it again")
         leave = self.step == 0 and space.region_3d.view_perspective == "CAMERA"
@@ -165,12 +165,6 @@ def tracking_keys(head: Any) -> dict[int, np.ndarray]:
     """Timestep -> parameters of the frames that are marked as keys."""
     stored = json.loads(head.get(tags.TRACKING_KEYS) or "{}") if is_head(head) else {}
     return {int(timestep): np.array(values, float) for timestep, values in stored.items()}
-
-
-def capture_cameras(head: Any) -> list[Any]:
-    """The head's cameras, by index."""
-    cameras = tags.find(tags.CAMERA, Path(head[tags.CAPTURE]))
-    return sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
 
 
 # An avatar from a video

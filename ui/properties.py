@@ -1,4 +1,4 @@
-"""Properties of a scene, saved with the .blend file."""
+"""Properties of a scene, saved with the .blend file, and preferences of the add-on."""
 
 import json
 from typing import Any
@@ -6,10 +6,13 @@ from typing import Any
 import bpy
 
 from ..operators import options
-from ..operators.common import AtEnd, register_classes
+from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
+from ..operators.request import has_training_python, test
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
+from ..stga_addon.worker.training_python import PYTHON_VARIABLE
+from .sidebar import draw_text
 
 
 def object_property(name: str, description: str, **more: Any) -> Any:
@@ -95,8 +98,7 @@ class ExtendSettings(ExtendOptions, bpy.types.PropertyGroup):
 
 
 class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
-    """Settings of the panel, one group for each scene; passed to operators as arguments, but for
-    head and splats."""
+    """Settings of the panel, one group for each scene; passed to operators as arguments."""
 
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update
     # function; Blender does not.
@@ -136,9 +138,50 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     avatar: options.path("Avatar", "Trained avatar file (.npz)")
 
 
+class Preferences(bpy.types.AddonPreferences):
+    bl_idname = package()
+
+    flame_model: options.path(
+        "FLAME Model",
+        "Your own FLAME model file (.pkl or .npz), from flame.is.tue.mpg.de; needed for captures "
+        "tracked with FLAME, and never part of this add-on",
+    )
+    training_python: options.text(
+        "Python",
+        "An interpreter that has torch, numba and what else tracking and training need; empty: "
+        "Blender's own, which has it all with the complete edition. The variable "
+        f"{PYTHON_VARIABLE} takes precedence",
+        subtype="FILE_PATH",
+    )
+    render_device: options.choice(
+        "Rendering Device",
+        "Device that renders splats for videos, and for images where Blender has no GPU context",
+        ("auto", "Auto", "A GPU if one is faster than the CPU and right, else the CPU"),
+        ("cpu", "CPU", "The processor"),
+        ("gpu", "GPU", "A GPU; rendering fails if none works"),
+    )
+
+    def draw(self, context: Any) -> None:
+        self.layout.prop(self, "flame_model")
+        self.layout.prop(self, "render_device")
+        box = self.layout.box()
+        row = box.split(factor=0.8, align=True)
+        row.prop(self, "training_python")
+        row.operator("stga.test_python")
+        if test.process is not None:
+            box.label(text=f"Testing {test.python}", icon="TIME")
+        elif test.error:
+            draw_text(box, context, test.error, "ERROR")
+        elif test.found is not None:
+            draw_text(box, context, f"{test.python}: {test.found.line}", "CHECKMARK")
+        elif not has_training_python(context):
+            remedy = "choose another, or install the complete edition"
+            draw_text(box, context, f"Blender's Python lacks packages: {remedy}", "INFO")
+
+
 CLASSES = (
     SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings,
-    SceneSettings,
+    SceneSettings, Preferences,
 )  # fmt: skip
 
 

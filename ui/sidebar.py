@@ -29,8 +29,7 @@ _shown: dict[Path, monitor.Curve] = {}
 
 
 class SidebarPanel:
-    """Mixin of panels, whose identifier is the name of the class: `TrainPanel` is
-    "STGA_PT_train"."""
+    """Mixin of panels: the identifier of `TrainPanel` is "STGA_PT_train"."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -46,8 +45,7 @@ class ClosedPanel(SidebarPanel):
 
 
 def draw_text(layout: Any, context: Any, text: str, icon: str = "NONE") -> None:
-    """Draw the text as labels, one for each line, because Blender truncates labels instead of
-    wrapping them; the icon before the first."""
+    """Draw the text as a label for each line, because Blender truncates; the icon at the first."""
     column = layout.column(align=True)
     lines = textwrap.wrap(text, _columns(context) - (3 if icon != "NONE" else 0))
     for row, line in enumerate(lines):
@@ -61,8 +59,7 @@ def _columns(context: Any) -> int:
 
 
 def set_options(button: Any, settings: Any, options: type) -> None:
-    """Give an operator's button the settings' values of the properties that both take from the
-    class `options`."""
+    """Give an operator's button the settings' values of the properties in the class `options`."""
     for base in options.__mro__[:-1]:
         for name in base.__annotations__:
             setattr(button, name, getattr(settings, name))
@@ -72,8 +69,7 @@ def set_options(button: Any, settings: Any, options: type) -> None:
 
 
 def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
-    """Draw the progress of the scene's request with its Cancel button; returns False where none is
-    running."""
+    """Draw the progress of the scene's request with its Cancel button; False where none runs."""
     state = monitor.state_of(context.scene, kind)
     if state.error:
         draw_text(layout, context, state.error, "ERROR")

@@ -1,7 +1,7 @@
 """ARKit's 52 weights as parameters of one FLAME head: fitted, or exact for the bundled head."""
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ..flame.sequence import FlameSequence, with_identity
 from ..tracking.posed_points import PosedPoints, SurfacePoints
 from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL, Performance
-from .shapes import EYE_JOINTS, JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
+from .shapes import JAW_OPEN, MOUTH_CLOSE, effective_weights, face_points, face_shapes
 
 JAW_SHAPES = ("jawOpen", "jawLeft", "jawRight")
 """Those that turn the jaw; jawForward, which a rotation cannot do, is left to the expressions."""
@@ -48,7 +48,6 @@ class HeadMap:
     expressions  (FEATURES, E) coefficients per feature (`features`)
     jaw          (52, 3) axis-angle per weight
     eyes         (52, 6) axis-angle of left and right eye per weight
-    reach        (52,) 0 to 1: how much of each shape's displacement the head can do
     """
 
     points: SurfacePoints
@@ -57,7 +56,6 @@ class HeadMap:
     expressions: np.ndarray
     jaw: np.ndarray
     eyes: np.ndarray
-    reach: np.ndarray
 
     def parameters(self, weights: np.ndarray) -> np.ndarray:
         """(T, E + 9) expression coefficients, jaw and eyes of weights (T, 52)."""
@@ -103,7 +101,11 @@ def head_map(sequence: FlameSequence, name: str) -> HeadMap:
     if key not in _cache:
         places, used = face_points(sequence.model, name)
         points = SurfacePoints(places.face[used], places.barycentric[used])
-        _cache[key] = (_named if person.expression_names else _fitted)(person, points, used)
+        if person.expression_names:
+            _cache[key] = _named(person, points, used)
+        else:
+            fit = _Fit(person, points, used)
+            _cache[key] = HeadMap(points, used, fit.targets, fit.expressions(), fit.jaw, _gaze())
         if len(_cache) > CACHED_MAPS:
             del _cache[next(iter(_cache))]
     return _cache[key]
@@ -116,13 +118,6 @@ def person_of(model: FlameModel, neutral: np.ndarray) -> FlameSequence:
     return FlameSequence(model, np.zeros(model.n_identity), offset, (), no_frames.__getitem__)
 
 
-def _fitted(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
-    """The map of a model without identity components."""
-    fit = _Fit(person, points, used)
-    found = HeadMap(points, used, fit.targets, fit.expressions(), fit.jaw, _gaze(), np.zeros(COUNT))
-    return replace(found, reach=_reach(found, fit, person))
-
-
 def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadMap:
     """The map of a model without identity components whose expressions are ARKit's shapes."""
     columns = [COLUMN[name] for name in person.expression_names]
@@ -131,8 +126,7 @@ def _named(person: FlameModel, points: SurfacePoints, used: np.ndarray) -> HeadM
     shapes = np.moveaxis(person.shapedirs, 2, 0)
     targets[columns] = [points.on(shape, person.faces) for shape in shapes]
     expressions[columns, range(person.n_expression)] = 1
-    reach = np.isin(np.arange(COUNT), columns).astype(np.float64)
-    return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), _gaze(), reach)
+    return HeadMap(points, used, targets, expressions, np.zeros((COUNT, 3)), _gaze())
 
 
 class _Fit:
@@ -217,24 +211,6 @@ def _gaze() -> np.ndarray:
         eyes[COLUMN[f"eyeLookOut{side}"], first + 1] = outward * GAZE_RAD
         eyes[COLUMN[f"eyeLookIn{side}"], first + 1] = -outward * GAZE_RAD
     return eyes
-
-
-def _reach(found: HeadMap, fit: _Fit, person: FlameModel) -> np.ndarray:
-    """(52,) of each shape alone, mouthClose at an open jaw; gaze is whole with eyeballs."""
-    weights = np.eye(COUNT)
-    weights[MOUTH_CLOSE, JAW_OPEN] = 1
-    values = found.parameters(weights)
-    count = fit.count
-    moved = np.stack(
-        [fit.posed.positions(row[:count], fit.rigid(row[count : count + 3])) for row in values]
-    )
-    done = moved - fit.neutral
-    done[MOUTH_CLOSE] = moved[MOUTH_CLOSE] - moved[JAW_OPEN]
-    size, missed = np.linalg.norm([found.targets, found.targets - done], axis=(2, 3))
-    reach = np.clip(1 - missed / np.maximum(size, 1e-12), 0, 1) * (size > 0)
-    eyeballs = (person.weights[:, EYE_JOINTS] > 0.5).any()
-    looks = np.array([name.startswith("eyeLook") for name in ARKIT_SHAPES])
-    return np.where(looks & eyeballs, 1.0, reach)
 
 
 def page_controls(sequence: FlameSequence | None) -> ShapeControls | None:

@@ -83,8 +83,7 @@ def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
 
 
 def quiet_neutral(frames: Sequence[FlameFrame]) -> dict[str, np.ndarray]:
-    """Part -> the median of its parameters over the frames that are most alike, in whatever order:
-    a face keeps returning to rest."""
+    """Part -> the median of its parameters over the frames most alike: a face returns to rest."""
     parts = _by_part(evenly_spread(frames, MAX_COMPARED_FRAMES))
     face = np.concatenate([parts["face"], parts["jaw"]], axis=1)
     squares = (face**2).sum(axis=1)

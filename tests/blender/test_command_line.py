@@ -179,7 +179,7 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
 
 def test_a_farms_python_comes_first(extension, monkeypatch):
     """Catches a farm's variable that is ignored, or overrules an operator's Python."""
-    operators = extension.operators.training_python
+    operators = extension.operators.request
     worker = extension.stga_addon.worker.training_python
     monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
     assert operators.training_python(bpy.context) == "/farm/python"

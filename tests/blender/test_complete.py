@@ -57,7 +57,7 @@ bpy.ops.stga.open_demo()
 result["next run"] = settings.run_folder
 result["log"] = (Path(result["run"]) / "job/worker.log").read_text()
 bpy.ops.stga.test_python()
-result["check"] = sys.modules[module + ".operators.training_python"].test.found.line
+result["check"] = sys.modules[module + ".operators.request"].test.found.line
 bpy.ops.stga.avatar_from_video(filepath=video, folder=str(home / "avatar"), minutes=0.05)
 splats = settings.splats
 result["made"] = [settings.head["stga_capture"], splats["stga_run"], len(splats.data.vertices)]

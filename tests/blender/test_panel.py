@@ -9,57 +9,13 @@ from types import SimpleNamespace
 import bpy
 import pytest
 from capture.factory import write_mesh_capture
+from gui.layouts import filled
 
 from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 
 from .test_curve import lines
 from .test_operators import write_ball_avatar
-
-
-class Layout:
-    """Stands in for a panel's layout, and notes the texts."""
-
-    def __init__(self, texts=None):
-        self.__dict__["texts"] = [] if texts is None else texts
-
-    def operator(self, name, text="", **_):
-        self.texts.append(text or name)
-        return SimpleNamespace()
-
-    def operator_menu_enum(self, name, prop, text=""):
-        self.texts.append(text)
-
-    def label(self, text="", **_):
-        self.texts.append(text)
-
-    def prop(self, owner, name, **_):
-        assert name.startswith("[") or hasattr(owner, name)
-
-    def prop_search(self, owner, name, other, collection, **_):
-        assert hasattr(owner, name)
-        assert hasattr(other, collection)
-
-    def progress(self, factor, text):
-        self.texts.append(text)
-
-    def template_list(self, *_, **__):
-        pass
-
-    def template_icon(self, *_, **__):
-        self.texts.append("curve")
-
-    def _part(self, **_):
-        return Layout(self.texts)
-
-    row = column = box = split = grid_flow = _part
-
-    def __setattr__(self, name, value):
-        pass
-
-
-def panels(extension) -> list[type]:
-    return [cls for cls in extension.ui.panel.CLASSES if issubclass(cls, bpy.types.Panel)]
 
 
 @pytest.fixture
@@ -102,24 +58,20 @@ def draw(extension, name: str = "") -> list[str]:
         window_manager=bpy.context.window_manager,
         screen=SimpleNamespace(is_animation_playing=False),
     )
-    layout = Layout()
-    for cls in [cls for cls in panels(extension) if name in cls.bl_idname]:
-        own = [base for base in reversed(cls.__mro__) if base.__module__.startswith("stga")]
-        members = {
-            key: value
-            for base in own
-            for key, value in vars(base).items()
-            if not key.startswith("__")
-        }
-        panel = type(cls.__name__, (), members)()  # Blender makes panels itself, in a window only
-        panel.layout = layout
-        panel.draw(context)
-    return layout.texts
+    panels = [cls for cls in extension.ui.panel.CLASSES if issubclass(cls, bpy.types.Panel)]
+    layouts = [filled(cls, context) for cls in panels if name in cls.bl_idname]
+    leaves = [leaf for layout in layouts for leaf in layout.leaves]
+    for leaf in leaves:
+        if leaf.kind == "prop":
+            owner, prop = leaf.arguments[:2]
+            assert prop.startswith("[") or hasattr(owner, prop)
+    shown = [leaf for leaf in leaves if not leaf.kind.startswith(("prop", "template_list"))]
+    return [leaf.text or leaf.kind for leaf in shown]
 
 
 def test_drawing_reads_no_file(extension, trained, monkeypatch):
     """Catches panels that open, stat or list files, which would block redraws."""
-    extension.operators.training_python.has_training_python(bpy.context)
+    extension.operators.request.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
         raise AssertionError(f"file access while drawing: {arguments}")
@@ -135,7 +87,7 @@ def test_drawing_reads_no_file(extension, trained, monkeypatch):
         texts = draw(extension)
     finally:
         monkeypatch.undo()
-    assert {"Trained", "curve", "Apply Refined Tracking", "stga.analyze_capture"} <= set(texts)
+    assert {"Trained", "template_icon", "Apply Refined Tracking", "Analyze Capture"} <= set(texts)
 
 
 def test_errors_of_the_monitor_are_in_the_panel(extension, trained, monkeypatch, capsys):

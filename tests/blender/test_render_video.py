@@ -120,11 +120,11 @@ def test_turntable_of_a_ply(extension, tmp_path):
     assert min(shown) > 0.5 * max(shown) > 0
 
 
-def test_failures_leave_no_job(shown, monkeypatch):
+def test_failures_leave_no_job(extension, shown, monkeypatch):
     """Catches a traceback, a path that is refused only after everything was recorded, a recording
     that keeps filling a full disk, and a job that is left behind where its worker cannot be
     started."""
-    operator = sys.modules["stga_checkout.operators.render_video"]
+    operator = extension.operators.render_video
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -151,7 +151,7 @@ def test_failures_leave_no_job(shown, monkeypatch):
 
 def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     """Catches temporary folders of videos that nobody dismissed."""
-    operator = sys.modules["stga_checkout.operators.render_video"]
+    operator = extension.operators.render_video
     folder = temporary / "stga_video_kept"
     folder.mkdir()
     operator.Recorder(folder / operator.RECORDING).close()
@@ -162,9 +162,9 @@ def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     assert not folder.exists()
 
 
-def around_each_image(monkeypatch, before, after) -> None:
+def around_each_image(extension, monkeypatch, before, after) -> None:
     """Call `before()` and `after()` around the recording of every image."""
-    operator = sys.modules["stga_checkout.operators.render_video"].RenderVideo
+    operator = extension.operators.render_video.RenderVideo
     own = operator.record
 
     def record(*arguments):
@@ -179,14 +179,14 @@ def around_each_image(monkeypatch, before, after) -> None:
     monkeypatch.setattr(operator, "record", record)
 
 
-def test_a_recording_follows_its_own_scene(shown, monkeypatch):
+def test_a_recording_follows_its_own_scene(extension, shown, monkeypatch):
     """Catches images of the scene in the window, and a frame moved in another."""
     render = {"path": "scene", "format": "png"}
     bpy.ops.stga.render_video(filepath=str(shown / "alone"), **render)
     own, other = bpy.context.scene, bpy.data.scenes.new("other")
     other.frame_set(7)
     window = bpy.context.window_manager.windows[0]
-    around_each_image(monkeypatch, lambda: setattr(window, "scene", other), lambda: None)
+    around_each_image(extension, monkeypatch, lambda: setattr(window, "scene", other), lambda: None)
     try:
         bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
         assert window.scene == other
@@ -201,16 +201,16 @@ def test_a_recording_follows_its_own_scene(shown, monkeypatch):
         assert np.array_equal(alone, beside)
 
 
-def test_a_recording_keeps_the_last_frame_only(shown, monkeypatch):
+def test_a_recording_keeps_the_last_frame_only(extension, shown, monkeypatch):
     """Catches splats of every recorded frame that stay in memory until the video is rendered."""
-    posed, counts = sys.modules["stga_checkout.operators.render_video"].PosedSplats, []
+    posed, counts = extension.operators.render_video.PosedSplats, []
 
     def count() -> None:
         gc.collect()
         # Not isinstance, which raises for a weak proxy whose object has gone.
         counts.append(sum(type(each) is posed for each in gc.get_objects()))
 
-    around_each_image(monkeypatch, lambda: None, count)
+    around_each_image(extension, monkeypatch, lambda: None, count)
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
     bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png")
     assert len(counts) == 5

@@ -70,7 +70,8 @@ def test_the_whole_way_of_the_panel(tracked, extension):
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert settings.tracking_capture == str(tracked)
     assert settings.tracking_shown
-    cameras = extension.operators.track.capture_cameras(head)
+    cameras = extension.stga_addon.scene.tags.find(tags.CAMERA, tracked)
+    cameras = sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
     assert [len(camera.data.background_images) for camera in cameras] == [5] * 5
     look_through(cameras)
     before = {frame: mesh_at(frame) for frame in range(5)}

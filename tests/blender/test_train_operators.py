@@ -108,28 +108,20 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     bpy.ops.stga.train(directory=folder, resume=True)
 
 
-@pytest.mark.parametrize(
-    ("device", "adapter", "wanted"),
-    [("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")],
-)
-def test_device_reaches_the_request(
-    device, adapter, wanted, head, tmp_path, monkeypatch, extension
-):
+def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
     """Catches a device of the panel that training does not get, a GPU chosen by name that another
-    one trains instead of, and a name that moves the CPU's training."""
-    asked = ask_only(monkeypatch, extension)
-    bpy.ops.stga.train(directory=str(tmp_path / "run"), device=device, adapter=adapter)
-    assert asked[-1].device == wanted
-
-
-def test_gpus_are_those_of_the_last_test(monkeypatch, extension):
-    """Catches a list of another Python's GPUs, and a traceback in the panel before the first
-    test."""
-    train, own = extension.operators.train, extension.operators.training_python
-    monkeypatch.setattr(own.test, "found", None)
-    assert train.list_adapters(None, None, "") == []
-    monkeypatch.setattr(own.test, "found", own.Checked("", ("Card (Vulkan)", "Card (Vulkan) #2")))
-    assert train.list_adapters(None, None, "") == ["Card (Vulkan)", "Card (Vulkan) #2"]
+    one trains instead of, a name that moves the CPU's training, a list of another Python's GPUs,
+    and a traceback in the panel before the first test."""
+    asked, test = ask_only(monkeypatch, extension), extension.operators.request.test
+    for device, adapter, wanted in (
+        ("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")
+    ):  # fmt: skip
+        bpy.ops.stga.train(directory=str(tmp_path / "run"), device=device, adapter=adapter)
+        assert asked[-1].device == wanted
+    for adapters in ((), ("Card (Vulkan)", "Card (Vulkan) #2")):
+        checked = extension.operators.request.Checked("", adapters) if adapters else None
+        monkeypatch.setattr(test, "found", checked)
+        assert extension.operators.train.list_adapters(None, None, "") == [*adapters]
 
 
 def test_mistakes_of_training_are_sentences(extension, head, tmp_path, monkeypatch):
@@ -170,27 +162,20 @@ def test_a_cancelled_training_that_is_waited_for(head, tmp_path):
 
 
 def test_running_worker_cannot_be_replaced_or_dismissed(worker):
-    """Catches a second worker in the same folder, and a dismissed training whose worker
-    continues."""
+    """Catches a second worker in the same folder, a dismissed training whose worker continues, and
+    a Dismiss that deletes what a user put into the request's folder."""
     assert not bpy.ops.stga.train.poll()
     assert not bpy.ops.stga.dismiss.poll()
     bpy.ops.stga.cancel(request="training")
     assert worker.report(Progress(0.5, "Training"))
+    (worker.folder / "notes.txt").write_text("mine")
     worker.leave()
     assert not bpy.ops.stga.cancel.poll()
     assert bpy.ops.stga.train.poll()
     bpy.ops.stga.dismiss(request="training")
-    assert not (worker.run / "job").exists()
+    assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
     assert bpy.context.scene.stga.training_run == ""
     assert not bpy.ops.stga.dismiss.poll()
-
-
-def test_dismiss_removes_a_requests_files_only(worker):
-    """Catches a Dismiss that deletes what a user put into the request's folder."""
-    (worker.folder / "notes.txt").write_text("mine")
-    worker.leave()
-    bpy.ops.stga.dismiss(request="training")
-    assert [path.name for path in worker.folder.iterdir()] == ["notes.txt"]
 
 
 def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
@@ -323,6 +308,6 @@ def test_python_is_tested_without_a_window(extension, tmp_path):
     with pytest.raises(RuntimeError, match="is not a Python that runs this add-on"):
         bpy.ops.stga.test_python(python="false")
     bpy.ops.stga.test_python(python=sys.executable)
-    assert extension.operators.training_python.test.found.line.startswith(
+    assert extension.operators.request.test.found.line.startswith(
         f"Python {sys.version.split()[0]}, torch "
     )

@@ -1,88 +1,20 @@
-"""The panels of the sidebar as their layouts are filled: texts, the width that they need, and
-buttons."""
+"""The panels of the sidebar as their layouts are filled, and the buttons in them."""
 
 from types import SimpleNamespace
 from typing import Any
 
-import blf
 import bpy
 from in_window import in_viewport, module, viewport
+from layouts import Layout, filled
 
-PADDING, ICON, NUMBER = 8, 20, 40
-"""Around a text in its button, an icon, and the value in a field, in pixels at a resolution scale
-of 1, as all widths."""
 PANEL_MARGIN = 36
 """Of a sidebar's width: tabs, and the borders of panel and sub-panel."""
-NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
-
-
-class Layout:
-    """Takes the place of a panel's layout, and keeps what is drawn."""
-
-    def __init__(self, kind: str = "column", **options: Any) -> None:
-        self.kind, self.options, self.items = kind, options, list[Any]()
-
-    def __getattr__(self, kind: str) -> Any:
-        if kind.startswith("__"):
-            raise AttributeError(kind)
-
-        def draw(*arguments: Any, **options: Any) -> Any:
-            nested = kind in NESTED
-            self.items.append(Layout(kind, **options) if nested else Leaf(kind, arguments, options))
-            return self.items[-1] if nested else self.items[-1].button
-
-        return draw
-
-    @property
-    def leaves(self) -> list[Any]:
-        return [leaf for item in self.items for leaf in item.leaves]
-
-    @property
-    def text(self) -> str:
-        return " ".join(leaf.text for leaf in self.leaves)
-
-    @property
-    def width(self) -> float:
-        """That the texts need."""
-        widths = [item.width for item in self.items] or [0.0]
-        if self.kind == "row":  # whose items are equally wide
-            return len(widths) * max(widths)
-        if self.kind == "split":
-            return widths[0] / self.options.get("factor", 0.5)
-        return max(widths) * max(self.options.get("columns", 1), 1)
-
-
-class Leaf:
-    """A label, field or button, with its width: that of the text, the icon and the value."""
-
-    def __init__(self, kind: str, arguments: Any, options: dict[str, Any]) -> None:
-        self.kind, self.arguments, self.options = kind, arguments, options
-        self.leaves, self.button, self.text, self.is_number = [self], SimpleNamespace(), "", False
-        if kind == "operator":
-            group, name = arguments[0].split(".")
-            self.text = getattr(getattr(bpy.ops, group), name).get_rna_type().name
-        elif kind in ("prop", "prop_search") and hasattr(arguments[0], "bl_rna"):
-            field = arguments[0].bl_rna.properties.get(arguments[1])
-            if field is not None:  # no custom property
-                self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
-        self.text = options.get("text", self.text)
-
-    @property
-    def width(self) -> float:
-        blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
-        text = blf.dimensions(0, self.text)[0] + PADDING if self.text else 0.0
-        has_icon = self.options.get("icon", "NONE") != "NONE" or "icon_value" in self.options
-        return float(text + (ICON if has_icon else 0) + (NUMBER if self.is_number else 0))
 
 
 def draw(panel: Any) -> Layout:
     """What a panel draws now."""
-    own = {name: thing for name, thing in vars(panel).items() if name[:2] != "__"}
-    stand_in = type("StandIn", (), own)()
-    stand_in.layout = Layout()
     with in_viewport("UI"):  # which has a width
-        stand_in.draw(bpy.context)
-    return stand_in.layout  # type: ignore[no-any-return]
+        return filled(panel, bpy.context)
 
 
 def drawn() -> dict[str, Layout]:
@@ -103,7 +35,7 @@ def buttons() -> dict[str, tuple[str, dict[str, Any]]]:
     operators._import_menu(SimpleNamespace(layout=menus["Import"]), bpy.context)
     operators._export_menu(SimpleNamespace(layout=menus["Export"]), bpy.context)
     found: dict[str, tuple[str, dict[str, Any]]] = {}
-    preferences = draw(module("ui.preferences").Preferences)
+    preferences = draw(module("ui.properties").Preferences)
     for panel, layout in {**drawn(), **menus, "Preferences": preferences}.items():
         for leaf in layout.leaves:
             if leaf.kind == "operator":

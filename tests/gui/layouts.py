@@ -1,0 +1,81 @@
+"""A stand-in for the layout that a panel fills: texts, buttons, and the width that they need."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import blf
+import bpy
+
+PADDING, ICON, NUMBER = 8, 20, 40
+"""Around a text in its button, an icon, and the value in a field, in pixels at a resolution scale
+of 1, as all widths."""
+NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
+
+
+class Layout:
+    """Takes the place of a panel's layout, and keeps what is drawn."""
+
+    def __init__(self, kind: str = "column", **options: Any) -> None:
+        self.kind, self.options, self.items = kind, options, list[Any]()
+
+    def __getattr__(self, kind: str) -> Any:
+        if kind.startswith("__"):
+            raise AttributeError(kind)
+
+        def draw(*arguments: Any, **options: Any) -> Any:
+            nested = kind in NESTED
+            self.items.append(Layout(kind, **options) if nested else Leaf(kind, arguments, options))
+            return self.items[-1] if nested else self.items[-1].button
+
+        return draw
+
+    @property
+    def leaves(self) -> list[Any]:
+        return [leaf for item in self.items for leaf in item.leaves]
+
+    @property
+    def text(self) -> str:
+        return " ".join(leaf.text for leaf in self.leaves)
+
+    @property
+    def width(self) -> float:
+        """That the texts need."""
+        widths = [item.width for item in self.items] or [0.0]
+        if self.kind == "row":  # whose items are equally wide
+            return len(widths) * max(widths)
+        if self.kind == "split":
+            return widths[0] / self.options.get("factor", 0.5)
+        return max(widths) * max(self.options.get("columns", 1), 1)
+
+
+class Leaf:
+    """A label, field or button, with its width: that of the text, the icon and the value."""
+
+    def __init__(self, kind: str, arguments: Any, options: dict[str, Any]) -> None:
+        self.kind, self.arguments, self.options = kind, arguments, options
+        self.leaves, self.button, self.text, self.is_number = [self], SimpleNamespace(), "", False
+        if kind == "operator":
+            group, name = arguments[0].split(".")
+            self.text = getattr(getattr(bpy.ops, group), name).get_rna_type().name
+        elif kind in ("prop", "prop_search") and hasattr(arguments[0], "bl_rna"):
+            field = arguments[0].bl_rna.properties.get(arguments[1])
+            if field is not None:  # no custom property
+                self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
+        self.text = options.get("text", self.text)
+
+    @property
+    def width(self) -> float:
+        blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
+        text = blf.dimensions(0, self.text)[0] + PADDING if self.text else 0.0
+        has_icon = self.options.get("icon", "NONE") != "NONE" or "icon_value" in self.options
+        return float(text + (ICON if has_icon else 0) + (NUMBER if self.is_number else 0))
+
+
+def filled(panel: Any, context: Any) -> Layout:
+    """What a panel draws; Blender makes panels itself, in a window only."""
+    own = [vars(base) for base in reversed(panel.__mro__) if ".ui." in base.__module__]
+    members = {name: thing for part in own for name, thing in part.items() if name[:2] != "__"}
+    stand_in = type(panel.__name__, (), members)()
+    stand_in.layout = Layout()
+    stand_in.draw(context)
+    return stand_in.layout  # type: ignore[no-any-return]
