@@ -93,7 +93,7 @@ class MeasureRange(Edit, bpy.types.Operator):
 
 
 class LiveSession:
-    """Receives packets, poses the head and records. `monitor`'s timer calls `tick`.
+    """Receives packets, poses the head and records. A timer calls `tick` (`monitor.watch`).
 
     found, trained: the head's map and the range that its avatar was trained on; None where shape
     keys of ARKit's names are posed.

@@ -1,5 +1,5 @@
-"""Request monitor: the one timer, which reads the status of workers and brings their results into
-their scenes.
+"""Request monitor: a timer, which reads the status of workers and brings their results into their
+scenes, and timers of what else goes on beside the interface.
 
 What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and
 carries out effects, those that depend on the kind of request by the tables in `results`.
@@ -13,7 +13,7 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from subprocess import Popen
-from time import monotonic, sleep
+from time import sleep
 from typing import Any
 
 import bpy
@@ -51,21 +51,29 @@ curves: dict[Path, Curve | None] = {}
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
 _watched: list[Any] = []
-"""What the timer calls beside its checks of requests, at a rate of its own: `tick` returns the
-seconds until the next call, or None; `close` is called where file or extension is gone."""
-_requests_due = 0.0
-"""Monotonic time of the next check of requests, while something is called more often."""
+"""What has a timer of its own: `tick` returns the seconds until the next call, or None; `close` is
+called where file or extension is gone."""
 
 
 def watch(thing: Any) -> None:
-    """Call `thing.tick` from the timer until it returns None, the file is closed, or the extension
+    """Call `thing.tick` from a timer until it returns None, the file is closed, or the extension
     ends; then, or after an error, `thing.close`."""
-    global _requests_due
+
+    def tick() -> float | None:
+        interval = None
+        if thing in _watched:
+            try:
+                interval = thing.tick()
+            except Exception as error:
+                print(_describe(error))
+                thing.close()
+        if interval is None:
+            unwatch(thing)
+        return interval
+
     _watched.append(thing)
-    _requests_due = 0.0
-    if bpy.app.timers.is_registered(tick):  # at once, however long it would have waited
-        bpy.app.timers.unregister(tick)
-    _start_timer()
+    if has_timer():
+        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
 def unwatch(thing: Any) -> None:
@@ -135,29 +143,11 @@ def has_timer() -> bool:
 
 
 def tick() -> float | None:
-    """Check every request, and call what is watched; seconds until the next call, None to stop the
-    timer, as bpy.app.timers expects."""
-    global _requests_due
-    now = monotonic()
-    if _watched and now < _requests_due:  # the timer runs faster for something else
-        intervals = [_requests_due - now]
-    else:
-        scenes = [scene for scene in bpy.data.scenes if scene.library is None]
-        checked = [_check(scene, kind) for scene in scenes for kind in Kind]
-        intervals = [interval for interval in checked if interval is not None]
-        _requests_due = now + min(intervals, default=CHECK_INTERVAL_S)
-    for thing in list(_watched):
-        interval = None
-        try:
-            interval = thing.tick()
-        except Exception as error:
-            print(_describe(error))
-            thing.close()
-        if interval is None:
-            unwatch(thing)
-        else:
-            intervals.append(interval)
-    return min(intervals, default=None)
+    """Check every request; seconds until the next call, None to stop the timer, as bpy.app.timers
+    expects."""
+    scenes = [scene for scene in bpy.data.scenes if scene.library is None]
+    intervals = [_check(scene, kind) for scene in scenes for kind in Kind]
+    return min((interval for interval in intervals if interval is not None), default=None)
 
 
 def _check(scene: Any, kind: Kind) -> float | None:

@@ -46,10 +46,6 @@ def render_device() -> str:
     return str(stored.render_device) if stored else "auto"
 
 
-def _has_renderer(context: Any) -> bool:
-    return has_training_python(context) or has_gpu_context()
-
-
 class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
     """Render the splats as an MP4 video or as PNGs, in a process beside Blender: go on working
     meanwhile"""
@@ -57,7 +53,10 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
     needs = (
         need(lambda context: context.scene.stga.splats, "Show an avatar first"),
         idle(Kind.VIDEO),
-        need(_has_renderer, "Needs a GPU, or a Python that trains: choose one in the preferences"),
+        need(
+            lambda context: has_training_python(context) or has_gpu_context(),
+            "Needs a GPU, or a Python that trains: choose one in the preferences",
+        ),
     )
 
     filepath: options.path("File or Folder", "An .mp4 file, or a folder for PNGs", options=ONCE)

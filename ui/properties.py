@@ -60,7 +60,7 @@ def _take_minutes(settings: Any, context: Any) -> None:
 
 
 class EffectRow(bpy.types.PropertyGroup):
-    """Row of the table of effects, `name` is the effect's; filled by `operators.analyze`."""
+    """Row of the table of effects, `name` is the effect's; filled by `operators.results`."""
 
     choice: options.choice(
         "Choice",

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from capture.factory import write_flame_capture
+from capture.factory import write_flame_capture, write_mesh_capture
 
 from stga_addon.capture.open import OWN_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
@@ -68,6 +68,15 @@ def extension():
     module.register()
     yield module
     module.unregister()
+
+
+@pytest.fixture
+def head(extension, tmp_path: Path):
+    """The head of a mesh capture, in the folder `capture`."""
+    import bpy
+
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    return bpy.context.scene.stga.head
 
 
 @pytest.fixture(scope="session")

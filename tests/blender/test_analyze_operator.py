@@ -8,7 +8,6 @@ from pathlib import Path
 
 import bpy
 import pytest
-from capture.factory import write_mesh_capture
 
 from stga_addon.jobs.table import Kind
 from stga_addon.training.run.folder import read_run
@@ -16,10 +15,8 @@ from stga_addon.training.settings import PRESETS
 
 
 @pytest.fixture
-def chosen(extension, tmp_path):
-    """The scene's settings, with a head of a toy capture."""
-    root = write_mesh_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(root))
+def chosen(head):
+    """The settings of a scene with a head."""
     return bpy.context.scene.stga
 
 

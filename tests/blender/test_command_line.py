@@ -135,11 +135,14 @@ def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize("command", ["train", "track", "avatar"])
 def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monkeypatch, command):
-    """Catches a command in Blender's Python although another was chosen."""
+    """Catches a command in Blender's Python although another was chosen, and a farm's variable that
+    overrules an operator's Python."""
     chosen = tmp_path / "python"
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
     monkeypatch.setenv(extension.stga_addon.worker.training_python.PYTHON_VARIABLE, str(chosen))
+    given = extension.operators.request.training_python(bpy.context, "/given/python")
+    assert given == "/given/python"
     model = [] if command == "train" else ["--model", "HEAD"]
     more = ["--iterations", "2"] if command != "track" else []
     arguments = [command, "FOOTAGE", *model, "--out", "OUT", *more]
@@ -175,15 +178,6 @@ def test_training_is_the_panels(stga, here, folder, tmp_path):
     for other in others:
         for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_a_farms_python_comes_first(extension, monkeypatch):
-    """Catches a farm's variable that is ignored, or overrules an operator's Python."""
-    operators = extension.operators.request
-    worker = extension.stga_addon.worker.training_python
-    monkeypatch.setenv(worker.PYTHON_VARIABLE, "/farm/python")
-    assert operators.training_python(bpy.context) == "/farm/python"
-    assert operators.training_python(bpy.context, "/given/python") == "/given/python"
 
 
 @pytest.mark.slow

@@ -20,10 +20,8 @@ from .test_train_operators import ask_only
 
 
 @pytest.fixture
-def head(extension, tmp_path):
-    """The head of a mesh capture, with a painted vertex group of forty triangles."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    head = bpy.context.scene.stga.head
+def head(head):
+    """With a painted vertex group of forty triangles."""
     corners = np.array([polygon.vertices[:] for polygon in head.data.polygons])
     group = head.vertex_groups.new(name="cheek")
     group.add(np.unique(corners[:40]).tolist(), 0.8, "REPLACE")

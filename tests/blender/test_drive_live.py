@@ -38,7 +38,7 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
         filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz")
     )
     settings = bpy.context.scene.stga.drive
-    settings.port, settings.takes = free_port(), str(tmp_path / "takes")
+    settings.port, settings.takes = wire.free_port(), str(tmp_path / "takes")
     own = FlameSequence(model, shape, None, (), {}.__getitem__)
     recorded = read_motion(tmp_path / "own.npz", model)
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -61,12 +61,6 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
     if sessions.session() is not None:
         sessions.session().stop()
     sender.close()
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def the_head():
@@ -249,8 +243,9 @@ def test_a_minute_without_growth(live):
     def minute(first: int) -> None:
         for number in range(600):
             live.send(rows[number % 10], first + number, subject="A" if number % 7 else "B")
-            if number % 3 == 0:
-                live.sessions.session().stream.receive("1.2.3.4", noise.bytes(40), number / 60)
+            other = wire.live_link_face({}, number, subject=str(first + number))
+            for data in (noise.bytes(40), other):
+                live.sessions.session().stream.receive(f"1.2.3.{number}", data, number / 60)
 
     minute(0)
     gc.collect()

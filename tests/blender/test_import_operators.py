@@ -70,19 +70,15 @@ def test_a_motion_file_is_a_rig(tmp_path, model):
 def test_importing_again_doubles_nothing(tmp_path, model, kind):
     """Catches a second head, rig, camera, action or image for the same source, and an import of the
     one mesh that was clicked."""
-    folder, motion = tmp_path / "capture", tmp_path / "motion.npz"
-    if kind == "capture":
-        write_mesh_capture(folder)
-        bring = partial(bpy.ops.stga.import_capture, directory=str(folder))
-    elif kind == "flame":
-        write_flame_capture(folder)
-        bring = partial(bpy.ops.stga.import_capture, directory=str(folder), flame=str(model))
-    elif kind == "motion":
-        write_motion(motion)
-        bring = partial(bpy.ops.stga.import_motion, filepath=str(motion), flame=str(model))
-    else:
-        mesh = write_meshes(tmp_path / "meshes")
-        bring = partial(bpy.ops.stga.import_meshes, filepath=str(mesh))
+    folder, ops = tmp_path / "source", bpy.ops.stga
+    write = {"capture": write_mesh_capture, "flame": write_flame_capture, "motion": write_motion}
+    written = {**write, "meshes": write_meshes}[kind](folder)
+    bring = {
+        "capture": partial(ops.import_capture, directory=str(folder)),
+        "flame": partial(ops.import_capture, directory=str(folder), flame=str(model)),
+        "motion": partial(ops.import_motion, filepath=f"{folder}.npz", flame=str(model)),
+        "meshes": partial(ops.import_meshes, filepath=str(written)),
+    }[kind]
     bring()
     once = state_of_file()
     bring()

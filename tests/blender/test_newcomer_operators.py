@@ -8,7 +8,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_mesh_capture
 from light.scenes import lit_avatar
 
 from stga_addon.scene import tags
@@ -33,12 +32,6 @@ BUTTONS = {
     "File",
     "/captures/anna: was tracked with FLAME and needs a FLAME model": "Choose It",
 }
-
-
-@pytest.fixture
-def head(extension, tmp_path):
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
-    return bpy.context.scene.stga.head
 
 
 @pytest.mark.parametrize("sentence", BUTTONS)

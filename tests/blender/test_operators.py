@@ -22,9 +22,7 @@ from stga_addon.export.formats import export_avatar
 from stga_addon.export.ply import read_ply, write_ply
 from stga_addon.jobs.track import Track
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.display import splat_nodes
-from stga_addon.scene.display.splat_nodes import POINTS
-from stga_addon.scene.display.splat_object import evaluated_splats, set_input
+from stga_addon.scene.display.splat_object import evaluated_splats
 from stga_addon.scene.vertex_groups import read_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
@@ -48,7 +46,6 @@ SET_BY_PANEL = {
 }
 """Operator -> properties that its button in the panel sets, or that a user chooses in its file
 dialog."""
-AXES = {"Y": (0, 1, 0), "-Y": (0, -1, 0), "Z": (0, 0, 1)}
 
 
 @pytest.fixture
@@ -187,7 +184,7 @@ def test_from_import_to_show(tmp_path, layout):
 
 def test_exports(shown, tmp_path):
     """Catches formats that Blender cannot write, exports of the neutral pose or of the wrong frame,
-    frames left out, and a rate that is not the scene's."""
+    frames left out, a rate that is not the scene's, and a page whose head lies on its back."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     capture, avatar = shown
     bpy.context.scene.render.fps = 30
@@ -211,16 +208,11 @@ def test_exports(shown, tmp_path):
     np.testing.assert_array_equal(read_ply(tmp_path / "one.ply").xyz, many)
     with pytest.raises(RuntimeError, match="not tracked with FLAME"):
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / "pair"), format="gaussian-avatars")
-
-
-def test_export_of_a_web_page(shown, tmp_path):
-    """Catches a page without FLAME of other frames than the scene's, or whose head lies on its
-    back."""
     bpy.context.scene.frame_start = 1
     bpy.ops.stga.export_avatar(filepath=str(tmp_path / "a.stga"), format="web")
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
     assert len(arrays["translation"]) == 3
-    centers = [shown[0].mesh(timestep).mean(0) for timestep in (1, 3)]
+    centers = [capture.mesh(timestep).mean(0) for timestep in (1, 3)]
     np.testing.assert_allclose(arrays["translation"][[0, 2]], centers, atol=1e-5)
     up = np.array(bpy.context.scene.stga.head.matrix_world.to_3x3()) @ header["up"]
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
@@ -273,19 +265,19 @@ def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
     assert bpy.context.scene.frame_current == 1
 
 
-@pytest.mark.parametrize("up", AXES)
-def test_import_ply(tmp_path, up):
+def test_import_ply(tmp_path):
     """Catches a scan that lies on its back: the file's up axis must point along Blender's z."""
     vertices, faces = ball()
     splats = lattice_splats(vertices, faces.astype(np.int32), order=0)
     splats = replace(splats, face=np.zeros(len(faces), np.int32))
     write_ply(tmp_path / "scan.ply", splats)
-    bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"), up=up)
-    shown = bpy.context.scene.stga.splats
-    bpy.context.view_layer.update()
-    turned = np.array(shown.matrix_world)[:3, :3] @ AXES[up]
-    np.testing.assert_allclose(turned, (0, 0, 1), atol=1e-6)
-    assert len(evaluated_splats(shown)[0]) == len(splats)
+    for up, axis in (("Y", (0, 1, 0)), ("-Y", (0, -1, 0)), ("Z", (0, 0, 1))):
+        bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"), up=up)
+        shown = bpy.context.scene.stga.splats
+        bpy.context.view_layer.update()
+        turned = np.array(shown.matrix_world)[:3, :3] @ axis
+        np.testing.assert_allclose(turned, (0, 0, 1), atol=1e-6)
+        assert len(evaluated_splats(shown)[0]) == len(splats)
 
 
 def test_mistakes_are_sentences(mesh_capture, tmp_path):
@@ -320,22 +312,3 @@ def test_standard_view():
     bpy.context.scene.view_settings.view_transform = "AgX"
     bpy.ops.stga.standard_view()
     assert bpy.context.scene.view_settings.view_transform == "Standard"
-
-
-def test_show_selection_after_select(shown):
-    """Catches the two sides of the vertex groups' name and weight drifting apart: Python writes,
-    nodes read."""
-    bpy.ops.stga.select(threshold=0.0015)
-    scene, (_, avatar) = bpy.context.scene, shown
-    set_input(scene.stga.splats, splat_nodes.DISPLAY, POINTS)
-    set_input(scene.stga.splats, splat_nodes.SHOW_SELECTION, True)
-    scene.frame_set(3)
-    points = next(
-        item.object.data
-        for item in bpy.context.evaluated_depsgraph_get().object_instances
-        if item.object.type == "POINTCLOUD"
-    )
-    color = np.empty(4 * len(points.points), np.float32)
-    points.attributes["stga_display_color"].data.foreach_get("color", color)
-    frozen = np.isclose(color.reshape(-1, 4), splat_nodes.FROZEN_COLOR).all(1)
-    np.testing.assert_array_equal(~frozen, read_selection(scene.stga.head)[3][avatar.splats.face])

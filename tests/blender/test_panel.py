@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import bpy
 import pytest
-from capture.factory import write_mesh_capture
 from gui.layouts import filled
 
 from stga_addon.jobs.table import Kind
@@ -19,9 +18,8 @@ from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
-def trained(extension, tmp_path, monkeypatch):
+def trained(extension, head, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.select(threshold=0.0005)
     run, jobs, monitor = tmp_path / "run", extension.stga_addon.jobs, extension.operators.monitor
     folder = jobs.perform.request_folder(run)

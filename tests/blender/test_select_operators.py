@@ -1,11 +1,8 @@
 """Choosing what is selected as a whole, counting it, and seeing it."""
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_mesh_capture
 
 from stga_addon.capture.open import open_capture
 from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection
@@ -17,28 +14,17 @@ from .test_operators import write_ball_avatar
 pytestmark = pytest.mark.usefixtures("extension")
 
 
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    folder = write_mesh_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder))
-    return folder
-
-
-def the_head():
-    return bpy.context.scene.stga.head
-
-
 def rows() -> list[tuple[int, int, int]]:
     return [
         (row.frame, row.triangles, row.splats) for row in bpy.context.scene.stga.selected_frames
     ]
 
 
-def paint_chin(capture) -> np.ndarray:
+def paint_chin(head, capture) -> np.ndarray:
     """A vertex group of triangles half of which never move: (F,) bool."""
     centres = capture.neutral[capture.faces].mean(1)
     low = np.unique(capture.faces[centres[:, 1] < -0.02])
-    the_head().vertex_groups.new(name="chin").add(low.tolist(), 1.0, "REPLACE")
+    head.vertex_groups.new(name="chin").add(low.tolist(), 1.0, "REPLACE")
     region = np.isin(capture.faces, low).all(1)
     moved = (capture.mesh(3) - capture.neutral)[capture.faces].mean(1)
     offset = np.linalg.norm(moved[region], axis=1)
@@ -46,12 +32,12 @@ def paint_chin(capture) -> np.ndarray:
     return region
 
 
-def test_regions_that_are_selected_as_a_whole(folder):
+def test_regions_that_are_selected_as_a_whole(head, tmp_path):
     """Catches a painted region that is ignored or taken triangle by triangle, a tick in the panel
     that the selection does not hear of, and a misspelt or unpainted region that silently selects
     nothing."""
-    capture, head = open_capture(folder), the_head()
-    region = paint_chin(capture)
+    capture = open_capture(tmp_path / "capture")
+    region = paint_chin(head, capture)
     alone = select_capture(capture, SelectionOptions(threshold=0.0005))[3]
     for expected in (alone | region, alone):
         bpy.ops.stga.toggle_region(name="chin")
@@ -73,18 +59,18 @@ def test_regions_that_are_selected_as_a_whole(folder):
     assert {t: faces.tolist() for t, faces in read_selection(head).items()} == before
 
 
-def test_the_table_counts_what_each_frame_trains(folder, tmp_path):
+def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     """Catches counts of the rule instead of the groups, of six splats a triangle always, or of
     another head."""
     bpy.ops.stga.select(threshold=0.0005)
-    chosen = read_selection(the_head())
+    chosen = read_selection(head)
     assert rows() == [(t, int(faces.sum()), 6 * int(faces.sum())) for t, faces in chosen.items()]
     avatar = write_ball_avatar(tmp_path / "a.npz", order=4)
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
     per_face = np.bincount(avatar.splats.face, minlength=len(avatar.faces))
-    the_head().vertex_groups["stga_3"].remove(list(range(80)))
+    head.vertex_groups["stga_3"].remove(list(range(80)))
     bpy.ops.stga.count_selected()
-    painted = read_selection(the_head())
+    painted = read_selection(head)
     assert painted[3].sum() < chosen[3].sum()
     assert rows() == [
         (t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()
@@ -99,27 +85,26 @@ def materials_of(head) -> set[str]:
     return {mesh.materials[polygon.material_index].name for polygon in mesh.polygons}
 
 
-def heat(name: str, kind: str, size: int) -> np.ndarray:
-    attribute = the_head().data.attributes[name].data
+def heat(head, name: str, kind: str, size: int) -> np.ndarray:
+    attribute = head.data.attributes[name].data
     values = np.empty(len(attribute) * size, np.float32)
     attribute.foreach_get(kind, values)
     return values
 
 
-def test_heat_map(folder, tmp_path):
+def test_heat_map(head, tmp_path):
     """Catches colors on the wrong triangles or of yesterday's selection, a heat map that the splats
     cover, and a head that does not look as before once they are gone."""
     with pytest.raises(RuntimeError, match="no frame selects a triangle yet"):
         bpy.ops.stga.heat_map()
-    head = the_head()
     head.data.materials.append(bpy.data.materials.new("skin"))
     bpy.ops.stga.select(threshold=0.0025)
     bpy.ops.stga.heat_map()
     bpy.ops.stga.select(threshold=0.0015)
     expected = np.mean(list(read_selection(head).values()), axis=0)
-    np.testing.assert_allclose(heat(SHARE, "value", 1), expected, atol=1e-6)
+    np.testing.assert_allclose(heat(head, SHARE, "value", 1), expected, atol=1e-6)
     assert head.data.color_attributes.active_color.name == HEAT
-    color = heat(HEAT, "color", 4).reshape(-1, 3, 4)
+    color = heat(head, HEAT, "color", 4).reshape(-1, 3, 4)
     assert (color == color[:, :1]).all(), "a triangle's corners differ"
     hottest, never = color[expected.argmax(), 0], color[expected.argmin(), 0]
     assert hottest[0] > 0.8 > 0.2 > never[0]

@@ -14,7 +14,6 @@ import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
 
 from stga_addon.avatar.file import read_avatar, write_avatar
-from stga_addon.files import write_json
 from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene.display.splat_object import evaluated_splats
@@ -23,11 +22,10 @@ from .test_operators import write_ball_avatar
 
 
 @pytest.fixture
-def head(extension, tmp_path):
-    """The head of a mesh capture, with a selection."""
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+def head(head):
+    """With a selection."""
     bpy.ops.stga.select(threshold=0.0005)
-    return bpy.context.scene.stga.head
+    return head
 
 
 @pytest.fixture
@@ -283,18 +281,6 @@ def test_moved_blend_file(extension, worker, tmp_path):
     assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == "none"
     assert monitor.state_of(bpy.context.scene, Kind.TRAINING).place == tmp_path / "run"
     bpy.ops.stga.dismiss(request="training")
-
-
-def test_failed_worker_ends_the_timer(extension, worker):
-    """Catches a progress bar that never ends, and a failure without the end of the log."""
-    monitor = extension.operators.monitor
-    (worker.folder / "worker.log").write_text("Killed\n")
-    failure = {"state": "failed", "error": "a bug", "traceback": "Traceback: here\n"}
-    write_json(worker.folder / "status.json", failure)
-    last = monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot
-    assert last.state.failed
-    assert last.log_tail == ("Killed",)
-    assert monitor.tick() is None
 
 
 @pytest.mark.slow

@@ -18,6 +18,8 @@ from stga_addon.driving.performance import (
 from stga_addon.driving.read_performance import is_performance, read_performance
 from stga_addon.errors import StgaError
 
+from .live import wire
+
 PASCAL = [name[0].upper() + name[1:] for name in ARKIT_SHAPES]
 ROTATIONS = [f"{s}{a}" for s in ("Head", "LeftEye", "RightEye") for a in ("Yaw", "Pitch", "Roll")]
 HEADER = ["Timecode", "BlendShapeCount", *PASCAL, *ROTATIONS]
@@ -95,7 +97,7 @@ def test_fifty_one_shapes_and_a_takes_folder(tmp_path):
     assert not found.weights[:, 51].any()
 
 
-def test_every_json_form_and_audio2face_csv(tmp_path):
+def test_every_form_of_json_csv_and_text(tmp_path):
     """Catches a tool whose file is refused, or whose weights come to other shapes."""
     order = RNG.permutation(52)
     names = [ARKIT_SHAPES[k] for k in order]
@@ -126,20 +128,11 @@ def test_every_json_form_and_audio2face_csv(tmp_path):
     found = read_performance(tmp_path / "a2f.csv")
     np.testing.assert_allclose(found.weights, WEIGHTS)
     assert found.fps == pytest.approx(25)
-
-
-def test_facial_mocap_lines(tmp_path):
-    """Catches percent taken for shares, degrees for radians, and the separator of version 2."""
-    short = {name: name.replace("Left", "_L").replace("Right", "_R") for name in ARKIT_SHAPES}
-    lines = []
-    for n, row in enumerate(WEIGHTS):
-        sign = "&" if n % 2 else "-"
-        fields = [f"{n}{sign}{100 * v:.2f}" for n, v in zip(short.values(), row, strict=True)]
-        rest = "|=head#90,45,-30,0.1,0.2,0.3|rightEye#1,2,3|leftEye#1,2,3|"
-        lines.append("|".join(fields) + rest)
-    (tmp_path / "take.txt").write_text("\n".join(lines))
+    named = [dict(zip(ARKIT_SHAPES, row, strict=True)) for row in WEIGHTS]
+    packets = [wire.facial_mocap(row, (90, 45, -30)) for row in named]
+    (tmp_path / "take.txt").write_bytes(b"\n".join(packets))
     found = read_performance(tmp_path / "take.txt")
-    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)
+    np.testing.assert_allclose(found.weights, WEIGHTS, atol=0.0051)  # whole percents
     np.testing.assert_allclose(np.degrees(found.head), [[45, 90, -30]] * 6)
 
 

@@ -306,26 +306,6 @@ def live() -> Iterator[Any]:
     yield opened(FIRST)
 
 
-def export() -> Iterator[Any]:
-    """Every format; then what can be opened again."""
-    seen["exported"] = {}
-    for name, format in module("stga_addon.export.formats").FORMATS.items():
-        path = FOLDER / f"avatar_{name}{next(iter(format.suffixes), '')}"
-        how = click(f"Export {name}", bpy.ops.stga.export_avatar, filepath=str(path), format=name)
-        if how == {"message"}:  # a package is missing
-            continue
-        files = [path, *path.rglob("*")] if path.is_dir() else [path]
-        seen["exported"][name] = sum(each.stat().st_size for each in files)
-        yield 0.1
-    count, file = len(chosen().splats.data.vertices), str(FOLDER / "avatar_ply.ply")
-    click("Import PLY", bpy.ops.stga.import_ply, filepath=file)
-    shown = chosen().splats
-    seen["opened again"] = [count, len(shown.data.vertices)]
-    shot("opened again")
-    bpy.data.objects.remove(shown)
-    click("Show Avatar", bpy.ops.stga.show_avatar, filepath=chosen().avatar)
-
-
 def display() -> Iterator[Any]:
     shading, lighting = viewport()[1].spaces.active.shading, bpy.context.scene.stga_lighting
     seen["shading"] = {}
@@ -342,24 +322,6 @@ def display() -> Iterator[Any]:
         seen["exposure"] = lighting.exposure
         yield 0.2
         shot(f"light {mode}")
-
-
-def select() -> Iterator[Any]:
-    click("Select Triangles", bpy.ops.stga.select)
-    click("Row", setattr, chosen(), "selected_row", 2)
-    seen["frame of row"] = [bpy.context.scene.frame_current, chosen().selected_frames[2].frame]
-    yield 0.2
-    shot("selected")
-
-
-def reopen() -> Iterator[Any]:
-    """Save and open again."""
-    run = Path(chosen().run_folder)
-    click("Save", bpy.ops.wm.save_as_mainfile, filepath=str(FIRST))
-    bpy.ops.wm.open_mainfile(filepath=str(FIRST))
-    yield 0.3
-    seen["run found"] = Path(bpy.path.abspath(chosen().run_folder)) == run
-    shot("reopened")
 
 
 def pressed() -> Iterator[Any]:
@@ -492,8 +454,8 @@ def drop() -> Iterator[Any]:
     subprocess.run(["xdotool", "key", "Escape"], check=True)
 
 
-STEPS = """fresh open_demo misunderstand train pose live display select export reopen
-pressed duplicate delete append render drop disable"""
+STEPS = """fresh open_demo misunderstand train pose live display pressed duplicate delete append
+render drop disable"""
 
 
 def steps() -> Iterator[Any]:

@@ -40,14 +40,12 @@ def test_the_first_hour(tmp_path: Path) -> None:
     assert [text for text in texts if len(text.split()) > MAX_WORDS] == []
     assert (seen["cut"], seen["undo"], seen["kept"]) == ({}, {}, [])
     assert not any(name.endswith(".blend") for name in seen["proposed"].values())
-    names = ("left", "run found", "appended", "deletion undone")
+    names = ("left", "appended", "deletion undone")
     assert [name for name in names if not seen[name]] == []
     assert [*seen["duplicates undone"].values()] == [True, True]
-    assert len({*seen["frame of row"], *seen["opened again"]}) == 2
     assert abs(seen["exposure"]) > 0.1
     assert {*seen["shading"].values()} == {"MATERIAL", "SOLID"}
     for moved, left, poses, draws in seen["driven"].values():
         assert moved > 1e-3 > 1e-5 > left
         assert poses >= min(MIN_POSES_PER_SECOND, 0.9 * draws)
-    assert min(seen["exported"].values()) > 0
     assert np.all([np.min(found) > 0 for found in seen["images"].values()])

@@ -1,6 +1,7 @@
 """Packets written by hand from the layouts of the protocols."""
 
 import re
+import socket
 import struct
 
 import numpy as np
@@ -35,6 +36,12 @@ def facial_mocap(weights, head=(0, 0, 0), separator="-"):
     angles = ",".join(f"{value}" for value in head)
     rest = f"|=head#{angles},0.1,0.2,-0.3|rightEye#1,2,0|leftEye#1,2,0|"
     return ("|".join(fields) + rest).encode()
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 def mixed(seed: int) -> dict[str, float]:
