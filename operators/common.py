@@ -52,19 +52,15 @@ class Action:
         return all(need(cls, context) for need in cls.needs)
 
     def execute(self, context: Any) -> set[str]:
-        return self.perform(context, self.run)
-
-    def perform(self, context: Any, work: Callable[[Any], set[str] | None]) -> set[str]:
-        """Do `work(context)`: a StgaError becomes an error report, without a traceback, and nothing
-        that is returned FINISHED; the pointer says that Blender is busy, and how far it is
-        (`show_progress`)."""
+        """A StgaError becomes an error report, without a traceback, and nothing that is returned
+        FINISHED; the pointer says that Blender is busy, and how far it is (`show_progress`)."""
         manager, window = context.window_manager, context.window
         manager.stga_message = ""
         if window is not None:
             manager.progress_begin(0, 1)
             window.cursor_modal_set("WAIT")
         try:
-            return work(context) or {"FINISHED"}
+            return self.run(context) or {"FINISHED"}
         except (StgaError, Cancelled) as error:
             self.tell("ERROR", str(error))
             return {"CANCELLED"}

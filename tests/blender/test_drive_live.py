@@ -56,7 +56,6 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
         frames=[recorded.frame(timestep) for timestep in recorded.timesteps],
         map=head_map(own, "demo"),
         takes=tmp_path / "takes",
-        monitor=extension.operators.monitor,
     )
     if sessions.session() is not None:
         sessions.session().stop()
@@ -72,10 +71,15 @@ def mesh() -> np.ndarray:
     return evaluated_vertices(the_head())
 
 
-def expected(live, weights: dict[str, float], head=(0.0, 0.0, 0.0)) -> np.ndarray:
+TURN = (0.1, 0.2, -0.1)
+
+
+def assert_shows(live, weights: dict[str, float]) -> None:
+    """The head is posed by the weights, and by TURN."""
     row = np.array([[weights.get(name, 0.0) for name in ARKIT_SHAPES]])
-    take = Performance(np.zeros(1), row, np.array([head]), 60.0)
-    return flame_forward(live.own.model, live.own.shape, live.map.frames(take)[0])
+    take = Performance(np.zeros(1), row, np.array([TURN]), 60.0)
+    expected = flame_forward(live.own.model, live.own.shape, live.map.frames(take)[0])
+    np.testing.assert_allclose(mesh(), expected, atol=TOLERANCE_M)
 
 
 def half(seed: int) -> dict[str, float]:
@@ -89,12 +93,10 @@ def test_the_head_follows_and_comes_back(live):
     bpy.ops.stga.drive_live()
     for number in range(3):
         weights = half(number)
-        assert 0 < live.send(weights, number, head=(0.1, 0.2, -0.1)) <= 1 / 60
-        np.testing.assert_allclose(
-            mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M
-        )
+        assert 0 < live.send(weights, number, head=TURN) <= 1 / 60
+        assert_shows(live, weights)
     bpy.context.scene.frame_set(2)  # its own animation does not come between two packets
-    np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+    assert_shows(live, weights)
     bpy.context.scene.frame_set(1)
     bpy.ops.stga.stop_live()
     np.testing.assert_allclose(mesh(), before, atol=1e-7)
@@ -141,8 +143,8 @@ def test_sliders_rest_meanwhile(live):
     slider.value = 0.25
     bpy.ops.stga.drive_live()
     weights = half(1)
-    live.send(weights, 1, head=(0.1, 0.2, -0.1))
-    np.testing.assert_allclose(mesh(), expected(live, weights, (0.1, 0.2, -0.1)), atol=TOLERANCE_M)
+    live.send(weights, 1, head=TURN)
+    assert_shows(live, weights)
     bpy.ops.stga.stop_live()
     assert slider.value == 0.25
 
