@@ -118,7 +118,7 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
     rng = np.random.default_rng(7)
     weights = random_poses(poses + QUIET_FRAMES, rng)
     weights[:QUIET_FRAMES] = 0.02 * weights[:QUIET_FRAMES]
-    take = Performance(np.arange(len(weights)) / 30, weights, None, 30.0)
+    take = Performance(np.arange(len(weights)) / 30, weights, np.zeros(3), 30.0)
     bias = _leaked(driver)
     tracked = [replace(frame, expr=frame.expr + bias) for frame in driver.map.frames(take)]
     theirs = quiet_neutral(tracked)
@@ -194,7 +194,7 @@ def _fitted(head: Head, wanted: list[np.ndarray], start: np.ndarray) -> np.ndarr
 def there_and_back(head: Head) -> np.ndarray:
     """(52,) largest error of each weight over 300 random poses."""
     weights = random_poses(300, np.random.default_rng(11))
-    take = Performance(np.arange(len(weights)) / 30, weights, None, 30.0)
+    take = Performance(np.arange(len(weights)) / 30, weights, np.zeros(3), 30.0)
     back = arkit_weights(head.map.frames(take), head.map, head.sequence)
     return np.asarray(np.abs(back - effective_weights(weights)).max(axis=0))
 

@@ -230,8 +230,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             where = self.start, name, self.place == "strip"
             apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, *where)
             return name, len(weights)
-        still, turns = np.zeros(3), np.zeros((len(weights), 3))
-        turns = turns if performance.head is None else head_turns(performance.head)
+        still, turns = np.zeros(3), head_turns(performance.head)
         frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
         # on the expression the sliders would act
         self._apply(head, frames, name, list({*parts, "expression"}), weights=weights)

@@ -66,9 +66,7 @@ class HeadMap:
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
         values, zero = self.parameters(performance.weights), np.zeros(3)
-        count, turns = self.expressions.shape[1], np.zeros((len(values), 3))
-        if performance.head is not None:
-            turns = head_turns(performance.head)
+        count, turns = self.expressions.shape[1], head_turns(performance.head)
         return [
             FlameFrame(row[:count], zero, turn, row[count : count + 3], zero, row[count + 3 :])
             for row, turn in zip(values, turns, strict=True)

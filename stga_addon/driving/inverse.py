@@ -148,10 +148,9 @@ def write_performance(path: Path, performance: Performance) -> None:
     """Write a performance as a CSV file in Live Link Face's layout, atomically."""
     names = [name[0].upper() + name[1:] for name in ARKIT_SHAPES]
     header = ["Timecode", "BlendShapeCount", *names, *EXTRA_COLUMNS]
-    head = np.zeros((len(performance.times), 3)) if performance.head is None else performance.head
     lines = [",".join(header)]
-    eyes = np.zeros((len(head), len(EXTRA_COLUMNS) - 3))
-    rows = np.hstack([performance.weights, head, eyes]).tolist()
+    eyes = np.zeros((len(performance.times), len(EXTRA_COLUMNS) - 3))
+    rows = np.hstack([performance.weights, performance.head, eyes]).tolist()
     for time, cells in zip(performance.times.tolist(), rows, strict=True):
         count, sub = divmod(round(time * TIMECODE_BASE * 1000), 1000)
         whole, frame = divmod(count, TIMECODE_BASE)

@@ -288,7 +288,7 @@ def prepared_performance(
     if options.neutral == "quiet":
         weights = quiet_weights(performance)
     if options.neutral in ("quiet", "first"):
-        rest = replace(performance, weights=weights[None], head=None)
+        rest = replace(performance, weights=weights[None], head=np.zeros(3))
     changed = corrected(resampled(performance, fps), options, rest)
     return at_strength(smoothed(changed, options.smoothing), options)
 

@@ -85,14 +85,18 @@ class Performance:
 
     times    (T,) seconds, ascending from 0; rows that were lost leave gaps
     weights  (T, 52) in the order of `ARKIT_SHAPES`, 0 to 1 at the source
-    head     (T, 3) yaw, pitch, roll in radians; None where the source has none
+    head     (T, 3) yaw, pitch, roll in radians; zero where the source has none, or None is given
     fps      rows per second where none is lost
     """
 
     times: np.ndarray
     weights: np.ndarray
-    head: np.ndarray | None
+    head: np.ndarray
     fps: float
+
+    def __post_init__(self) -> None:
+        head = 0.0 if self.head is None else self.head
+        object.__setattr__(self, "head", np.broadcast_to(head, (len(self.weights), 3)))
 
     @property
     def lost(self) -> int:
@@ -111,13 +115,13 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
         columns = [np.interp(times, performance.times, column) for column in values.T]
         return np.stack(columns, axis=1)
 
-    head = None if performance.head is None else interpolated(performance.head)
-    return Performance(times, interpolated(performance.weights), head, rate)
+    weights, head = interpolated(performance.weights), interpolated(performance.head)
+    return Performance(times, weights, head, rate)
 
 
 def mirrored(performance: Performance) -> Performance:
     """Left and right exchanged; the head's yaw and roll change their signs."""
-    head = None if performance.head is None else performance.head * [-1.0, 1.0, -1.0]
+    head = performance.head * [-1.0, 1.0, -1.0]
     return replace(performance, weights=performance.weights[:, MIRROR], head=head)
 
 
@@ -143,25 +147,22 @@ def smoothed(performance: Performance, seconds: float) -> Performance:
         padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
         return np.stack([np.convolve(column, kernel, "valid") for column in padded.T], axis=1)
 
-    head = None if performance.head is None else convolved(performance.head)
-    return replace(performance, weights=convolved(performance.weights), head=head)
+    weights, head = convolved(performance.weights), convolved(performance.head)
+    return replace(performance, weights=weights, head=head)
 
 
 def amplified(performance: Performance, gains: Mapping[str, float]) -> Performance:
     """Weights times the gain of their part (PARTS, "head") or of their own name, else 1."""
     factors = np.array([gains.get(name, gains.get(part_of(name), 1.0)) for name in ARKIT_SHAPES])
-    head = None if performance.head is None else performance.head * gains.get("head", 1.0)
+    head = performance.head * gains.get("head", 1.0)
     return replace(performance, weights=performance.weights * factors, head=head)
 
 
 def relative_to(performance: Performance, rest: Performance) -> Performance:
     """Without the face and head rotation of `rest` (its first row); a weight of 1 stays 1."""
     neutral = rest.weights[0]
-    head = performance.head
-    if head is not None and rest.head is not None:
-        head = head - rest.head[0]
-    room = np.maximum(1.0 - neutral, 0.1)
-    return replace(performance, weights=(performance.weights - neutral) / room, head=head)
+    weights = (performance.weights - neutral) / np.maximum(1.0 - neutral, 0.1)
+    return replace(performance, weights=weights, head=performance.head - rest.head[0])
 
 
 @dataclass(frozen=True)

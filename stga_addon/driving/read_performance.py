@@ -179,7 +179,7 @@ def _read_csv(path: Path) -> Performance:
     weights = np.zeros((len(body), COUNT))
     for column, index in columns.items():
         weights[:, column] = values(index)
-    head = None
+    head = np.zeros(3)
     if all(name in plain for name in HEAD_COLUMNS):
         head = np.stack([values(plain[name]) for name in HEAD_COLUMNS], axis=1)
     at = next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
@@ -189,7 +189,7 @@ def _read_csv(path: Path) -> Performance:
         times = seconds_of(str(path), codes)
     elif at is not None:
         times = values(at)
-    return _performance(path, times, weights, None if head is None or not head.any() else head)
+    return _performance(path, times, weights, head)
 
 
 def _read_packets(path: Path) -> Performance:
@@ -200,8 +200,8 @@ def _read_packets(path: Path) -> Performance:
         raise StgaError(f"{path}: has no line of iFacialMocap, {problem}")
     columns_of(str(path), known[0].names)
     weights = np.stack([packet.weights for packet in known if packet.weights is not None])
-    heads = [packet.head for packet in known]
-    head = None if any(turn is None for turn in heads) else np.array(heads)
+    heads = [packet.head for packet in known if packet.head is not None]
+    head = np.array(heads) if len(heads) == len(known) else np.zeros(3)
     return _performance(path, None, weights, head)
 
 
@@ -229,7 +229,7 @@ def _read_json(path: Path) -> Performance:
     about = {**(inner if isinstance(inner, dict) else {}), **outer}
     key = next((key for key in ("exportFps", "fps") if key in about), "")
     fps = _number(f"{path}: {key}", about[key]) if key else None
-    return _performance(path, times, weights, None, fps)
+    return _performance(path, times, weights, np.zeros(3), fps)
 
 
 def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
@@ -268,7 +268,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _performance(
-    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray | None,
+    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray,
     fps: float | None = None,
 ) -> Performance:  # fmt: skip
     """The checked performance in the order of its times; of rows with the same time the first."""
@@ -277,7 +277,7 @@ def _performance(
     if not (np.abs(weights) <= MAX_WEIGHT).all():
         problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
         raise StgaError(f"{path}: {problem}")
-    if head is not None and not (np.abs(head) <= 4 * math.pi).all():
+    if not (np.abs(head) <= 4 * math.pi).all():
         problem = "head rotation is beyond two turns, or not finite; expected radians"
         raise StgaError(f"{path}: {problem}")
     if times is None:
@@ -293,7 +293,8 @@ def _performance(
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
-    return Performance(times, weights[first], None if head is None else head[first], rate)
+    head = np.broadcast_to(head, (len(weights), 3))[first]
+    return Performance(times, weights[first], head, rate)
 
 
 READERS = {".csv": _read_csv, ".json": _read_json, ".txt": _read_packets}

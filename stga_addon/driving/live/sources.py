@@ -260,13 +260,13 @@ MAX_LEAD_S = 5.0
 def row_of(*packets: FacePacket) -> Performance:
     """The mean of packets with a face, one at least, as a performance of one row."""
     found = _rows_of(packets, np.zeros(1), DEFAULT_FPS)
-    head = None if found.head is None else found.head.mean(0, keepdims=True)
-    return replace(found, weights=found.weights.mean(0, keepdims=True), head=head)
+    weights, head = (each.mean(0, keepdims=True) for each in (found.weights, found.head))
+    return replace(found, weights=weights, head=head)
 
 
 def _rows_of(packets: Sequence[FacePacket], times: np.ndarray, fps: float) -> Performance:
     heads = [packet.head for packet in packets if packet.head is not None]
-    head = np.array(heads) if len(heads) == len(packets) else None
+    head = np.array(heads) if len(heads) == len(packets) else np.zeros(3)
     return Performance(times, np.array([packet.weights for packet in packets]), head, fps)
 
 
@@ -277,9 +277,7 @@ def eased(
     if before is None or smoothing_s <= 0:
         return row
     share = 1 - np.exp(-step_s / smoothing_s)
-    head = row.head
-    if head is not None and before.head is not None:
-        head = before.head + share * (head - before.head)
+    head = before.head + share * (row.head - before.head)
     return replace(row, weights=before.weights + share * (row.weights - before.weights), head=head)
 
 

@@ -203,7 +203,7 @@ def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np
     open_jaw = np.eye(COUNT)[JAW_OPEN]
     weights = np.concatenate([np.zeros((1, COUNT)), np.eye(COUNT), np.eye(COUNT)[PRODUCTS]])
     weights[1 + COUNT :] += open_jaw
-    frames = found.frames(Performance(np.arange(len(weights)), weights, None, 1.0))
+    frames = found.frames(Performance(np.arange(len(weights)), weights, np.zeros(3), 1.0))
     person = partial(flame_forward, sequence.model, sequence.shape)
     meshes = np.stack([person(frame, sequence.static_offset) for frame in frames])
     alone, pairs = meshes[1 : 1 + COUNT] - meshes[0], meshes[1 + COUNT :] - meshes[0]
