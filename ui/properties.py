@@ -105,12 +105,14 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
 
     head: object_property("Head", "Imported head that the steps work on", update=_forget_rows)
     track: bpy.props.PointerProperty(type=TrackSettings)
-    # absolute path of the current or last tracking
+    # absolute paths of the last tracking, avatar of a video, and run; whether they have reached the
+    # scene (`operators.results.PLACES`)
     tracking_capture: _hidden(bpy.props.StringProperty)
-    tracking_shown: _hidden(bpy.props.BoolProperty)  # it was imported
-    # absolute path of the current or last video's avatar
+    tracking_shown: _hidden(bpy.props.BoolProperty)
     avatar_folder: _hidden(bpy.props.StringProperty)
-    avatar_shown: _hidden(bpy.props.BoolProperty)  # it has reached the scene
+    avatar_shown: _hidden(bpy.props.BoolProperty)
+    training_run: _hidden(bpy.props.StringProperty)
+    result_shown: _hidden(bpy.props.BoolProperty)
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: options.integer("Frame", "Go to this frame", get=_current_row, set=_go_to_row)
     motion_source: object_property(
@@ -132,9 +134,6 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     show_result: options.boolean(
         "Show When Trained", "Show the avatar on the head when training has finished", default=True
     )
-    # absolute path of the current or last run
-    training_run: _hidden(bpy.props.StringProperty)
-    result_shown: _hidden(bpy.props.BoolProperty)  # its avatar has reached the scene
     avatar: options.path("Avatar", "Trained avatar file (.npz)")
 
 

@@ -27,11 +27,6 @@ def stga(extension):
     )
 
 
-@pytest.fixture
-def folder(extension, tmp_path) -> Path:
-    return write_mesh_capture(tmp_path / "capture")
-
-
 def save_and_open(path: Path) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -44,12 +39,13 @@ def show_avatar(path: Path, capture) -> Avatar:
     return avatar
 
 
-def test_the_open_head_stands_in_for_the_capture(stga, folder, tmp_path, capfd):
+def test_the_open_head_stands_in_for_the_capture(stga, tmp_path, capfd):
     """Catches a parser that asks for less than it needs, a command on nothing, or on the open head
     although another is named."""
     with pytest.raises(SystemExit, match="2"):
         stga("info")
     assert "CAPTURE" in capfd.readouterr().err
+    folder = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder))
     save_and_open(tmp_path / "head.blend")
     assert stga("select", "--threshold", 0.0005) == 0
@@ -121,15 +117,14 @@ def test_render_of_the_open_head(stga, here, tmp_path):
     assert pictures != tracked
 
 
-def test_missing_training_python(stga, extension, folder, monkeypatch, capsys):
+def test_missing_training_python(stga, extension, head, tmp_path, monkeypatch, capsys):
     """Catches a traceback, or success, where nothing can train."""
     monkeypatch.setattr(
         extension.stga_addon.worker.training_python, "missing_packages", lambda: ["torch"]
     )
-    assert stga("train", folder, "--out", folder / "run") == 2
+    assert stga("train", tmp_path / "capture", "--out", tmp_path / "run") == 2
     expected = "Install the complete edition of the add-on, or choose a Python"
     assert expected in capsys.readouterr().err
-    bpy.ops.stga.import_capture(directory=str(folder))
     assert stga("select") == 0  # needs none
 
 
@@ -152,13 +147,11 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
 
 
 @pytest.mark.slow
-def test_training_is_the_panels(stga, here, folder, tmp_path):
+def test_training_is_the_panels(stga, here, head, tmp_path):
     """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings:
     with the same seed, all give the same numbers."""
     pytest.importorskip("torch")
-    bpy.ops.stga.import_capture(directory=str(folder))
     bpy.ops.stga.select(threshold=0.0005)
-    head = bpy.context.scene.stga.head
     head.vertex_groups["stga_3"].remove(list(range(60)))
     head.vertex_groups.new(name="stga_0").add(list(range(40)), 1.0, "REPLACE")
     painted = read_selection(head)
