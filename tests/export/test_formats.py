@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture import factory
-from robustness.test_disks import PRIVATE, can_mount
 
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar
@@ -118,7 +118,17 @@ def test_rate_of_a_capture(tmp_path: Path, timesteps, fps, in_a_row, at_their_nu
     assert np.isclose(playback_fps(None), DEFAULT_FPS)
 
 
+# In a namespace of its own a process may mount a disk without being root, and nobody else sees it.
+PRIVATE = ["unshare", "-rm"]
 SMALL_DISK = 'mount -t tmpfs -o size=24m small "$1" && exec "$2" "$3" "$1"'
+
+
+def can_mount() -> bool:
+    mount = [*PRIVATE, "mount", "-t", "tmpfs", "none", "/mnt"]
+    return (
+        shutil.which("unshare") is not None
+        and not subprocess.run(mount, capture_output=True).returncode
+    )
 
 
 @pytest.mark.slow
