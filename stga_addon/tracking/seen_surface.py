@@ -54,7 +54,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class Sought:
+class SurfaceSearch:
     """Surface points (N) that are looked for, by a sweep; near (N,) bool: of which masks may
     tell."""
 
@@ -204,7 +204,7 @@ def large_parts(model: FlameModel) -> np.ndarray:
 def seen_surface(
     fit: HeadFit,
     timestep: int,
-    sought: Sought,
+    sought: SurfaceSearch,
     images: Pictures,
     masks: Pictures,
     visible: VisiblePoints,
@@ -253,7 +253,7 @@ def _posed(
     return vertices, points.on(vertices, faces), normals
 
 
-def outlines_agree(fit: HeadFit, take: RecordedTake, sought: Sought) -> bool:
+def outlines_agree(fit: HeadFit, take: RecordedTake, sought: SurfaceSearch) -> bool:
     """Whether masks, if any, end where the surface in the images does."""
     distances, faces = [np.zeros(0)], fit.head.model.faces
     chosen, reach = sought.points[sought.near], sought.sweep.reach

@@ -19,7 +19,7 @@ from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .seen_surface import (
     SeenSurface,
-    Sought,
+    SurfaceSearch,
     Sweep,
     VisiblePoints,
     near_landmarks,
@@ -105,7 +105,7 @@ def fit_surface(
     points, done = surface_points(head, SURFACE_POINTS), 0
     near = near_landmarks(head, points, take)
     by_skin, by_outline = (
-        [Sought(points, near, sweep) for sweep in sweeps]
+        [SurfaceSearch(points, near, sweep) for sweep in sweeps]
         for sweeps in (IDENTITY_SWEEPS, OUTLINE_SWEEPS)
     )
 
@@ -143,11 +143,13 @@ def fit_surface(
     sought = []
     for sweep, count in TAKE_SWEEPS:
         on = points[rows[:: 1 + len(rows) // count]]
-        sought.append(Sought(on, near_landmarks(found.head, on, take), sweep))
+        sought.append(SurfaceSearch(on, near_landmarks(found.head, on, take), sweep))
     return _whole_take(found, fit, take, observed, sought, search)
 
 
-def _seen_part(fit: HeadFit, take: RecordedTake, sought: Sought, step: Step) -> list[SeenSurface]:
+def _seen_part(
+    fit: HeadFit, take: RecordedTake, sought: SurfaceSearch, step: Step
+) -> list[SeenSurface]:
     """The surface at each of the fit's timesteps, from images and masks."""
     seen = []
     for t in fit.parameters:
@@ -165,7 +167,7 @@ def _identity(
     head: HeadModel,
     fit: HeadFit,
     take: RecordedTake,
-    sought: Sequence[Sought],
+    sought: Sequence[SurfaceSearch],
     search: Callable[..., list[SeenSurface]],
 ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
     """Identity, scale and offsets from the timesteps of the fit, in rounds of what is sought, and
@@ -213,7 +215,7 @@ def _whole_take(
     first: HeadFit,
     take: RecordedTake,
     observed: Mapping[int, Observation],
-    sought: Sequence[Sought],
+    sought: Sequence[SurfaceSearch],
     search: Callable[..., list],
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
@@ -255,7 +257,7 @@ def _found_part(
     take: RecordedTake,
     landmarks: Sequence[Observation],
     share: np.ndarray,
-    sought: Sequence[Sought],
+    sought: Sequence[SurfaceSearch],
     step: Step,
 ) -> list[tuple[np.ndarray, Observation]]:
     """Parameters (E + 18,) of each of the fit's timesteps, and landmarks and surface that they were

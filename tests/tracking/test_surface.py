@@ -15,7 +15,7 @@ from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
 from stga_addon.tracking.posed_points import SurfacePoints
 from stga_addon.tracking.seen_surface import (
-    Sought,
+    SurfaceSearch,
     Sweep,
     facing,
     gray_view,
@@ -312,5 +312,5 @@ def test_mattes_that_are_too_wide_are_not_followed(head):
             mask = binary_dilation(mask, iterations=wide) if wide else mask
             shown.append((camera, 255 * mask.astype(np.uint8)))
         masked = replace(take, masks=lambda t, own=shown: own)
-        assert outlines_agree(fit, masked, Sought(points, near, sweep)) is agree
-    assert not outlines_agree(fit, take, Sought(points, np.ones(len(points), bool), sweep))
+        assert outlines_agree(fit, masked, SurfaceSearch(points, near, sweep)) is agree
+    assert not outlines_agree(fit, take, SurfaceSearch(points, np.ones(len(points), bool), sweep))
