@@ -192,14 +192,8 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         prepared.capture,
     )
     parent = read_run(continuation.parent).settings
-    before: dict[str, Any] = {
-        "strain_color": parent.strain_color,
-        "driven_offsets": parent.driven_offsets,
-    }
-    now: dict[str, Any] = {
-        "strain_color": settings.strain_color,
-        "driven_offsets": settings.driven_offsets,
-    }
+    before: dict[str, Any] = {"driven_offsets": parent.driven_offsets}
+    now: dict[str, Any] = {"driven_offsets": settings.driven_offsets}
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]

@@ -43,7 +43,6 @@ from stga_addon.raster.cpu.rasterize import (
     render_forward,
     sort_by_depth,
     tile_grid,
-    with_strain_color,
 )
 from stga_addon.raster.cpu.threads import parallel, pieces, threads
 from stga_addon.raster.cpu.tiles import (
@@ -180,8 +179,7 @@ def stages(
     pixels, background = width * height, np.ones(3, np.float32)
     tiles_x, tiles_y = tile_grid(width, height)
     state, buffers = new_state(splats), BufferPool()
-    parameters, face = with_strain_color(state.parameters), state.face
-    gradients = with_strain_color(state.gradients)
+    parameters, gradients, face = state.parameters, state.gradients, state.face
     r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
     lists, columns, rect = r.lists, r.projection.columns, r.projection.rect
     rows = lists.visible

@@ -1,15 +1,15 @@
 """Local frames of triangles, in which splats are stored, and baking to world space (STGA,
 embedding)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ..flame.quaternions import from_matrices, multiply, normalized
-from .splats import SH_C0, Splats, no_strain_color
-from .strain import StrainBasis, gram_strain
+from .splats import SH_C0, Splats
+from .strain import StrainBasis, gram_deformation
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
@@ -19,6 +19,8 @@ on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and
 the rounding."""
 # from this z on, the perpendicular of a unit vector is sought in the x direction
 UPRIGHT_COSINE = 0.8
+NOTHING = np.zeros((1, 0), np.float32)
+"""Of `FaceFrames.deformation` and `color` where nothing needs or drives them."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,16 @@ class FaceFrames:
     """Per triangle: world = scale · rotation @ local + origin.
 
     origin (F, 3) meters, rotation (F, 3, 3) proper, scale (F,).
-    strain (F, S) float32 (`avatar.strain`), S = 3, or 0 where it is not needed.
+    deformation (F, D) float32 (`avatar.strain`), D = 6, or 0 where it is not needed.
+    color (F, C) float32 sRGB, added to the colors of a triangle's splats (`avatar.offsets`), C = 3,
+    or 0 where nothing is.
     """
 
     origin: np.ndarray
     rotation: np.ndarray
     scale: np.ndarray
-    strain: np.ndarray
+    deformation: np.ndarray = field(default_factory=lambda: NOTHING)
+    color: np.ndarray = field(default_factory=lambda: NOTHING)
 
     @cached_property
     def quaternion(self) -> np.ndarray:
@@ -40,8 +45,7 @@ class FaceFrames:
         return from_matrices(self.rotation)
 
 
-NO_STRAIN = np.zeros((1, 0), np.float32)
-WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.ones(1), NO_STRAIN)
+WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.ones(1))
 """The single frame of a world-space set of splats (face 0)."""
 
 
@@ -79,10 +83,11 @@ def face_frames(
         scale = (edge + np.where(no_edge, side, height)) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
-    deformed = np.zeros((len(faces), 0), np.float32)
+    deformed = NOTHING
     if strain is not None:
         first_squared, second_squared = triangles.squared
-        deformed = gram_strain(strain, first_squared, _dot(to_p1, to_p2), second_squared)
+        products = first_squared, _dot(to_p1, to_p2), second_squared
+        deformed = gram_deformation(strain, *products, triangles.normal)
     p0, p1, p2 = triangles.corners
     origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):
@@ -99,7 +104,7 @@ def frame_backward(
 
     The reverse of `face_frames`, with all vectors in the frame's own axes: by_frame (F, 7) are the
     gradients with respect to the origin (3), to a small rotation of the frame (3) and to the
-    logarithm of its scale. Strain passes no gradient on, and a line (see MIN_AREA_RATIO)
+    logarithm of its scale. Deformation passes no gradient on, and a line (see MIN_AREA_RATIO)
     only its force.
     """
     force, torque, growth = by_frame[:, :3], by_frame[:, 3:6], by_frame[:, 6]
@@ -143,8 +148,7 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
     """Bake local splats into world space. SH keep their coefficients: their directions are world
     directions.
 
-    Color that depends on strain is added to the constant coefficient, or left out where `frames`
-    have no strain.
+    The frames' color is added to the constant coefficient.
     """
     face, scale = splats.face, frames.scale[splats.face]
     xyz = points_to_world(splats.xyz, frames, face)
@@ -155,18 +159,17 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
         xyz=xyz.astype(np.float32),
         rotation=rotation.astype(np.float32),
         log_scale=log_scale.astype(np.float32),
-        sh=strained_sh(splats, frames),
+        sh=colored_sh(splats, frames),
         face=np.zeros_like(face),
-        strain_color=no_strain_color(len(xyz)),
     )
 
 
-def strained_sh(splats: Splats, frames: FaceFrames) -> np.ndarray:
-    """The splats' `sh` (N, K, 3) including the color change by strain."""
-    if not (frames.strain.shape[1] and splats.strain_color.shape[1]):
+def colored_sh(splats: Splats, frames: FaceFrames) -> np.ndarray:
+    """The splats' `sh` (N, K, 3) with the frames' color."""
+    if not frames.color.shape[1]:
         return splats.sh
-    sh, strain = splats.sh.copy(), frames.strain[splats.face]
-    sh[:, 0] += np.einsum("ns,nsc->nc", strain, splats.strain_color) / np.float32(SH_C0)
+    sh = splats.sh.copy()
+    sh[:, 0] += frames.color[splats.face] / np.float32(SH_C0)
     return sh
 
 

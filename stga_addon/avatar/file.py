@@ -3,7 +3,7 @@ avatar."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,13 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
-from .offsets import OFFSETS, moved_frames
-from .splats import ADDED, ARRAYS, Splats
-from .strain import STRAIN_COMPONENTS, StrainBasis, strain_basis
+from .offsets import OFFSETS, SIGNALS, moved_frames
+from .splats import ARRAYS, SH_C0, Splats
+from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
 FORMAT = "stga-avatar"
-VERSION = 2
+VERSIONS = 2, 3
+"""Read; the last is written. In version 2, each splat has strain colors of its own."""
 _HEADER = {
     "convention": str, "background": list, "antialiased": bool, "principal_point": str,
     "regions": list, "settings": dict,
@@ -81,10 +82,10 @@ class Avatar:
     antialiased  whether it was trained with opacity compensation (`render_forward`), and is
                  rendered so
     principal_point  convention of the capture that it was trained on (`read_transforms`)
-    strain_range  (F, 2, 3) float32 lowest and highest strain of each triangle that colors and
-                  positions follow (`avatar.strain`); None: the same for all, ±MAX_STRAIN
-    driven_offsets  name -> (F, S, 3) float32: how far a triangle's splats move with the signal of
-                    that name in `offsets.OFFSETS`: a vector in its frame for each of S components
+    strain_range  (F, 2, 6) float32 lowest and highest deformation of each triangle that colors and
+                  positions follow (`avatar.strain`); None: the same for all
+    driven_offsets  name -> (F, 3, 3) float32 of `offsets.OFFSETS`: change of a triangle's splats by
+                    each of three components of a signal
     light       what relighting needs, None where it was not estimated
     """
 
@@ -103,17 +104,23 @@ class Avatar:
 
     @property
     def follows_strain(self) -> bool:
-        """Whether colors or positions depend on the strain of the mesh."""
-        return self.splats.strain_color.shape[1] > 0 or bool(self.driven_offsets)
+        """Whether colors or positions depend on the deformation of the mesh."""
+        return bool(self.driven_offsets)
+
+    @cached_property
+    def without_light(self) -> "Avatar":
+        """Without what is the capture's light in it (`DrivenOffset.of_light`)."""
+        kept = {n: each for n, each in self.driven_offsets.items() if not OFFSETS[n].of_light}
+        return self if len(kept) == len(self.driven_offsets) else replace(self, driven_offsets=kept)
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
-        """The triangles' local frames on a posed mesh (V, 3), with strain where splats follow it,
-        and moved by the driven offsets."""
+        """The triangles' local frames on a posed mesh (V, 3), moved and colored by the driven
+        offsets."""
         basis, offsets = self._strain, self.driven_offsets
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
         if basis is None:
             return frames
-        return moved_frames(frames, offsets, lambda name: OFFSETS[name].signal(basis, frames))
+        return moved_frames(frames, offsets, lambda name: SIGNALS[name](basis, frames))
 
     @cached_property
     def _areas(self) -> np.ndarray:
@@ -132,7 +139,7 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     triangles.
     """
     _check(path, avatar)
-    header: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSIONS[-1]}
     header |= {name: kind(getattr(avatar, name)) for name, kind in _HEADER.items()}
     arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     masks = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
@@ -155,7 +162,7 @@ def read_avatar(path: Path) -> Avatar:
     malformed."""
     arrays = read_npz(path)
     header = _read_header(path, arrays)
-    needed = (*(name for name in ARRAYS if name not in ADDED), "neutral", "faces", "region_faces")
+    needed = (*ARRAYS, "neutral", "faces", "region_faces")
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
@@ -166,8 +173,10 @@ def read_avatar(path: Path) -> Avatar:
     values = {name: header[name] for name in _HEADER}
     values["regions"] = dict(zip(names, masks, strict=True))
     values["background"] = tuple(header["background"])
+    if header["version"] == VERSIONS[0]:
+        _convert_strain(path, arrays)
     avatar = Avatar(
-        splats=Splats(**{name: arrays[name] for name in ARRAYS if name in arrays}),
+        splats=Splats(**{name: arrays[name] for name in ARRAYS}),
         neutral=arrays["neutral"],
         faces=arrays["faces"],
         **values,
@@ -188,15 +197,50 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
         raise StgaError(f"{path}: header is not valid JSON ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
-    if header.get("version") != VERSION:
-        version = shorten(header.get("version"))
-        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {VERSION}")
+    if header.get("version") not in VERSIONS:
+        version, reads = shorten(header.get("version")), " and ".join(map(str, VERSIONS))
+        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {reads}")
     for name, kind in _HEADER.items():
         if not isinstance(header.get(name), kind):
             raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
     if not all(isinstance(name, str) for name in header["regions"]):
         raise StgaError(f"{path}: header field 'regions' holds something that is not a name")
     return header
+
+
+def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Turn what follows strain in version 2 into that of version 3, in place. Raises StgaError.
+
+    `strain_color` (N, 3, 3) of splats becomes "older_strain_color" of their triangles: the mean of
+    its splats, by how much of it they cover. At rest, splats keep their colors. `strain_range` (F,
+    2, 3) gets the range of a normal's change.
+    """
+    if arrays["faces"].ndim != 2 or arrays["xyz"].ndim != 2:
+        return  # as `_check` says
+    faces, count, known = len(arrays["faces"]), len(arrays["xyz"]), (2, STRAIN_COMPONENTS)
+    limits = arrays.get("strain_range")
+    if limits is not None:
+        check_array(path, "strain_range", limits, "float32", (faces, *known))
+        rest = np.broadcast_to(TRAINED_RANGE[:, STRAIN_COMPONENTS:], limits.shape)
+        limits = arrays["strain_range"] = np.concatenate([limits, rest], axis=2)
+    colors = arrays.pop("strain_color", np.zeros((count, 0, 3), np.float32))
+    if not colors.size:
+        return
+    check_array(path, "strain_color", colors, "float32", (count, STRAIN_COMPONENTS, 3))
+    for name in ("log_scale", "opacity", "sh", "face"):
+        kind = ARRAYS[name]
+        check_array(path, name, arrays[name], kind.dtype, (count, *kind.shape))
+    face = arrays["face"]
+    _check_index(path, "face", face, faces, "faces")
+    if limits is not None:
+        rest = at_rest(limits)[face, :STRAIN_COMPONENTS]
+        arrays["sh"][:, 0] += np.einsum("ns,nsc->nc", rest, colors) / np.float32(SH_C0)
+    area = np.sort(arrays["log_scale"], axis=1)[:, 1:].sum(1) - np.log1p(np.exp(-arrays["opacity"]))
+    weight = np.exp(area - area.max())
+    share = weight / np.maximum(np.bincount(face, weight, faces), np.finfo(np.float32).tiny)[face]
+    parts = (share[:, None] * colors.reshape(count, -1)).T
+    sums = [np.bincount(face, part, faces) for part in parts]
+    arrays["older_strain_color"] = np.stack(sums, 1).reshape(faces, -1, 3).astype(np.float32)
 
 
 def _check(path: Path, avatar: Avatar) -> None:
@@ -217,9 +261,9 @@ def _check(path: Path, avatar: Avatar) -> None:
             raise StgaError(f"{path}: {name} has {found}, expected one of {kind.sizes}")
     faces, limits, color = len(avatar.faces), avatar.strain_range, avatar.background
     if limits is not None:
-        check_array(path, "strain_range", limits, "float32", (faces, 2, STRAIN_COMPONENTS))
+        check_array(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
     for name, coefficients in avatar.driven_offsets.items():
-        check_array(path, name, coefficients, "float32", (faces, OFFSETS[name].signals, 3))
+        check_array(path, name, coefficients, "float32", (faces, STRAIN_COMPONENTS, 3))
     _check_index(path, "face", avatar.splats.face, faces, "faces")
     for name, mask in avatar.regions.items():
         check_array(path, f"region {name!r}", mask, "bool", (faces,))

@@ -1,5 +1,5 @@
-"""Driven offsets: coefficients of each triangle, trained, by which its splats follow a signal of
-the pose."""
+"""Driven offsets: coefficients of each triangle, trained, by which positions and colors of its
+splats follow a signal of the pose."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -7,52 +7,68 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .embedding import FaceFrames
-from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain
+from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain, strain_from_rest
 
-Signal = Callable[[StrainBasis, FaceFrames], np.ndarray]
-"""(F, S) float32 of a posed mesh's triangles, from the neutral mesh's basis and the frames; 0 where
-it is at rest."""
+SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
+    "strain": lambda basis, frames: strain_from_rest(basis, frames.deformation),
+    "smoothed_strain": lambda basis, frames: smoothed_strain(basis, frames.deformation),
+    "normal": lambda basis, frames: frames.deformation[:, STRAIN_COMPONENTS:],
+}
+"""By name: (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the
+frames; 0 where it is at rest. "normal": the change of the unit normal, world axes."""
+POSITION, COLOR = "position", "color"
 
 
 @dataclass(frozen=True)
 class DrivenOffset:
-    """A row of OFFSETS: a triangle's splats move by signal (S,) · coefficients (S, 3), in its own
-    frame.
+    """A row of OFFSETS: a triangle's splats change by signal (3,) · coefficients (3, 3).
 
-    name        of the coefficients (F, S, 3) in settings, avatar files and checkpoints
-    signals     S
-    signal      what drives it
-    rate_share  learning rate per unit of the signal, as a share of that of the splats' positions
+    name        of the coefficients (F, 3, 3) in settings, avatar files and checkpoints
+    signal      what drives it, of SIGNALS
+    target      POSITION: by a vector in the triangle's own axes and unit; COLOR: sRGB
+    rate, rate_share  learning rate: which of `Rates`, and a share of it
+    of_light    whether it is the capture's light, which other light takes the place of
     """
 
     name: str
-    signals: int
-    signal: Signal
+    signal: str
+    target: str
+    rate: str
     rate_share: float
+    of_light: bool = False
 
 
-STRAIN_POSITION = DrivenOffset(
-    "strain_position", STRAIN_COMPONENTS,
-    lambda basis, frames: smoothed_strain(basis, frames.strain), rate_share=0.5,
-)  # fmt: skip
-"""Positions that follow the strain around their triangle: skin that is compressed bulges."""
-OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in (STRAIN_POSITION,)}
-"""By name. Everything that trains, stores or poses avatars goes by this table."""
+_ROWS = (
+    DrivenOffset("strain_position", "smoothed_strain", POSITION, "xyz", 0.5),
+    DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
+    DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
+    DrivenOffset("older_strain_color", "strain", COLOR, "strain_color", 1.0),
+)
+OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
+"""By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
+compressed bulges and darkens; skin that turns in a light that stays gets brighter or darker. The
+last is read from avatars of version 0.2.0, and trained where their runs are continued."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """(F, 3) in each triangle's own axes and unit: coefficients (F, S, 3) times signal (F, S)."""
+    """(F, 3): coefficients (F, S, 3) times signal (F, S)."""
     return np.asarray(np.einsum("fk,fkc->fc", signal, coefficients))
 
 
 def moved_frames(
     frames: FaceFrames, coefficients: Mapping[str, np.ndarray], signal: Callable[[str], np.ndarray]
 ) -> FaceFrames:
-    """The frames, moved by every driven offset of which there are coefficients; signal: name -> (F,
-    S)."""
+    """The frames, moved and colored by every driven offset of which there are coefficients; signal:
+    name of SIGNALS -> (F, 3)."""
+    color = np.zeros((len(frames.scale), 3), np.float32)
     for name, values in coefficients.items():
+        offset = OFFSETS[name]
+        change = offset_of(values, signal(offset.signal))
+        if offset.target == COLOR:
+            color += change
+            frames = replace(frames, color=color)
+            continue
         # In one type: einsum takes several times as long where it has to convert.
-        shift = offset_of(values, signal(name)).astype(np.float64)
-        turned = np.einsum("fij,fj->fi", frames.rotation, shift)
+        turned = np.einsum("fij,fj->fi", frames.rotation, change.astype(np.float64))
         frames = replace(frames, origin=frames.origin + frames.scale[:, None] * turned)
     return frames

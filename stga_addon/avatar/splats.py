@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ..flame.quaternions import normalized
-from .strain import STRAIN_COMPONENTS
 
 MAX_SH_DEGREE = 3
 SH_C0 = 0.28209479177387814
@@ -34,8 +33,6 @@ class Splats:
     face       (N,) int32 index of the triangle that the splat is bound to; 0 in world space
     unbound    (N,) bool: splats of hair and shoulders; they follow their triangle without being
                limited to it
-    strain_color  (N, S, 3) change of the degree-0 coefficient's color per unit of the triangle's
-                  strain (`strain`), S = 3, or 0 (default) where colors do not depend on deformation
     """
 
     xyz: np.ndarray
@@ -45,11 +42,6 @@ class Splats:
     sh: np.ndarray
     face: np.ndarray
     unbound: np.ndarray
-    strain_color: np.ndarray = None  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.strain_color is None:
-            object.__setattr__(self, "strain_color", no_strain_color(len(self.xyz)))
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -93,23 +85,14 @@ ARRAYS = {
     "sh": SplatArray(shape=(-1, 3), sizes=tuple(n**2 for n in range(1, MAX_SH_DEGREE + 2))),
     "face": SplatArray("int32"),
     "unbound": SplatArray("bool"),
-    "strain_color": SplatArray(shape=(-1, 3), sizes=(0, STRAIN_COMPONENTS)),
 }
 """The fields of `Splats`, by which files and checkpoints are read."""
-ADDED = {name: max(array.sizes) for name, array in ARRAYS.items() if 0 in array.sizes}
-"""Arrays that an effect adds, which have no coefficients without it -> how many with it. A field of
-the same name switches them in `TrainingSettings`, and one in `Rates` trains them."""
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """All splats of sets with coefficients of the same kinds, in order."""
     names = [field.name for field in fields(Splats)]
     return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def no_strain_color(count: int) -> np.ndarray:
-    """An empty `strain_color` for `count` splats."""
-    return np.zeros((count, 0, 3), np.float32)
 
 
 def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:

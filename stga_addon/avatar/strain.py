@@ -1,5 +1,5 @@
-"""Strain of triangles, which colors and positions may follow: skin that is compressed darkens and
-bulges."""
+"""Deformation of triangles, which colors and positions may follow: strain, and how the normal
+turned."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,14 +15,16 @@ STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
 MIN_COMPRESSION = 0.2
 """Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly
 noise."""
-COLOR_RANGE = np.array(
-    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN], [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN]],
+MAX_NORMAL_CHANGE = 2.0
+"""Of a unit normal, in each component."""
+TRAINED_RANGE = np.array(
+    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN, *3 * [-MAX_NORMAL_CHANGE]],
+     [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN, *3 * [MAX_NORMAL_CHANGE]]],
     np.float32,
-)
-"""Lowest and highest strain that colors and positions are trained to follow. Folds and their
+)  # fmt: skip
+"""Lowest and highest deformation that colors and positions are trained to follow. Folds and their
 shadows come with compression and shear; what is fitted to compression is not to be continued into
-stretch. Within this range, a mesh at rest has −MIN_COMPRESSION, not 0: a constant share of the
-colors, which the splats' `sh` are trained beside."""
+stretch. Within this range, a mesh at rest has a strain of −MIN_COMPRESSION, not 0."""
 RANGE_MARGIN = 1.2
 """How far from rest splats follow a triangle's strain, as a multiple of what was seen in training:
 other expressions are a little stronger now and then."""
@@ -67,7 +69,8 @@ class StrainBasis:
     corners (3, F): `faces` by corner.
     vertex_faces: V lists of the triangles that touch a vertex.
     vertex_weight (V,): a third of one over how many these are.
-    range (F, 2, 3): lowest and highest strain; beyond, it is clipped.
+    normal (3, F): unit normals of the neutral mesh, 0 of triangles without area.
+    range (F, 2, 6): lowest and highest deformation; beyond, it is clipped.
     neighbors: `edge_neighbors`.
     neighbor_weight (F,): one over how many neighbors a triangle has and itself.
     """
@@ -79,18 +82,19 @@ class StrainBasis:
     corners: np.ndarray
     vertex_faces: IndexLists
     vertex_weight: np.ndarray
+    normal: np.ndarray
     range: np.ndarray
     neighbors: IndexLists
     neighbor_weight: np.ndarray
 
 
 def strain_basis(
-    neutral: np.ndarray, faces: np.ndarray, strain_range: np.ndarray | None = None
+    neutral: np.ndarray, faces: np.ndarray, limits: np.ndarray | None = None
 ) -> StrainBasis:
     """The basis of a neutral mesh: neutral (V, 3) meters, faces (F, 3). A triangle without area
     stays unstrained.
 
-    strain_range: (F, 2, 3) `StrainBasis.range`; None: ±MAX_STRAIN.
+    limits: (F, 2, 6) `StrainBasis.range`; None: ±MAX_STRAIN and ±MAX_NORMAL_CHANGE.
     """
     p0, p1, p2 = np.asarray(neutral, np.float64)[faces.T]
     d1, d2 = p1 - p0, p2 - p0
@@ -108,9 +112,10 @@ def strain_basis(
     to_tensor = _product(a1, a1) / 2, _product(a1, a2), _product(a2, a2) / 2
     to_plane = _product(along, along), _product(across, across), _product(along, across)
     twice = np.array([1.0, 1, 1, 2, 2, 2])  # a tensor has each of the mixed components twice
-    if strain_range is None:
-        ends = np.array([[-MAX_STRAIN], [MAX_STRAIN]], np.float32)
-        strain_range = np.broadcast_to(ends, (len(faces), 2, STRAIN_COMPONENTS))
+    if limits is None:
+        highest = np.repeat([MAX_STRAIN, MAX_NORMAL_CHANGE], STRAIN_COMPONENTS)
+        ends = np.stack([-highest, highest]).astype(np.float32)
+        limits = np.broadcast_to(ends, (len(faces), *ends.shape))
     return StrainBasis(
         faces=faces,
         gram=_by_component(np.stack([_dot(d1, d1), _dot(d1, d2), _dot(d2, d2)], -1)),
@@ -119,7 +124,8 @@ def strain_basis(
         corners=corners,
         vertex_faces=vertex_faces,
         vertex_weight=(1 / (3 * np.maximum(vertex_faces.counts, 1))).astype(np.float32),
-        range=_by_component(strain_range),
+        normal=_unit(normal.T),
+        range=_by_component(limits),
         neighbors=neighbors,
         neighbor_weight=(1 / (1 + neighbors.counts)).astype(np.float32),
     )
@@ -166,13 +172,18 @@ def edge_neighbors(faces: np.ndarray) -> IndexLists:
     return _index_lists(one, other, len(faces))
 
 
-def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
-    """Strain (F, 3) float32 around each triangle, which positions follow: 0 for a mesh at rest.
+def strain_from_rest(basis: StrainBasis, deformed: np.ndarray) -> np.ndarray:
+    """Strain (F, 3) float32 of `deformation` (F, 6), less that of a mesh at rest."""
+    return np.asarray((deformed - at_rest(basis.range))[:, :STRAIN_COMPONENTS], np.float32)
 
-    strain (F, 3): of `face_strain`. Less that at rest, then AVERAGING_ROUNDS times the mean of a
+
+def smoothed_strain(basis: StrainBasis, deformed: np.ndarray) -> np.ndarray:
+    """Strain (F, 3) float32 around each triangle: 0 for a mesh at rest.
+
+    deformed (F, 6): of `deformation`. `strain_from_rest`, then AVERAGING_ROUNDS times the mean of a
     triangle and those that share an edge with it, component by component.
     """
-    smoothed = np.ascontiguousarray((strain - rest_strain(basis.range)).T, np.float32)
+    smoothed = np.ascontiguousarray(strain_from_rest(basis, deformed).T)
     for _ in range(AVERAGING_ROUNDS):
         total = smoothed.copy()
         _add_listed(basis.neighbors, smoothed, total)
@@ -180,58 +191,59 @@ def smoothed_strain(basis: StrainBasis, strain: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(smoothed.T)
 
 
-def color_range(count: int) -> np.ndarray:
-    """COLOR_RANGE for each of `count` triangles: (count, 2, 3) float32."""
-    return np.broadcast_to(COLOR_RANGE, (count, *COLOR_RANGE.shape)).copy()
+def trained_range(count: int) -> np.ndarray:
+    """TRAINED_RANGE for each of `count` triangles: (count, 2, 6) float32."""
+    return np.broadcast_to(TRAINED_RANGE, (count, *TRAINED_RANGE.shape)).copy()
 
 
-def rest_strain(limits: np.ndarray) -> np.ndarray:
-    """Strain (…, 3) of a mesh at rest within limits (…, 2, 3)."""
+def at_rest(limits: np.ndarray) -> np.ndarray:
+    """Deformation (…, 6) of a mesh at rest within limits (…, 2, 6)."""
     return np.asarray(np.clip(np.float32(0), limits[..., 0, :], limits[..., 1, :]))
 
 
 def seen_range(basis: StrainBasis, meshes: Iterable[np.ndarray]) -> np.ndarray:
-    """Lowest and highest strain (F, 2, 3) float32 of each triangle in posed meshes (V, 3), with a
-    margin.
+    """Lowest and highest deformation (F, 2, 6) float32 of each triangle in posed meshes (V, 3),
+    with a margin.
 
     It includes the neutral mesh, and stays within that of the basis. What is fitted to a few
     expressions is not extrapolated to stronger ones.
     """
-    strains = (face_strain(basis, mesh) for mesh in meshes)
-    seen = range_with_margin(rest_strain(basis.range), strains)
+    seen = range_with_margin(at_rest(basis.range), (deformation(basis, mesh) for mesh in meshes))
     return np.clip(seen, basis.range[:, :1], basis.range[:, 1:]).astype(np.float32)
 
 
-def range_with_margin(rest: np.ndarray, strains: Iterable[np.ndarray]) -> np.ndarray:
+def range_with_margin(rest: np.ndarray, values: Iterable[np.ndarray]) -> np.ndarray:
     """Lowest and highest (F, 2, D) of rest (F, D) and of values (F, D) that are RANGE_MARGIN times
     as far from it."""
     seen = np.stack([rest, rest], axis=1)
-    for strain in strains:
-        wider = rest + np.float32(RANGE_MARGIN) * (strain - rest)
+    for value in values:
+        wider = rest + np.float32(RANGE_MARGIN) * (value - rest)
         seen[:, 0], seen[:, 1] = np.minimum(seen[:, 0], wider), np.maximum(seen[:, 1], wider)
     return np.asarray(seen)
 
 
-def face_strain(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
-    """Strain (F, 3) float32 of every triangle of a posed mesh: 5·E within its range; E = 0 for a
-    mesh moved rigidly.
+def deformation(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
+    """Strain (3) and change of the unit normal (3) of every triangle of a posed mesh within their
+    ranges, (F, 6) float32. Strain is 5·E, and E = 0 for a mesh moved rigidly.
 
     vertices (V, 3) meters. E = ½(FᵀF − I) is Green's strain of the map from the neutral to the
     posed mesh, averaged over the triangles that touch a triangle (each vertex's mean over its
     triangles, then the mean of its three vertices), so that colors do not jump at edges. Columns:
-    along the neutral triangle's first edge, across it, shear.
+    along the neutral triangle's first edge, across it, shear, then the normal's x, y, z in world
+    axes.
     """
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
     e1, e2 = p1 - p0, p2 - p0
-    return gram_strain(basis, _dot(e1.T, e1.T), _dot(e1.T, e2.T), _dot(e2.T, e2.T))
+    products = _dot(e1.T, e1.T), _dot(e1.T, e2.T), _dot(e2.T, e2.T)
+    return gram_deformation(basis, *products, np.cross(e1, e2, axis=0))
 
 
-def gram_strain(
-    basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.ndarray
+def gram_deformation(
+    basis: StrainBasis, d11: np.ndarray, d12: np.ndarray, d22: np.ndarray, normal: np.ndarray
 ) -> np.ndarray:
-    """`face_strain` from scalar products (F,) of the posed triangles' edges p1 − p0 and p2 − p0, in
-    square meters."""
+    """`deformation` from scalar products (F,) of the posed triangles' edges p1 − p0 and p2 − p0,
+    and their cross product (3, F), in square meters."""
     # Vectors and tensors are rows (·, F) here: numpy computes whole rows in a fraction of the time
     # of short columns.
     change = np.asarray(np.stack([d11, d12, d22]) - basis.gram.T, np.float32)
@@ -240,9 +252,17 @@ def gram_strain(
     _add_listed(basis.vertex_faces, tensor, at_vertex)
     p0, p1, p2 = np.take(at_vertex * basis.vertex_weight, basis.corners, axis=1).transpose(1, 0, 2)
     strain = np.einsum("df,kdf->kf", p0 + p1 + p2, basis.to_plane.transpose(1, 2, 0))
+    turned = np.where(basis.normal.any(0), _unit(normal) - basis.normal, 0.0)
+    found = np.concatenate([np.float32(STRAIN_GAIN) * strain, turned.astype(np.float32)])
     lowest, highest = basis.range.transpose(1, 2, 0)
-    within = np.minimum(np.maximum(np.float32(STRAIN_GAIN) * strain, lowest), highest)
-    return np.ascontiguousarray(within.T)
+    return np.ascontiguousarray(np.minimum(np.maximum(found, lowest), highest).T)
+
+
+def _unit(normal: np.ndarray) -> np.ndarray:
+    """Unit vectors (3, F); 0 where triangles have no area."""
+    square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    flat = square < MIN_SQUARED_NORMAL
+    return np.asarray(np.where(flat, 0.0, normal / np.sqrt(np.where(flat, 1.0, square))))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..avatar.embedding import to_world
 from ..avatar.file import Avatar
+from ..avatar.offsets import COLOR, OFFSETS
 from ..avatar.splats import Splats
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
@@ -74,6 +75,10 @@ class Format:
     is_page: bool = False
 
 
+def _moving_color(avatar: Avatar) -> bool:
+    return any(OFFSETS[name].target == COLOR for name in avatar.driven_offsets)
+
+
 FORMATS = {
     "ply": Format(
         "PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer",
@@ -92,9 +97,10 @@ FORMATS = {
         "USD", "The frames of the scene as an animated particle field",
         (".usdc", ".usdz"), "range",
         lambda path, item: write_usd(
-            path, item.frames(path), item.playback.fps, item.avatar.splats.strain_color.size > 0
+            path, item.frames(path), item.playback.fps, _moving_color(item.avatar)
         ),
-        lambda avatar, frames: usd_bytes(avatar.splats, frames), has_rate=True,
+        lambda avatar, frames: usd_bytes(avatar.splats, frames, _moving_color(avatar)),
+        has_rate=True,
     ),
     "web": Format(
         "Web Page", "The frames of the scene as a page that plays them, or as data for a server",

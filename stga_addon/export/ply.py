@@ -9,9 +9,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
-from ..avatar.embedding import FaceFrames, face_frames, strained_sh, to_local, to_world
+from ..avatar.embedding import FaceFrames, face_frames, to_local, to_world
 from ..avatar.file import Avatar
-from ..avatar.splats import MAX_SH_DEGREE, Splats, no_strain_color
+from ..avatar.splats import MAX_SH_DEGREE, Splats
 from ..errors import StgaError
 from ..files import NumberedFiles, file_size, replacing, replacing_together, save_npz
 from ..flame.sequence import FlameSequence, motion_arrays
@@ -237,13 +237,10 @@ def in_convention(avatar: Avatar, convention: str) -> Splats:
     mesh.
 
     Both conventions have their origin at the centroid, which is left out for precision. On deformed
-    triangles the conventions scale differently, and so do the splats. What follows strain is that
-    of the neutral mesh.
+    triangles the conventions scale differently, and so do the splats. Driven offsets are left out:
+    they are 0 on the neutral mesh.
     """
     splats = avatar.splats
-    if splats.strain_color.shape[1]:
-        sh = strained_sh(splats, avatar.frames(avatar.neutral))
-        splats = replace(splats, sh=sh, strain_color=no_strain_color(len(sh)))
     if convention == avatar.convention:
         return splats
 

@@ -64,11 +64,10 @@ def write_usd(
                 layer.unlink(missing_ok=True)
 
 
-def usd_bytes(splats: Splats, frames: int) -> int:
-    """Size of the binary file: poses, and colors that follow them, per frame, the rest once."""
+def usd_bytes(splats: Splats, frames: int, moving_color: bool) -> int:
+    """Size of the binary file: poses, and moving colors, per frame, the rest once."""
     coefficients = 3 * splats.sh.shape[1]
-    moving = splats.strain_color.shape[1] > 0
-    once, each = (4, 40 + 2 * coefficients) if moving else (4 + 4 * coefficients, 40)
+    once, each = (4, 40 + 2 * coefficients) if moving_color else (4 + 4 * coefficients, 40)
     return len(splats) * (once + each * frames)
 
 

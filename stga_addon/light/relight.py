@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..avatar.file import Avatar
-from ..avatar.splats import SH_C0, no_strain_color, sh_color
+from ..avatar.offsets import COLOR, OFFSETS
+from ..avatar.splats import SH_C0, sh_color
 from ..capture.color import linear_to_srgb, srgb_to_linear
 from ..capture.mesh_geometry import vertex_normals, weighted_procrustes
 from ..errors import StgaError
@@ -111,7 +112,7 @@ class Relighter:
 
     @cached_property
     def albedo(self) -> np.ndarray:
-        """(N, 3) linear, of the neutral mesh (without color by strain)."""
+        """(N, 3) linear, of the neutral mesh (without what is driven)."""
         return self._albedo(self.diffuse_color)
 
     @cached_property
@@ -211,7 +212,7 @@ class Relighter:
             part = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
             reflected = REFLECTANCE * (z - 1.04 * part) + 1.04 * part + w
             highlight += np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
-        color = self._with_strain(self.diffuse_color, mesh)
+        color = _with_driven(self.diffuse_color, self.avatar.without_light, mesh)
         albedo = self.albedo if color is self.diffuse_color else self._albedo(color)
         lit = albedo * arriving * np.float32(1 / np.pi)
         lit += np.float32(lighting.specular) * highlight
@@ -233,19 +234,11 @@ class Relighter:
             albedo = albedo ** (1 - damping) * np.exp(np.log(albedo).mean(0)) ** damping
         return np.asarray(albedo.astype(np.float32))
 
-    def _with_strain(self, color: np.ndarray, mesh: np.ndarray) -> np.ndarray:
-        """The color (N, 3) on a posed mesh, where it follows strain; else the same array."""
-        splats = self.avatar.splats
-        if not splats.strain_color.shape[1]:
-            return color
-        strain = self.avatar.frames(mesh).strain[splats.face]
-        return np.asarray(color + np.einsum("ns,nsc->nc", strain, splats.strain_color))
-
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""
         splats = self.avatar.splats
         direction = _unit(self._at_splats(mesh) - np.asarray(eye, np.float32))
-        color = self._with_strain(sh_color(splats.sh, direction), mesh)
+        color = _with_driven(sh_color(splats.sh, direction), self.avatar, mesh)
         return srgb_to_linear(np.maximum(color, 0)).astype(np.float32)
 
     @cached_property
@@ -257,10 +250,20 @@ class Relighter:
         return at_splats(values, self.corners, self.weights)
 
 
+def _with_driven(color: np.ndarray, avatar: Avatar, mesh: np.ndarray) -> np.ndarray:
+    """Splats' color (N, 3) with that of their triangles on a posed mesh, where there is any; else
+    the same array."""
+    if not avatar.follows_strain:
+        return color
+    driven = avatar.frames(mesh).color
+    return np.asarray(color + driven[avatar.splats.face]) if driven.shape[1] else color
+
+
 def albedo_avatar(avatar: Avatar) -> Avatar:
     """The avatar whose colors are albedo in sRGB, whatever the view; without light. Raises
     StgaError."""
     color = linear_to_srgb(np.clip(Relighter(avatar).albedo, 0, 1))
     sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
-    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
-    return replace(avatar, splats=splats, light=None)
+    moving = {n: each for n, each in avatar.driven_offsets.items() if OFFSETS[n].target != COLOR}
+    splats = replace(avatar.splats, sh=sh)
+    return replace(avatar, splats=splats, driven_offsets=moving, light=None)

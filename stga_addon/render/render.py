@@ -19,9 +19,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..avatar.embedding import WORLD, FaceFrames
+from ..avatar.embedding import NOTHING, WORLD, FaceFrames
 from ..avatar.file import Avatar
-from ..avatar.splats import SH_C0, Splats, no_strain_color
+from ..avatar.splats import SH_C0, Splats
 from ..capture.camera import Camera
 from ..raster.cpu.layout import Parameters
 from ..raster.cpu.rasterize import frames_in_camera, render_forward
@@ -79,8 +79,9 @@ def render_colors(
 ) -> np.ndarray:  # fmt: skip
     """`render_avatar` with sRGB colors (N, 3), as `light.relight` finds them, not its own."""
     sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
-    splats = replace(avatar.splats, sh=sh, strain_color=no_strain_color(len(sh)))
-    return render_avatar(replace(avatar, splats=splats), mesh, camera, background, composer, behind)
+    pose = replace(avatar.frames(mesh), color=NOTHING), avatar.antialiased
+    splats = replace(avatar.splats, sh=sh)
+    return render(splats, camera, background, *pose, composer, behind)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """Visible splat objects as plain values, which both renderers are given; numpy only."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from ..avatar.embedding import FaceFrames
+from ..avatar.embedding import NOTHING, FaceFrames
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import linear_to_srgb
 from ..light.relight import Relighter
@@ -41,7 +42,12 @@ class Relit:
         splats = self.relighter.avatar.splats
         color = self.relighter.colors(self.mesh, eye, self.lighting, self.casters)
         sh = ((color - np.float32(0.5)) / np.float32(SH_C0))[:, None]
-        return replace(splats, sh=sh, strain_color=splats.strain_color[:, :0])
+        return replace(splats, sh=sh)
+
+    @cached_property
+    def face_color(self) -> np.ndarray:
+        """(F, 3), or (·, 0): of the frames' color, what belongs to the relit colors."""
+        return self.relighter.avatar.without_light.frames(self.mesh).color
 
 
 @dataclass(frozen=True)
@@ -60,19 +66,21 @@ class SceneLayer:
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
         """The splats as the settings show them; eye (3,): camera in the scene, where relit."""
-        splats, settings = self.splats, self.settings
+        splats, frames, settings = self.splats, self.frames, self.settings
         if self.relit is not None:
             assert eye is not None
             splats = self.relit.splats(self.eye_in_avatar(eye))
+            frames = replace(frames, color=NOTHING)
         visible = 1 / (1 + np.exp(-splats.opacity)) >= settings.opacity_threshold
         visible &= random_percentage(len(splats)) < settings.percentage
         if self.frozen is not None:
             frozen = self.frozen[splats.face]
             if settings.show_selection:
-                sh, strain_color = splats.sh.copy(), splats.strain_color.copy()
-                sh[frozen] = strain_color[frozen] = 0
-                sh[frozen, 0] = (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
-                splats = replace(splats, sh=sh, strain_color=strain_color)
+                sh, gray = splats.sh.copy(), (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
+                sh[frozen], sh[frozen, 0] = 0, gray
+                splats = replace(splats, sh=sh)
+                color = np.where(self.frozen[:, None], np.float32(0), frames.color)
+                frames = replace(frames, color=color)
             visible &= ~(frozen & settings.selected_only)
         if splats.sh_degree > 0 and not settings.view_dependent:
             splats = replace(splats, sh=splats.sh[:, :1])
@@ -81,7 +89,7 @@ class SceneLayer:
             factor = np.float32(np.log(max(settings.size, 1e-6)))
             splats = replace(splats, log_scale=splats.log_scale + factor)
         splats = splats if visible.all() else splats.rows(visible)
-        return PosedSplats(splats, self.frames, self.to_world, self.antialiased)
+        return PosedSplats(splats, frames, self.to_world, self.antialiased)
 
     def eye_in_avatar(self, eye: np.ndarray) -> np.ndarray:
         """(3,) of a position (3,) in the scene."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..avatar.embedding import CONVENTIONS
 from ..avatar.offsets import OFFSETS
-from ..avatar.splats import ADDED, MAX_SH_DEGREE
+from ..avatar.splats import MAX_SH_DEGREE
 from ..errors import StgaError
 from ..options import duration, option
 from ..schema import MAX_COUNT, complaint, setting, validate
@@ -34,8 +34,8 @@ MAX_GROWTH = 100
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rates at the start, of positions in local units (meters of the neutral mesh),
-    scales as logarithms and opacity as logit; each decays exponentially to `position_end` or `end`
-    of itself."""
+    scales as logarithms, opacity as logit and, `strain_color`, of colors that follow the pose; each
+    decays exponentially to `position_end` or `end` of itself."""
 
     xyz: float = setting(4e-4, 0, MAX_RATE)
     rotation: float = setting(1e-2, 0, MAX_RATE)
@@ -128,8 +128,7 @@ class TrainingSettings:
                    training and evaluations see the head over the color `background`
     scale, coarse_share   size of the images trained on, as a share of the captured ones; during the
                           first `coarse_share` of the budget half of that
-    strain_color   splats have color that depends on the deformation of their triangle
-    driven_offsets  names of `avatar.offsets.OFFSETS`: splats move with signals of the pose
+    driven_offsets  names of `avatar.offsets.OFFSETS`: splats follow signals of the pose
     antialiased    splats narrower than a pixel lose opacity instead of growing (`render_forward`)
     teeth          put splats on the rows of teeth that FLAME's mesh is given
     torso          hull points below the neck follow FLAME's root joint, not the head's nearest
@@ -201,7 +200,6 @@ class TrainingSettings:
         "quality, and with it training time; `stga presets` shows the times", None,
         choices={name: preset.purpose for name, preset in PRESETS.items()},
     )  # fmt: skip
-    strain_color: bool = False
     driven_offsets: tuple[str, ...] = ()
     antialiased: bool = False
     teeth: bool = True
@@ -214,14 +212,9 @@ class TrainingSettings:
     )  # fmt: skip
 
     @property
-    def added(self) -> tuple[str, ...]:
-        """The arrays of ADDED that effects add to splats."""
-        return tuple(name for name in ADDED if getattr(self, name))
-
-    @property
     def follows_strain(self) -> bool:
-        """Whether colors or positions depend on the strain of the mesh."""
-        return self.strain_color or bool(self.driven_offsets)
+        """Whether colors or positions depend on the deformation of the mesh."""
+        return bool(self.driven_offsets)
 
     def lattice_order(self, triangles: int) -> int:
         """Of a mesh of so many triangles: decides how many splats there will be."""

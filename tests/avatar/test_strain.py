@@ -1,4 +1,5 @@
-"""Strain of a triangle against what the deformation gradient says, and colors that follow it."""
+"""Deformation of a triangle against what the deformation gradient and the normals say, and colors
+and positions that follow it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +11,18 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import (
     AVERAGING_ROUNDS,
     MAX_STRAIN,
     MIN_COMPRESSION,
     RANGE_MARGIN,
-    color_range,
+    deformation,
     edge_neighbors,
-    face_strain,
     seen_range,
     smoothed_strain,
     strain_basis,
+    trained_range,
 )
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
@@ -38,15 +40,16 @@ def sheet(seed: int = 0) -> np.ndarray:
 
 def colored(neutral: np.ndarray, seed: int = 0) -> Avatar:
     splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
-    color = np.random.default_rng(seed).normal(0, 0.2, (len(splats), 3, 3)).astype(np.float32)
-    return Avatar(replace(splats, strain_color=color), "stga", neutral.astype(np.float32), FACES)
+    colors = np.random.default_rng(seed).normal(0, 0.2, (2, len(FACES), 3, 3)).astype(np.float32)
+    offsets = dict(zip(("strain_color", "normal_color"), colors, strict=True))
+    return Avatar(splats, "stga", neutral.astype(np.float32), FACES, driven_offsets=offsets)
 
 
 def test_rigid_motion_far_away_does_not_strain() -> None:
     """Catches strain of pose instead of expression, and cancellation 100 m from the origin."""
     neutral = sheet()
     turned = neutral @ Rotation.random(random_state=2).as_matrix().T + [100, -50, 20]
-    assert np.abs(face_strain(strain_basis(neutral, FACES), turned)).max() < 1e-6
+    assert np.abs(deformation(strain_basis(neutral, FACES), turned)[:, :3]).max() < 1e-6
 
 
 @pytest.mark.parametrize("broken", ["point", "line", "posed point", "torn"])
@@ -61,27 +64,28 @@ def test_broken_triangles_stay_finite(broken: str) -> None:
         posed[:] = 0
     if broken == "torn":
         posed *= 1000
-    strain = face_strain(strain_basis(neutral, FACES), posed)
-    assert np.isfinite(strain).all()
-    assert np.abs(strain).max() <= 2
+    found = deformation(strain_basis(neutral, FACES), posed)
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() <= 2
     if broken in ("point", "line"):
-        assert not strain[1].any()
+        assert not found[1].any()
 
 
-def test_strain_stays_within_what_was_seen() -> None:
+def test_deformation_stays_within_what_was_seen() -> None:
     """Catches colors extrapolated beyond the trained expressions, a range of another triangle or
     component, one that clips what was trained, a margin counted from 0 where a mesh at rest is
     clipped to less, and one beyond what may be followed."""
     neutral, rng = sheet(), np.random.default_rng(4)
-    allowed = color_range(len(FACES))
+    allowed = trained_range(len(FACES))
     posed = [neutral + rng.normal(0, 3e-4, neutral.shape) for _ in range(3)]
     posed.append(0.7 * neutral)
-    strains = np.stack([face_strain(strain_basis(neutral, FACES, allowed), mesh) for mesh in posed])
-    limits = seen_range(strain_basis(neutral, FACES, allowed), posed)
-    rest = np.array([-MIN_COMPRESSION, -MIN_COMPRESSION, 0])
+    basis = strain_basis(neutral, FACES, allowed)
+    every = np.stack([deformation(basis, mesh) for mesh in posed])
+    limits = seen_range(basis, posed)
+    rest = np.array([-MIN_COMPRESSION, -MIN_COMPRESSION, 0, 0, 0, 0])
     for face in range(len(FACES)):
-        for component in range(3):
-            values = [rest[component], *strains[:, face, component]]
+        for component in range(6):
+            values = [rest[component], *every[:, face, component]]
             lowest = rest[component] - RANGE_MARGIN * (rest[component] - min(values))
             highest = rest[component] + RANGE_MARGIN * (max(values) - rest[component])
             expected = max(lowest, -MAX_STRAIN), min(highest, allowed[face, 1, component])
@@ -89,33 +93,31 @@ def test_strain_stays_within_what_was_seen() -> None:
     assert limits[:, 0, :2].max() < -MIN_COMPRESSION
     assert (limits[:, 1, :2] == np.float32(-MIN_COMPRESSION)).all()
     limited = strain_basis(neutral, FACES, limits)
-    for mesh, strain in zip(posed, strains, strict=True):
-        np.testing.assert_array_equal(face_strain(limited, mesh), strain)
+    for mesh, found in zip(posed, every, strict=True):
+        np.testing.assert_array_equal(deformation(limited, mesh), found)
     stronger = neutral + 4 * (posed[0] - neutral)
     free, clipped = (
-        face_strain(basis, stronger) for basis in (strain_basis(neutral, FACES), limited)
+        deformation(basis, stronger) for basis in (strain_basis(neutral, FACES), limited)
     )
     np.testing.assert_array_equal(clipped, np.clip(free, limits[:, 0], limits[:, 1]))
-    assert (np.abs(free) > np.abs(clipped) + 0.01).any()
+    assert (np.abs(free) > np.abs(clipped) + 0.01).any(0)[[0, 1, 3, 4]].all()
 
 
 def test_the_range_is_in_the_file_and_in_renderings(tmp_path: Path) -> None:
-    """Catches strain colors or their range lost in the file, files from before they existed being
-    refused, a range that frames ignore, and one of another shape that is not refused."""
+    """Catches driven colors or their range lost in the file, a range that frames ignore, and one of
+    another shape that is not refused."""
     neutral = sheet()
     stretched = (1.1 * neutral).astype(np.float32)
-    limits = np.zeros((len(FACES), 2, 3), np.float32)
+    limits = np.zeros((len(FACES), 2, 6), np.float32)
     avatar = replace(colored(neutral), strain_range=limits)
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
-    np.testing.assert_array_equal(found.splats.strain_color, avatar.splats.strain_color)
-    with np.load(tmp_path / "a.npz") as arrays:
-        np.savez(tmp_path / "old.npz", **{n: a for n, a in arrays.items() if "strain" not in n})
-    assert read_avatar(tmp_path / "old.npz").splats.strain_color.shape == (len(avatar.splats), 0, 3)
+    for name, coefficients in avatar.driven_offsets.items():
+        np.testing.assert_array_equal(found.driven_offsets[name], coefficients)
     np.testing.assert_array_equal(found.strain_range, limits)
-    assert np.abs(colored(neutral).frames(stretched).strain).max() > 0.1
-    assert not found.frames(stretched).strain.any()
-    expected = r"strain_range is float32 \(3, 2, 3\), expected float32 \(4, 2, 3\)"
+    assert np.abs(colored(neutral).frames(stretched).color).max() > 0.01
+    assert not found.frames(stretched).color.any()
+    expected = r"strain_range is float32 \(3, 2, 6\), expected float32 \(4, 2, 6\)"
     with pytest.raises(StgaError, match=expected):
         write_avatar(tmp_path / "b.npz", replace(avatar, strain_range=limits[1:]))
 
@@ -130,17 +132,15 @@ def test_baking_keeps_the_picture() -> None:
     white = (1.0, 1.0, 1.0)
     drawn = render_avatar(avatar, posed, camera, white)
     baked = to_world(avatar.splats, avatar.frames(posed))
-    assert baked.strain_color.shape[1] == 0
     np.testing.assert_allclose(render(baked, camera, white), drawn, atol=2e-5)
-    without = replace(avatar.splats, strain_color=np.zeros_like(avatar.splats.strain_color))
-    plain = replace(avatar, splats=without)
+    plain = replace(avatar, driven_offsets={})
     assert np.abs(render_avatar(plain, posed, camera, white) - drawn).max() > 0.05
     undeformed = face_frames(posed, FACES, neutral)
     np.testing.assert_array_equal(to_world(avatar.splats, undeformed).sh, avatar.splats.sh)
 
 
 def following(neutral: np.ndarray, seed: int = 0) -> Avatar:
-    """An avatar without strain colors whose triangles' splats move by millimeters with strain."""
+    """An avatar without driven colors whose triangles' splats move by millimeters with strain."""
     splats = lattice_splats(neutral, FACES, 1, 0, opacity_logit=2.0)
     position = np.random.default_rng(seed).normal(0, 3e-3, (len(FACES), 3, 3)).astype(np.float32)
     offsets = {"strain_position": position}
@@ -175,9 +175,9 @@ def test_strain_is_averaged_over_whatever_touches() -> None:
         along, across = (v / np.linalg.norm(v) for v in (first, np.cross(normal, first)))
         axes.append((along, across))
         moved = np.stack([posed[face[1]] - posed[face[0]], posed[face[2]] - posed[face[0]]], 1)
-        deformation = moved @ np.linalg.pinv(np.stack([first, second], 1))
+        gradient = moved @ np.linalg.pinv(np.stack([first, second], 1))
         plane = np.outer(along, along) + np.outer(across, across)
-        tensors.append((deformation.T @ deformation - plane) / 2)
+        tensors.append((gradient.T @ gradient - plane) / 2)
     at_vertex = [
         np.mean([t for t, face in zip(tensors, faces, strict=True) if v in face], 0)
         for v in range(6)
@@ -187,25 +187,68 @@ def test_strain_is_averaged_over_whatever_touches() -> None:
         pairs = (along, along), (across, across), (along, across)
         expected = 5 * np.array([a @ mean @ b for a, b in pairs])
         assert np.abs(expected).max() > 0.1
-        found = face_strain(strain_basis(neutral, faces), posed)[f]
+        found = deformation(strain_basis(neutral, faces), posed)[f, :3]
         np.testing.assert_allclose(found, np.clip(expected, -MAX_STRAIN, MAX_STRAIN), atol=1e-5)
 
 
 def test_smoothed_strain_is_averaged_over_edges() -> None:
     """Catches another weight or number of rounds, and a mesh at rest that is not zero."""
     (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
-    basis = strain_basis(neutral, faces, color_range(len(faces)))
-    strain = face_strain(basis, posed)
+    basis = strain_basis(neutral, faces, trained_range(len(faces)))
+    deformed = deformation(basis, posed)
     average = np.zeros((len(faces), len(faces)))
     for f in range(len(faces)):
         members = [g for g in range(len(faces)) if len(set(faces[f]) & set(faces[g])) >= 2]
         average[f, members] = 1 / len(members)
-    moved = strain - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0]
+    moved = deformed[:, :3] - [-MIN_COMPRESSION, -MIN_COMPRESSION, 0]
     expected = np.linalg.matrix_power(average, AVERAGING_ROUNDS) @ moved
-    np.testing.assert_allclose(smoothed_strain(basis, strain), expected, atol=1e-6)
+    np.testing.assert_allclose(smoothed_strain(basis, deformed), expected, atol=1e-6)
     assert np.abs(expected).max() > 0.1
     turned = neutral @ Rotation.from_rotvec([0.3, 1, -2]).as_matrix().T
-    np.testing.assert_allclose(smoothed_strain(basis, face_strain(basis, turned)), 0, atol=1e-6)
+    np.testing.assert_allclose(smoothed_strain(basis, deformation(basis, turned)), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
+def test_colors_follow_strain_and_normals(convention: str) -> None:
+    """Catches coefficients of another triangle, signal or component, normals in the triangle's own
+    axes, or of the posed mesh only, one of two colors that is lost, and the capture's light that
+    stays where other light takes its place: plain loops."""
+    neutral, posed = sheet(), sheet(3)
+    avatar = replace(colored(neutral), convention=convention)
+    basis = strain_basis(neutral, FACES)
+    smoothed = smoothed_strain(basis, deformation(basis, posed))
+    by_strain, by_normal = avatar.driven_offsets.values()
+    for f, (a, b, c) in enumerate(FACES):
+        normals = [np.cross(m[b] - m[a], m[c] - m[a]) for m in (posed, neutral)]
+        after, before = (normal / np.linalg.norm(normal) for normal in normals)
+        skin = sum(smoothed[f, k] * by_strain[f, k] for k in range(3))
+        light = sum((after - before)[k] * by_normal[f, k] for k in range(3))
+        assert np.abs(light).max() > 1e-3
+        np.testing.assert_allclose(avatar.frames(posed).color[f], skin + light, atol=1e-6)
+        np.testing.assert_allclose(avatar.without_light.frames(posed).color[f], skin, atol=1e-6)
+    np.testing.assert_allclose(avatar.frames(neutral).color, 0, atol=1e-6)
+
+
+def test_older_files_keep_their_colors(tmp_path: Path) -> None:
+    """Catches files of version 2, where each splat has strain colors of its own, that are refused,
+    whose colors at rest change, or follow another splat or triangle."""
+    neutral, rng = sheet(), np.random.default_rng(5)
+    avatar = replace(colored(neutral), driven_offsets={})
+    write_avatar(tmp_path / "a.npz", avatar)
+    with np.load(tmp_path / "a.npz") as arrays:
+        header = arrays["header"].tobytes().replace(b'"version": 3', b'"version": 2')
+        arrays = {**arrays, "header": np.frombuffer(header, np.uint8)}
+    by_face = rng.normal(0, 0.2, (len(FACES), 3, 3)).astype(np.float32)
+    arrays["strain_color"] = by_face[avatar.splats.face]
+    arrays["strain_range"] = trained_range(len(FACES))[..., :3]
+    np.savez(tmp_path / "old.npz", **arrays)
+    found = read_avatar(tmp_path / "old.npz")
+    np.testing.assert_allclose(found.driven_offsets["older_strain_color"], by_face, atol=1e-6)
+    rest = -MIN_COMPRESSION * by_face[:, :2].sum(1)[avatar.splats.face]
+    np.testing.assert_allclose(
+        found.splats.sh[:, 0], avatar.splats.sh[:, 0] + rest / SH_C0, rtol=1e-5
+    )
+    np.testing.assert_allclose(found.frames(neutral).color, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
@@ -217,7 +260,7 @@ def test_positions_follow_strain(convention: str, tmp_path: Path) -> None:
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
     basis = strain_basis(neutral, FACES)
-    smoothed = smoothed_strain(basis, face_strain(basis, posed)).astype(np.float64)
+    smoothed = smoothed_strain(basis, deformation(basis, posed)).astype(np.float64)
     moves = avatar.driven_offsets["strain_position"]
     shift = [sum(smoothed[f, k] * moves[f, k] for k in range(3)) for f in range(len(FACES))]
     xyz = avatar.splats.xyz + np.array(shift)[avatar.splats.face]

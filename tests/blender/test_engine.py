@@ -28,7 +28,13 @@ from stga_addon.scene.render import engine
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
 from .exr import read_exr
-from .test_splat_object import active_camera, animated_head, avatar_of, random_splats
+from .test_splat_object import (
+    active_camera,
+    animated_head,
+    avatar_of,
+    driven_avatar,
+    random_splats,
+)
 
 WIDTH, HEIGHT = 96, 64
 TOLERANCE = 1 / 255
@@ -130,18 +136,14 @@ def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT) -> 
     return Camera(width, height, focal, focal, cx, cy, view)
 
 
-def strained() -> Avatar:
-    """An avatar with every part that strain moves or colors."""
-    avatar, rng = textured(avatar_of("stga"), -6.5), np.random.default_rng(4)
-    colors = rng.normal(0, 0.2, (3000, 3, 3)).astype(np.float32)
-    positions = rng.normal(0, 0.004, (len(avatar.faces), 3, 3)).astype(np.float32)
-    avatar = replace(avatar, splats=replace(avatar.splats, strain_color=colors), antialiased=True)
-    return replace(avatar, driven_offsets={"strain_position": positions})
+def driven() -> Avatar:
+    """An avatar with every part that the deformation moves or colors."""
+    return replace(textured(driven_avatar("stga", count=3000), -6.5), antialiased=True)
 
 
 @pytest.mark.parametrize(
     ("make", "background"),
-    [(strained, 1.0), (lambda: textured(avatar_of("gaussian_avatars"), -1), 0.0)],
+    [(driven, 1.0), (lambda: textured(avatar_of("gaussian_avatars"), -1), 0.0)],
 )
 def test_image_equals_render_avatar(make, background, tmp_path):
     """Catches another camera, color, order or pose than `stga render`'s, alpha that does not match

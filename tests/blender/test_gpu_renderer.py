@@ -13,6 +13,7 @@ from raster import reference
 from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.offsets import OFFSETS, POSITION
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.light.harmonics import uniform
@@ -38,8 +39,8 @@ TURNED = np.array(
 ) @ np.diag([1.3, 0.8, 1, 1])
 
 
-def avatar(degree: int, strain: bool = False) -> Avatar:
-    """Splats of every size, opacity and color on a ball."""
+def avatar(degree: int, *driven: str) -> Avatar:
+    """Splats of every size, opacity and color on a ball, with driven offsets of these names."""
     vertices, faces = ball()
     rng = np.random.default_rng(degree)
     splats = lattice_splats(vertices, faces := faces.astype(np.int32), 3, sh_degree=degree)
@@ -51,15 +52,18 @@ def avatar(degree: int, strain: bool = False) -> Avatar:
         log_scale=rng.normal(-6, 0.6, (count, 3)).astype(np.float32),
         opacity=rng.normal(0, 2, count).astype(np.float32),
         sh=rng.normal(0, 0.3, splats.sh.shape).astype(np.float32),
-        strain_color=rng.normal(0, 0.3, (count, 3 * strain, 3)).astype(np.float32),
     )
-    return Avatar(splats, "stga", vertices.astype(np.float32), faces)
+    return with_driven(Avatar(splats, "stga", vertices.astype(np.float32), faces), *driven)
 
 
-def with_offset(of: Avatar) -> Avatar:
-    shape = (len(of.faces), 3, 3)
-    values = np.random.default_rng(9).normal(0, 5e-3, shape).astype(np.float32)
-    return replace(of, driven_offsets={"strain_position": values})
+def with_driven(of: Avatar, *names: str) -> Avatar:
+    """With these driven offsets, and ranges of normals that clip small turns."""
+    rng, count = np.random.default_rng(9), len(of.faces)
+    units = [5e-3 if OFFSETS[name].target == POSITION else 0.6 for name in names]
+    values = [rng.normal(0, unit, (count, 3, 3)).astype(np.float32) for unit in units]
+    ends = np.repeat([[-2.0, -0.06], [2.0, 0.03]], 3, axis=1).astype(np.float32)
+    limits, offsets = np.tile(ends, (count, 1, 1)), dict(zip(names, values, strict=True))
+    return replace(of, strain_range=limits, driven_offsets=offsets)
 
 
 def layer(
@@ -84,17 +88,17 @@ def cases() -> dict[str, tuple[list[SceneLayer], Camera]]:
     display = DisplaySettings(0.7, 0.3, 60.0, False, True, False)
     frozen = np.arange(len(avatar(0).faces)) % 3 == 0
     only = DisplaySettings(selected_only=True)
-    three = [layer(avatar(0)), layer(avatar(3, True), TURNED), unembedded(avatar(2))]
+    three = [layer(avatar(0)), layer(avatar(3, "strain_color"), TURNED), unembedded(avatar(2))]
     return {
         "sh 0": ([layer(avatar(0))], near),
         "sh 3": ([layer(avatar(3))], near),
-        "sh 1, strain": ([layer(avatar(1, strain=True))], near),
-        "strain position": ([layer(with_offset(avatar(1)))], near),
+        "driven": ([layer(avatar(1, *OFFSETS))], near),
+        "strain position": ([layer(avatar(1, "strain_position"))], near),
         "antialiased": ([layer(avatar(0), antialiased=True)], near),
         "orthographic": ([layer(avatar(3))], far),
         "inside": ([layer(avatar(2))], inside),
         "two and world": (three, near),
-        "display settings": ([layer(avatar(2, True), settings=display, frozen=frozen)], near),
+        "display settings": ([layer(avatar(2, *OFFSETS), settings=display, frozen=frozen)], near),
         "selected only": ([layer(avatar(0), settings=only, frozen=frozen)], near),
     }
 
@@ -178,7 +182,7 @@ def test_other_splats_in_the_compact_format() -> None:
 def relit_layers(mode: str) -> list[SceneLayer]:
     """A ball and a plate under four kinds of light and a world, with an object that throws a
     shadow; beside it one as recorded."""
-    avatar = lit_avatar(degree=1)
+    avatar = with_driven(lit_avatar(degree=1), *OFFSETS)
     mesh = avatar.neutral.astype(np.float64) * [1.05, 0.97, 1.0]
     eye = np.ones(3)
     disk = Light("area", eye * 2, (-0.5, 0.3, 0.4), direction=(0.5, -0.3, -0.4))

@@ -16,7 +16,7 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.scene.layers import FROZEN_COLOR
 
-from .test_splat_object import avatar_of, same_rotation
+from .test_splat_object import driven_avatar, same_rotation
 
 SCRIPT = Path(__file__).with_name("native_script.py")
 BLENDERS = filter(None, map(shlex.split, os.environ.get("STGA_BLENDER", "").split(" ; ")))
@@ -29,13 +29,9 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     """Catches an attribute that is missing, or named or activated in another way than Blender reads
     it: sizes as logarithms or without their factor, opacities as logits or dropped, splats that do
     not move with the mesh, harmonics in another order or turned with triangles, and colors without
-    strain, selection or new light."""
-    avatar, rng = avatar_of("stga", 400), np.random.default_rng(4)
-    splats = replace(
-        avatar.splats,
-        sh=rng.normal(0, 0.4, (400, 16, 3)).astype(np.float32),
-        strain_color=rng.normal(0, 0.2, (400, 3, 3)).astype(np.float32),
-    )
+    deformation, selection or new light."""
+    avatar, rng = driven_avatar("stga", count=400), np.random.default_rng(4)
+    splats = replace(avatar.splats, sh=rng.normal(0, 0.4, (400, 16, 3)).astype(np.float32))
     avatar = replace(avatar, splats=splats)
     turn = [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]
     posed = avatar.neutral @ turn + rng.normal(0, 0.004, avatar.neutral.shape)

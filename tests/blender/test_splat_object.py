@@ -1,7 +1,7 @@
 """Splat objects against the numpy embedding, on a head that shape keys animate."""
 
 from dataclasses import replace
-from itertools import product
+from itertools import combinations
 
 import bpy
 import mathutils
@@ -10,8 +10,9 @@ import pytest
 
 from stga_addon.avatar.embedding import CONVENTIONS, to_world
 from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.offsets import OFFSETS, POSITION
 from stga_addon.avatar.splats import SH_C0, Splats
-from stga_addon.avatar.strain import edge_neighbors, rest_strain
+from stga_addon.avatar.strain import at_rest, edge_neighbors
 from stga_addon.errors import StgaError
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.display import splat_nodes
@@ -199,11 +200,14 @@ def test_colors_follow_the_active_camera(degree):
     np.testing.assert_allclose(displayed_colors(shown), linear(0.5 + SH_C0 * sh[:, 0]), atol=2e-6)
 
 
-def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Avatar:
-    """Splats that move with strain, on a mesh with boundaries, an edge of three triangles and a
-    line for a triangle.
+def driven_avatar(
+    convention: str, names: tuple[str, ...] = tuple(OFFSETS), seed: int = 6, count: int = 1500
+) -> Avatar:
+    """Splats that follow the deformation, on a mesh with boundaries, an edge of three triangles and
+    a line for a triangle.
 
-    Within their ranges of strain, some triangles at rest have another strain than 0.
+    Within their ranges of strain, some triangles at rest have another strain than 0; small turns
+    leave the range of normals.
     """
     avatar = avatar_of(convention, count)
     rng, neutral, faces = np.random.default_rng(seed), avatar.neutral.copy(), avatar.faces
@@ -211,28 +215,28 @@ def following_positions(convention: str, seed: int = 6, count: int = 1500) -> Av
     fin = np.append(faces[100, :2], len(neutral))
     neutral = np.append(neutral, [1.2 * neutral[faces[100, 0]] - 0.2 * neutral.mean(0)], axis=0)
     faces = np.append(faces, [fin], axis=0).astype(np.int32)
-    ends = [rng.uniform(-2, -0.3, (len(faces), 3)), rng.uniform(-0.3, 2, (len(faces), 3))]
-    unit = 0.004 if convention == "stga" else 0.3
+    lowest, highest = [[-2, -0.3], [-0.3, -0.02]], [[-0.3, 2], [0.02, 0.3]]
+    ends = [rng.uniform(*np.repeat(each, 3, 0).T, (len(faces), 6)) for each in (lowest, highest)]
+    moves = 0.004 if convention == "stga" else 0.3
+    units = [moves if OFFSETS[name].target == POSITION else 0.5 for name in names]
+    values = [rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32) for unit in units]
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
-    offsets = {"strain_position": rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32)}
     avatar = replace(avatar, splats=splats, neutral=neutral.astype(np.float32), faces=faces)
-    limits = np.stack(ends, 1).astype(np.float32)
+    limits, offsets = np.stack(ends, 1).astype(np.float32), dict(zip(names, values, strict=True))
     return replace(avatar, strain_range=limits, driven_offsets=offsets)
 
 
 @pytest.mark.parametrize(
-    ("has_colors", "has_positions"), [(False, True), (True, True), (True, False)]
+    "names", [("strain_position",), ("strain_color",), ("normal_color",), tuple(OFFSETS)]
 )
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_splats_follow_strain(convention, has_colors, has_positions, tmp_path):
-    """Catches strain averaged over other triangles or too few times, not relative to rest, and
-    coefficients of another triangle, in other axes or another unit, or that a saved file loses:
-    against numpy on the deformed mesh."""
-    avatar = following_positions(convention)
-    avatar = avatar if has_positions else replace(avatar, driven_offsets={})
-    colors = np.random.default_rng(4).normal(0, 0.2, (1500, 3 * has_colors, 3)).astype(np.float32)
-    splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1], strain_color=colors)
-    avatar = replace(avatar, splats=splats, antialiased=has_colors)
+def test_splats_follow_the_deformation(convention, names, tmp_path):
+    """Catches strain averaged over other triangles or too few times, not relative to rest, normals
+    in other axes or beyond their range, and coefficients of another triangle, in other axes or
+    another unit, or that a saved file loses: against numpy on the deformed mesh."""
+    avatar, is_all = driven_avatar(convention, names), len(names) == len(OFFSETS)
+    splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1])
+    avatar = replace(avatar, splats=splats, antialiased=is_all)
     # at a boundary, inside, an edge of three
     assert {2, 3, 4} <= set(edge_neighbors(avatar.faces).counts.tolist())
     head = animated_head(avatar.neutral, avatar.faces)
@@ -241,9 +245,8 @@ def test_splats_follow_strain(convention, has_colors, has_positions, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     shown, head = bpy.data.objects["head splats"], bpy.data.objects["head"]
     stored = stored_avatar(shown)
-    assert set(stored.driven_offsets) == set(avatar.driven_offsets)
-    assert stored.antialiased == avatar.antialiased == has_colors
-    np.testing.assert_array_equal(stored.splats.strain_color, avatar.splats.strain_color)
+    assert set(stored.driven_offsets) == set(names)
+    assert stored.antialiased == avatar.antialiased == is_all
     np.testing.assert_array_equal(stored.strain_range, avatar.strain_range)
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     unmoved = replace(avatar, driven_offsets={})
@@ -252,21 +255,26 @@ def test_splats_follow_strain(convention, has_colors, has_positions, tmp_path):
         posed = evaluated_vertices(head)
         frames, plain, again = (each.frames(posed) for each in (avatar, unmoved, stored))
         np.testing.assert_array_equal(again.origin, frames.origin)
+        np.testing.assert_array_equal(again.color, frames.color)
         moved = np.median(np.linalg.norm(frames.origin - plain.origin, axis=1))
-        assert moved > 3e-4 if has_positions else moved == 0
-        assert np.abs(frames.strain).max() > 0.5
+        assert moved > 3e-4 if "strain_position" in names else moved == 0
+        assert np.abs(frames.deformation[:, :3]).max() > 0.5
+        clipped = (frames.deformation[:, None, 3:] == avatar.strain_range[:, :, 3:]).any(1)
+        assert 0.2 < clipped.mean() < 0.8
         assert_follows(shown, head, avatar)
         expected = 0.5 + SH_C0 * to_world(avatar.splats, frames).sh[:, 0]
         np.testing.assert_allclose(displayed_colors(shown), linear(expected), atol=1e-3)
     bpy.context.scene.frame_set(FRAMES[0])
     head.shape_key_clear()
-    assert np.abs(rest_strain(avatar.strain_range)).max() > 0.2
+    assert np.abs(at_rest(avatar.strain_range)).max() > 0.2
     assert_follows(shown, head, unmoved)
+    expected = linear(0.5 + SH_C0 * avatar.splats.sh[:, 0])
+    np.testing.assert_allclose(displayed_colors(shown), expected, atol=1e-4)
 
 
 def test_updated_splats_follow_strain_anew():
     """Catches new splats shown with the strain coefficients of the first ones."""
-    first, second = (following_positions("stga", seed) for seed in (6, 7))
+    first, second = (driven_avatar("stga", ("strain_position",), seed) for seed in (6, 7))
     second = replace(second, neutral=first.neutral, faces=first.faces)
     head = animated_head(first.neutral, first.faces)
     shown = show_avatar(first, head)
@@ -278,8 +286,7 @@ def test_updated_splats_follow_strain_anew():
     stored = stored_avatar(shown).driven_offsets["strain_position"]
     np.testing.assert_array_equal(stored, second.driven_offsets["strain_position"])
     assert not can_update(shown, replace(second, driven_offsets={}))
-    colored = replace(second.splats, strain_color=np.zeros((len(second.splats), 3, 3), np.float32))
-    assert not can_update(shown, replace(second, splats=colored))
+    assert not can_update(shown, driven_avatar("stga"))
     set_input(shown, splat_nodes.NEUTRAL, None)
     assert not can_update(shown, second)
 
@@ -302,11 +309,11 @@ def test_world_splats():
 def test_names_of_trees_are_told_apart():
     """Catches names that Blender shortens, and a tree found for a similar name."""
     kinds = [
-        splat_nodes.TreeOptions(convention, degree, *strain)
+        splat_nodes.TreeOptions(convention, degree, names)
         for convention in (*CONVENTIONS, None)
         for degree in range(4)
-        for strain in product((False, True), ((), ("strain_position",)))
-        if convention or not any(strain)
+        for count in range(1 + len(OFFSETS) if convention else 1)
+        for names in combinations(OFFSETS, count)
     ]
     for kind in (kinds[-1], *(kind for kind in kinds if kind.offsets and kind.degree == 3)):
         assert splat_nodes.splat_tree(kind).name == kind.tree_name
@@ -389,7 +396,7 @@ def test_selection_grays_out_frozen_splats():
     assert len(evaluated_splats(shown)[0]) == 1000
 
 
-TREES = [("stga", 3, True), (None, 0, False), ("gaussian_avatars", 3, True, ("strain_position",))]
+TREES = [("stga", 3, ("normal_color",)), (None, 0, ()), ("gaussian_avatars", 3, tuple(OFFSETS))]
 
 
 @pytest.mark.parametrize("kind", TREES)
@@ -409,4 +416,4 @@ def test_trees_are_built_one_node_group_at_a_time(kind):
     sockets = [socket for node in nodes for socket in node.inputs if socket.type == "STRING"]
     names = [socket.default_value for socket in sockets]
     assert splat_nodes.stored.XYZ in names
-    assert any("strain" in name for name in names) == (options.strain_color or bool(kind[3:]))
+    assert any("strain" in name for name in names) == bool(options.offsets)

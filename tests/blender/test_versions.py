@@ -18,6 +18,7 @@ from capture.factory import ball, write_flame_capture
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.capture.open import open_capture
 from stga_addon.development.package import build_zip
 from stga_addon.export.ply import read_ply
@@ -56,7 +57,9 @@ def test_the_whole_workflow(version: str, kernel_bundle: tuple[Path, str], tmp_p
     splats = lattice_splats(capture.neutral, faces, order=0)
     positions = rng.normal(0, 0.003, (len(faces), 3, 3)).astype(np.float32)
     neutral = capture.neutral.astype(np.float32)
-    avatar = Avatar(splats, "stga", neutral, faces, driven_offsets={"strain_position": positions})
+    avatar = Avatar(
+        splats, "stga", neutral, faces, driven_offsets=dict.fromkeys(OFFSETS, positions)
+    )
     write_avatar(tmp_path / "a.npz", avatar)
     moving = {"expr": rng.normal(size=(5, 2)), "pose": rng.normal(0, 0.3, (5, 15))}
     other = moving | {"shape": np.ones(4)}

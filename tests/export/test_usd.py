@@ -26,9 +26,13 @@ def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple
         yield frame, avatar.neutral + rng.normal(0, 0.01, avatar.neutral.shape)
 
 
-def strained(avatar: Avatar) -> Avatar:
-    change = np.random.default_rng(3).normal(0, 0.1, (len(avatar.splats), 3, 3)).astype(np.float32)
-    return replace(avatar, splats=replace(avatar.splats, strain_color=change))
+def colored(avatar: Avatar) -> Avatar:
+    rng, shape = np.random.default_rng(3), (len(avatar.faces), 3, 3)
+    driven = {
+        name: rng.normal(0, 0.1, shape).astype(np.float32)
+        for name in ("strain_color", "normal_color")
+    }
+    return replace(avatar, driven_offsets=driven)
 
 
 def opened(path: Path) -> Any:
@@ -58,12 +62,12 @@ def splats_at(stage: Any, time: float) -> Splats:
     )
 
 
-@pytest.mark.parametrize("color", ["constant", "strain"])
+@pytest.mark.parametrize("color", ["constant", "driven"])
 @pytest.mark.parametrize("suffix", [".usdc", ".usdz"])
 def test_reads_back_and_renders_equal(avatar, tmp_path, suffix, color):
-    """Catches wrong quaternion or coefficient order, activations, frames, no strain."""
+    """Catches wrong quaternion or coefficient order, activations, frames, no driven color."""
     path = tmp_path / f"a{suffix}"
-    stage_of = avatar if color == "constant" else strained(avatar)
+    stage_of = avatar if color == "constant" else colored(avatar)
     assert export_avatar(path, stage_of, "usd", moved(avatar), playback=PLAYBACK) == [path]
     stage = opened(path)
     times = stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()
@@ -112,7 +116,7 @@ def test_size_is_known_before(avatar, tmp_path):
     pytest.importorskip("pxr.Usd", reason=MISSING)
     many = np.random.default_rng(0).integers(0, len(avatar.splats), 5000)
     avatar = replace(avatar, splats=avatar.splats.rows(many))
-    for item in (avatar, strained(avatar)):
+    for item in (avatar, colored(avatar)):
         export_avatar(tmp_path / "a.usdc", item, "usd", moved(item, (0, 1, 2, 3)))
         size = (tmp_path / "a.usdc").stat().st_size
         assert FORMATS["usd"].size(item, 4) == pytest.approx(size, rel=0.02)

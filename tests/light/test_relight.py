@@ -98,6 +98,30 @@ def test_recorded_and_mix(relighter):
     np.testing.assert_allclose(srgb_to_linear(mixed), expected, rtol=1e-3, atol=1e-4)
 
 
+def test_only_recorded_colors_follow_the_normals(relighter):
+    """Catches light of the capture that stays in relit colors, or that recorded ones lose; and
+    colors by strain that either loses."""
+    mesh, count = relighter.avatar.neutral * [1.1, 0.8, 1.0], len(relighter.avatar.faces)
+    rng, names = np.random.default_rng(5), ("strain_color", "normal_color")
+    values = {n: rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32) for n in names}
+    ends = np.repeat([[-2.0, -0.05], [2.0, 0.03]], 3, axis=1).astype(np.float32)
+    avatar = replace(relighter.avatar, strain_range=np.tile(ends, (count, 1, 1)))
+    sun = Lighting(lights=(Light("sun", np.full(3, 3.0), direction=(1, 0, 0)),))
+    assert not relighter.distant_in_head(mesh, sun)[1].share
+
+    def colors(mode: str, *names: str) -> np.ndarray:
+        driven = replace(avatar, driven_offsets={name: values[name] for name in names})
+        return Relighter(driven).colors(mesh, EYE, replace(sun, mode=mode))
+
+    lit = colors("scene", *names)
+    np.testing.assert_array_equal(lit, colors("scene", "strain_color"))
+    assert np.abs(lit - colors("scene")).mean() > 0.01
+    recorded, frames = colors("recorded"), replace(avatar, driven_offsets=values).frames(mesh)
+    expected = np.maximum(recorded + frames.color[avatar.splats.face], 0)
+    np.testing.assert_allclose(colors("recorded", *names), expected, atol=1e-5)
+    assert np.abs(expected - colors("recorded", "strain_color")).mean() > 0.01
+
+
 def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
     """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure,
     white; also where nothing of the recorded colors is kept."""

@@ -24,14 +24,12 @@ def render_differentiable(
     `cpu.autograd.render_differentiable`."""
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
     camera_frames = frames_in_camera(frames, camera)
-    strains = camera_frames.strain.shape[1]
-    given = [tensor for tensor in splats if tensor is not None]
     images = []
     for depth_as_color in (False, True):
         options = ViewOptions(
-            camera, degree, strains=strains, depth_as_color=depth_as_color, antialiased=antialiased
+            camera, degree, depth_as_color=depth_as_color, antialiased=antialiased
         )
-        images.append(_Blend.apply(options, camera_frames, face, *given))
+        images.append(_Blend.apply(options, camera_frames, face, *splats))
     (rgb, transmittance), (depth, _) = images
     return rgb, 1 - transmittance, depth[0]
 

@@ -16,9 +16,10 @@ from stga_addon.training.optimize.adam import PLAIN
 pytestmark = pytest.mark.needs("adapter")
 
 OPTIONS = PLAIN._replace(beta2=np.float32(0.99), ema_share=np.float32(0.05))
-RATES = {name: 0.01 * (n + 1) for n, name in enumerate((*Parameters._fields, "sh_rest"))}
-COEFFICIENTS, STRAINS = 4, 2
-STRIDE = 11 + 3 * COEFFICIENTS + 3 * STRAINS
+NAMES = *Parameters._fields, "sh_rest", "strain_color"
+RATES = {name: 0.01 * (n + 1) for n, name in enumerate(NAMES)}
+COEFFICIENTS = 4
+STRIDE = 11 + 3 * COEFFICIENTS
 TABLES = ("splats", "gradients", "first", "second", "average")
 
 
@@ -54,9 +55,7 @@ def on_device(
         upload("test traits", traits), upload("test limits", state.limits.T),
     )  # fmt: skip
     given = {name: buffers[name] for name in TABLES[:2]}
-    given["view"] = device.uniform(
-        "View", splats=n, coefficients=COEFFICIENTS, strain_colors=STRAINS
-    )
+    given["view"] = device.uniform("View", splats=n, coefficients=COEFFICIENTS)
     given |= {"face": upload("test face", state.face), "screen": device.buffer("test screen", n)}
     given["wanted"] = upload("test wanted", state.wanted.astype(np.uint32))
     upload_step(device, RATES, options, weights, statistics=False)
@@ -74,7 +73,6 @@ def test_a_broken_gradient_leaves_its_field(device: Device, value: float) -> Non
     state.wanted[:] = True
     expected = split_rows(on_device(device, state).splats, COEFFICIENTS)
     columns = {"xyz": 1, "rotation": 6, "log_scale": 8, "opacity": 10, "sh": 20}
-    columns["strain_color"] = STRIDE - 1
     for row, column in enumerate(columns.values()):
         state.gradients[row, column] = value
     got, before = (

@@ -10,12 +10,21 @@ from numerics.meshes import bent_ball, collapsed
 from raster import gpu_device
 from raster.test_kernels import SCENES
 from stga_addon.avatar.embedding import CONVENTIONS, face_frames
-from stga_addon.avatar.strain import MAX_STRAIN, STRAIN_COMPONENTS, strain_basis
+from stga_addon.avatar.offsets import SIGNALS
+from stga_addon.avatar.strain import MAX_STRAIN, strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.rasterize import frames_in_camera, tile_grid
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.frames import Embedding
-from stga_addon.raster.gpu.layout import COUNTS, HIDDEN, NEEDED, OVERFLOWED, WORKGROUP
+from stga_addon.raster.gpu.layout import (
+    COUNTS,
+    FRAME_COLOR,
+    FRAME_STRIDE,
+    HIDDEN,
+    NEEDED,
+    OVERFLOWED,
+    WORKGROUP,
+)
 from stga_addon.raster.gpu.optimizer import image_loss, upload_target
 from stga_addon.raster.gpu.rasterize import counts_buffer, sort_keys
 from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
@@ -139,7 +148,7 @@ FRAME_TOLERANCE = 2e-6
 
 @pytest.mark.parametrize("mesh", ["ball", "collapsed", "lines in the neutral mesh", "far away"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str) -> None:
+def test_frames_and_signals_are_numpys(device: Device, convention: str, mesh: str) -> None:
     """Catches another rule for a triangle without area, an axis that differs, and edges that lose
     digits in float32."""
     posed, neutral, faces = bent_ball() if mesh in ("ball", "far away") else collapsed()
@@ -150,22 +159,26 @@ def test_frames_and_strain_are_numpys(device: Device, convention: str, mesh: str
     if mesh == "far away":
         shift, pose = np.array([1e4, -1e4, 1e4]), camera.world_to_camera
         posed, pose[:3, 3] = posed + shift, -pose[:3, :3] @ shift
-    ends = np.random.default_rng(8).uniform(0, 1.5, (len(faces), 2, STRAIN_COMPONENTS))
+    ends = np.random.default_rng(8).uniform(0, 1.5, (len(faces), 2, 6))
     ends[:, 0] *= -1
     basis = strain_basis(neutral, faces, np.float32(ends) if mesh == "ball" else None)
-    expected = frames_in_camera(face_frames(posed, faces, neutral, convention, basis), camera)
+    in_world = face_frames(posed, faces, neutral, convention, basis)
+    expected = frames_in_camera(in_world, camera)
     step = Embedding(device, neutral, faces, convention, basis)
     step.upload(posed, camera)
     with device.record() as work:
         table = step.compose(work, {})
-    frames = device.read(table, (len(faces), 12 + STRAIN_COMPONENTS))
+    frames = device.read(table, (len(faces), FRAME_STRIDE))
     np.testing.assert_allclose(frames[:, :3], expected.origin, atol=FRAME_TOLERANCE)
     # The area of what is a line in float32, whose root is the scale, has hardly any digits.
     tolerance = 1e-5 if mesh == "collapsed" else FRAME_TOLERANCE
     np.testing.assert_allclose(frames[:, 3:12].reshape(-1, 3, 3), expected.matrix, atol=tolerance)
-    assert expected.strain.any()
-    if mesh == "lines in the neutral mesh":
-        # A strain per area that is hardly there; float64 has few digits of it, too.
-        assert (np.abs(frames[:, 12:]) <= MAX_STRAIN).all()
-    else:
-        np.testing.assert_allclose(frames[:, 12:], expected.strain, atol=5e-6)
+    assert not frames[:, FRAME_COLOR:].any()
+    for name, signal in SIGNALS.items():
+        found, wanted = device.read(step.signals[name], (len(faces), 3)), signal(basis, in_world)
+        assert wanted.any()
+        if mesh == "lines in the neutral mesh" or (mesh, name) == ("collapsed", "normal"):
+            # A deformation per area that is hardly there; float64 has few digits of it, too.
+            assert (np.abs(found) <= MAX_STRAIN).all()
+        else:
+            np.testing.assert_allclose(found, wanted, atol=5e-6)

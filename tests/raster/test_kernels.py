@@ -9,7 +9,6 @@ import torch
 from raster import reference
 from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
 from stga_addon.avatar.splats import SH_C0
-from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
@@ -30,7 +29,6 @@ DEPTH_TOLERANCE = 4e-5
 # Color is a plain weighted sum. Opacity and the geometry come through (1 − alpha) divisions and the
 # inverse 2D covariance, whose float32 conditioning worsens with the splats' anisotropy.
 GRADIENT_TOLERANCE = {"sh": 1e-5, "opacity": 2e-5, "xyz": 2e-5, "rotation": 2e-5, "log_scale": 5e-5}
-GRADIENT_TOLERANCE["strain_color"] = 2e-5
 
 
 @dataclass(frozen=True)
@@ -120,12 +118,10 @@ def reference_gradients(
     placed = [tensors[name] for name in NAMES]
     if frames is not None:
         placed[:3] = reference.embed(*placed[:3], frames, torch.from_numpy(face).long())
-    if "strain_color" in tensors:
-        strain = torch.from_numpy(frames.strain[face]).double()
-        shift = torch.einsum("ns,nsc->nc", strain, tensors["strain_color"]) / SH_C0
-        placed[4] = placed[4] + torch.nn.functional.pad(
-            shift[:, None], (0, 0, 0, placed[4].shape[1] - 1)
-        )
+        if frames.color.shape[1]:
+            shift = torch.from_numpy(frames.color[face]).double() / SH_C0
+            rest = placed[4].shape[1] - 1
+            placed[4] = placed[4] + torch.nn.functional.pad(shift[:, None], (0, 0, 0, rest))
     images = reference.render(*placed, scene.camera, scene.degree, near, antialiased)
     return finish(images, cotangents, tensors)
 
@@ -266,23 +262,21 @@ def test_screen_gradient_is_that_of_the_projected_center():
     )
 
 
-def test_color_follows_strain_with_the_right_gradient(back_end):
-    """Catches strain of the wrong triangle, a coefficient in the wrong unit, and a gradient that
-    misses the clamp."""
+def test_color_is_added_with_the_right_gradient(back_end):
+    """Catches color of the wrong triangle or in the wrong unit, and a gradient that misses the
+    clamp."""
     scene, rng = SCENES["dark"], np.random.default_rng(31)
     count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
     faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
     posed = neutral + 0.1 * rng.normal(size=neutral.shape)
-    frames = face_frames(posed, faces, neutral, strain=strain_basis(neutral, faces))
+    color = rng.normal(0, 0.3, (len(faces), 3)).astype(np.float32)
+    frames = replace(face_frames(posed, faces, neutral), color=color)
     face = rng.integers(0, len(faces), count).astype(np.int32)
-    color = {"strain_color": rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32)}
-    assert len(np.unique(frames.strain[face], axis=0)) > 5
-    scene = replace(scene, splats=scene.splats | color)
     given = scene, random_cotangents(scene.camera, 5), frames, face
     images, gradients = kernel_gradients(*given)
     expected_images, expected = reference_gradients(*given)
     assert_images_agree(images, expected_images)
-    assert_gradients_agree(gradients, {name: expected[name] for name in color})
+    assert_gradients_agree(gradients, {"sh": expected["sh"]})
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 
 from stga_addon.avatar.embedding import WORLD, face_frames
 from stga_addon.avatar.splats import Splats
-from stga_addon.avatar.strain import strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.errors import StgaError
 from stga_addon.raster.cpu.compose import compose
@@ -44,12 +43,10 @@ def world(splats: Splats, place: np.ndarray = HERE) -> PosedSplats:
 def embedded() -> PosedSplats:
     rng = np.random.default_rng(1)
     faces, neutral = np.array([[0, 1, 2], [1, 3, 2]]), rng.normal(0, 0.2, (4, 3)) + AHEAD
-    frames = face_frames(1.1 * neutral, faces, neutral, strain=strain_basis(neutral, faces))
+    frames = face_frames(1.1 * neutral, faces, neutral)
+    frames = replace(frames, color=rng.normal(0, 0.3, (2, 3)).astype(np.float32))
     splats = cloud(60, 2, 2)
-    colors = rng.normal(0, 0.3, (60, 3, 3)).astype(np.float32)
-    return PosedSplats(
-        replace(splats, xyz=0.05 * splats.xyz, strain_color=colors), frames, HERE, True
-    )
+    return PosedSplats(replace(splats, xyz=0.05 * splats.xyz), frames, HERE, True)
 
 
 def test_one_layer_gives_the_pixels_of_render():

@@ -29,8 +29,8 @@ def adapter() -> str:
 
 
 def scene() -> list[PosedSplats]:
-    """Layers of different degrees and with and without strain, antialiasing, and a place of their
-    own."""
+    """Layers of different degrees and with and without triangles' color, antialiasing, and a place
+    of their own."""
     place = np.diag([1.2, 1.2, 1.2, 1.0])
     place[:3, :3] = place[:3, :3] @ [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
     gray = cloud(70, 4)

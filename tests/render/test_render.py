@@ -1,6 +1,7 @@
 """The public functions of `render.render`, and the example of its docstring."""
 
 import doctest
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,12 +84,11 @@ def test_background_and_values_are_clipped_display_values() -> None:
 
 @pytest.mark.needs("adapter")
 def test_a_gpu_renders_the_same_picture() -> None:
-    """Catches strain, frames, background or antialiasing that only the CPU draws."""
+    """Catches triangles' colors, frames, background or antialiasing that only the CPU draws."""
     from numerics.meshes import bent_ball
     from raster import gpu_device
 
     from stga_addon.avatar.embedding import face_frames
-    from stga_addon.avatar.strain import strain_basis
     from stga_addon.render.device import Composer
 
     posed, neutral, faces = bent_ball()
@@ -101,11 +101,11 @@ def test_a_gpu_renders_the_same_picture() -> None:
         sh=random.normal(0, 0.4, (count, 4, 3)).astype(np.float32),
         face=np.arange(count, dtype=np.int32),
         unbound=np.zeros(count, bool),
-        strain_color=random.normal(0, 0.3, (count, 3, 3)).astype(np.float32),
     )
     size = float(np.ptp(posed, axis=0).max())
     camera = look_at((0, 0, 2.5 * size), posed.mean(0), width=90, height=70, focal_length=150)
-    frames = face_frames(posed, faces, neutral, "stga", strain_basis(neutral, faces))
+    color = random.normal(0, 0.3, (count, 3)).astype(np.float32)
+    frames = replace(face_frames(posed, faces, neutral), color=color)
     expected = render(splats, camera, (0.2, 0.9, 0.4), frames, antialiased=True)
     composer = Composer(f"gpu:{gpu_device.device().name}")
     got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, composer)

@@ -1,11 +1,13 @@
 """Training of driven offsets: gradient, step, run folder."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.offsets import STRAIN_POSITION
+from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION
 from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam
@@ -22,27 +24,32 @@ def squeezed(toy: Capture) -> Capture:
     return replace(toy, mesh=lambda timestep: toy.neutral * scales[timestep])
 
 
-def make_trainer(capture: Capture, seed: int = 0) -> Trainer:
+SIZES = {POSITION: 1e-3, COLOR: 0.1}
+"""Of coefficients."""
+
+
+def make_trainer(capture: Capture, *offsets: str, seed: int = 0) -> Trainer:
     settings = quick_settings(
-        "global", lattice=1, driven_offsets=("strain_position",), random_background=False
+        "global", lattice=1, driven_offsets=offsets or tuple(OFFSETS), random_background=False
     )
-    trainer = Trainer(capture, settings, {})
-    position = trainer.state.driven_offsets["strain_position"]
-    position.value[:] = np.random.default_rng(seed).normal(0, 1e-3, position.value.shape)
+    trainer, rng = Trainer(capture, settings, {}), np.random.default_rng(seed)
+    for name, state in trainer.state.driven_offsets.items():
+        state.value[:] = rng.normal(0, SIZES[OFFSETS[name].target], state.value.shape)
     return trainer
 
 
-def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
+@pytest.mark.parametrize("name", OFFSETS)
+def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture, name: str) -> None:
     """Catches a gradient of the wrong sign, unit or axes, and one summed over other splats: against
     differences of the loss by each coefficient of a few triangles."""
     capture = squeezed(toy)
-    trainer = make_trainer(capture)
+    trainer, offset = make_trainer(capture, name), OFFSETS[name]
     view = capture.views["train"][0]
     target = np.random.default_rng(1).integers(
         0, 255, (view.camera.height, view.camera.width, 3), np.uint8
     )
     state = trainer.state
-    position = state.driven_offsets["strain_position"]
+    position = state.driven_offsets[name]
     before = position.value.copy()
     kept = [array.copy() for array in state.parameters]
 
@@ -63,7 +70,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
     strongest = touched[np.argsort(-np.abs(gradient[touched]).max((1, 2)))[:6]]
     for face in strongest:
         component, axis = np.unravel_index(np.abs(gradient[face]).argmax(), (3, 3))
-        step = 5e-4
+        step = 5e-4 if offset.target == POSITION else 5e-3
         ends = []
         for sign in (1, -1):
             changed = before.copy()
@@ -71,7 +78,7 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture) -> None:
             ends.append(loss(changed))
         slope = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
-    rate = STRAIN_POSITION.rate_share * trainer.settings.rates.xyz
+    rate = offset.rate_share * getattr(trainer.settings.rates, offset.rate)
     moved = (stepped - before)[strongest]
     # Adam's first step is as long as the rate
     np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)
@@ -82,7 +89,7 @@ def test_the_step_is_adam_in_float64() -> None:
     """Catches a bias correction, an average or a count that is not each triangle's own, gradients
     of splats that were not trained, and a broken gradient that gets in."""
     rng, faces, rate, ema_share, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
-    state = new_offset(rng.normal(0, 1, (faces, 3, 3)))
+    state, offset = new_offset(rng.normal(0, 1, (faces, 3, 3))), OFFSETS["strain_position"]
     value, average = state.value.astype(np.float64), state.value.astype(np.float64)
     first, second, steps = np.zeros_like(value), np.zeros_like(value), np.zeros(faces, int)
     for number in range(8):
@@ -93,8 +100,8 @@ def test_the_step_is_adam_in_float64() -> None:
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
         adam.step_offsets(
-            {"strain_position": state}, rows, face, gradient,
-            {"strain_position": smoothed}.__getitem__, rate,
+            {offset.name: state}, rows, face, SimpleNamespace(xyz=gradient),
+            {offset.signal: smoothed}.__getitem__, {offset.rate: rate},
             adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon)),
         )  # fmt: skip
         for f in np.unique(face[rows]):
@@ -106,7 +113,7 @@ def test_the_step_is_adam_in_float64() -> None:
             first[f] = 0.9 * first[f] + 0.1 * g
             second[f] = 0.999 * second[f] + 0.001 * g**2
             m, v = first[f] / (1 - 0.9 ** steps[f]), second[f] / (1 - 0.999 ** steps[f])
-            value[f] -= STRAIN_POSITION.rate_share * rate * m / (np.sqrt(v) + epsilon)
+            value[f] -= offset.rate_share * rate * m / (np.sqrt(v) + epsilon)
             average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
     np.testing.assert_array_equal(state.steps, steps)
     assert steps.min() == 0
@@ -119,13 +126,14 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
     """Catches a trainer whose splats move otherwise than those of the avatar that it writes."""
     capture = squeezed(toy)
     trainer = make_trainer(capture)
-    position = trainer.state.driven_offsets["strain_position"]
-    position.average[:] = 10 * position.value
+    for state in trainer.state.driven_offsets.values():
+        state.average[:] = 3 * state.value
     view = capture.views["val"][0]
     seen = trained_strain_range(capture, capture.mesh, None)
     avatar = Avatar(
         trainer.state.splats(averaged=True), "stga", capture.neutral.astype(np.float32),
-        capture.faces, strain_range=seen, driven_offsets={"strain_position": position.average},
+        capture.faces, strain_range=seen,
+        driven_offsets={n: state.average for n, state in trainer.state.driven_offsets.items()},
     )  # fmt: skip
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
@@ -136,11 +144,10 @@ def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
 
 
 def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
-    """Catches triangles that are not selected, whose splats would move in all frames."""
+    """Catches triangles that are not selected, whose splats would change in all frames."""
     capture = squeezed(toy)
     local = {"warm_up_share": 0.0, "global_interval": 1000}
-    offsets = ("strain_position",)
-    settings = quick_settings("selective", lattice=1, driven_offsets=offsets, **local)
+    settings = quick_settings("selective", lattice=1, driven_offsets=tuple(OFFSETS), **local)
     selected = np.zeros(len(capture.faces), bool)
     selected[:200] = True
     trainer = Trainer(capture, settings, dict.fromkeys(capture.timesteps, selected))
@@ -148,7 +155,7 @@ def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
     target = np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
     for _ in range(3):
         trainer.step(view, target, 0.5)
-    position = trainer.state.driven_offsets["strain_position"]
-    assert position.steps[:200].max() > 0
-    assert not position.steps[200:].any()
-    assert not position.value[200:].any()
+    for state in trainer.state.driven_offsets.values():
+        assert state.steps[:200].max() > 0
+        assert not state.steps[200:].any()
+        assert not state.value[200:].any()

@@ -50,7 +50,7 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("version", 2, "has run format version 2, this add-on reads 4 to 7$"),
+        ("version", 2, "has run format version 2, this add-on reads 4 to 8$"),
         ("version", None, "has run format version None"),
         ("format", "stga-avatar", "is not a run"),
         ("capture", None, "setting capture: expected a path, got None"),

@@ -142,6 +142,11 @@ def test_moved_captures_and_refined_meshes_are_accepted(
     assert read_run(copy).capture == other
 
 
+AS_THEN = {"strain_color": True, "driven_offsets": ["strain_position"]}
+"""Before version 8, of a run whose driven offsets are now `FOLLOWS`."""
+FOLLOWS = "strain_position", "older_strain_color"
+
+
 @pytest.mark.parametrize(
     ("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD)), (6, {"adam_nesterov"})]
 )
@@ -154,17 +159,20 @@ def test_runs_of_earlier_format_versions_are_resumed(
 
     def recorded(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
         known = {name: value for name, value in to_json(settings).items() if name not in lacks}
+        known |= AS_THEN
         digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
         return replace(identity_of(capture, principal_point, settings), settings=digest)
 
     with monkeypatch.context() as before:
         before.setattr(open_run_module, "identity_of", recorded)
-        train(toy, out, make_run(toy, **OLD), report=stop_at(ITERATIONS // 2))
+        begun = make_run(toy, driven_offsets=FOLLOWS, **OLD)
+        train(toy, out, begun, report=stop_at(ITERATIONS // 2))
 
     def as_then(document: dict[str, Any]) -> None:
         document["version"] = version
         for name in lacks:
             del document["settings"][name]
+        document["settings"] |= AS_THEN
 
     factory.edit(out / "run.json", as_then)
     opened = open_run(out)
@@ -173,7 +181,7 @@ def test_runs_of_earlier_format_versions_are_resumed(
     assert read_checkpoint(out).iteration == ITERATIONS
     assert open_run(out).run == opened.run
     with pytest.raises(StgaError, match="begun with other settings"):
-        train(toy, out, make_run(toy, torso=True, **OLD), resume=True)
+        train(toy, out, make_run(toy, torso=True, driven_offsets=FOLLOWS, **OLD), resume=True)
 
 
 def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:

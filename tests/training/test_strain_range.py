@@ -1,4 +1,4 @@
-"""The range of strain that an avatar takes along from its training."""
+"""The range of deformation that an avatar takes along from its training."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,11 +8,11 @@ import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.avatar.strain import (
-    COLOR_RANGE,
     MIN_COMPRESSION,
-    color_range,
-    face_strain,
+    TRAINED_RANGE,
+    deformation,
     strain_basis,
+    trained_range,
 )
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
@@ -28,6 +28,8 @@ from stga_addon.training.settings import Rates
 
 from .toys import quick_settings, random_splats, stop_at
 
+COLORS = "strain_color", "normal_color"
+
 
 def deformed(toy: Capture, timestep: int) -> np.ndarray:
     """The toy's mesh, stretched by another amount along each axis in each timestep."""
@@ -35,14 +37,14 @@ def deformed(toy: Capture, timestep: int) -> np.ndarray:
 
 
 def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
-    basis = strain_basis(toy.neutral, toy.faces, color_range(len(toy.faces)))
-    return np.stack([face_strain(basis, deformed(toy, t)) for t in sorted(timesteps)])
+    basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
+    return np.stack([deformation(basis, deformed(toy, t)) for t in sorted(timesteps)])
 
 
 def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path) -> None:
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
-    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     found = read_avatar(train(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
     trained = strains(toy, {view.timestep for view in toy.views["train"]})
     limits = found.strain_range
@@ -50,16 +52,20 @@ def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path)
     assert (limits[:, 0] <= trained.min(0)).all()
     assert (trained.max(0) <= limits[:, 1]).all()
     assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
-    without = Run(toy.root, None, "vhap", replace(settings, strain_color=False))
+    without = Run(toy.root, None, "vhap", replace(settings, driven_offsets=()))
     assert read_avatar(train(capture, tmp_path / "off", without)).strain_range is None
 
 
 def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) -> None:
     """Catches an avatar that forgets expressions because only one frame was refined."""
     count = len(toy.faces)
-    limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 3)).copy()
+    limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 6)).copy()
     neutral = toy.neutral.astype(np.float32)
-    parent = Avatar(random_splats(20, count), "stga", neutral, toy.faces, strain_range=limits)
+    offsets = {"strain_color": np.zeros((count, 3, 3), np.float32)}
+    parent = Avatar(
+        random_splats(20, count), "stga", neutral, toy.faces, strain_range=limits,
+        driven_offsets=offsets,
+    )  # fmt: skip
     write_avatar(tmp_path / "avatar.npz", parent)
     continuation = Continuation(tmp_path, "", 0, 0)
     alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
@@ -69,10 +75,10 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     np.testing.assert_array_equal(both[:, 0], np.minimum(alone[:, 0], -0.5))
     # its parent followed stretch
     np.testing.assert_array_equal(both[:, 1, :2], np.float32(-MIN_COMPRESSION))
-    np.testing.assert_array_equal(both[:, 1, 2], np.maximum(alone[:, 1, 2], np.float32(0.01)))
+    np.testing.assert_array_equal(both[:, 1, 2:], np.maximum(alone[:, 1, 2:], np.float32(0.01)))
     write_avatar(tmp_path / "avatar.npz", replace(parent, strain_range=None))
     unlimited = trained_strain_range(toy, lambda t: deformed(toy, t), continuation)
-    np.testing.assert_array_equal(unlimited, np.broadcast_to(COLOR_RANGE, (count, 2, 3)))
+    np.testing.assert_array_equal(unlimited, np.broadcast_to(TRAINED_RANGE, (count, 2, 6)))
 
 
 def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> None:
@@ -82,7 +88,7 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
     basis = FrameStore(toy, "stga", strain=True).strain
     assert basis is not None
     larger, little, smaller = (
-        face_strain(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9)
+        deformation(basis, scale * np.asarray(toy.neutral)) for scale in (1.05, 0.985, 0.9)
     )
     np.testing.assert_array_equal(larger[:, :2], np.float32(-MIN_COMPRESSION))
     np.testing.assert_array_equal(little[:, :2], np.float32(-MIN_COMPRESSION))
@@ -90,7 +96,7 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
     limits = trained_strain_range(toy, lambda t: 1.05 * np.asarray(toy.neutral), None)
     np.testing.assert_array_equal(limits[:, :, :2], np.float32(-MIN_COMPRESSION))
     sheared = np.asarray(toy.neutral) @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]])
-    shear = face_strain(basis, sheared)[:, 2]
+    shear = deformation(basis, sheared)[:, 2]
     assert shear.min() < -0.05
     assert shear.max() > 0.05
 
@@ -99,11 +105,11 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
 def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, limited: bool) -> None:
     """Catches a run of an earlier version that is resumed, which changes all its colors at once,
     and one that is finished but cannot be opened."""
-    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     path = train(toy, out, run, report=stop_at(2))
     avatar = read_avatar(path)
-    wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 3)).copy()
+    wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 6)).copy()
     write_avatar(path, replace(avatar, strain_range=wider if limited else None))
     before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
     earlier = r"avatar\.npz: colors follow strain as in an earlier version; train it anew"
@@ -124,9 +130,9 @@ def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
     def mesh(timestep: int) -> np.ndarray:
         return np.asarray(toy.neutral) * (0.85 if timestep in blink else 1.0)
 
-    basis = strain_basis(toy.neutral, toy.faces, color_range(len(toy.faces)))
+    basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
     limits = trained_strain_range(replace(toy, views=views), mesh, None)
-    assert (limits[:, 0] <= face_strain(basis, mesh(blink[0]))).all()
+    assert (limits[:, 0] <= deformation(basis, mesh(blink[0]))).all()
 
 
 def test_evaluation_while_training_measures_the_avatar_that_is_written(
@@ -141,7 +147,7 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(
     weak = tuple(view for view in toy.views["train"] if view.timestep not in strong)
     plain = {"iterations": 20, "lattice": 0, "sh_degree": 0, "sh_steps": (), "ema_share": 1.0}
     rates = Rates(strain_color=0.5)
-    settings = quick_settings("global", strain_color=True, rates=rates, **plain)
+    settings = quick_settings("global", driven_offsets=COLORS, rates=rates, **plain)
     capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
     path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
     best = min(read_metrics(tmp_path / "run"), key=lambda line: line["detail_difference"])
@@ -151,13 +157,13 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(
 
 def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
     """Catches a resumed run that clips its colors to what another run has seen."""
-    settings = quick_settings("global", iterations=4, lattice=0, strain_color=True)
+    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     train(toy, out, run, report=stop_at(2))
-    limits, digest = color_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
+    limits, digest = trained_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
     for (stored, identity), says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),
-        ((limits[1:], digest), r"strain_range is float32 .*, expected float32 \(320, 2, 3\)"),
+        ((limits[1:], digest), r"strain_range is float32 .*, expected float32 \(320, 2, 6\)"),
     ):
         arrays = {"strain_range": stored, "identity": np.frombuffer(identity.encode(), np.uint8)}
         write_npz(out / STRAIN_RANGE, arrays)

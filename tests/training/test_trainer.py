@@ -11,6 +11,7 @@ from capture import factory
 from PIL import Image
 
 from stga_addon.avatar.embedding import face_frames, to_world
+from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
@@ -34,7 +35,7 @@ def lower_part(capture: Capture) -> dict[int, np.ndarray]:
 
 
 def make_trainer(capture: Capture, strategy: str = "selective", **changes: Any) -> Trainer:
-    quiet = {"density_interval": 0, "stray_reset_interval": 0, "strain_color": True}
+    quiet = {"density_interval": 0, "stray_reset_interval": 0, "driven_offsets": tuple(OFFSETS)}
     quiet |= {"warm_up_share": 0.0, "global_interval": 2}
     return Trainer(capture, quick_settings(strategy, **{**quiet, **changes}), lower_part(capture))
 

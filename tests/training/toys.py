@@ -23,7 +23,6 @@ def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Spl
         sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
         face=rng.integers(0, faces, count).astype(np.int32),
         unbound=rng.random(count) < 0.3,
-        strain_color=rng.normal(0, 0.1, (count, 3, 3)).astype(np.float32),
     )
 
 

@@ -22,7 +22,7 @@ from ..playback import Playback
 from ..spz import smallest_three
 
 MAGIC = b"STGA"
-FORMAT, VERSION = "stga-web", 2
+FORMAT, VERSION = "stga-web", 3
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
@@ -187,7 +187,8 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return basis, coefficients / largest
 
 
-POSITION_STEP_M = 4e-6
+POSITION_STEP_M, MOVED_STEP_M = 4e-6, 0.25e-6
+"""Of splats, and of how far they move with a unit of strain."""
 STEPS = {
     # The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each.
     "rotation": 1 / 724,
@@ -196,7 +197,11 @@ STEPS = {
     # Of the constant SH coefficient, which a color has 0.28 times.
     "color": 0.004,
     "sh": 0.005,
-    "strain_color": 0.008,
+    # Signals of driven offsets are at most 2 in each of three components: half a step of each moves
+    # a splat by 0.75 µm along an axis (MOVED_STEP_M), or changes its color by 0.19 / 255.
+    "strain_color": 2.0**-12,
+    "normal_color": 2.0**-12,
+    "older_strain_color": 2.0**-12,
     # Of the ends of a triangle's range: positions that follow strain by 2 mm err by 2 µm.
     "strain_range": 0.002,
     # Meters, so fine that no thin triangle becomes a line, or the reverse.
@@ -212,12 +217,6 @@ STEPS = {
 }
 """Array -> step of its fixed-point values: half of one is the largest error. With POSITION_STEP_M
 they leave a picture of large random splats 55 dB PSNR at least (tests/export/web/test_page.py)."""
-OFFSET_STEPS_M = {"strain_position": POSITION_STEP_M / 16}
-"""Driven offset that the player has a signal for (`player/face_frames.js`) -> step of its
-coefficients.
-
-Strain is at most MAX_STRAIN = 2 from rest in each of three components: half a step of each moves a
-splat by 0.75 µm along an axis at most, where half of POSITION_STEP_M is 2 µm."""
 IRRADIANCE_STEPS = 65535
 """Steps to the largest irradiance of the capture, whose level is any."""
 
@@ -228,7 +227,7 @@ MIN_SLIDER_RANGE, SLIDER_HEADROOM = 1.0, 1.5
 def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = False) -> bytes:
     """The data file of an avatar that `rig` moves; `exact`: float32 instead of fixed point.
 
-    Raises ValueError where a value is not finite, or a driven offset is not in OFFSET_STEPS_M.
+    Raises ValueError where a value is not finite, or the player lacks a driven offset.
     """
     relighter = None if avatar.light is None else Relighter(avatar)
     surface = avatar.splats.face if relighter is None else relighter.face
@@ -246,13 +245,13 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     unit = float(frames.scale.max(initial=1e-6))
     steps = STEPS | {"xyz": POSITION_STEP_M / unit, "light_lash_corners": POSITION_STEP_M / unit}
+    steps["strain_position"] = MOVED_STEP_M / unit
     if avatar.follows_strain and avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range.reshape(faces, -1)
     for name, coefficients in avatar.driven_offsets.items():
-        if name not in OFFSET_STEPS_M:
+        if name not in steps:
             raise ValueError(f"the web player has no driven offset {name}")
         arrays[name] = coefficients.reshape(faces, -1)
-        steps[name] = OFFSET_STEPS_M[name] / unit
     header = _header(avatar, rig, playback)
     if playback.controls is not None and rig.expressions:
         controls = playback.controls
@@ -282,7 +281,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
 
 def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
     largest, smaller = smallest_three(splats.rotation)
-    optional = {"sh": splats.sh[:, 1:], "strain_color": splats.strain_color}
+    view = splats.sh[:, 1:].reshape(len(splats), -1)
     return {
         "xyz": splats.xyz,
         "rotation": smaller,
@@ -290,7 +289,7 @@ def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
         "log_scale": splats.log_scale,
         "opacity": splats.opacities(),
         "color": splats.sh[:, 0],
-        **{name: part.reshape(len(part), -1) for name, part in optional.items() if part.shape[1]},
+        **({"sh": view} if view.shape[1] else {}),
     }
 
 

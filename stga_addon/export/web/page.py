@@ -123,5 +123,5 @@ def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bo
 def web_bytes(avatar: Avatar) -> int:
     """About the size of a page of the avatar."""
     splats = avatar.splats
-    coefficients = splats.sh.size + splats.strain_color.size
+    coefficients = splats.sh.size + sum(each.size for each in avatar.driven_offsets.values())
     return round(BYTES_PER_SPLAT * len(splats) + BYTES_PER_COEFFICIENT * coefficients)

@@ -29,8 +29,8 @@ def compose(
             *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
         )
         project_forward(
-            np.arange(len(splats)), everywhere, rasterize.with_strain_color(parameters),
-            splats.face, layer_frames(layer, camera), splats.sh_degree, False, layer.antialiased,
+            np.arange(len(splats)), everywhere, parameters, splats.face,
+            layer_frames(layer, camera), splats.sh_degree, False, layer.antialiased,
             Projection(*(array[rows] for array in projection)),
         )  # fmt: skip
         begin = rows.stop

@@ -5,8 +5,8 @@ Stages: `project` (splats to the screen), `tiles` (which splats reach which tile
 pixels), and `image_loss`; each forward and, but for `tiles`, backward. The kernels take one tuple
 of arrays per concern, float32 unless said; `gpu/layout.py` says what of it the GPU's tables hold.
 
-N splats, F triangles, K = (degree + 1)² SH coefficients, S components of strain, P (tile, splat)
-pairs, image H × W. Gradients of a scalar have the name of the quantity after `v_`.
+N splats, F triangles, K = (degree + 1)² SH coefficients, P (tile, splat) pairs, image H × W.
+Gradients of a scalar have the name of the quantity after `v_`.
 """
 
 from typing import Any, NamedTuple
@@ -28,9 +28,8 @@ PROJECTED = 9
 class Parameters(NamedTuple):
     """What is trained of N splats, raw as in `Splats`: numpy arrays, in `autograd` torch tensors.
 
-    xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3);
-    strain_color (N, S, 3), or None where colors do not follow strain. The triangles (N,) int32 that
-    the splats are bound to are passed beside them.
+    xyz (N, 3), rotation (N, 4) wxyz, log_scale (N, 3), opacity (N,) logit, sh (N, K, 3). The
+    triangles (N,) int32 that the splats are bound to are passed beside them.
     """
 
     xyz: Any
@@ -38,21 +37,20 @@ class Parameters(NamedTuple):
     log_scale: Any
     opacity: Any
     sh: Any
-    strain_color: Any = None
 
 
 class CameraFrames(NamedTuple):
     """Frames of the triangles in camera space, and the camera: camera point = matrix @ local point
     + origin.
 
-    origin (F, 3) meters, matrix (F, 3, 3) with the triangle's scale in it, strain (F, S); to_world
-    (3, 3) rotation from camera to world; intrinsics (4,) fl_x, fl_y, cx, cy in pixels; size (2,)
-    int64 width, height.
+    origin (F, 3) meters, matrix (F, 3, 3) with the triangle's scale in it, color (F, 3) added to
+    that of its splats, or (·, 0) where nothing is; to_world (3, 3) rotation from camera to world;
+    intrinsics (4,) fl_x, fl_y, cx, cy in pixels; size (2,) int64 width, height.
     """
 
     origin: np.ndarray
     matrix: np.ndarray
-    strain: np.ndarray
+    color: np.ndarray
     to_world: np.ndarray
     intrinsics: np.ndarray
     size: np.ndarray

@@ -146,16 +146,14 @@ def project_forward(
     rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above
     and to the left are rendered; a splat's bounds end at these, and one that reaches none of them
     counts as not visible. face (N,) int32.
-    degree: of the spherical harmonics used, at most the stored one. Colors follow as many
-    components of strain as both the frames and the splats have.
+    degree: of the spherical harmonics used, at most the stored one.
     depth_as_color: blend (depth, 0, 0) instead of the color. antialiased: what LOW_PASS_PX2 adds to
     a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
     mode).
     """
-    sh, strain_color, strain = splats.sh, splats.strain_color, frames.strain
+    sh, by_face = splats.sh, frames.color
     projected, depth, extent_y = projection.columns, projection.depth, projection.extent_y
     rect = projection.rect
-    strains = np.uint64(min(strain.shape[1], strain_color.shape[1]))
     tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
@@ -176,11 +174,11 @@ def project_forward(
                 q = seen[n]
                 i = np.uint64(some[q])
                 red, green, blue = _color(b, q, i, coefficients, sh)
-                f = np.uint64(face[i])
-                for k in range(strains):
-                    red += strain[f, k] * strain_color[i, k, 0]
-                    green += strain[f, k] * strain_color[i, k, 1]
-                    blue += strain[f, k] * strain_color[i, k, 2]
+                if by_face.shape[1] > 0:
+                    f = np.uint64(face[i])
+                    red, green, blue = (
+                        red + by_face[f, 0], green + by_face[f, 1], blue + by_face[f, 2]
+                    )  # fmt: skip
                 # Before the cut at zero, which would turn NaN and −∞ into black.
                 if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
                     rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
@@ -277,9 +275,7 @@ def project_backward(
     pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with
     respect to the projected center in units of half the image, for density control.
     """
-    sh, strain = splats.sh, frames.strain
-    v_sh, v_strain_color = gradients.sh, gradients.strain_color
-    strains = np.uint64(min(strain.shape[1], splats.strain_color.shape[1]))
+    sh, v_sh = splats.sh, gradients.sh
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
@@ -295,15 +291,9 @@ def project_backward(
             block.compute_harmonics(b, frames.to_world)
             for q in range(np.uint64(len(some))):
                 i = np.uint64(some[q])
-                f = np.uint64(face[i])
                 if depth_as_color:
                     b[block.V_CAMERA_Z + q] += b[block.G_RED + q]
                     b[block.G_RED + q] = b[block.G_GREEN + q] = b[block.G_BLUE + q] = ZERO
                 _color_gradient(b, q, i, coefficients, sh, v_sh)
-                for k in range(np.uint64(v_strain_color.shape[1])):
-                    weight = strain[f, k] if k < strains else ZERO
-                    v_strain_color[i, k, 0] = weight * b[block.G_RED + q]
-                    v_strain_color[i, k, 1] = weight * b[block.G_GREEN + q]
-                    v_strain_color[i, k, 2] = weight * b[block.G_BLUE + q]
             block.differentiate_position(b, frames.to_world)
             _store_gradient(some, b, gradients, screen_gradient)

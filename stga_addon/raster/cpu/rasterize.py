@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ...avatar.embedding import FaceFrames
-from ...avatar.splats import no_strain_color
 from ...capture.camera import Camera
 from . import tiles as tiling
 from .blend import blend_backward, blend_forward
@@ -89,7 +88,7 @@ def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
     return CameraFrames(
         origin=origin,
         matrix=matrix,
-        strain=frames.strain,
+        color=frames.color,
         to_world=np.ascontiguousarray(rotation.T, np.float32),
         intrinsics=np.array([camera.fl_x, camera.fl_y, camera.cx, camera.cy], np.float32),
         size=np.array([camera.width, camera.height], np.int64),
@@ -112,7 +111,7 @@ def render_forward(
     that this adds.
     buffers: memory to reuse; the output is then valid until the next one with the same buffers.
     """
-    splats, buffers = with_strain_color(splats), buffers or BufferPool()
+    buffers = buffers or BufferPool()
     width, height = frames.size.tolist()
     tiles_x, tiles_y = tile_grid(width, height)
     projection = new_projection(len(splats.xyz), buffers)
@@ -178,9 +177,8 @@ def render_backward(
         np.ascontiguousarray(v_transmittance), pair_gradients,
     )  # fmt: skip
     project_backward(
-        rows, with_strain_color(splats), face, frames, output.degree, output.depth_as_color,
-        output.antialiased, columns, lists, pair_gradients, with_strain_color(gradients),
-        screen_gradient,
+        rows, splats, face, frames, output.degree, output.depth_as_color, output.antialiased,
+        columns, lists, pair_gradients, gradients, screen_gradient,
     )  # fmt: skip
     return rows, screen_gradient
 
@@ -261,13 +259,6 @@ def sort_by_depth(
         tiling.move_by_digit(counts, keys, order, *digit, moved_keys, moved)
         keys, moved_keys, order, moved = moved_keys, keys, moved, order
     return visible, order, first_pair, pairs, total
-
-
-def with_strain_color(splats: Parameters) -> Parameters:
-    """The same with an empty `strain_color` instead of None, for the kernels."""
-    if splats.strain_color is not None:
-        return splats
-    return splats._replace(strain_color=no_strain_color(len(splats.xyz)))
 
 
 def tile_grid(width: int, height: int) -> tuple[int, int]:

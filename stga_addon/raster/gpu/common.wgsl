@@ -1,17 +1,17 @@
 // Common to all kernels, after the constants and structs of layout.py.
 //
 // A table is a flat array of 32-bit words, row by row, without padding: word c of row i is table[i * stride + c]. N
-// splats, F triangles, K SH coefficients, S strain colors, P (tile, splat) pairs, image H × W. `Device.kernel` binds
+// splats, F triangles, K SH coefficients, P (tile, splat) pairs, image H × W. `Device.kernel` binds
 // those that an entry point uses, for reading where it assigns to none of their words. A file declares what only it uses.
 
 var<uniform> view: View;
-var<storage> splats: array<f32>; // (N, 11 + 3K + 3S) the fields of `cpu.layout.Parameters` in order
+var<storage> splats: array<f32>; // (N, 11 + 3K) the fields of `cpu.layout.Parameters` in order
 var<storage> gradients: array<f32>; // as the splats
 var<storage> face: array<u32>; // (N,) each splat's triangle
-// (F, 12 + columns) a triangle's origin (3), matrix (3, 3) by rows, strain, in camera space.
+// (F, FRAME_STRIDE) a triangle's origin (3), matrix (3, 3) by rows, in camera space; color (3) that is added.
 var<storage> frames: array<f32>;
-var<storage> coefficients: array<f32>; // (F, S, 3) of a driven offset: `Avatar.driven_offsets`
-var<storage> driving: array<f32>; // (F, S) its signal
+var<storage> coefficients: array<f32>; // (F, 3, 3) of a driven offset: `Avatar.driven_offsets`
+var<storage> driving: array<f32>; // (F, 3) its signal
 var<storage> projected: array<f32>; // (N, PROJECTED) a splat on the screen: the columns of `cpu.layout`
 var<storage> rect: array<vec4i>; // (N,) tile bounds x0, y0, x1, y1 of a splat, as in `Projection`
 var<storage> screen: array<f32>; // (N,) length of the gradient by the projected center in units of half the image
@@ -25,8 +25,6 @@ var<storage> rendered: array<u32>; // (tiles,) 1 for the touched tiles and those
 var<storage> tile_range: array<vec2u>; // (tiles,) a tile's first pair and one past its last
 var<storage> image: array<f32>; // (3, H, W)
 var<storage> v_image: array<f32>; // (3, H, W)
-
-override SIGNALS: u32 = 1u; // S of a driven offset
 
 // A thread in a dispatch whose workgroups fill rows of up to 65,535 (see Device.groups_of).
 struct Thread {
@@ -45,12 +43,7 @@ fn thread_number(thread: Thread) -> u32 {
 
 // Words per row of the tables of splats and of their gradients.
 fn splat_stride() -> u32 {
-  return SH + 3u * view.coefficients + 3u * view.strain_colors;
-}
-
-// Words per row of the table of triangle frames.
-fn frame_stride() -> u32 {
-  return FRAME_STRAIN + view.frame_strains;
+  return SH + 3u * view.coefficients;
 }
 
 const MAX_EXPONENT: f32 = 88.0; // the largest whose exponential float32 holds

@@ -63,8 +63,8 @@ def _compose(
         first = 0
         for n, (layer, table, frames, tables) in enumerate(given):
             options = ViewOptions(
-                camera, layer.splats.sh_degree, strains=frames.strain.shape[1],
-                depth_as_color=depth_as_color, antialiased=layer.antialiased,
+                camera, layer.splats.sh_degree, depth_as_color=depth_as_color,
+                antialiased=layer.antialiased,
             )  # fmt: skip
             view = rasterizer.upload_view(table, options, frames.to_world, first, f"view {n}")
             work.dispatch("project.forward", table.count, tables | {"view": view})
@@ -72,7 +72,7 @@ def _compose(
 
     def render() -> Tables:
         """The colors, of all layers together; submitted."""
-        view = rasterizer.upload_view(SplatTable(None, None, count, 0, 0), ViewOptions(camera, 0))
+        view = rasterizer.upload_view(SplatTable(None, None, count, 0), ViewOptions(camera, 0))
         with device.record() as work:
             project(work)
             return rasterizer.draw(work, view, count, camera)

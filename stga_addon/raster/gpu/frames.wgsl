@@ -1,4 +1,4 @@
-// Camera-space frames and strain of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
+// Camera-space frames and deformation of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
 // them, and their move by driven offsets (`avatar/offsets/offset.py`). A thread is a triangle.
 //
 // Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
@@ -9,27 +9,27 @@ var<storage> vertices: array<f32>; // (V, 6): a position's float32 and what is l
 var<storage> faces: array<u32>; // (F, 3)
 // (F,) area in the neutral mesh, 0 where a triangle counts as a line.
 var<storage> neutral_area: array<f32>;
-// (F, 21 + 8·S): `gram`, `to_tensor`, `to_plane` and `range` of the `StrainBasis`.
+// (F, BASIS_STRIDE): `gram`, `to_tensor`, `to_plane`, `normal` and `range` of the `StrainBasis`.
 var<storage> basis: array<f32>;
 // (V + 1 + 3·F): where the triangles that touch a vertex begin in this array, then those triangles.
 var<storage> vertex_faces: array<u32>;
 // (F, 6): a triangle's own strain as xx, yy, zz, xy, yz, zx.
 var<storage> tensors: array<f32>;
-// (F, S): strain less that at rest, which positions follow where it is averaged.
-var<storage> strain_from_rest: array<f32>;
+var<storage> strain_from_rest: array<f32>; // (F, 3): strain less that at rest
+var<storage> normal_change: array<f32>; // (F, 3): of the unit normal, world axes
 // (F + 1 + N): where the triangles that share an edge with a triangle begin in this array, then those triangles.
 var<storage> neighbors: array<u32>;
-var<storage> smoothed: array<f32>; // (F, S): as averaged in the rounds so far
-var<storage> averaged: array<f32>; // (F, S): once more
+var<storage> smoothed: array<f32>; // (F, 3): as averaged in the rounds so far
+var<storage> averaged: array<f32>; // (F, 3): once more
 
 const LEAST_STRAIN: f32 = 3.0e-6; // twice what float32's rounding makes of none
 const TENSOR: u32 = 6u; // words of a tensor
 const TO_TENSOR: u32 = 3u; // columns of `basis`
 const TO_PLANE: u32 = 21u;
-
-fn basis_stride() -> u32 {
-  return TO_PLANE + (TENSOR + 2u) * pose.strains;
-}
+const NORMAL: u32 = 39u;
+const LOWEST: u32 = 42u; // three of strain, three of the normal's change
+const HIGHEST: u32 = 48u;
+const BASIS_STRIDE: u32 = 54u;
 
 struct Edges {
   first: vec3f, // from corner 0 to corner 1
@@ -64,7 +64,7 @@ fn perpendicular(first: vec3f, raw_normal: vec3f, longest: f32) -> vec3f {
   return normal / length(normal);
 }
 
-// Write a triangle's origin and matrix: camera point = matrix · local + origin. And its strain, where it is wanted.
+// Write a triangle's origin and matrix: camera point = matrix · local + origin. And its deformation, where it is wanted.
 @compute @workgroup_size(WORKGROUP)
 fn compose(thread: Thread) {
   let f = thread_number(thread);
@@ -99,7 +99,7 @@ fn compose(thread: Thread) {
       scale = sqrt(0.5 * length(raw_normal) / neutral_area[f]);
     }
   }
-  let at = f * (FRAME_STRAIN + pose.strains);
+  let at = f * FRAME_STRIDE;
   let center = vec4f(e.center, 1.0);
   for (var axis = 0u; axis < 3u; axis++) {
     frames[at + FRAME_ORIGIN + axis] = dot(pose.rows[axis], center);
@@ -108,14 +108,31 @@ fn compose(thread: Thread) {
       frames[at + FRAME_MATRIX + 3u * axis + c] = row[c];
     }
   }
-  if pose.strains > 0u {
+  for (var c = 0u; c < 3u; c++) {
+    frames[at + FRAME_COLOR + c] = 0.0;
+  }
+  if pose.follows == 1u {
     write_tensor(f, e);
+    write_normal_change(f, raw_normal);
+  }
+}
+
+// Of the unit normal, 0 of a posed triangle without area; none where the neutral one has none.
+fn write_normal_change(f: u32, raw_normal: vec3f) {
+  let at = f * BASIS_STRIDE;
+  let neutral = vec3f(basis[at + NORMAL], basis[at + NORMAL + 1u], basis[at + NORMAL + 2u]);
+  let size = length(raw_normal);
+  let unit = select(vec3f(0.0), raw_normal / size, size * size >= MIN_SQUARED_NORMAL);
+  let change = select(vec3f(0.0), unit - neutral, dot(neutral, neutral) > 0.0);
+  for (var c = 0u; c < 3u; c++) {
+    let within = clamp(change[c], basis[at + LOWEST + 3u + c], basis[at + HIGHEST + 3u + c]);
+    normal_change[3u * f + c] = select(within, 0.0, abs(within) < LEAST_STRAIN);
   }
 }
 
 // Green's strain of a triangle: the change of its edges' squared lengths and product, as a tensor.
 fn write_tensor(f: u32, e: Edges) {
-  let at = f * basis_stride();
+  let at = f * BASIS_STRIDE;
   let gram = vec3f(dot(e.first, e.first), dot(e.first, e.second), dot(e.second, e.second));
   let change = gram - vec3f(basis[at], basis[at + 1u], basis[at + 2u]);
   for (var d = 0u; d < TENSOR; d++) {
@@ -143,18 +160,18 @@ fn average_strain(thread: Thread) {
       }
     }
   }
-  for (var k = 0u; k < pose.strains; k++) {
-    let row = f * basis_stride() + TO_PLANE + TENSOR * k;
+  for (var k = 0u; k < STRAIN_COMPONENTS; k++) {
+    let row = f * BASIS_STRIDE + TO_PLANE + TENSOR * k;
     var strain = 0.0;
     for (var d = 0u; d < TENSOR; d++) {
       strain += mean[d] * basis[row + d];
     }
-    let range = f * basis_stride() + TO_PLANE + TENSOR * pose.strains + k;
-    strain = clamp(STRAIN_GAIN * strain, basis[range], basis[range + pose.strains]);
+    let lowest = basis[f * BASIS_STRIDE + LOWEST + k];
+    let highest = basis[f * BASIS_STRIDE + HIGHEST + k];
+    strain = clamp(STRAIN_GAIN * strain, lowest, highest);
     // Rounding of a rigid triangle is no strain: Adam would take its sign for a gradient and step at full rate.
     strain = select(strain, 0.0, abs(strain) < LEAST_STRAIN);
-    frames[f * (FRAME_STRAIN + pose.strains) + FRAME_STRAIN + k] = strain;
-    strain_from_rest[f * pose.strains + k] = strain - clamp(0.0, basis[range], basis[range + pose.strains]);
+    strain_from_rest[3u * f + k] = strain - clamp(0.0, lowest, highest);
   }
 }
 
@@ -165,29 +182,47 @@ fn smooth_strain(thread: Thread) {
   if f >= pose.triangles {
     return;
   }
-  for (var k = 0u; k < pose.strains; k++) {
-    var total = smoothed[f * pose.strains + k];
+  for (var k = 0u; k < STRAIN_COMPONENTS; k++) {
+    var total = smoothed[3u * f + k];
     let end = neighbors[f + 1u];
     for (var n = neighbors[f]; n < end; n++) {
-      total += smoothed[neighbors[n] * pose.strains + k];
+      total += smoothed[3u * neighbors[n] + k];
     }
-    averaged[f * pose.strains + k] = total / f32(1u + end - neighbors[f]);
+    averaged[3u * f + k] = total / f32(1u + end - neighbors[f]);
   }
 }
 
-// Move a triangle's origin by Σ signal · coefficients, in the triangle's axes and unit.
+// Σ signal · coefficients of a triangle.
+fn driven(f: u32) -> vec3f {
+  var change = vec3f(0.0);
+  for (var row = 3u * f; row < 3u * f + 3u; row++) {
+    change += driving[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
+  }
+  return change;
+}
+
+// Add what is driven to a triangle's color.
+@compute @workgroup_size(WORKGROUP)
+fn color(thread: Thread) {
+  let f = thread_number(thread);
+  if f >= pose.triangles {
+    return;
+  }
+  let change = driven(f);
+  for (var c = 0u; c < 3u; c++) {
+    frames[f * FRAME_STRIDE + FRAME_COLOR + c] += change[c];
+  }
+}
+
+// Move a triangle's origin by what is driven, in the triangle's axes and unit.
 @compute @workgroup_size(WORKGROUP)
 fn shift(thread: Thread) {
   let f = thread_number(thread);
   if f >= pose.triangles {
     return;
   }
-  var moved = vec3f(0.0);
-  for (var k = 0u; k < SIGNALS; k++) {
-    let row = f * SIGNALS + k;
-    moved += driving[row] * vec3f(coefficients[3u * row], coefficients[3u * row + 1u], coefficients[3u * row + 2u]);
-  }
-  let at = f * (FRAME_STRAIN + pose.strains);
+  let moved = driven(f);
+  let at = f * FRAME_STRIDE;
   for (var axis = 0u; axis < 3u; axis++) {
     let row = at + FRAME_MATRIX + 3u * axis;
     frames[at + FRAME_ORIGIN + axis] += dot(vec3f(frames[row], frames[row + 1u], frames[row + 2u]), moved);

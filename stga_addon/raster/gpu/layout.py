@@ -23,8 +23,9 @@ SORT_GROUPS, PAIR_GROUPS, PAIRS, NEEDED, OVERFLOWED, COUNTS = 0, 3, 6, 7, 8, 9
 """Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and
 1 if they did not fit since the host last cleared it."""
 XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
-"""Columns of a splat; its strain colors begin after the SH coefficients."""
-FRAME_ORIGIN, FRAME_MATRIX, FRAME_STRAIN = 0, 3, 12
+"""Columns of a splat."""
+FRAME_ORIGIN, FRAME_MATRIX, FRAME_COLOR, FRAME_STRIDE = 0, 3, 12, 15
+"""Columns of a triangle's frame."""
 
 UNIFORMS = {
     "View": np.dtype(
@@ -35,23 +36,21 @@ UNIFORMS = {
             *((name, "u4") for name in ("width", "height", "tiles_x", "tiles_y")),
             ("splats", "u4"),  # N
             ("coefficients", "u4"),  # K, stored
-            ("strain_colors", "u4"),  # S, stored
             ("degree", "u4"),  # of the spherical harmonics in use
-            ("strains", "u4"),  # strain colors in use
-            ("frame_strains", "u4"),  # columns of strain in `frames`
             ("depth_as_color", "u4"),
             ("antialiased", "u4"),
             ("focused", "u4"),  # 0 where every splat is in focus
             ("ring", "u4"),  # tiles that are rendered around those which the focus touches
             ("capacity", "u4"),  # pairs that the buffers hold
             ("first", "u4"),  # row of the first of these splats in the tables of projected ones
+            *((f"padding_{n}", "u4") for n in range(3)),
         ]
     ),
     "Pose": np.dtype(
         [
             ("rows", "f4", (3, 4)),  # from the mesh, relative to its first vertex, to the camera
             ("triangles", "u4"),
-            ("strains", "u4"),  # components; 0 where neither colors nor positions follow strain
+            ("follows", "u4"),  # 1 where colors or positions follow the deformation
             ("area_scales", "u4"),  # 1: the convention "stga", 0: "gaussian_avatars"
             ("padding", "u4"),
         ]
@@ -70,7 +69,7 @@ UNIFORMS = {
                 "rates",
                 "f4",
                 (2, 4),
-            ),  # by field, see `field_of`; the last: harmonics above the first
+            ),  # by field, see `field_of`; then harmonics above the first, colors by the pose
             *((name, "f4") for name in ("beta1", "beta2", "log_beta1", "log_beta2", "epsilon")),
             ("ahead", "f4"),  # by how much of the way from the first moment to the gradient it goes
             ("ema_share", "f4"),  # least share of a step in the exponential moving average
@@ -85,7 +84,7 @@ UNIFORMS = {
 
 _OWN = (
     "WORKGROUP HIDDEN WANTED MAX_GROUPS SORT_BLOCK SORT_GROUPS PAIR_GROUPS PAIRS NEEDED OVERFLOWED"
-    " XYZ ROTATION LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX FRAME_STRAIN"
+    " XYZ ROTATION LOG_SCALE OPACITY_LOGIT SH FRAME_ORIGIN FRAME_MATRIX FRAME_COLOR FRAME_STRIDE"
 )
 _COLUMNS = "MEAN_X MEAN_Y PRECISION_X SHEAR PRECISION_Y OPACITY RED GREEN BLUE"
 _CPU = {
@@ -93,7 +92,7 @@ _CPU = {
     blend: "MAX_ALPHA MIN_ALPHA MIN_TRANSMITTANCE",
     splat_block: "LOW_PASS_PX2 NEAR_M QUATERNION_LIFT C0 C1 C2 C3 C4 C5 C6 C7 C8 C9",
     embedding: "MIN_AREA_RATIO UPRIGHT_COSINE",
-    strain: "STRAIN_GAIN STRAIN_COMPONENTS",
+    strain: "STRAIN_GAIN STRAIN_COMPONENTS MIN_SQUARED_NORMAL",
     image_loss: "WINDOW_RADIUS_PX",
     optimizer: "MAX_GRADIENT",
 }
@@ -109,7 +108,7 @@ CONSTANTS: dict[str, int | float] = {
 
 def splat_rows(splats: Parameters) -> np.ndarray:
     """Numpy arrays of splats as one table (N, stride) float32."""
-    parts = [np.asarray(part, np.float32) for part in splats if part is not None]
+    parts = [np.asarray(part, np.float32) for part in splats]
     flat = [part.reshape(len(part), math.prod(part.shape[1:])) for part in parts]
     return np.concatenate(flat, axis=1)
 
@@ -121,14 +120,13 @@ def list_words(lists: strain.IndexLists) -> np.ndarray:
 
 def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
     """The opposite of `splat_rows`: copies of its columns; coefficients: K."""
-    n, end = len(rows), SH + 3 * coefficients
+    n = len(rows)
     return Parameters(
         xyz=rows[:, XYZ:ROTATION].copy(),
         rotation=rows[:, ROTATION:LOG_SCALE].copy(),
         log_scale=rows[:, LOG_SCALE:OPACITY_LOGIT].copy(),
         opacity=rows[:, OPACITY_LOGIT].copy(),
-        sh=rows[:, SH:end].reshape(n, coefficients, 3).copy(),
-        strain_color=rows[:, end:].reshape(n, (rows.shape[1] - end) // 3, 3).copy(),
+        sh=rows[:, SH:].reshape(n, coefficients, 3).copy(),
     )
 
 

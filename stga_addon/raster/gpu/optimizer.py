@@ -7,25 +7,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...avatar.offsets import OFFSETS
+from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.splats import SH_C0
 from ..cpu.layout import Parameters
 from ..cpu.optimizer import AdamOptions
 from ..cpu.rasterize import tile_grid
 from .device import Device, Recording
-from .frames import SIGNALS
-from .layout import WORKGROUP
+from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
 KERNELS = (
-    "frames.compose frames.average_strain project.mark_focus project.forward project.backward"
+    "frames.compose frames.average_strain frames.smooth_strain frames.shift frames.color"
+    " project.mark_focus project.forward project.backward"
     " tiles.mark_touched tiles.choose_rendered tiles.count_pairs tiles.add_pairs tiles.fill_pairs"
     " tiles.find_ranges blend.forward blend.backward image_loss.gradient image_loss.total"
     " optimizer.measure_excess optimizer.join_excess optimizer.prepare optimizer.adam"
 )
-"""What any iteration may dispatch beside sorting and driven offsets."""
-RATES = (*Parameters._fields, "sh_rest")
-"""Learning rates in the order of the kernels; the last is that of the harmonics above the constant
-one."""
+"""What any iteration may dispatch beside sorting and steps of driven offsets."""
+RATES = (*Parameters._fields, "sh_rest", "strain_color")
+"""Learning rates in the order of the kernels."""
 
 
 def upload_target(
@@ -124,7 +124,7 @@ def optimize(
 class OffsetTables(NamedTuple):
     """Tables of a driven offset of F triangles in training, on the device.
 
-    coefficients, first, second, average  (F, S, 3) float32, with Adam's moments and the exponential
+    coefficients, first, second, average  (F, 3, 3) float32, with Adam's moments and the exponential
                                           moving average
     steps      (F,) uint32
     splats_of  of `splats_by_triangle`
@@ -159,13 +159,15 @@ def step_offsets(
     limits.
     """
     for name, tables in offsets.items():
-        all_tables = {**given, **tables._asdict(), "driving": signals[name]}
+        all_tables = {**given, **tables._asdict(), "driving": signals[OFFSETS[name].signal]}
         work.dispatch("optimizer.step_offset", triangles, all_tables, **offset_constants(name))
 
 
 def offset_constants(name: str) -> dict[str, float]:
     """The constants of `step_offset` for a driven offset."""
-    return {"SIGNALS": OFFSETS[name].signals, "RATE_SHARE": OFFSETS[name].rate_share}
+    offset = OFFSETS[name]
+    by_splat = {"TARGET": SH, "PER_UNIT": 1 / SH_C0} if offset.target == COLOR else {"TARGET": XYZ}
+    return by_splat | {"RATE": RATES.index(offset.rate), "RATE_SHARE": offset.rate_share}
 
 
 def compile_kernels(device: Device) -> None:
@@ -176,8 +178,5 @@ def compile_kernels(device: Device) -> None:
     for constants in (*sort_passes(DEPTH_BITS, False), *sort_passes(MAX_TILE_BITS, True)):
         for entry in ("count", "place", "scatter"):
             device.kernel(f"sort.{entry}", **constants)
-    for name, signal in SIGNALS.items():
-        for kernel in signal.kernels:
-            device.kernel(kernel)
-        device.kernel("frames.shift", SIGNALS=OFFSETS[name].signals)
+    for name in OFFSETS:
         device.kernel("optimizer.step_offset", **offset_constants(name))

@@ -20,14 +20,17 @@ var<storage> steps: array<u32>; // (F,) of its triangles
 // (F + 1 + N): where each triangle's splats begin in this array, then those splats.
 var<storage> splats_of: array<u32>;
 
-override RATE_SHARE: f32 = 1.0; // its learning rate, as a share of that of the splats' positions
+// Of a driven offset: where the splats' gradient that trains it begins in a row, by how much of it, and its learning rate.
+override TARGET: u32 = 0u;
+override PER_UNIT: f32 = 1.0;
+override RATE: u32 = 0u;
+override RATE_SHARE: f32 = 1.0;
 
-const REST_RATE: u32 = 6u; // of the harmonics above the constant one
+const REST_RATE: u32 = 5u; // of the harmonics above the constant one
 
 // Number of the parameter that a column of a row belongs to: in the order of `cpu.layout.Parameters`.
 fn field_of(column: u32) -> u32 {
-  return u32(column >= ROTATION) + u32(column >= LOG_SCALE) + u32(column >= OPACITY_LOGIT) + u32(column >= SH)
-    + u32(column >= SH + 3u * view.coefficients);
+  return u32(column >= ROTATION) + u32(column >= LOG_SCALE) + u32(column >= OPACITY_LOGIT) + u32(column >= SH);
 }
 
 // For the given step of a row: what corrects the first and the second moment's bias, and its share in the average.
@@ -202,7 +205,7 @@ fn adam(thread: Thread) {
     return;
   }
   let correct = bitcast<vec3f>(corrections[i].xyz);
-  let is_rest = column >= SH + 3u && column < SH + 3u * view.coefficients;
+  let is_rest = column >= SH + 3u;
   let rate = select(field, REST_RATE, is_rest);
   let value = splats[n] - adam_step(n, gradients[n], step.rates[rate / 4u][rate % 4u], correct);
   splats[n] = value;
@@ -217,13 +220,13 @@ fn step_offset(thread: Thread) {
   if f >= step.triangles {
     return;
   }
-  var moved = vec3f(0.0); // a triangle moves all its splats alike, so its gradient is their sum
+  var total = vec3f(0.0); // a triangle changes all its splats alike, so its gradient is their sum
   var is_wanted = false;
   for (var n = splats_of[f]; n < splats_of[f + 1u]; n++) {
     let i = splats_of[n];
     if wanted[i] != 0u {
-      let at = i * splat_stride() + XYZ;
-      moved += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
+      let at = i * splat_stride() + TARGET;
+      total += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
       is_wanted = true;
     }
   }
@@ -231,18 +234,20 @@ fn step_offset(thread: Thread) {
     return;
   }
   steps[f] += 1u;
-  var broken = !(is_finite(moved.x) && is_finite(moved.y) && is_finite(moved.z));
-  for (var c = 0u; c < 3u * SIGNALS; c++) {
-    broken = broken || is_too_large(driving[f * SIGNALS + c / 3u] * moved[c % 3u]);
+  total *= PER_UNIT;
+  var broken = !(is_finite(total.x) && is_finite(total.y) && is_finite(total.z));
+  for (var c = 0u; c < 9u; c++) {
+    broken = broken || is_too_large(driving[3u * f + c / 3u] * total[c % 3u]);
   }
   if broken {
     return;
   }
   let correct = corrections_at(steps[f]);
-  for (var c = 0u; c < 3u * SIGNALS; c++) {
-    let n = 3u * SIGNALS * f + c;
-    let gradient = driving[f * SIGNALS + c / 3u] * moved[c % 3u];
-    let stepped = coefficients[n] - adam_step(n, gradient, RATE_SHARE * step.rates[0].x, correct);
+  let rate = RATE_SHARE * step.rates[RATE / 4u][RATE % 4u];
+  for (var c = 0u; c < 9u; c++) {
+    let n = 9u * f + c;
+    let gradient = driving[3u * f + c / 3u] * total[c % 3u];
+    let stepped = coefficients[n] - adam_step(n, gradient, rate, correct);
     coefficients[n] = stepped;
     average[n] += correct.z * (stepped - average[n]);
   }

@@ -33,7 +33,7 @@ fn frame_vec3(at: u32) -> vec3f {
 }
 
 fn read_frame(triangle: u32) -> Frame {
-  let at = triangle * frame_stride();
+  let at = triangle * FRAME_STRIDE;
   return Frame(
     frame_vec3(at + FRAME_ORIGIN),
     frame_vec3(at + FRAME_MATRIX),
@@ -222,15 +222,12 @@ fn project(i: u32) -> vec4i {
 
 fn color_of(at: u32, triangle: u32, direction: vec3f) -> vec3f {
   var b = harmonics(direction);
-  var color = vec3f(0.5);
+  let by_face = triangle * FRAME_STRIDE + FRAME_COLOR;
+  var color = 0.5 + vec3f(frames[by_face], frames[by_face + 1u], frames[by_face + 2u]);
   for (var k = 0u; k < MAX_COEFFICIENTS; k++) {
     if k < used_coefficients() {
       color += b[k] * splat_vec3(at + SH + 3u * k);
     }
-  }
-  let by_strain = at + SH + 3u * view.coefficients;
-  for (var k = 0u; k < view.strains; k++) {
-    color += frames[triangle * frame_stride() + FRAME_STRAIN + k] * splat_vec3(by_strain + 3u * k);
   }
   return color;
 }
@@ -294,7 +291,7 @@ fn backward(thread: Thread) {
     let color = vec3f(projected[p + RED], projected[p + GREEN], projected[p + BLUE]);
     v_color = select(vec3f(0.0), v_color, color > vec3f(0.0));
   }
-  v_position += write_color(at, face[i], s.position, v_color);
+  v_position += write_color(at, s.position, v_color);
   write_vec3(at + XYZ, frame.row_x * v_position.x + frame.row_y * v_position.y + frame.row_z * v_position.z);
 }
 
@@ -337,8 +334,8 @@ fn write_rotation(at: u32, s: CameraSplat, by_turn: mat3x3f) {
   write_vec3(at + ROTATION + 1u, along.yzw);
 }
 
-// Write the gradients of harmonics and strain colors; returns what the color's direction adds to the position's.
-fn write_color(at: u32, triangle: u32, position: vec3f, v_color: vec3f) -> vec3f {
+// Write the gradients of harmonics; returns what the color's direction adds to the position's.
+fn write_color(at: u32, position: vec3f, v_color: vec3f) -> vec3f {
   let away = 1.0 / length(position);
   let direction = to_world() * (position * away);
   var b = harmonics(direction);
@@ -351,14 +348,6 @@ fn write_color(at: u32, triangle: u32, position: vec3f, v_color: vec3f) -> vec3f
     } else if k < view.coefficients {
       write_vec3(column, vec3f(0.0));
     }
-  }
-  let by_strain = at + SH + 3u * view.coefficients;
-  for (var k = 0u; k < view.strain_colors; k++) {
-    var strain = 0.0;
-    if k < view.strains {
-      strain = frames[triangle * frame_stride() + FRAME_STRAIN + k];
-    }
-    write_vec3(by_strain + 3u * k, strain * v_color);
   }
   let by_direction = harmonics_gradient(direction, weights);
   return ((by_direction - dot(by_direction, direction) * direction) * away) * to_world();

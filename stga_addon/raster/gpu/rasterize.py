@@ -29,32 +29,30 @@ class SplatTable:
     """N splats on the device.
 
     rows, face  tables of `layout.py`: (N, stride) and the triangle (N,) of each
-    count, coefficients, strain_colors  N, K and S
+    count, coefficients  N and K
     """
 
     rows: Any
     face: Any
     count: int
     coefficients: int
-    strain_colors: int
 
     @property
     def stride(self) -> int:
         """Words per row."""
-        return layout.SH + 3 * (self.coefficients + self.strain_colors)
+        return layout.SH + 3 * self.coefficients
 
 
 @dataclass(frozen=True)
 class ViewOptions:
     """What a rendering depends on beside splats and frames; see `cpu.rasterize.render_forward`.
 
-    strains: columns of strain in the table of frames; focused: whether there is a focus.
+    focused: whether there is a focus.
     """
 
     camera: Camera
     degree: int
     background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
-    strains: int = 0
     depth_as_color: bool = False
     antialiased: bool = False
     focused: bool = False
@@ -171,11 +169,9 @@ class Rasterizer:
             background=(*options.background, 0), fl_x=camera.fl_x, fl_y=camera.fl_y, cx=camera.cx,
             cy=camera.cy, width=camera.width, height=camera.height, tiles_x=columns, tiles_y=rows,
             splats=splats.count, coefficients=splats.coefficients,
-            strain_colors=splats.strain_colors, degree=options.degree,
-            strains=min(options.strains, splats.strain_colors), frame_strains=options.strains,
-            depth_as_color=options.depth_as_color, antialiased=options.antialiased,
-            focused=options.focused, ring=-(-options.reach // TILE), capacity=self.capacity,
-            first=first,
+            degree=options.degree, depth_as_color=options.depth_as_color,
+            antialiased=options.antialiased, focused=options.focused,
+            ring=-(-options.reach // TILE), capacity=self.capacity, first=first,
         )  # fmt: skip
 
 
@@ -185,18 +181,21 @@ def upload_splats(
     """Numpy arrays of splats as a table on the device; layer: part of its name where there are
     several."""
     rows = layout.splat_rows(splats)
-    strain_colors = 0 if splats.strain_color is None else splats.strain_color.shape[1]
     table = device.upload(f"splats{layer}", rows)
     faces = device.upload(f"face{layer}", face.astype(np.uint32))
-    return SplatTable(table, faces, len(rows), splats.sh.shape[1], strain_colors)
+    return SplatTable(table, faces, len(rows), splats.sh.shape[1])
 
 
 def upload_frames(device: Device, frames: CameraFrames, layer: str = "") -> Any:
     """Frames in camera space, computed on the CPU, as a table on the device; layer: as in
     `upload_splats`."""
     count = len(frames.origin)
-    parts = (frames.origin, frames.matrix.reshape(count, 9), frames.strain)
-    return device.upload(f"frames{layer}", np.concatenate(parts, axis=1, dtype=np.float32))
+    rows = np.zeros((count, layout.FRAME_STRIDE), np.float32)
+    rows[:, : layout.FRAME_MATRIX] = frames.origin
+    rows[:, layout.FRAME_MATRIX : layout.FRAME_COLOR] = frames.matrix.reshape(count, 9)
+    if frames.color.shape[1]:
+        rows[:, layout.FRAME_COLOR :] = frames.color
+    return device.upload(f"frames{layer}", rows)
 
 
 def counts_buffer(device: Device) -> Any:

@@ -52,7 +52,6 @@ def try_device(device: Device) -> Trial:
         random.normal(size=(count, 3)) * 0.4 - 4.5,
         random.normal(size=count),
         random.normal(size=(count, (DEGREE + 1) ** 2, 3)) * 0.4,
-        np.zeros((count, 0, 3)),
     )
     splats = Parameters(*(value.astype(np.float32) for value in values))
     camera = Camera(size, size, 1.25 * size, 1.25 * size, middle, middle, np.eye(4))

@@ -1,13 +1,15 @@
-"""Node groups that compute triangles' frames and strain on the head, and place splats by them."""
+"""Node groups that compute triangles' frames on the head and what drives their splats, and place
+splats by them."""
 
 from collections.abc import Callable, Iterable
 from functools import cache, partial, reduce
-from typing import Any, NamedTuple
+from typing import Any
 
 import bpy
 
 from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
-from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, STRAIN_GAIN
+from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.strain import AVERAGING_ROUNDS, MIN_SQUARED_NORMAL, STRAIN_COMPONENTS, STRAIN_GAIN
 from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
 
@@ -117,9 +119,10 @@ PLACED[None] = _meshes("Place Splats (world)", partial(_placed_splats, None), "S
 """Splats (and the mesh with frames) -> splats in object space; None: in world space."""
 
 
-SMOOTHED_STRAIN = "stga_smoothed_strain"  # vector on the faces of the mesh from SMOOTHED
 # Temporary attributes on the faces of the deformed neutral mesh.
-_GRAM_CHANGE, _STRAIN = "stga_gram_change", "stga_strain"
+_GRAM_CHANGE = "stga_gram_change"
+_SIGNAL = "stga_signal_{}"  # by name
+FACE_COLOR = "stga_face_color"  # sRGB, added to the colors of a triangle's splats
 
 
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
@@ -146,8 +149,8 @@ def _weighted(nodes: Nodes, names: Iterable[str], factors: Iterable[Any]) -> Any
     return nodes.sum(*(nodes.scale(v, by) for v, by in zip(vectors, factors, strict=True)))
 
 
-def _strained(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh from `_deformed` with triangles' strain (`avatar.strain.face_strain`) stored."""
+def _strain_from_rest(nodes: Nodes) -> Any:
+    """`avatar.strain.strain_from_rest` of the mesh from DEFORMED."""
     # Faces to points and back: the mean over the triangles that touch a triangle.
     tensors = [nodes.attribute(half) for half in stored.TENSOR_HALVES]
     means = [nodes.at_points(tensor, "FLOAT_VECTOR") for tensor in tensors]
@@ -158,63 +161,69 @@ def _strained(nodes: Nodes, mesh: Any) -> Any:
             plane = nodes.attribute(stored.PLANE.format(index, half))
             products.append(nodes.vector("DOT_PRODUCT", mean, plane))
         strains.append(nodes.math("MULTIPLY", nodes.math("ADD", *products), STRAIN_GAIN))
-    strain = _in_range(nodes, nodes.combine(*strains))
-    return nodes.store(mesh, _STRAIN, strain, "FLOAT_VECTOR", "FACE")
+    strain = _in_range(nodes, nodes.combine(*strains), stored.STRAIN_RANGE)
+    return nodes.vector("SUBTRACT", strain, _in_range(nodes, (0, 0, 0), stored.STRAIN_RANGE))
 
 
-def _sampled_strain(nodes: Nodes, mesh: Any) -> Any:
-    """Strain of each splat's triangle as a vector; mesh: from `_strained`."""
-    strain, face = nodes.attribute(_STRAIN), nodes.attribute(stored.FACE, "INT")
-    return nodes.sample(mesh, strain, face, "FLOAT_VECTOR")
+def _with_strain(nodes: Nodes, mesh: Any) -> Any:
+    """The mesh from DEFORMED with that strain stored."""
+    strain = _strain_from_rest(nodes)
+    return nodes.store(mesh, _SIGNAL.format("strain"), strain, "FLOAT_VECTOR", "FACE")
 
 
 def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh with `avatar.strain.smoothed_strain` stored; mesh: from `_strained`."""
-    strain, rest = nodes.attribute(_STRAIN), _in_range(nodes, (0, 0, 0))
-    change = nodes.vector("SUBTRACT", strain, rest)
+    """The mesh from DEFORMED with `avatar.strain.smoothed_strain` stored."""
     # On faces, an iteration is the mean of a face and, by weight 1, those that share an edge.
-    inputs = {"Value": change, "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
+    inputs = {"Value": _strain_from_rest(nodes), "Iterations": AVERAGING_ROUNDS, "Weight": 1.0}
     smoothed = nodes.out("GeometryNodeBlurAttribute", inputs, data_type="FLOAT_VECTOR")
-    return nodes.store(mesh, SMOOTHED_STRAIN, smoothed, "FLOAT_VECTOR", "FACE")
+    return nodes.store(mesh, _SIGNAL.format("smoothed_strain"), smoothed, "FLOAT_VECTOR", "FACE")
 
 
-def _in_range(nodes: Nodes, strain: Any) -> Any:
-    lowest, highest = (nodes.attribute(name) for name in stored.RANGE)
-    return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", strain, highest), lowest)
+def _with_normal_change(nodes: Nodes, mesh: Any) -> Any:
+    """The mesh from DEFORMED with the change of triangles' unit normals in object axes stored."""
+    p0, p1, p2 = nodes.triangle_corners()
+    edges = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    normal, rest = nodes.vector("CROSS_PRODUCT", *edges), nodes.attribute(stored.NEUTRAL_NORMAL)
+    length = nodes.vector("LENGTH", normal)
+    has_area = nodes.compare("GREATER_EQUAL", length, MIN_SQUARED_NORMAL**0.5)
+    unit = nodes.switch("VECTOR", has_area, (0, 0, 0), nodes.vector("NORMALIZE", normal))
+    had_area = nodes.compare("GREATER_THAN", nodes.vector("LENGTH", rest), 0.5)
+    change = nodes.vector("SUBTRACT", unit, rest)
+    change = nodes.switch("VECTOR", had_area, (0, 0, 0), change)
+    change = _in_range(nodes, change, stored.NORMAL_RANGE)
+    return nodes.store(mesh, _SIGNAL.format("normal"), change, "FLOAT_VECTOR", "FACE")
+
+
+def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
+    lowest, highest = (nodes.attribute(name) for name in ends)
+    return nodes.vector("MAXIMUM", nodes.vector("MINIMUM", vector, highest), lowest)
 
 
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
-STRAIN = _meshes("Triangle Strain", _strained, "Deformed")
-SAMPLED_STRAIN = NodeGroup("STGA Sampled Strain", {"Strain": "Geometry"}, "Vector", _sampled_strain)
-SMOOTHED = _meshes("Smoothed Strain", _with_smoothed_strain, "Strain")
-
-
-class SignalNodes(NamedTuple):
-    """Nodes of a driven offset's signal, of three components at most: short label in names of
-    trees, group from the mesh of STRAIN to the same with the signal stored on faces, and the
-    attribute."""
-
-    label: str
-    group: NodeGroup
-    attribute: str
-
-
-SIGNALS = {"strain_position": SignalNodes("position", SMOOTHED, SMOOTHED_STRAIN)}
-"""Driven offset -> its signal; those without are displayed as trained only."""
+SIGNALS = {
+    "strain": _meshes("Strain", _with_strain, "Deformed"),
+    "smoothed_strain": _meshes("Smoothed Strain", _with_smoothed_strain, "Deformed"),
+    "normal": _meshes("Normal Change", _with_normal_change, "Deformed"),
+}
+"""By name, as in `avatar.offsets.SIGNALS`: mesh from DEFORMED -> the same with the signal's three
+components. What follows others is displayed as trained only."""
 
 
 @cache
-def shifted(offset: str, convention: str) -> NodeGroup:
-    """The group that moves frames by an offset: a mesh from STRAIN with FRAMES to the same mesh."""
+def driven(name: str, convention: str) -> NodeGroup:
+    """The group that moves or colors triangles by a driven offset, as
+    `avatar.offsets.moved_frames`: a mesh from FRAMES with the signal to the same mesh."""
 
     def build(nodes: Nodes, mesh: Any) -> Any:
-        mesh = nodes.group(SIGNALS[offset].group, mesh)
-        signal = nodes.components(nodes.attribute(SIGNALS[offset].attribute))
-        names = [stored.DRIVEN_OFFSET.format(offset, index) for index in range(len(signal))]
-        # In the frames' own axes and unit (`avatar.offsets.moved_frames`).
-        local = _weighted(nodes, names, signal)
-        moved, _, _ = _in_space(nodes, nodes.attribute, local, convention)
-        origin = nodes.vector("ADD", nodes.attribute(_FRAME_ORIGIN), moved)
-        return nodes.store(mesh, _FRAME_ORIGIN, origin, "FLOAT_VECTOR", "FACE")
+        offset = OFFSETS[name]
+        signal = nodes.components(nodes.attribute(_SIGNAL.format(offset.signal)))
+        names = [stored.DRIVEN_OFFSET.format(name, index) for index in range(len(signal))]
+        target, change = FACE_COLOR, _weighted(nodes, names, signal)
+        if offset.target != COLOR:
+            target = _FRAME_ORIGIN
+            change, _, _ = _in_space(nodes, nodes.attribute, change, convention)
+        # A color that is not there yet counts as 0.
+        total = nodes.vector("ADD", nodes.attribute(target), change)
+        return nodes.store(mesh, target, total, "FLOAT_VECTOR", "FACE")
 
-    return _meshes(f"Driven Offset ({SIGNALS[offset].label}, {convention})", build, "Frames")
+    return _meshes(f"Driven Offset ({name}, {convention})", build, "Frames")

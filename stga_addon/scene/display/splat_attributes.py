@@ -26,7 +26,6 @@ OPACITY = "stga_opacity"  # 0 to 1
 COLOR = "stga_color"  # constant part, scene-linear
 RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame: where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
-STRAIN_COLOR = "stga_strain_color_{}"
 FACE = "stga_face"
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
@@ -37,7 +36,10 @@ WORLD_ROTATION, WORLD_SCALE = "rotation", "scale"
 # and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
 GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
-RANGE = ("stga_strain_lowest", "stga_strain_highest")
+NEUTRAL_NORMAL = "stga_neutral_normal"
+STRAIN_RANGE = "stga_strain_lowest", "stga_strain_highest"
+NORMAL_RANGE = "stga_normal_lowest", "stga_normal_highest"
+_RANGE = tuple(name for ends in zip(STRAIN_RANGE, NORMAL_RANGE, strict=True) for name in ends)
 DRIVEN_OFFSET = "stga_{}_{}"  # by name and component of the signal, as in `Avatar.driven_offsets`
 
 Attributes = dict[str, tuple[str, str, np.ndarray]]
@@ -59,21 +61,21 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     splats = splat_attributes(avatar.splats)
     splats[FACE] = "INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)
     splats[NEUTRAL_AREA] = _number(areas[avatar.splats.face])
-    neutral: Attributes = {}  # what nodes need to have splats follow strain
+    neutral: Attributes = {}  # what nodes need to have splats follow the deformation
     if avatar.follows_strain:
         basis = strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)
-        neutral[GRAM] = _vector(basis.gram)
-        for name, ends in zip(RANGE, basis.range.transpose(1, 0, 2), strict=True):
-            neutral[name] = _vector(ends)
+        neutral[GRAM], neutral[NEUTRAL_NORMAL] = _vector(basis.gram), _vector(basis.normal.T)
+        neutral[NEUTRAL_AREA] = _number(areas)
+        ends = basis.range.reshape(-1, 4, 3).swapaxes(0, 1)
+        neutral |= {name: _vector(end) for name, end in zip(_RANGE, ends, strict=True)}
         for name, tensors in ((TENSOR, basis.to_tensor), (PLANE, basis.to_plane)):
             for index in range(STRAIN_COMPONENTS):
                 for start, half in zip((0, 3), TENSOR_HALVES, strict=True):
                     vector = tensors[:, index, start : start + 3]
                     neutral[name.format(index, half)] = _vector(vector)
         for offset, coefficients in avatar.driven_offsets.items():
-            for index in range(coefficients.shape[1]):
-                neutral[DRIVEN_OFFSET.format(offset, index)] = _vector(coefficients[:, index])
-            neutral[NEUTRAL_AREA] = _number(areas)
+            for index, name in enumerate(_offset_names(offset)):
+                neutral[name] = _vector(coefficients[:, index])
     return SplatAttributes(splats, neutral, avatar.light)
 
 
@@ -96,9 +98,8 @@ def splat_attributes(splats: Splats) -> Attributes:
         OPACITY: _number(1 / (1 + np.exp(-splats.opacity.astype(np.float64)))),
         COLOR: ("FLOAT_COLOR", "color", flat_floats(with_alpha(linear))),
     }
-    for name, coefficients in ((SH, splats.sh), (STRAIN_COLOR, splats.strain_color)):
-        for index in range(coefficients.shape[1]):
-            attributes[name.format(index)] = _vector(coefficients[:, index])
+    for index in range(splats.sh.shape[1]):
+        attributes[SH.format(index)] = _vector(splats.sh[:, index])
     return attributes
 
 
@@ -128,14 +129,9 @@ def write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
 
 def read_splats(mesh: Any) -> Splats:
     """The splats in a splat object's mesh, with unit rotations, all bound to their triangles."""
-    count = len(mesh.vertices)
-
-    def coefficients(name: str) -> np.ndarray:
-        found = [np.zeros((count, 0, 3), np.float32)]
-        while (each := name.format(len(found) - 1)) in mesh.attributes:
-            found.append(read_attribute(mesh, each)[:, None])
-        return np.concatenate(found, 1)
-
+    count, sh = len(mesh.vertices), list[np.ndarray]()
+    while (name := SH.format(len(sh))) in mesh.attributes:
+        sh.append(read_attribute(mesh, name))
     opacity = read_attribute(mesh, OPACITY).astype(np.float64)
     face = FACE in mesh.attributes
     # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
@@ -145,21 +141,26 @@ def read_splats(mesh: Any) -> Splats:
             rotation=read_attribute(mesh, ROTATION),
             log_scale=np.log(read_attribute(mesh, SCALE).astype(np.float64)).astype(np.float32),
             opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
-            sh=coefficients(SH),
+            sh=np.stack(sh, 1),
             face=read_attribute(mesh, FACE) if face else np.zeros(count, np.int32),
             unbound=np.zeros(count, bool),
-            strain_color=coefficients(STRAIN_COLOR),
         )
 
 
 def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     """`Avatar.driven_offsets` as stored in a neutral mesh."""
-    found = {}
-    for name, offset in OFFSETS.items():
-        stored = [DRIVEN_OFFSET.format(name, index) for index in range(offset.signals)]
-        if (coefficients := read_vectors(neutral, stored)) is not None:
-            found[name] = coefficients
-    return found
+    stored = {name: read_vectors(neutral, _offset_names(name)) for name in OFFSETS}
+    return {name: found for name, found in stored.items() if found is not None}
+
+
+def read_strain_range(neutral: Any) -> np.ndarray | None:
+    """`Avatar.strain_range` as stored in a neutral mesh."""
+    ends = read_vectors(neutral, _RANGE)
+    return None if ends is None else ends.reshape(-1, 2, 6)
+
+
+def _offset_names(offset: str) -> list[str]:
+    return [DRIVEN_OFFSET.format(offset, index) for index in range(STRAIN_COMPONENTS)]
 
 
 def read_attribute(mesh: Any, name: str) -> np.ndarray:

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import bpy
 
+from ...avatar.offsets import COLOR, OFFSETS
 from ...avatar.splats import SH_C0, harmonics
 from ...capture.meshes import SELECTED_WEIGHT
 from .. import tags
 from ..compat import NATIVE_SPLATS, native_splats
 from ..layers import FROZEN_COLOR
 from . import splat_attributes as stored
-from .frame_nodes import DEFORMED, FRAMES, PLACED, SAMPLED_STRAIN, SIGNALS, STRAIN, shifted
+from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, SIGNALS, driven
 from .node_builder import NodeGroup, Nodes, find_tree, new_material, new_socket, new_tree
 
 # Inputs of the modifier, by their displayed names.
@@ -28,14 +29,11 @@ SHOW_SELECTION = "Show Selection"
 SELECTED_ONLY = "Selected Only"
 
 
-def constant_color(nodes: Nodes, strain: Any) -> Any:
-    """The part of each splat's sRGB color, not clamped, that does not depend on the view. strain:
-    vector from SAMPLED_STRAIN, None where colors do not follow it."""
-    terms = [nodes.scale(nodes.attribute(stored.SH.format(0)), SH_C0), (0.5, 0.5, 0.5)]
-    for index, factor in enumerate(() if strain is None else nodes.components(strain)):
-        color = nodes.attribute(stored.STRAIN_COLOR.format(index))
-        terms.append(nodes.scale(color, factor))
-    return nodes.sum(*terms)
+def constant_color(nodes: Nodes, added: Any) -> Any:
+    """The part of each splat's sRGB color, not clamped, that does not depend on the view. added:
+    the color of its triangle, None where nothing drives colors."""
+    color = nodes.scale(nodes.attribute(stored.SH.format(0)), SH_C0)
+    return nodes.sum(color, (0.5, 0.5, 0.5), *(() if added is None else (added,)))
 
 
 def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
@@ -288,19 +286,28 @@ _FROZEN = "stga_frozen"
 
 class TreeOptions(NamedTuple):
     """What a node tree depends on: the embedding's convention (None: world space), degree of
-    harmonics, whether colors follow strain, and the driven offsets, of SIGNALS, in its order."""
+    harmonics, and the driven offsets, names of OFFSETS in its order."""
 
     convention: str | None
     degree: int = 0
-    strain_color: bool = False
     offsets: tuple[str, ...] = ()
 
     @property
+    def signals(self) -> list[str]:
+        """What drives the offsets, each once."""
+        return list(dict.fromkeys(OFFSETS[name].signal for name in self.offsets))
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether an offset drives colors."""
+        return any(OFFSETS[name].target == COLOR for name in self.offsets)
+
+    @property
     def tree_name(self) -> str:
-        """At most 59 characters: Blender before 5.0 has room for 63, and may add ".001"."""
+        """At most 59 characters: Blender before 5.0 has room for 63, and may add ".001". Of
+        offsets, the words' initials."""
         parts = [self.convention or "world", f"SH {self.degree}"]
-        parts += ["color"] if self.strain_color else []
-        parts += [SIGNALS[name].label for name in self.offsets]
+        parts += ["".join(word[0] for word in name.split("_")) for name in self.offsets]
         return f"STGA Splats ({', '.join(parts)})"
 
 
@@ -320,18 +327,15 @@ def build_next_node_group(options: TreeOptions) -> bool:
     timer, it keeps the UI responsive."""
     if find_tree(options.tree_name) is not None:
         return False
-    convention, degree, strain_color, offsets = options
+    convention, degree, offsets = options
     # What `_build` uses, each after those that it uses itself.
     groups = [PLACED[convention], _RELIT, *MODES.values(), *SH_BANDS[:degree]]
     if convention is not None:
         groups += [FRAMES[convention], _FROZEN_SPLATS]
-    if strain_color or offsets:
-        groups += [DEFORMED, STRAIN]
-    if strain_color:
-        groups.append(SAMPLED_STRAIN)
-    for name in offsets if convention is not None else ():
-        groups += [SIGNALS[name].group, shifted(name, convention)]
-    if degree > 0 or strain_color:
+        groups += [DEFORMED] if offsets else []
+        groups += [SIGNALS[name] for name in options.signals]
+        groups += [driven(name, convention) for name in offsets]
+    if degree > 0 or options.is_colored:
         groups.append(SRGB_TO_LINEAR)
     groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else []
     missing = next((group for group in groups if find_tree(f".{group.name}") is None), None)
@@ -376,22 +380,25 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
     visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
-    strain, gray = None, False
+    added, gray = None, False
     if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)
     else:
-        head, strained = nodes.object_info(inputs[HEAD]).outputs["Geometry"], None
-        if options.strain_color or options.offsets:
-            # The neutral mesh, deformed as the head is, with strain on its triangles.
+        head = mesh = nodes.object_info(inputs[HEAD]).outputs["Geometry"]
+        if options.offsets:  # the neutral mesh, deformed as the head is
             neutral = nodes.object_info(inputs[NEUTRAL], "ORIGINAL").outputs["Geometry"]
-            strained = nodes.group(STRAIN, nodes.group(DEFORMED, head, neutral))
-        frames = nodes.group(FRAMES[options.convention], strained if options.offsets else head)
+            mesh = nodes.group(DEFORMED, head, neutral)
+        for name in options.signals:
+            mesh = nodes.group(SIGNALS[name], mesh)
+        mesh = nodes.group(FRAMES[options.convention], mesh)
         for name in options.offsets:
-            frames = nodes.group(shifted(name, options.convention), frames)
-        splats = nodes.group(PLACED[options.convention], splats, frames)
-        strain = nodes.group(SAMPLED_STRAIN, strained) if options.strain_color else None
-        color = _color(nodes, inputs, strain, options.degree)
+            mesh = nodes.group(driven(name, options.convention), mesh)
+        splats = nodes.group(PLACED[options.convention], splats, mesh)
+        if options.is_colored:
+            face = nodes.attribute(stored.FACE, "INT")
+            added = nodes.sample(mesh, nodes.attribute(FACE_COLOR), face, "FLOAT_VECTOR")
+        color = _color(nodes, inputs, added, options.degree)
         splats = nodes.store(splats, _FROZEN, nodes.group(_FROZEN_SPLATS, head), "BOOLEAN")
         frozen = nodes.attribute(_FROZEN, "BOOLEAN")
         gray = nodes.logic("AND", frozen, inputs[SHOW_SELECTION])
@@ -401,7 +408,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     native = None
     if NATIVE_SPLATS:
         view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
-        fields = inputs[SIZE], constant_color(nodes, strain), view_dependent, gray
+        fields = inputs[SIZE], constant_color(nodes, added), view_dependent, gray
         native = nodes.group(NATIVE_GROUPS[options.degree], splats, visible, *fields)
     shown = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
     nodes.finish("NodeGroupOutput", {"Geometry": shown})
@@ -409,13 +416,13 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     display.default_value = AS_TRAINED  # the menu has items only once it is linked
 
 
-def _color(nodes: Nodes, inputs: Any, strain: Any, degree: int) -> Any:
-    """Scene-linear color of each splat; strain: a vector field, None where unused."""
+def _color(nodes: Nodes, inputs: Any, added: Any, degree: int) -> Any:
+    """Scene-linear color of each splat; added: as of `constant_color`."""
     color = nodes.attribute(stored.COLOR, "FLOAT_COLOR")
-    if strain is None and degree == 0:
+    if added is None and degree == 0:
         return color
-    srgb = constant_color(nodes, strain)
-    if strain is not None:
+    srgb = constant_color(nodes, added)
+    if added is not None:
         color = nodes.group(SRGB_TO_LINEAR, srgb)
     if degree == 0:
         return color

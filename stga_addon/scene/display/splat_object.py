@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 
 from ...avatar.file import Avatar, AvatarLight
+from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
@@ -78,7 +79,7 @@ def show_world_splats(splats: Splats, name: str) -> Any:
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
-    """Whether the avatar differs from this object's in splats and strain only."""
+    """Whether the avatar differs from this object's only in splats and how they follow the mesh."""
     if _stored_neutral(splat_object) is None:
         return False
     kind = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
@@ -204,7 +205,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         neutral=mesh_vertices(neutral),
         faces=mesh_triangles(neutral),
         antialiased=bool(splat_object[tags.ANTIALIASED]),
-        strain_range=stored.read_vectors(neutral, stored.RANGE),
+        strain_range=stored.read_strain_range(neutral),
         driven_offsets=stored.read_driven_offsets(neutral),
         light=stored.read_light(neutral),
     )
@@ -243,6 +244,6 @@ def _splat_object(name: str, collection: Any, options: splat_nodes.TreeOptions) 
 
 
 def _tree_options(avatar: Avatar) -> splat_nodes.TreeOptions:
-    degree, strain = avatar.splats.sh_degree, avatar.splats.strain_color.shape[1] > 0
-    offsets = tuple(name for name in SIGNALS if name in avatar.driven_offsets)
-    return splat_nodes.TreeOptions(avatar.convention, degree, strain, offsets)
+    shown = [name for name, offset in OFFSETS.items() if offset.signal in SIGNALS]
+    offsets = tuple(name for name in shown if name in avatar.driven_offsets)
+    return splat_nodes.TreeOptions(avatar.convention, avatar.splats.sh_degree, offsets)

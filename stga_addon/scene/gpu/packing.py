@@ -61,12 +61,11 @@ class StaticSplats:
             with np.errstate(over="ignore"):
                 axes[rows, 0, 3] = splats.opacities()
             axes[rows, 1, 3], axes[rows, 2, 3] = random_percentage(len(splats)), index
-            coefficients = np.concatenate([splats.sh, splats.strain_color], axis=1)
-            colors.append(np.pad(coefficients, ((0, 0), (0, 0), (0, 1))).reshape(-1, 4))
-            self.rows[index] = first_color, begin, coefficients.shape[1], splats.sh_degree
+            colors.append(np.pad(splats.sh, ((0, 0), (0, 0), (0, 1))).reshape(-1, 4))
+            self.rows[index] = first_color, begin, splats.sh.shape[1], splats.sh_degree
             begin, first_face = rows.stop, first_face + len(layer.frames.origin)
             first_color += len(colors[-1])
-        if max(first_color, 3 * count, 4 * first_face) > MAX_INDEX:
+        if max(first_color, 3 * count, 5 * first_face) > MAX_INDEX:
             raise StgaError(f"{count} splats are too many to display as trained; choose Points")
         centers[:, 3] = self.face
         self.positions = np.ascontiguousarray(centers[:, :3].T)
@@ -90,9 +89,10 @@ def frame_block(frames: FaceFrames) -> np.ndarray:
 
 
 class PosedFrames(NamedTuple):
-    """The triangles of all layers as a camera sees them. texels (4, F, 4) float32: three rows of
-    the map to camera space, then strain and whether frozen. depth_rows (4, F) float32: the third
-    row, less `base` meters, which far away would round differences off."""
+    """The triangles of all layers as a camera sees them. texels (5, F, 4) float32: three rows of
+    the map to camera space, color and whether frozen, `Relit.face_color`; the last only where there
+    is any. depth_rows (4, F) float32: the third row, less `base` meters, which far away would round
+    differences off."""
 
     texels: np.ndarray
     depth_rows: np.ndarray
@@ -104,7 +104,9 @@ def posed_frames(
 ) -> PosedFrames:
     """Compose `frame_block` of each layer with its object and the camera, in float64."""
     count = sum(len(layer.frames.origin) for layer in layers)
-    texels, depth_rows = np.zeros((4, count, 4), np.float32), np.empty((4, count), np.float32)
+    is_relit = any(layer.relit is not None for layer in layers)
+    texels = np.zeros((5 if is_relit else 4, count, 4), np.float32)
+    depth_rows = np.empty((4, count), np.float32)
     begin, base = 0, 0.0
     for layer, block in zip(layers, blocks, strict=True):
         to_camera = view.camera.world_to_camera @ layer.to_world
@@ -115,7 +117,9 @@ def posed_frames(
         base = base if begin else float(part[2, 0, 3])
         part[2, :, 3] -= base
         depth_rows[:, rows] = part[2].T
-        texels[3, rows, : layer.frames.strain.shape[1]] = layer.frames.strain
+        texels[3, rows, : layer.frames.color.shape[1]] = layer.frames.color
+        if layer.relit is not None:
+            texels[4, rows, : layer.relit.face_color.shape[1]] = layer.relit.face_color
         texels[3, rows, 3] = 0 if layer.frozen is None else layer.frozen
         begin = rows.stop
     return PosedFrames(texels, depth_rows, base)
@@ -167,8 +171,7 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
     for layer, first, row in zip(layers, static.rows, rows, strict=True):
         settings = layer.settings
         row[0] = first if settings.view_dependent else (*first[:3], 0)
-        strained = bool(layer.frames.strain.shape[1] and layer.splats.strain_color.shape[1])
-        row[1] = layer.antialiased, strained, settings.size, settings.opacity_threshold
+        row[1] = layer.antialiased, 0, settings.size, settings.opacity_threshold
         # From directions in camera space to those of training: without scale and reflection.
         u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
         row[2:5, :3] = (u @ v).T

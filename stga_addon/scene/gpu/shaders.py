@@ -6,12 +6,12 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
     centers  per splat: xyz in its triangle's frame, index of the triangle
     axes     per splat: three axes times standard deviations; beside them opacity, random
              percentage, layer
-    colors   per splat: spherical harmonics, then strain colors
+    colors   per splat: spherical harmonics
     frames   three rows of the triangles' maps to camera space (all triangles' first rows, then
-             second, …), then strain
+             second, …), then color and whether frozen, then color where the scene lights them
     table    the view: focal lengths and principal point; width, height, number of clip planes; 6
              clip planes; per layer: first color, first splat, colors per splat, degree;
-             antialiased, strained, size, opacity threshold; three rows of the matrix to directions,
+             antialiased, 0, size, opacity threshold; three rows of the matrix to directions,
              with percentage, show selection, selected only
 Where the scene lights splats, as `light.relight.Relighter` does:
     surface   per splat: recorded sRGB without what depends on the view, roughness; irradiance of
@@ -99,7 +99,7 @@ float lit_share_of(int map_index, int first, vec3 point, float cosine)
   return lit_share(corner, place, local.z - shadow_bias(cosine, lens.z));
 }
 
-vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
+vec3 relit(int splat, int layer, vec3 recorded, vec3 face_color)
 {
   int row = RELIT_TEXELS * layer;
   vec4 factor = TEXEL(lights, row), settings = TEXEL(lights, row + 1);
@@ -154,7 +154,7 @@ vec3 relit(int splat, int layer, vec3 recorded, vec3 strain_color)
     highlight += light * d.z * ggx(normal, toward, view, wide);
   }
   highlight += sky_highlight(row + 4, normal, normalize(eye.xyz - means[0]), roughness, old.a);
-  color.rgb += strain_color;
+  color.rgb += face_color;
   typical.a = eye.w;
   vec4 kept = TEXEL(lights, row + 13);
   vec3 lit = lit_color(color, old.rgb, arriving, settings.y * highlight, recorded, typical, kept);
@@ -248,9 +248,9 @@ void main()
   int face = int(center.w), row = VIEW_TEXELS + LAYER_TEXELS * int(axis2.w);
   vec4 color_rows = TEXEL(table, row), display = TEXEL(table, row + 1);
   vec4 turn0 = TEXEL(table, row + 2), turn1 = TEXEL(table, row + 3);
-  vec4 turn2 = TEXEL(table, row + 4), strain = TEXEL(frames, 3 * faces + face);
+  vec4 turn2 = TEXEL(table, row + 4), face_color = TEXEL(frames, 3 * faces + face);
   float opacity = axis0.w;
-  bool frozen = strain.w > 0.5;
+  bool frozen = face_color.w > 0.5;
   if (opacity < display.w || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
     return;
   }
@@ -282,17 +282,9 @@ void main()
   vec3 toward = normalize(p);
   vec3 direction = vec3(dot(turn0.xyz, toward), dot(turn1.xyz, toward), dot(turn2.xyz, toward));
   int first = int(color_rows.x) + (splat - int(color_rows.y)) * int(color_rows.z);
-  vec3 color = spherical_harmonics(first, int(color_rows.w), direction);
-  vec3 by_strain = vec3(0.0);
-  if (display.y > 0.5) {
-    int last = first + int(color_rows.z); /* the strain colors are the last three */
-    for (int k = 0; k < 3; k++) {
-      by_strain += strain[k] * TEXEL(colors, last - 3 + k).rgb;
-    }
-    color += by_strain;
-  }
+  vec3 color = face_color.rgb + spherical_harmonics(first, int(color_rows.w), direction);
 #ifdef RELIT
-  color = relit(splat, int(axis2.w), color, by_strain);
+  color = relit(splat, int(axis2.w), color, TEXEL(frames, 4 * faces + face).rgb);
 #endif
   if (!(abs(color.r) + abs(color.g) + abs(color.b) < 1e30)) {
     return;

@@ -6,7 +6,6 @@ from functools import cache, cached_property
 import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
-from ...avatar.strain import STRAIN_GAIN, color_range, rest_strain
 from ...capture.model import Capture, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
@@ -66,20 +65,19 @@ class CaptureFacts:
         drifts = self.drifts.gain >= evidence.MIN_EXPOSURE_LEVELS
         return colors / self.drift[:, None] if drifts else colors
 
-    def strain_dependence(self, is_smoothed: bool) -> dict[str, Evidence]:
-        """Of colors on their triangle's strain, in the range that the other views would train, or
-        smoothed around it, as what moves over the triangle changes them: in "frames" that are left
-        out, as unseen expressions, and in "cameras" that are, as other views of known expressions;
-        a single camera is not left out."""
+    def signal_dependence(self, name: str) -> dict[str, Evidence]:
+        """Of colors on a signal of their triangle, in the range that the other views would train:
+        in "frames" that are left out, as unseen expressions, and in "cameras" that are, as other
+        views of known expressions; a single camera is not left out."""
         samples = self.samples
-        strain, rest = samples.strain, rest_strain(color_range(len(samples.faces)))
-        if is_smoothed:
-            strain, rest = samples.smoothed_strain, np.zeros_like(samples.smoothed_strain[0])
+        signal = samples.signals[name]
         folds = {"frames": evidence.consecutive_folds(samples.timestep)}
         if self.cameras > 1:
             folds["cameras"] = evidence.scattered_folds(samples.camera)
         return {
-            kind: evidence.linear_evidence(self.matched_colors, strain, own, rest=rest)
+            kind: evidence.linear_evidence(
+                self.matched_colors, signal, own, rest=np.zeros_like(signal[0])
+            )
             for kind, own in folds.items()
         }
 
@@ -123,11 +121,10 @@ class CaptureFacts:
         chosen = select_capture(self.sampled, self.settings.selection)
         return float(np.mean([faces.mean() for faces in chosen.values()]))
 
-    @cached_property
-    def strain(self) -> float:
-        """Root mean square change of the triangles' stretch over time, as a share of their size."""
-        strain = self.samples.strain
-        return float(np.sqrt(((strain - strain.mean(0)) ** 2).mean())) / STRAIN_GAIN
+    def signal_change(self, name: str) -> float:
+        """Root mean square change of a signal of the triangles over time."""
+        signal = self.samples.signals[name]
+        return float(np.sqrt(((signal - signal.mean(0)) ** 2).mean()))
 
     @cached_property
     def frames(self) -> list[FlameFrame]:

@@ -30,8 +30,8 @@ deformation: with less, trainings with and without differ by no more than their 
 (docs/experiments.md)."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
-MIN_STRETCH = 1e-6
-"""Share of a triangle's size; less is rounding."""
+MIN_SIGNAL_CHANGE = 1e-5
+"""Of strain or a unit normal; less is rounding."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
 """Of pixels at the head; above it, splats narrower than a pixel look different to each camera."""
 FINE_SPLAT_PIXELS = 4.0
@@ -178,15 +178,15 @@ def selection(facts: CaptureFacts) -> Verdict:
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
-def strain(facts: CaptureFacts, follows: str, what: str, is_smoothed: bool) -> Verdict:
-    """On where what follows brings enough in the mean of frames and cameras that were left out: of
-    what a head shows, unseen expressions and unseen views count alike."""
-    if facts.strain < MIN_STRETCH:
-        return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
+def driven(facts: CaptureFacts, signal: str, what: str) -> Verdict:
+    """On where colors that follow a signal gain enough in the mean of frames and cameras that were
+    left out: of what a head shows, unseen expressions and unseen views count alike."""
+    if facts.signal_change(signal) < MIN_SIGNAL_CHANGE:
+        return Verdict(False, f"{what} is the same in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
-        reason = f"{facts.timesteps} frames are too few to tell how {follows} deformation"
+        reason = f"{facts.timesteps} frames are too few to tell what follows {what}"
         return Verdict(False, reason)
-    left_out = facts.strain_dependence(is_smoothed)
+    left_out = facts.signal_dependence(signal)
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
     figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
     is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
@@ -272,15 +272,14 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     return Verdict(outside > MAX_OUTSIDE_SHARE, reason)
 
 
-_AROUND = "deformation around a triangle"
+_STRAIN = partial(driven, signal="smoothed_strain", what="the deformation around a triangle")
 RULES: dict[str, Rule] = {
     "view-color": view_color, "exposure": exposure, "antialiasing": antialiasing,
     "background": background, "hull-points": hull_points, "depth-limits": depth_limits,
     "density": density, "selection": selection,
-    "strain-color": partial(
-        strain, follows="color follows", what="deformation", is_smoothed=False),
-    "strain-position": partial(
-        strain, follows="positions follow", what=_AROUND, is_smoothed=True),
+    "strain-color": _STRAIN,
+    "normal-color": partial(driven, signal="normal", what="where a triangle faces"),
+    "strain-position": _STRAIN,
     "relight": relight, "world": world, "teeth": teeth, "torso": torso,
     "neck": partial(turning, joints=[1]), "jaw": partial(turning, joints=[2]),
     "eyes": partial(turning, joints=[3, 4]), "dynamic-offsets": dynamic_offsets,

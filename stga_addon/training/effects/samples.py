@@ -7,7 +7,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, uniform_filter
 
-from ...avatar.strain import color_range, face_strain, smoothed_strain, strain_basis
+from ...avatar.embedding import face_frames
+from ...avatar.offsets import SIGNALS
+from ...avatar.strain import strain_basis, trained_range
 from ...capture.images import WHITE_LEVEL, read_view
 from ...capture.model import Capture, View, evenly_spread
 
@@ -36,8 +38,7 @@ class Samples:
     color      (S, K, 3) float32 from 0 to 255, mean around the triangle's center; NaN where it is
                not visible
     direction  (S, K, 3) unit vectors from the camera to the triangle, world axes
-    strain, smoothed_strain  (S, K, 3) of the triangles and around them, as far as colors and
-               positions follow it (`avatar.strain`)
+    signals    name of `avatar.offsets.SIGNALS` -> (S, K, 3), in the range that is trained
     pixels     (S, K) area of the triangle in pixels; NaN where it is not visible
     pixel_width  (S,) meters that a pixel spans at the head; NaN for a head behind the camera
     foreground, uncovered  (S,) pixels inside the mask, and those of them that lie beside the mesh;
@@ -53,8 +54,7 @@ class Samples:
     timestep: np.ndarray
     color: np.ndarray
     direction: np.ndarray
-    strain: np.ndarray
-    smoothed_strain: np.ndarray
+    signals: dict[str, np.ndarray]
     pixels: np.ndarray
     pixel_width: np.ndarray
     foreground: np.ndarray
@@ -91,16 +91,25 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
     rng = np.random.default_rng(seed)
     count = len(capture.faces)
     faces = np.sort(rng.permutation(count)[:MAX_FACES])
-    basis = strain_basis(capture.neutral, capture.faces, color_range(count))
-    strain = {t: face_strain(basis, capture.mesh(t)) for t in {view.timestep for view in views}}
-    smoothed = {t: smoothed_strain(basis, found)[faces] for t, found in strain.items()}
+    neutral, triangles = capture.neutral, capture.faces
+    basis = strain_basis(neutral, triangles, trained_range(count))
+    posed = {
+        timestep: face_frames(capture.mesh(timestep), triangles, neutral, strain=basis)
+        for timestep in {view.timestep for view in views}
+    }
+    signals = {
+        name: {timestep: signal(basis, frames)[faces] for timestep, frames in posed.items()}
+        for name, signal in SIGNALS.items()
+    }
     rows = [_sample_view(capture, view, faces) for view in views]
     return Samples(
         faces,
         np.array([view.camera_index for view in views]),
         np.array([view.timestep for view in views]),
-        strain=np.stack([strain[view.timestep][faces] for view in views]),
-        smoothed_strain=np.stack([smoothed[view.timestep] for view in views]),
+        signals={
+            name: np.stack([by_timestep[view.timestep] for view in views])
+            for name, by_timestep in signals.items()
+        },
         **{name: np.stack([row[name] for row in rows]) for name in rows[0]},
     )
 

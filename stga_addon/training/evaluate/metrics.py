@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion, prewitt, uniform_filter
 
+from ...avatar.embedding import NOTHING
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
@@ -358,8 +359,7 @@ def triangle_residuals(
     )
     # Gray: a color clamped at black would have no gradient. The blending weights do not depend on
     # colors.
-    no_colors = np.zeros_like(splats.sh), np.zeros_like(splats.strain_color)
-    gray = colored._replace(sh=no_colors[0], strain_color=no_colors[1])
+    gray = colored._replace(sh=np.zeros_like(splats.sh))
     gradients = Parameters(*(np.zeros_like(array) for array in colored))
     red, green, blue = (round(255 * level) for level in avatar.background)
     for view in views:
@@ -369,16 +369,17 @@ def triangle_residuals(
         mesh = np.asarray(capture.mesh(view.timestep))
         frames = frames_in_camera(avatar.frames(mesh), scaled.camera)
         render = partial(
-            render_forward, face=splats.face, frames=frames, background=background,
+            render_forward, face=splats.face, background=background,
             antialiased=avatar.antialiased, buffers=buffers,
         )  # fmt: skip
-        image = render(colored, degree=splats.sh_degree).image
+        image = render(colored, frames=frames, degree=splats.sh_degree).image
         shown = target.transpose(2, 0, 1).astype(np.float32) / 255
         difference = np.abs(np.clip(image, 0, 1) - shown).mean(0)
         # The gradient with respect to a color is the sum of blending weights times that with
         # respect to the image.
         v_image = np.stack([difference, np.ones_like(difference), np.zeros_like(difference)])
-        output = render(gray, degree=0)
+        frames = frames._replace(color=NOTHING)
+        output = render(gray, frames=frames, degree=0)
         rows, _ = render_backward(
             output, gray, splats.face, frames, v_image, gradients, buffers=buffers
         )

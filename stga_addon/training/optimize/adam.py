@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ...avatar.offsets import OFFSETS
-from ...avatar.splats import MAX_SH_DEGREE
+from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.splats import MAX_SH_DEGREE, SH_C0
 from ...capture.camera import Camera
+from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
 from ..settings import TrainingSettings
 from .state import OffsetState, TrainState
@@ -52,23 +53,29 @@ def step_offsets(
     states: Mapping[str, OffsetState],
     rows: np.ndarray,
     face: np.ndarray,
-    xyz_gradient: np.ndarray,
+    gradients: Parameters,
     signal: Callable[[str], np.ndarray],
-    position_rate: float,
+    rates: Mapping[str, float],
     options: AdamOptions,
 ) -> None:
-    """Adam step of the triangles face (N,) of the listed splats rows (M,), whose positions have
-    xyz_gradient (N, 3).
+    """Adam step of the triangles face (N,) of the listed splats rows (M,), which have these
+    gradients.
 
-    signal: name of an offset -> (F, S); position_rate: the splats'. A triangle moves all its
-    splats alike, so its gradient is their sum.
+    signal: name of SIGNALS -> (F, 3); rates: the splats'. A triangle changes all its splats alike,
+    so its gradient is their sum.
     """
+    totals: dict[str, np.ndarray] = {}  # by target
     for name, state in states.items():
-        count = len(state.steps)
-        total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
-        sum_by_triangle(rows, face, xyz_gradient, total, trained)
-        gradient = signal(name)[:, :, None] * total[:, None, :]
-        rates = np.full(gradient[0].size, OFFSETS[name].rate_share * position_rate, np.float32)
+        offset, count = OFFSETS[name], len(state.steps)
+        if offset.target not in totals:
+            by_splat, per_unit = gradients.xyz, 1.0
+            if offset.target == COLOR:
+                by_splat, per_unit = np.ascontiguousarray(gradients.sh[:, 0]), 1 / SH_C0
+            total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
+            sum_by_triangle(rows, face, by_splat, total, trained)
+            totals[offset.target] = np.float32(per_unit) * total
+        gradient = signal(offset.signal)[:, :, None] * totals[offset.target][:, None, :]
+        rate = np.full(gradient[0].size, offset.rate_share * rates[offset.rate], np.float32)
         arrays = (state.value, gradient, state.first, state.second, state.average)
-        tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rates])
+        tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rate])
         adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
-from ...avatar.offsets import offset_of
+from ...avatar.offsets import COLOR, OFFSETS, offset_of
 from ...capture.model import View
 from ...raster.cpu import optimizer, rasterize
 from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, change_background, image_loss
@@ -101,8 +101,8 @@ class CpuBackend:
         )
         options = adam.adam_options(settings, batch.view.camera)
         adam.step_offsets(  # before the limits' gradients are added
-            state.driven_offsets, rows, face, gradients.xyz,
-            self._frames.signals(batch.view.timestep), batch.rates["xyz"], options,
+            state.driven_offsets, rows, face, gradients, self._frames.signals(batch.view.timestep),
+            batch.rates, options,
         )  # fmt: skip
         # what keeps splats near what they cover, and unbound ones out of the air
         if settings.scale_weight:
@@ -186,8 +186,9 @@ class CpuBackend:
         store, state, timestep = self._frames, self.state, shots[0][0].timestep
         frames, splats, face = store.of(timestep), state.parameters, state.face
         for name, offset in state.driven_offsets.items():
-            shift = offset_of(offset.value, store.signals(timestep)(name))
-            splats = splats._replace(xyz=splats.xyz + shift[face])
+            if OFFSETS[name].target != COLOR:
+                shift = offset_of(offset.value, store.signals(timestep)(OFFSETS[name].signal))
+                splats = splats._replace(xyz=splats.xyz + shift[face])
         total, by_frame = 0.0, np.zeros((len(frames.scale), 7))
         for (view, image), weight in zip(shots, weights, strict=True):
             rows, _, loss = self._backward(view, image, background, sh_degree, None)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
-from ...avatar.offsets import OFFSETS, moved_frames
-from ...avatar.strain import color_range, strain_basis
+from ...avatar.offsets import SIGNALS, moved_frames
+from ...avatar.strain import strain_basis, trained_range
 from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
@@ -40,10 +40,10 @@ class FrameStore:
         limits: np.ndarray | None = None,
     ) -> None:
         """moved_mesh: (V, 3) of a timestep in place of the capture's, which may change, None where
-        it is the capture's; limits (F, 2, 3): lowest and highest strain that is followed; None:
-        COLOR_RANGE."""
+        it is the capture's; limits (F, 2, 6): lowest and highest deformation that is followed;
+        None: TRAINED_RANGE."""
         self.capture, self.convention, self._moved_mesh = capture, convention, moved_mesh
-        limits = color_range(len(capture.faces)) if limits is None else limits
+        limits = trained_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self.units = np.ones(len(capture.faces), np.float32)
         if convention != "gaussian_avatars":
@@ -68,19 +68,19 @@ class FrameStore:
         return entry.frames
 
     def signals(self, timestep: int) -> Callable[[str], np.ndarray]:
-        """Name of a driven offset -> its signal (F, S); only where there is a `strain` basis."""
+        """Name of SIGNALS -> the signal (F, 3); only where there is a `strain` basis."""
 
         def signal(name: str) -> np.ndarray:
             assert self.strain is not None
             frames, entry = self.of(timestep), self._latest(timestep)
             if name not in entry.signals:
-                entry.signals[name] = OFFSETS[name].signal(self.strain, frames)
+                entry.signals[name] = SIGNALS[name](self.strain, frames)
             return entry.signals[name]
 
         return signal
 
     def moved(self, timestep: int, coefficients: Mapping[str, np.ndarray]) -> FaceFrames:
-        """The timestep's frames, moved by the driven offsets of these coefficients."""
+        """The timestep's frames, moved and colored by the driven offsets of these coefficients."""
         return moved_frames(self.of(timestep), coefficients, self.signals(timestep))
 
     def mesh(self, timestep: int, read: np.ndarray | None = None) -> np.ndarray:
@@ -93,7 +93,7 @@ class FrameStore:
 
     @contextmanager
     def strain_within(self, limits: np.ndarray | None) -> Iterator[None]:
-        """Follow strain within other limits (F, 2, 3) for a while; None: within the same."""
+        """Follow strain within other limits (F, 2, 6) for a while; None: within the same."""
         before = self.strain
         if limits is None or before is None:
             yield

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.offsets import OFFSETS
 from ...capture.model import View
 from ...raster.cpu.image_loss import LOSS_REACH_PX
 from ...raster.gpu import optimizer, rasterize
@@ -52,9 +51,8 @@ class GpuBackend:
         self._settings, self._frames, self.device = settings, frames, device
         self._rasterizer = rasterize.Rasterizer(device)
         self._embedding = Embedding(
-            device, capture.neutral, capture.faces, frames.convention, frames.strain,
-            state.driven_offsets,
-        )  # fmt: skip
+            device, capture.neutral, capture.faces, frames.convention, frames.strain
+        )
         self._triangles = len(capture.faces)
         distance_limits = settings.distance_limit * frames.units
         self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
@@ -81,7 +79,7 @@ class GpuBackend:
         traits, sums = read(self._tables.traits, (count, 2)), history.view(np.float32)
         offsets = {}
         for name, each in self._offsets.items():
-            shape = self._triangles, OFFSETS[name].signals, 3
+            shape = self._triangles, 3, 3
             parts = (each.coefficients, each.first, each.second, each.average)
             value, first, second, average = (read(part, shape) for part in parts)
             steps = read(each.steps, (self._triangles,), np.int32)
@@ -197,14 +195,14 @@ class GpuBackend:
         self, work: Recording, splats: rasterize.SplatTable, offsets: Mapping[str, Any], view: View,
         background: np.ndarray, sh_degree: int, selected: np.ndarray | None = None,
     ) -> rasterize.Tables:  # fmt: skip
-        """Record a view of the splats, moved by driven offsets with these coefficients (F, S, 3) on
+        """Record a view of the splats, moved by driven offsets with these coefficients (F, 3, 3) on
         the device.
 
         Only the tiles around the splats on the selected triangles, if any are given.
         """
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
         options = rasterize.ViewOptions(
-            view.camera, sh_degree, background, self._embedding.strains,
+            view.camera, sh_degree, background,
             antialiased=self._settings.antialiased, focused=selected is not None,
             reach=LOSS_REACH_PX,
         )  # fmt: skip

@@ -3,7 +3,6 @@ hull points for what the mesh does not cover (hair, shoulders, clothes); a flat 
 camera."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_cdt
@@ -11,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ...avatar.embedding import face_frames, to_local, to_world
 from ...avatar.lattice import lattice_splats, lattice_weights
-from ...avatar.splats import ADDED, SH_C0, Splats, joined
+from ...avatar.splats import SH_C0, Splats, joined
 from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
 from ...capture.mesh_geometry import MIN_DEPTH_M, connected_parts, rasterize, silhouette
@@ -74,9 +73,7 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
         parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
     elif settings.hull_points:
         parts.append(hull_points(capture, first, convention, degree, settings.torso))
-    splats = joined(parts)
-    added = {name: np.zeros((len(splats), ADDED[name], 3), np.float32) for name in settings.added}
-    return replace(splats, **added)
+    return joined(parts)
 
 
 def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarray:

@@ -188,7 +188,7 @@ class UnseenSides:
         rows = self.triangles[state.face] & ~state.unbound
         flat = (self.color[state.face[rows]] - 0.5) / SH_C0
         for kept in (state.parameters, state.average, state.first, state.second):
-            kept.sh[rows] = kept.strain_color[rows] = 0
+            kept.sh[rows] = 0
         state.parameters.sh[rows, 0] = state.average.sh[rows, 0] = flat
         return state
 

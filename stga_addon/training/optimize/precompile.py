@@ -17,7 +17,7 @@ from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
 from .cpu_backend import image_gradient, whole_image
-from .state import TrainState, new_state, with_effects
+from .state import TrainState, new_state, with_offsets
 
 HELPER_TIMEOUT_S = 120.0
 POLL_INTERVAL_S = 0.05
@@ -82,12 +82,13 @@ def _step() -> None:
     optimizer.opacity_weight(rows, opacity, state.unseen_share, 1.0, gradients.opacity)
     optimizer.distance_limit(rows, xyz, face, unbound, limits[0], 1.0, gradients.xyz)
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
-    adam.step(state, rows, dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3))
+    rates = dict.fromkeys((*Parameters._fields, "sh_rest", "strain_color"), 1e-3)
+    adam.step(state, rows, rates)
     screen, total = state.screen_gradient, state.gradient_count
     optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
     adam.step_offsets(
-        with_effects(state, (), OFFSETS, 2).driven_offsets, rows, face, gradients.xyz,
-        lambda name: np.zeros((2, OFFSETS[name].signals), np.float32), 1e-3, adam.PLAIN,
+        with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients,
+        lambda name: np.zeros((2, 3), np.float32), rates, adam.PLAIN,
     )  # fmt: skip
 
 

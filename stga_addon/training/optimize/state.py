@@ -4,14 +4,13 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from ...avatar.file import Avatar
-from ...avatar.offsets import OFFSETS
-from ...avatar.splats import ADDED, Splats
+from ...avatar.splats import Splats
+from ...avatar.strain import STRAIN_COMPONENTS
 from ...capture.model import View
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamTables
@@ -42,7 +41,7 @@ class Batch:
 @dataclass
 class OffsetState:
     """Coefficients of a driven offset (`Avatar.driven_offsets`) of a mesh's F triangles in
-    training: as in `TrainState`, (F, S, 3) float32 and (F,) int32."""
+    training: as in `TrainState`, (F, 3, 3) float32 and (F,) int32."""
 
     value: np.ndarray
     first: np.ndarray
@@ -52,7 +51,7 @@ class OffsetState:
 
 
 def new_offset(coefficients: np.ndarray) -> OffsetState:
-    """A copy of coefficients (F, S, 3), with zero moments."""
+    """A copy of coefficients (F, 3, 3), with zero moments."""
     value = np.array(coefficients, np.float32)
     zeros, steps = np.zeros_like(value), np.zeros(len(value), np.int32)
     return OffsetState(value, zeros, zeros.copy(), value.copy(), steps)
@@ -150,18 +149,11 @@ def join(state: TrainState, other: TrainState) -> TrainState:
     return replace(state_of(rows), driven_offsets=state.driven_offsets)
 
 
-def with_effects(
-    state: TrainState, added: Collection[str], offsets: Collection[str], triangles: int
-) -> TrainState:
-    """The state with these arrays of ADDED and these driven offsets of so many triangles, too;
-    those that it lacked begin by zero."""
-    flat = arrays_of(state)
-    for table, name in product(("parameters", "gradients", "first", "second", "average"), added):
-        if not flat[f"{table}/{name}"].shape[1]:
-            flat[f"{table}/{name}"] = np.zeros((len(state), ADDED[name], 3), np.float32)
-    sizes = {name: (triangles, OFFSETS[name].signals, 3) for name in offsets}
-    zeros = {name: new_offset(np.zeros(size)) for name, size in sizes.items()}
-    return replace(state_of(flat), driven_offsets={**zeros, **state.driven_offsets})
+def with_offsets(state: TrainState, offsets: Collection[str], triangles: int) -> TrainState:
+    """The state with these driven offsets of so many triangles, too; those that it lacked begin by
+    zero."""
+    zeros = {name: new_offset(np.zeros((triangles, STRAIN_COMPONENTS, 3))) for name in offsets}
+    return replace(state, driven_offsets={**zeros, **state.driven_offsets})
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
+from ...avatar.offsets import OFFSETS
 from ...capture.model import Capture, View
 from ...errors import StgaError
 from ...render.device import adapter_name
@@ -17,7 +18,7 @@ from .avatar_tracking import RefinedTracking
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .state import Batch, TrainState, new_state, with_effects
+from .state import Batch, TrainState, new_state, with_offsets
 
 if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
     from .gpu_backend import GpuBackend
@@ -91,7 +92,7 @@ class Trainer:
         """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of
         `choose_device`.
 
-        strain_range (F, 2, 3): within which colors and positions follow strain; None: COLOR_RANGE.
+        strain_range (F, 2, 6): within which deformation is followed; None: TRAINED_RANGE.
         """
         self.capture, self.settings = capture, settings
         self.strategy = Strategy(settings, selection)
@@ -107,7 +108,7 @@ class Trainer:
         if state is None:
             splats = initial_splats(capture, settings)
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
-            state = with_effects(state, (), settings.driven_offsets, len(capture.faces))
+            state = with_offsets(state, settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self.frames, state)
         self._outlines: list[post_step.Outline] | None = None
         self._sides: post_step.UnseenSides | None = None
@@ -227,6 +228,6 @@ def make_backend(
     from .gpu_backend import GpuBackend
 
     for name in state.driven_offsets:
-        if name not in SIGNALS:
+        if OFFSETS[name].signal not in SIGNALS:
             raise StgaError(f"driven offset {name}: is trained on the CPU only, not on {device}")
     return GpuBackend(Device(adapter_name(device)), settings, frames, state)

@@ -1,5 +1,5 @@
-"""Checkpoints of a training run, the selection that it trains, and the range of strain that it has
-trained on, within which its avatar's colors and positions follow strain, as files in its folder."""
+"""Checkpoints of a training run, the selection that it trains, and the range of deformation that it
+has trained on, within which its avatar's colors and positions follow it, as files in its folder."""
 
 import json
 import math
@@ -13,8 +13,14 @@ import numpy as np
 
 from ...avatar.file import Avatar, check_array, read_avatar
 from ...avatar.offsets import OFFSETS
-from ...avatar.splats import ADDED, ARRAYS
-from ...avatar.strain import COLOR_RANGE, color_range, seen_range, strain_basis
+from ...avatar.splats import ARRAYS
+from ...avatar.strain import (
+    STRAIN_COMPONENTS,
+    TRAINED_RANGE,
+    seen_range,
+    strain_basis,
+    trained_range,
+)
 from ...capture.model import Capture
 from ...errors import StgaError, shorten
 from ...files import read_npz, write_npz
@@ -22,10 +28,10 @@ from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
-VERSION = 3
+VERSION = 4
 TRACKING, IDENTITY = "tracking/parameters", "identity"
 STRAIN_RANGE = "strain_range.npz"
-"""`strain_range` (F, 2, 3) float32 of a run, and `identity`."""
+"""`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
 OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
@@ -106,12 +112,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             text = "refines the tracking as version 0.2.0 did; train into another folder"
             raise StgaError(f"{path}: {text}")
         offsets = {}
-        for effect, offset in OFFSETS.items():
+        for effect in OFFSETS:
             names = [name for name in arrays if name.startswith(f"{effect}/")]
             if names:
                 taken = {name.removeprefix(f"{effect}/"): arrays.pop(name) for name in names}
                 offsets[effect] = found = OffsetState(**taken)
-                whole, tail = found.steps.shape[:1], (offset.signals, 3)
+                whole, tail = found.steps.shape[:1], (STRAIN_COMPONENTS, 3)
                 for part, array in taken.items():
                     kind = ("int32", whole) if part == "steps" else ("float32", (*whole, *tail))
                     check_array(path, f"{effect}/{part}", array, *kind)
@@ -186,8 +192,6 @@ def check_fits(
     elif splats.sh_degree != settings.sh_degree:
         found = f"SH degree {splats.sh_degree}, run.json says {settings.sh_degree}"
         text = f"its splats have {found}"
-    for name in {name for name in ADDED if getattr(splats, name).shape[1]} ^ set(settings.added):
-        text = text or f"its splats and run.json disagree on {name}"
     for name in state.driven_offsets.keys() ^ set(settings.driven_offsets):
         text = text or f"its checkpoint and run.json disagree on the driven offset {name}"
     for name, offset in state.driven_offsets.items():
@@ -201,12 +205,12 @@ def check_fits(
 def trained_strain_range(
     capture: Capture, mesh: Callable[[int], np.ndarray], continuation: Continuation | None
 ) -> np.ndarray:
-    """`Avatar.strain_range` (F, 2, 3) of a run: what all its training timesteps show, and what its
+    """`Avatar.strain_range` (F, 2, 6) of a run: what all its training timesteps show, and what its
     parent's did.
 
-    mesh: timestep -> (V, 3) that is trained on; one at a time is held. Within COLOR_RANGE.
+    mesh: timestep -> (V, 3) that is trained on; one at a time is held. Within TRAINED_RANGE.
     """
-    limits = color_range(len(capture.faces))
+    limits = trained_range(len(capture.faces))
     basis = strain_basis(capture.neutral, capture.faces, limits)
     timesteps = sorted({view.timestep for view in capture.views["train"]})
     seen = seen_range(basis, (mesh(timestep) for timestep in timesteps))
@@ -221,7 +225,7 @@ def trained_strain_range(
 
 
 def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | None:
-    """The range (F, 2, 3) of a run that has begun in the folder, measured and written where the
+    """The range (F, 2, 6) of a run that has begun in the folder, measured and written where the
     folder has no file yet.
 
     None where nothing follows strain, and with refined tracking, which moves the meshes while it
@@ -237,24 +241,27 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     arrays = read_npz(path)
     if not np.array_equal(arrays.get(IDENTITY, ()), identity):
         raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
-    found, shape = arrays.get("strain_range", np.zeros(0)), (len(capture.faces), *COLOR_RANGE.shape)
+    found, shape = (
+        arrays.get("strain_range", np.zeros(0)),
+        (len(capture.faces), *TRAINED_RANGE.shape),
+    )
     check_array(path, "strain_range", found, "float32", shape)
-    if not _is_color_range(found):
-        text = "is not within the range that colors are trained to follow; remove it"
+    if not _is_trained_range(found):
+        text = "is not within the range that is trained; remove it"
         raise StgaError(f"{path}: 'strain_range' {text}")
     return found
 
 
-def require_color_range(path: Path, avatar: Avatar) -> None:
-    """Raise StgaError, naming the path, where an avatar follows strain beyond COLOR_RANGE.
+def require_trained_range(path: Path, avatar: Avatar) -> None:
+    """Raise StgaError, naming the path, where an avatar follows strain beyond TRAINED_RANGE.
 
     An earlier version trained it: more training would change it at once.
     """
     limits = avatar.strain_range
-    if avatar.follows_strain and (limits is None or not _is_color_range(limits)):
+    if avatar.follows_strain and (limits is None or not _is_trained_range(limits)):
         raise StgaError(f"{path}: {OLDER_COLORS}")
 
 
-def _is_color_range(limits: np.ndarray) -> bool:
-    """Whether limits (F, 2, 3) lie within COLOR_RANGE; not so where one is NaN."""
-    return bool(((limits[:, 0] >= COLOR_RANGE[0]) & (limits[:, 1] <= COLOR_RANGE[1])).all())
+def _is_trained_range(limits: np.ndarray) -> bool:
+    """Whether limits (F, 2, 6) lie within TRAINED_RANGE; not so where one is NaN."""
+    return bool(((limits[:, 0] >= TRAINED_RANGE[0]) & (limits[:, 1] <= TRAINED_RANGE[1])).all())

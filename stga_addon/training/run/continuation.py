@@ -11,7 +11,6 @@ from operator import add
 import numpy as np
 
 from ...avatar.file import read_avatar
-from ...avatar.splats import ADDED
 from ...capture.model import Capture, View, evenly_spread
 from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
@@ -20,10 +19,10 @@ from ...selection import select_capture
 from ..evaluate import metrics
 from ..evaluate.metrics import RESIDUAL_SCALE, EvaluationView, Residuals, triangle_residuals
 from ..optimize.image_preparation import image_preparation
-from ..optimize.state import TrainState, state_of_avatar, with_effects
+from ..optimize.state import TrainState, state_of_avatar, with_offsets
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
-from .checkpoint import read_checkpoint, require_color_range
+from .checkpoint import read_checkpoint, require_trained_range
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
 
@@ -85,7 +84,7 @@ def starting_state(
     Where the settings have colors or positions follow strain and the avatar's do not, they begin by
     zero. The optimizer continues where the parent's checkpoint is of that very avatar; otherwise
     its moments are zero. Raises StgaError where the avatar is not the one that the continuation was
-    made for, or `require_color_range` does.
+    made for, or `require_trained_range` does.
     """
     folder = continuation.parent
     if file_digest(folder / AVATAR) != continuation.avatar:
@@ -93,7 +92,7 @@ def starting_state(
             f"{folder / AVATAR}: has changed since this continuation was started from it"
         )
     avatar = read_avatar(folder / AVATAR)
-    require_color_range(folder / AVATAR, avatar)
+    require_trained_range(folder / AVATAR, avatar)
     state = state_of_avatar(avatar)
     if (folder / CHECKPOINT).exists():
         kept = read_checkpoint(folder).state
@@ -109,7 +108,7 @@ def starting_state(
             )
             for offset in kept.driven_offsets.values():
                 offset.value = offset.average.copy()
-    return with_effects(state, settings.added, settings.driven_offsets, triangles)
+    return with_offsets(state, settings.driven_offsets, triangles)
 
 
 def continued_settings(
@@ -123,14 +122,14 @@ def continued_settings(
     """The settings of a run for its continuation by one of CONTINUATIONS. Raises StgaError for a
     value not allowed.
 
-    What effects add to splats begins with the first rate of the run in an extension: other
+    Colors that follow the pose begin with the first rate of the run in an extension: other
     expressions strain triangles in directions that the old takes never showed.
     """
     first = settings.rates
     ends = {"position_end": first.position_end**START_SHARE, "end": first.end**START_SHARE}
     rates = replace(first, **learning_rates(first, START_SHARE), **ends)  # from there on
     if strategy == "extend":
-        rates = replace(rates, **{name: getattr(first, name) for name in ADDED})
+        rates = replace(rates, strain_color=first.strain_color)
     continued = replace(
         settings,
         strategy=strategy,

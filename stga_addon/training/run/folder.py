@@ -27,7 +27,7 @@ from .identity import (
     difference,
     earlier_identity,
     identity_of,
-    settings_since,
+    read_settings,
 )
 
 FORMAT, VERSION = "stga-run", max(LATER_SETTINGS)
@@ -123,7 +123,7 @@ def read_run(folder: Path) -> Run:
         found = f"has run format version {shorten(version)}"
         raise StgaError(f"{path}: {found}, this add-on reads {reads}")
     if isinstance(values.get("settings"), dict):
-        values["settings"].update(settings_since(version))
+        values["settings"] = read_settings(version, values["settings"])
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:

@@ -21,8 +21,10 @@ LATER_SETTINGS: dict[int, dict[str, Any]] = {
     5: {"torso": False},
     6: {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False},
     7: {"adam_nesterov": False},
+    8: {},
 }
-"""Format version -> settings that earlier runs lack, with what these were trained with."""
+"""Format version -> settings that earlier runs lack, with what these were trained with. Before 8,
+`strain_color` was a setting of its own (`read_settings`)."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,16 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     )
 
 
-def settings_since(version: int) -> dict[str, Any]:
-    """What runs of this format version lack, with what they were trained with."""
+def read_settings(version: int, settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a run of this format version as those of today, with what they lack."""
+    found = settings | _settings_since(version)
+    offsets = found.get("driven_offsets")
+    if found.pop("strain_color", False) is True and isinstance(offsets, list):
+        found["driven_offsets"] = [*offsets, "older_strain_color"]
+    return found
+
+
+def _settings_since(version: int) -> dict[str, Any]:
     later = (values for since, values in LATER_SETTINGS.items() if since > version)
     return {name: value for values in later for name, value in values.items()}
 
@@ -88,7 +98,11 @@ def earlier_identity(
     identity: RunIdentity, settings: TrainingSettings, version: int
 ) -> RunIdentity:
     """As an earlier format version recorded it; the same for settings that are not of one."""
-    later, known = settings_since(version), to_json(settings)
+    later, known = _settings_since(version), to_json(settings)
+    if version < max(LATER_SETTINGS):
+        offsets = [name for name in known["driven_offsets"] if name != "older_strain_color"]
+        follows = len(offsets) < len(known["driven_offsets"])
+        known |= {"driven_offsets": offsets, "strain_color": follows}
     if any(known.pop(name) != value for name, value in later.items()):
         return identity
     return replace(identity, settings=_settings_digest(known))

@@ -419,7 +419,7 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     if not (folder / AVATAR).exists():
         evaluator.best_difference = math.inf  # so that the next evaluation writes one
     elif not session._is_finished():
-        checkpoints.require_color_range(folder / AVATAR, read_avatar(folder / AVATAR))
+        checkpoints.require_trained_range(folder / AVATAR, read_avatar(folder / AVATAR))
     folders.write_run(folder, run)  # capture, model and device may be others now
     return session
 

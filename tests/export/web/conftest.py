@@ -11,6 +11,7 @@ from flame.small_head import small_head
 
 from export.web.browser import Browser, find_browser
 from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.playback import Playback, ShapeControls
@@ -74,11 +75,10 @@ def make_head(
     convention: str = "stga",
     sh_degree: int = 3,
     antialiased: bool = True,
-    strain: bool = True,
-    strain_position: bool = False,
+    offsets: tuple[str, ...] = tuple(OFFSETS),
 ) -> Head:
-    """strain: whether colors follow it; strain_position: whether splats move with it, as far as
-    they spread."""
+    """offsets: names of driven offsets, which the ranges of most triangles cut off; splats move as
+    far as they spread."""
     model = small_head(0)
     rng = np.random.default_rng(3)
     frames = [
@@ -105,18 +105,18 @@ def make_head(
         log_scale=splats.log_scale * np.float32(0.3) + size[1],
         sh=splats.sh * np.float32(0.3),
     )
-    if strain:
-        strain_color = rng.normal(0, 0.1, (SPLATS, 3, 3)).astype(np.float32)
-        splats = replace(splats, strain_color=strain_color)
     neutral = neutral_mesh(sequence).astype(np.float32)
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
     limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
-    moves = rng.normal(0, 0.3 * unit, (len(model.faces), 3, 3)).astype(np.float32)
+    sizes = {"strain_position": 0.3 * unit, "strain_color": 0.1, "normal_color": 0.5}
+    driven = {
+        name: rng.normal(0, size, (len(model.faces), 3, 3)).astype(np.float32)
+        for name, size in sizes.items()
+    }
     avatar = Avatar(splats, convention, neutral, model.faces, antialiased=antialiased)
-    if strain or strain_position:
-        avatar = replace(avatar, strain_range=limits)
-    if strain_position:
-        avatar = replace(avatar, driven_offsets={"strain_position": moves})
+    if offsets:
+        kept = {name: driven[name] for name in offsets}
+        avatar = replace(avatar, strain_range=limits, driven_offsets=kept)
     camera = look_at((0.15, 0.05, 1.0), (0, 0, 0), SIZE, SIZE, 3.0 * SIZE)
     return Head(avatar, sequence, meshes, camera)
 

@@ -1,4 +1,4 @@
-// Vertices, frames and strain of every recorded frame of a data file, as JSON: node evaluate.mjs PLAYER_FOLDER FILE
+// Vertices, frames and signals of every recorded frame of a data file, as JSON: node evaluate.mjs PLAYER_FOLDER FILE
 import { readFile } from 'node:fs/promises';
 import { pathToFileURL } from 'node:url';
 
@@ -15,16 +15,20 @@ try {
   const camera = header.views[0]?.world_to_camera ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
   const texels = new Float32Array(FACE_FLOATS * frames.count);
   const results = [];
+  const { signals } = frames;
   for (let frame = 0; frame < motion.frames; frame++) {
     motion.sample(frame);
     frames.update(rig.pose(motion));
+    frames.annotate(null, texels);
     frames.compose(camera, texels);
     const order = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values).sort(texels);
     results.push({
       vertices: Array.from(rig.vertices),
       frames: Array.from(frames.world),
-      strain: Array.from(frames.strain?.values ?? []),
-      smoothed: Array.from(frames.offsets[0]?.signal.values ?? []),
+      strain: Array.from(signals.smoothed_strain?.strain.values ?? []),
+      smoothed: Array.from(signals.smoothed_strain?.values ?? []),
+      normal: Array.from(signals.normal?.values ?? []),
+      texels: Array.from(texels),
       order: Array.from(order),
     });
   }

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.errors import StgaError
 from stga_addon.export.playback import Playback
 from stga_addon.export.web import data_file
@@ -48,7 +49,7 @@ def test_splats_come_back_within_their_steps(head):
     assert np.array_equal(found.face, original.face)
     assert np.abs(found.xyz - original.xyz).max() <= data_file.POSITION_STEP_M
     assert np.abs(np.abs((found.rotation * unit).sum(1)) - 1).max() < 1e-5
-    for field in ("log_scale", "sh", "strain_color"):
+    for field in ("log_scale", "sh"):
         error = np.abs(getattr(found, field) - getattr(original, field)).max()
         assert error <= data_file.STEPS[field] / 2 + 1e-6, field
     selected = np.unpackbits(arrays["selection"].astype(np.uint8), axis=1)
@@ -57,23 +58,24 @@ def test_splats_come_back_within_their_steps(head):
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-@pytest.mark.parametrize("strain", [False, True])
-def test_strain_moves_splats_by_less_than_their_own_step(convention, strain):
-    """Catches vectors stored in another unit or order, and a range that is left out where no color
-    needs it."""
-    head = make_head(convention, strain=strain, strain_position=True)
+@pytest.mark.parametrize("offsets", [tuple(OFFSETS), ("strain_position",)])
+def test_driven_offsets_err_by_less_than_what_they_change(convention, offsets):
+    """Catches coefficients stored in another unit or order, an offset that comes with none, and a
+    range that is left out where no color needs it."""
+    head = make_head(convention, offsets=offsets)
     avatar = head.avatar
     _, arrays = read_web_data(head.data())
-    assert ("strain_color" in arrays) == strain
-    limits = arrays["strain_range"].reshape(-1, 2, 3)
+    assert set(OFFSETS) & set(arrays) == set(offsets)
+    limits = arrays["strain_range"].reshape(-1, 2, 6)
     assert np.abs(limits - avatar.strain_range).max() <= 0.001 + 1e-6
     unit = avatar.frames(avatar.neutral).scale.max()
-    found = arrays["strain_position"].reshape(-1, 3, 3)
-    error = np.abs(found - avatar.driven_offsets["strain_position"]).max() * unit
-    assert error <= data_file.OFFSET_STEPS_M["strain_position"] / 2 + 1e-9
-    stored = replace(avatar, driven_offsets={"strain_position": found})
+    found = {name: arrays[name].reshape(-1, 3, 3) for name in offsets}
+    stored = replace(avatar, driven_offsets=found)
     for mesh in head.meshes:
         expected = avatar.frames(mesh)
+        if len(offsets) > 1:
+            assert np.abs(expected.color).max() > 0.1
+            assert np.abs(stored.frames(mesh).color - expected.color).max() < 0.25 / 255
         still = replace(avatar, driven_offsets={}).frames(mesh).origin
         moved = np.linalg.norm(expected.origin - still, axis=1)
         error = np.abs(stored.frames(mesh).origin - expected.origin).max(1)

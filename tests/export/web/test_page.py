@@ -69,7 +69,7 @@ def psnr(browser: Browser, head: Head, frame: int) -> float:
     return difference(picture(browser, frame), expected)
 
 
-OTHER = {"convention": "gaussian_avatars", "strain": False}
+OTHER = {"convention": "gaussian_avatars", "offsets": ()}
 
 
 @pytest.mark.parametrize(
@@ -78,9 +78,8 @@ OTHER = {"convention": "gaussian_avatars", "strain": False}
         ({}, True),
         ({}, False),
         ({**OTHER, "sh_degree": 1, "antialiased": False}, True),
-        ({"strain_position": True}, True),
-        ({"strain_position": True}, False),
-        ({**OTHER, "strain_position": True}, False),
+        ({"offsets": ("normal_color",)}, True),
+        ({**OTHER, "offsets": ("strain_position",)}, False),
         ({"baked": True}, False),
     ],
 )
@@ -105,16 +104,17 @@ def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
     """Catches a page that differs from the renderer on the size, cameras and meshes of a capture,
     and steps of the data file that are coarse enough to be seen."""
     capture = open_capture(shared_data / "studio_head")
-    splats = initial_splats(capture, make_settings(iterations=1, strain_color=True))
+    splats = initial_splats(capture, make_settings(iterations=1))
     rng = np.random.default_rng(0)
     splats = replace(
         splats,
         opacity=splats.opacity + np.float32(3.0),
         sh=splats.sh + rng.normal(0, 0.05, splats.sh.shape).astype(np.float32),
-        strain_color=rng.normal(0, 0.03, splats.strain_color.shape).astype(np.float32),
     )
-    neutral = capture.neutral.astype(np.float32)
-    avatar = Avatar(splats, "stga", neutral, capture.faces, antialiased=True)
+    neutral, shape = capture.neutral.astype(np.float32), (len(capture.faces), 3, 3)
+    colors = "strain_color", "normal_color"
+    driven = {name: rng.normal(0, 0.03, shape).astype(np.float32) for name in colors}
+    avatar = Avatar(splats, "stga", neutral, capture.faces, antialiased=True, driven_offsets=driven)
     views = [capture.views["val"][0], capture.views["test"][20]]
     meshes = [capture.mesh(view.timestep) for view in views]
     playback = Playback(title="Studio", fps=2.0, views={"a": views[0].camera, "b": views[1].camera})

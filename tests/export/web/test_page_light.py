@@ -91,8 +91,8 @@ def set_lighting(browser: Browser, lighting: object) -> None:
     ("options", "exact"),
     [
         ({}, True),
-        ({"damping": 0.3, "convention": "gaussian_avatars", "sh_degree": 0, "strain": False}, True),
-        ({"sh_degree": 2, "strain_position": True}, False),
+        ({"damping": 0.3, "convention": "gaussian_avatars", "sh_degree": 0, "offsets": ()}, True),
+        ({"sh_degree": 2}, False),
         ({"sh_degree": 2, "alike": True}, True),
     ],
 )

@@ -1,4 +1,4 @@
-"""The player's numerics in Node against numpy: pose, frames, strain, order, and damaged files."""
+"""The player's numerics in Node against numpy: pose, frames, signals, order, and damaged files."""
 
 import functools
 import gzip
@@ -17,7 +17,8 @@ from avatar.conftest import random_splats
 
 from stga_addon.avatar.embedding import points_to_world
 from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.strain import color_range
+from stga_addon.avatar.offsets import OFFSETS
+from stga_addon.avatar.strain import trained_range
 from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import baked_rig, data_file
 from stga_addon.export.web.page import PLAYER
@@ -25,6 +26,8 @@ from stga_addon.export.web.page import PLAYER
 from .conftest import make_head
 
 pytestmark = pytest.mark.needs("node")
+
+COLORS = {"strain_color", "normal_color"}
 
 
 def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
@@ -35,6 +38,12 @@ def evaluated(data: bytes, folder: Path) -> dict[str, Any]:
     done = subprocess.run(command, capture_output=True, timeout=120)
     assert not done.stderr, done.stderr.decode()
     return dict(json.loads(done.stdout))
+
+
+def colors(result: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Change of each triangle's color (F, 3), and what of it is the light of the capture."""
+    texels = np.reshape(result["texels"], (-1, 5, 4))
+    return texels[:, 3, :3], texels[:, 4, :3]
 
 
 @pytest.mark.parametrize("baked", [False, True])
@@ -54,29 +63,28 @@ def test_pose_is_flames(head, baked, tmp_path):
 
 def test_a_head_at_rest_stays_where_it_is(tmp_path):
     """Catches strain that is not taken off: within the range of colors, a mesh at rest has some;
-    and a single frame, or an avatar without selection, color harmonics and strain, that the player
+    and a single frame, or an avatar without selection, color harmonics and offsets, that the player
     refuses."""
-    for strain_position in (True, False):
-        head = make_head(sh_degree=0, strain=False, strain_position=strain_position)
+    for offsets in (tuple(OFFSETS), ()):
+        head = make_head(sh_degree=0, offsets=offsets)
         neutral, faces = head.avatar.neutral, head.avatar.faces
-        avatar = replace(head.avatar, strain_range=color_range(len(faces)))
+        avatar = replace(head.avatar, strain_range=trained_range(len(faces)))
         data = data_file(avatar, baked_rig([neutral]), Playback(), exact=True)
         [result] = evaluated(data, tmp_path)["results"]
-        assert np.min(result["strain"], initial=0) < -0.19 or not strain_position
+        assert np.min(result["strain"], initial=0) < -0.19 or not offsets
+        assert np.abs(colors(result)).max() < 1e-5
         assert np.abs(np.reshape(result["vertices"], (-1, 3)) - neutral).max() < 1e-6
         origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
         assert np.abs(origin - neutral[faces].mean(1)).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("strain", "strain_position"), [(True, False), (True, True), (False, True)]
-)
+@pytest.mark.parametrize("offsets", [tuple(OFFSETS), ("strain_position",), ("normal_color",)])
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_frames_and_strain_are_the_embedding(convention, strain, strain_position, tmp_path):
-    """Catches another axis, scale, sliver rule or strain than the one that the splats were trained
-    with, and origins that do not move with the smoothed strain, or with that of the frame
-    before."""
-    head = make_head(convention, strain=strain, strain_position=strain_position)
+def test_frames_and_signals_are_the_embedding(convention, offsets, tmp_path):
+    """Catches another axis, scale, sliver rule, strain or change of the normal than those that the
+    splats were trained with; origins and colors that do not follow them, or follow those of the
+    frame before; and color that is, or is not, the light of the capture."""
+    head = make_head(convention, offsets=offsets)
     results = evaluated(head.data(exact=True), tmp_path)["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
         expected = head.avatar.frames(mesh)
@@ -87,26 +95,38 @@ def test_frames_and_strain_are_the_embedding(convention, strain, strain_position
         assert np.quantile(error, 0.99) < 1e-3
         assert np.abs(found[..., 3] - expected.origin).max() < 1e-6
         still = replace(head.avatar, driven_offsets={}).frames(mesh).origin
-        assert (np.abs(expected.origin - still).max() > 1e-3) == strain_position
-        error = np.abs(np.reshape(result["strain"], (-1, 3)) - expected.strain)
-        assert np.quantile(error, 0.99) < 2e-3
-        free = replace(head.avatar, strain_range=None).frames(mesh).strain
-        assert (np.abs(free - expected.strain) > 0.01).mean() > 0.05  # the range matters here
+        assert (np.abs(expected.origin - still).max() > 1e-3) == ("strain_position" in offsets)
+        free = replace(head.avatar, strain_range=None).frames(mesh).deformation
+        matters = (np.abs(free - expected.deformation) > 0.01).mean(0)  # the range
+        for name, columns in (("strain", np.s_[:3]), ("normal", np.s_[3:])):
+            if not result[name]:
+                continue
+            error = np.abs(np.reshape(result[name], (-1, 3)) - expected.deformation[:, columns])
+            assert np.quantile(error, 0.99) < 2e-3
+            assert matters[columns].min() > 0.05
+        whole, light = colors(result)
+        for avatar, color in ((head.avatar, whole), (head.avatar.without_light, whole - light)):
+            driven = avatar.frames(mesh).color if set(avatar.driven_offsets) & COLORS else color * 0
+            assert np.quantile(np.abs(color - driven), 0.99) < 1e-3
+        assert (np.abs(light).max() > 0.1) == ("normal_color" in offsets)
 
 
 def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
     """Catches neighbors that are lost, or counted another number of times, where more than two
     triangles share an edge, two share all edges, or one has an edge twice: against a search of all
-    pairs of edges, and numpy's frames."""
+    pairs of edges, and numpy's frames; and the normal of a triangle without area on the neutral
+    mesh, or on the posed one."""
     rng = np.random.default_rng(0)
     neutral = rng.normal(0, 0.1, (9, 3)).astype(np.float32)
+    neutral[8] = neutral[7]
     faces = np.stack([rng.permutation(9)[:3] for _ in range(40)]).astype(np.int32)
-    faces[30:33], faces[33] = faces[:3], faces[0, ::-1]
+    faces[30:33], faces[33], faces[34] = faces[:3], faces[0, ::-1], [7, 8, 0]
     faces[35:] = [[3, 3, 4], [3, 4, 4], [5, 6, 5], [7, 7, 7], [4, 3, 8]]
-    moves = rng.normal(0, 0.01, (40, 3, 3)).astype(np.float32)
+    driven = {n: rng.normal(0, 0.01, (40, 3, 3)).astype(np.float32) for n in OFFSETS}
     avatar = Avatar(random_splats(1, 60, 40, 0), "stga", neutral, faces)
-    avatar = replace(avatar, driven_offsets={"strain_position": moves})
+    avatar = replace(avatar, driven_offsets=driven)
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
+    meshes.append(0 * neutral)
     data = data_file(avatar, baked_rig(meshes), Playback(), exact=True)
     edges = [Counter(frozenset((face[k - 1], face[k])) for k in range(3)) for face in faces]
     pairs = itertools.product(edges, repeat=2)
@@ -120,7 +140,9 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
             expected = weight @ expected / weight.sum(1, keepdims=True)
         assert np.abs(np.reshape(result["smoothed"], (-1, 3)) - expected).max() < 1e-9
         origin = np.reshape(result["frames"], (-1, 3, 4))[..., 3]
-        assert np.abs(origin - avatar.frames(mesh).origin).max() < 1e-5
+        frames = avatar.frames(mesh)
+        assert np.abs(origin - frames.origin).max() < 1e-5 or not mesh.any()
+        assert np.abs(colors(result)[0] - frames.color).max() < 1e-5
 
 
 def with_header(raw: bytes, *keys: str | int, value: Any) -> bytes:

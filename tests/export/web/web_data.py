@@ -16,7 +16,7 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     raw = gzip.decompress(data)
     magic, version, length = struct.unpack_from("<4sII", raw)
     assert magic == b"STGA"
-    assert version == 2
+    assert version == 3
     header = json.loads(raw[12 : 12 + length])
     at = 12 + length
     arrays = {}
@@ -50,7 +50,6 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
     opacity = np.clip(arrays["opacity"].astype(np.float64), 1e-6, 1 - 1e-6)
     rest = arrays.get("sh", np.zeros((count, 0))).reshape(count, -1, 3)
     per_face = arrays["splats_per_face"]
-    strained = arrays.get("strain_color", np.zeros((count, 0), np.float32))
     return Splats(
         xyz=arrays["xyz"],
         rotation=rotation.astype(np.float32),
@@ -59,7 +58,6 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
         sh=np.concatenate([arrays["color"][:, None], rest], axis=1).astype(np.float32),
         face=np.repeat(np.arange(len(per_face)), per_face).astype(np.int32),
         unbound=np.zeros(count, bool),
-        strain_color=strained.reshape(count, -1, 3),
     )
 
 

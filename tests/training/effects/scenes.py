@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from PIL import Image, ImageDraw
 
-from stga_addon.avatar.strain import face_strain, strain_basis
+from stga_addon.avatar.strain import deformation, strain_basis
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 
@@ -16,25 +16,30 @@ SIZE, FOCAL, SUPERSAMPLED = 100, 420.0, 3
 NOISE = 1.5  # levels
 
 Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(strain (F, 3), unit direction from the camera (F, 3), unit place on the ball (F, 3)) -> levels
-(F,) that are added to the triangles' own colors."""
+"""(deformation (F, 6), unit direction from the camera (F, 3), unit place on the ball (F, 3)) ->
+levels (F,) that are added to the triangles' own colors."""
 
 
-def nothing(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
-    return np.zeros(len(strain))
+def nothing(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    return np.zeros(len(deformed))
 
 
-def wrinkles(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def wrinkles(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Darker where the first edge shrinks, but no lighter where it grows."""
-    return 60 * np.minimum(strain[:, 0], 0)
+    return 60 * np.minimum(deformed[:, 0], 0)
 
 
-def sliding(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def sliding(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Stripes that move over triangles which shrink."""
-    return 30 * np.sin(12 * (place[:, 0] + 0.3 * np.minimum(strain[:, 0] + strain[:, 1], 0)))
+    return 30 * np.sin(12 * (place[:, 0] + 0.3 * np.minimum(deformed[:, 0] + deformed[:, 1], 0)))
 
 
-def gloss(strain: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+def shade(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Matt, in a light from above that does not turn with the ball."""
+    return np.asarray(60 * deformed[:, 3:] @ np.array([0.2, 0.9, 0.3]))
+
+
+def gloss(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
     """A light beside the cameras, mirrored where the ball is polished."""
     mirrored = direction - 2 * np.einsum("fi,fi->f", direction, place)[:, None] * place
     light = np.array([0.3, 0.4, 0.86])
@@ -77,12 +82,12 @@ def photograph(folder: Path, scene: Scene) -> Capture:
     basis = strain_basis(vertices, faces)
     views = []
     for t, mesh in meshes.items():
-        strain = face_strain(basis, mesh)
+        deformed = deformation(basis, mesh)
         for c in range(scene.cameras):
             camera = _camera(c, scene.cameras)
             away = mesh[faces].mean(1) - camera.position
             away /= np.linalg.norm(away, axis=1, keepdims=True)
-            seen = colors + scene.paint(strain, away, place)[:, None]
+            seen = colors + scene.paint(deformed, away, place)[:, None]
             if scene.drift is not None:
                 seen = seen * scene.drift[t]
             if scene.gain is not None:

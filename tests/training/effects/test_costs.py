@@ -46,7 +46,7 @@ def train(capture, out, monkeypatch, choice):
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
     session.train(capture, out, Run(capture.root, None, "vhap", settings, plan))
-    return calls, read_checkpoint(out).state.splats()
+    return calls, read_checkpoint(out).state
 
 
 def counting(calls, effect, function):
@@ -59,16 +59,16 @@ def counting(calls, effect, function):
 
 def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
     """Catches work and memory of an effect that is off, and one that is on but not called."""
-    calls, splats = train(painted(), tmp_path / "off", monkeypatch, "off")
+    calls, state = train(painted(), tmp_path / "off", monkeypatch, "off")
     assert calls == {}
-    assert splats.sh.shape[1] == 1
-    assert splats.strain_color.size == 0
-    assert len(splats) == 6 * len(painted().faces)
-    calls, splats = train(painted(), tmp_path / "on", monkeypatch, "on")
+    assert state.parameters.sh.shape[1] == 1
+    assert not state.driven_offsets
+    assert len(state) == 6 * len(painted().faces)
+    calls, state = train(painted(), tmp_path / "on", monkeypatch, "on")
     assert set(calls) == set(CALLS)
     assert calls["background"] == ITERATIONS
-    assert splats.sh.shape[1] == 16
-    assert splats.strain_color.shape[1] == 3
+    assert state.parameters.sh.shape[1] == 16
+    assert "strain_color" in state.driven_offsets
 
 
 @pytest.mark.parametrize("choice", ["on", "off"])

@@ -9,7 +9,7 @@ import pytest
 from stga_addon.avatar.embedding import FaceFrames, face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.lattice import lattice_splats
-from stga_addon.avatar.offsets import OFFSETS, DrivenOffset
+from stga_addon.avatar.offsets import OFFSETS, POSITION, SIGNALS, DrivenOffset
 from stga_addon.avatar.strain import StrainBasis
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
@@ -37,15 +37,16 @@ NAME = "toy_growth"
 
 
 def growth(basis: StrainBasis, frames: FaceFrames) -> np.ndarray:
-    """(F, 2): how much larger a triangle is than at rest, and the square of that."""
+    """(F, 3): how much larger a triangle is than at rest, and the square and cube of that."""
     larger = frames.scale - 1
-    return np.stack([larger, larger**2], axis=1).astype(np.float32)
+    return np.stack([larger, larger**2, larger**3], axis=1).astype(np.float32)
 
 
 @pytest.fixture(autouse=True)
 def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
-    monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, 2, growth, 1.0))
+    monkeypatch.setitem(SIGNALS, NAME, growth)
+    monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, NAME, POSITION, "xyz", 1.0))
     effect = Effect("toy-growth", "Head grows", "larger", "6 numbers", "", {}, {}, NAME, True)
     monkeypatch.setitem(EFFECTS, effect.name, effect)
     reason = "the head grows"
@@ -59,7 +60,8 @@ def capture(toy: Capture) -> Capture:
 
 
 def planned(capture: Capture) -> Run:
-    choices = dict.fromkeys(("strain-color", "strain-position", "view-color", "exposure"), "off")
+    others = [each.name for each in EFFECTS.values() if each.offset not in (None, NAME)]
+    choices = dict.fromkeys((*others, "view-color", "exposure"), "off")
     settings = quick_settings(
         "global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"}
     )
@@ -72,7 +74,7 @@ def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
     rng = np.random.default_rng(seed)
     neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3]]) / 10
     faces = np.int32([[0, 1, 2], [1, 3, 2]])
-    values = {NAME: rng.normal(0, 0.05, (2, 2, 3)).astype(np.float32)}
+    values = {NAME: rng.normal(0, 0.05, (2, 3, 3)).astype(np.float32)}
     return Avatar(
         lattice_splats(neutral, faces, 1), "stga", neutral, faces, driven_offsets=values
     ), neutral * 1.3
@@ -152,7 +154,8 @@ def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
     [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
     frames = face_frames(posed, avatar.faces, avatar.neutral)
     np.testing.assert_allclose(frames.scale, 1.3, rtol=1e-6)
-    local = 0.3 * avatar.driven_offsets[NAME][:, 0] + 0.09 * avatar.driven_offsets[NAME][:, 1]
+    first, second, third = avatar.driven_offsets[NAME].swapaxes(0, 1)
+    local = 0.3 * first + 0.09 * second + 0.027 * third
     moves = 1.3 * np.einsum("fij,fj->fi", frames.rotation, local.astype(np.float64))
     expected = to_world(avatar.splats, frames).xyz + moves[avatar.splats.face]
     np.testing.assert_allclose(read_ply(file).xyz, expected, atol=1e-6)

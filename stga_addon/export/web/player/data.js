@@ -3,11 +3,11 @@
 
 /** @import { Data, DataArray, Values } from './types.js' */
 
-import { SIGNALS } from './face_frames.js';
+import { OFFSETS } from './face_frames.js';
 
 export class DataError extends Error {}
 
-const VERSION = 2;
+const VERSION = 3;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 
 // Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
@@ -104,12 +104,10 @@ function checkData(header, arrays) {
   /** @type {[string, ...number[]][]} */
   const optional = [
     ['selection', frames, Math.ceil(faces / 8)],
-    ['strain_color', splats, 9],
-    ['strain_range', faces, 6],
+    ['strain_range', faces, 12],
     ['sh', splats, [9, 24, 45].find(count => count === arrays.sh?.shape[1]) ?? 0],
   ];
-  for (const [name, { components }] of Object.entries(SIGNALS))
-    optional.push([name, faces, 3 * components]);
+  for (const name of Object.keys(OFFSETS)) optional.push([name, faces, 9]);
   shapesOf.push(...optional.filter(([name]) => arrays[name]));
   if (header.shapes) {
     const controls = strings(header.shapes.names, 'shapes');

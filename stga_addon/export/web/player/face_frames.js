@@ -1,28 +1,29 @@
 // @ts-check
-// Local frames of the triangles, in which splats are stored, and what these follow: strain against
-// the neutral mesh. The rules are those of STGA for Blender's embedding.py and strain.py.
+// Local frames of the triangles, in which splats are stored, and how these follow the deformation
+// of the neutral mesh. The rules are those of STGA for Blender's embedding.py, strain.py and
+// offsets.py.
 
 /** @import { Arrays, Vector } from './types.js' */
 
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
 const STRAIN_GAIN = 5;
-const MAX_STRAIN = 2;
+const MAX_DEFORMATION = 2; // where the file has no ranges
 const AVERAGING_ROUNDS = 3; // of smoothed strain
 const MIN_SQUARED_NORMAL = 1e-24;
 
+/** Strain of each triangle, less that at rest. */
 class Strain {
-  // By `FaceFrames.sides` of the neutral mesh. Without a range (6·F: lowest three, highest three of
-  // a triangle) in the file, strain is within ±MAX_STRAIN.
-  /** @param {Arrays} arrays @param {Float64Array} sides */
-  constructor(arrays, sides) {
+  // By `FaceFrames.sides` of the neutral mesh and the range (12·F: lowest strain and change of the
+  // normal of a triangle, then the highest) that they stay in.
+  /** @param {Float64Array} sides @param {ArrayLike<number>} range @param {Arrays} arrays */
+  constructor(sides, range, arrays) {
     const faces = arrays.faces.values;
     this.faces = faces;
+    this.range = range;
     const count = faces.length / 3;
-    const limits = new Float32Array(6 * count);
-    this.range =
-      arrays.strain_range?.values ?? limits.map((_, k) => (k % 6 < 3 ? -MAX_STRAIN : MAX_STRAIN));
-    this.values = new Float32Array(3 * count);
+    this.values = new Float64Array(3 * count);
+    this.rest = this.values.map((_, k) => clipped(0, range, k + 9 * Math.floor(k / 3)));
     this.gram = new Float64Array(3 * count); // u·u, u·v, v·v of the neutral sides
     this.toTensor = new Float32Array(18 * count); // change of gram → tensor xx, yy, zz, xy, yz, zx
     this.toPlane = new Float32Array(18 * count); // tensor → along the first side, across it, shear
@@ -77,7 +78,7 @@ class Strain {
     for (let v = 0, at = 0; v < share.length; v++) {
       for (const end = at + 6; at < end; at++) atVertex[at] *= share[v];
     }
-    const { toPlane, range, values } = this;
+    const { rest, toPlane, range, values } = this;
     for (let f = 0; f < faces.length; f += 3) {
       const [i, j, k] = [6 * faces[f], 6 * faces[f + 1], 6 * faces[f + 2]];
       let along = 0;
@@ -89,34 +90,26 @@ class Strain {
         across += toPlane[t + 6] * part;
         shear += toPlane[t + 12] * part;
       }
-      const at = 2 * f;
-      values[f] = Math.min(range[at + 3], Math.max(range[at], STRAIN_GAIN * along));
-      values[f + 1] = Math.min(range[at + 4], Math.max(range[at + 1], STRAIN_GAIN * across));
-      values[f + 2] = Math.min(range[at + 5], Math.max(range[at + 2], STRAIN_GAIN * shear));
+      values[f] = clipped(STRAIN_GAIN * along, range, 4 * f) - rest[f];
+      values[f + 1] = clipped(STRAIN_GAIN * across, range, 4 * f + 1) - rest[f + 1];
+      values[f + 2] = clipped(STRAIN_GAIN * shear, range, 4 * f + 2) - rest[f + 2];
     }
   }
 }
 
-/** Strain around each triangle, which positions follow: 0 for a mesh at rest. */
+/** Strain around each triangle: 0 for a mesh at rest. */
 class SmoothedStrain {
-  static components = 3;
-
-  // Of `strain` (Strain), which is to be updated first.
-  /** @param {Strain} strain */
-  constructor(strain) {
-    const { faces, range } = strain;
-    this.strain = strain;
+  /** @param {Float64Array} sides @param {ArrayLike<number>} range @param {Arrays} arrays */
+  constructor(sides, range, arrays) {
+    this.strain = new Strain(sides, range, arrays);
+    const { faces, share } = this.strain;
     this.values = new Float64Array(faces.length);
     this.before = new Float64Array(faces.length); // of the last round
-    this.rest = Float64Array.from(this.values, (_, k) => {
-      const lowest = k + 3 * Math.floor(k / 3);
-      return Math.min(range[lowest + 3], Math.max(range[lowest], 0));
-    });
     /** @type {Map<number, number[]>} */
     const touching = new Map(); // the triangles at an edge, by its ends
     const edges = Array.from(faces, (vertex, c) => {
       const next = faces[c % 3 < 2 ? c + 1 : c - 2];
-      const ends = Math.min(vertex, next) * strain.share.length + Math.max(vertex, next);
+      const ends = Math.min(vertex, next) * share.length + Math.max(vertex, next);
       const triangles = touching.get(ends) ?? [];
       triangles.push(Math.floor(c / 3));
       touching.set(ends, triangles);
@@ -134,10 +127,12 @@ class SmoothedStrain {
     this.ends = ends;
   }
 
-  /** Follow the strain: AVERAGING_ROUNDS times the mean with those that share an edge. */
-  update() {
-    const { before, ends, neighbors, values } = this;
-    for (let k = 0; k < values.length; k++) values[k] = this.strain.values[k] - this.rest[k];
+  // Follow the posed triangles: AVERAGING_ROUNDS times the mean with those that share an edge.
+  /** @param {Float64Array} sides */
+  update(sides) {
+    const { before, ends, neighbors, strain, values } = this;
+    strain.update(sides);
+    values.set(strain.values);
     for (let round = 0; round < AVERAGING_ROUNDS; round++) {
       before.set(values);
       for (let f = 0, n = 0; f < ends.length; f++) {
@@ -154,6 +149,43 @@ class SmoothedStrain {
   }
 }
 
+/** Change of each triangle's unit normal since the neutral mesh. */
+class NormalChange {
+  /** @param {Float64Array} sides @param {ArrayLike<number>} range */
+  constructor(sides, range) {
+    this.range = range;
+    this.values = new Float64Array(sides.length / 3);
+    this.neutral = this.values.map((_, k) => {
+      const normal = 9 * Math.floor(k / 3) + 6;
+      return sides[normal + (k % 3)] * inverseLength(sides, normal);
+    });
+  }
+
+  /** @param {Float64Array} sides of the posed triangles */
+  update(sides) {
+    const { neutral, range, values } = this;
+    for (let f = 0; f < values.length; f += 3) {
+      const hasNormal = neutral[f] || neutral[f + 1] || neutral[f + 2];
+      const factor = inverseLength(sides, 3 * f + 6);
+      for (let k = 0; k < 3; k++) {
+        const change = hasNormal ? sides[3 * f + 6 + k] * factor - neutral[f + k] : 0;
+        values[f + k] = clipped(change, range, 4 * f + 3 + k);
+      }
+    }
+  }
+}
+
+// One over the length of the normal that begins at `at`; 0 of a triangle without area.
+/** @type {(sides: Float64Array, at: number) => number} */
+function inverseLength(sides, at) {
+  const square = sides[at] ** 2 + sides[at + 1] ** 2 + sides[at + 2] ** 2;
+  return square < MIN_SQUARED_NORMAL ? 0 : 1 / Math.sqrt(square);
+}
+
+// Within its range, whose lowest value is at `at`.
+/** @type {(value: number, range: ArrayLike<number>, at: number) => number} */
+const clipped = (value, range, at) => Math.min(range[at + 6], Math.max(range[at], value));
+
 // Symmetric part of the outer product of two vectors, times a factor: xx, yy, zz, xy, yz, zx.
 /** @type {(a: Vector, b: Vector, factor: number, out: Float32Array, at: number) => void} */
 function symmetricProduct(a, b, factor, out, at) {
@@ -164,18 +196,28 @@ function symmetricProduct(a, b, factor, out, at) {
   }
 }
 
-// By the name of their coefficients in a data file (faces, 3·components); of the strain, which is
-// updated first.
-export const SIGNALS = { strain_position: SmoothedStrain };
+// Three numbers a triangle, by name, which its splats may follow.
+const SIGNALS = { strain: Strain, smoothed_strain: SmoothedStrain, normal: NormalChange };
+
+/** @typedef {{ signal: keyof SIGNALS, target: 'position' | 'color' | 'light' }} Offset */
+// What coefficients (faces, 9) of that name in a data file change: for each component of the signal
+// a vector in the frame, or a color; 'light': one that is the light of the capture.
+/** @type {Record<string, Offset>} */
+export const OFFSETS = {
+  strain_position: { signal: 'smoothed_strain', target: 'position' },
+  strain_color: { signal: 'smoothed_strain', target: 'color' },
+  normal_color: { signal: 'normal', target: 'light' },
+  older_strain_color: { signal: 'strain', target: 'color' },
+};
 
 const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
 const UPRIGHT_COSINE = 0.8;
-// Of a triangle in the texture: three rows of matrix | origin, then strain | selected.
-export const FACE_FLOATS = 16;
+// Of a triangle in the texture: three rows of matrix | origin, then color | selected, and what of
+// the color is the light of the capture.
+export const FACE_FLOATS = 20;
 
 export class FaceFrames {
-  // Arrays of the data file, and the convention of the embedding; strain is computed where splats
-  // follow it.
+  // Arrays of the data file, and the convention of the embedding.
   /** @param {Arrays} arrays @param {string} convention */
   constructor(arrays, convention) {
     this.faces = arrays.faces.values;
@@ -190,39 +232,42 @@ export class FaceFrames {
     this.neutralArea = this.area; // while it is the neutral mesh that is placed
     this.placeFrames(Float64Array.from(arrays.neutral.values));
     this.neutralArea = this.area.slice();
-    const offsets = Object.entries(SIGNALS).filter(([name]) => arrays[name]);
-    const followsStrain = arrays.strain_color || offsets.length;
-    const strain = followsStrain ? new Strain(arrays, this.sides) : null;
-    this.strain = strain;
-    // Signals (S·F) and their coefficients (3·S·F): for each component a vector in the frame.
-    this.offsets = offsets.flatMap(([name, Signal]) => {
-      const { values } = arrays[name];
-      return strain ? { signal: new Signal(strain), coefficients: values } : [];
+    const range =
+      arrays.strain_range?.values ??
+      new Float32Array(12 * this.count).fill(MAX_DEFORMATION).map((v, k) => (k % 12 < 6 ? -v : v));
+    /** @type {Partial<Record<Offset['signal'], Strain | SmoothedStrain | NormalChange>>} */
+    this.signals = {};
+    this.offsets = Object.entries(OFFSETS).flatMap(([name, { signal, target }]) => {
+      if (!arrays[name]) return [];
+      const followed = (this.signals[signal] ??= new SIGNALS[signal](this.sides, range, arrays));
+      return { target, signal: followed, coefficients: arrays[name].values };
     });
+    const zeros = () => new Float64Array(3 * this.count);
+    // Of a triangle's splats; positions in its own axes and unit.
+    this.change = { position: zeros(), color: zeros(), light: zeros() };
   }
 
   // Follow the posed vertices (3·V).
   /** @param {Float64Array} vertices */
   update(vertices) {
-    const { count, world } = this;
+    const { change, offsets, sides, signals, world } = this;
     this.placeFrames(vertices);
-    this.strain?.update(this.sides);
-    for (const { signal, coefficients } of this.offsets) {
-      signal.update();
-      const { values } = signal;
-      const components = values.length / count;
-      for (let f = 0; f < count; f++) {
-        let [x, y, z] = [0, 0, 0];
-        for (let k = components * f; k < components * (f + 1); k++) {
-          x += values[k] * coefficients[3 * k];
-          y += values[k] * coefficients[3 * k + 1];
-          z += values[k] * coefficients[3 * k + 2];
-        }
-        // In the triangle's own axes and unit.
-        for (let to = 12 * f; to < 12 * f + 12; to += 4) {
-          world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
+    for (const signal of Object.values(signals)) signal.update(sides);
+    for (const sum of Object.values(change)) sum.fill(0);
+    for (const { coefficients, signal, target } of offsets) {
+      const [sum, { values }] = [change[target], signal];
+      for (let f = 0; f < sum.length; f += 3) {
+        for (let k = f, from = 3 * f; k < f + 3; k++, from += 3) {
+          sum[f] += values[k] * coefficients[from];
+          sum[f + 1] += values[k] * coefficients[from + 1];
+          sum[f + 2] += values[k] * coefficients[from + 2];
         }
       }
+    }
+    for (let f = 0, to = 0; f < change.position.length; f += 3) {
+      const [x, y, z] = [change.position[f], change.position[f + 1], change.position[f + 2]];
+      for (const end = to + 12; to < end; to += 4)
+        world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
     }
   }
 
@@ -298,14 +343,16 @@ export class FaceFrames {
     }
   }
 
-  // Write strain, for colors that follow it, and the triangles' selection flags (bits, or null: all
-  // selected).
+  // Write the changes of color, and the triangles' selection flags (bits, or null: all selected).
   /** @type {(selection: ArrayLike<number> | null, out: Float32Array) => void} */
   annotate(selection, out) {
-    const strain = this.strain?.values;
+    const { color, light } = this.change;
     for (let f = 0; f < this.count; f++) {
       const to = FACE_FLOATS * f + 12;
-      for (let k = 0; k < 3; k++) out[to + k] = strain ? strain[3 * f + k] : 0;
+      for (let k = 0; k < 3; k++) {
+        out[to + k] = color[3 * f + k] + light[3 * f + k];
+        out[to + 4 + k] = light[3 * f + k];
+      }
       out[to + 3] = selection ? (selection[f >> 3] >> (7 - (f & 7))) & 1 : 1;
     }
   }

@@ -273,7 +273,10 @@ const MIN_SHAPES = 10; // of a table that holds a performance
 export function readPerformance(text, names) {
   const all = text.replace(/^\uFEFF/, '').split(/\r?\n/);
   const lines = all.filter(line => line.trim());
-  const header = (lines[0] ?? '').toLowerCase().split(',').map(cell => cell.trim());
+  const header = (lines[0] ?? '')
+    .toLowerCase()
+    .split(',')
+    .map(cell => cell.trim());
   const plain = header.map(plainName);
   const columns = names.map(name => plain.indexOf(name.toLowerCase()));
   const used = columns.filter(column => column >= 0);

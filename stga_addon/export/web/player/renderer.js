@@ -242,18 +242,12 @@ function splatTexels({ xyz, splats_per_face, rotation, rotation_largest, ...arra
 
 /** @param {Arrays} arrays */
 function tailValues(arrays) {
-  const { xyz, sh, strain_color } = arrays;
-  const texels = tailSizes(arrays)[2];
-  const values = new Float32Array(paddedLength(Math.max(1, xyz.shape[0] * texels)));
-  let offset = 0;
-  for (const array of [sh, strain_color]) {
-    if (!array) continue;
-    const size = array.shape[1];
-    for (let splat = 0; splat < xyz.shape[0]; splat++) {
-      const own = array.values.subarray(size * splat, size * (splat + 1));
-      values.set(own, 4 * texels * splat + offset);
-    }
-    offset += size;
+  const { xyz, sh } = arrays;
+  const texels = tailSizes(arrays)[1];
+  const values = new Float32Array(paddedLength(xyz.shape[0] * texels));
+  for (let splat = 0; sh && splat < xyz.shape[0]; splat++) {
+    const own = sh.values.subarray(sh.shape[1] * splat, sh.shape[1] * (splat + 1));
+    values.set(own, 4 * texels * splat);
   }
   return values;
 }

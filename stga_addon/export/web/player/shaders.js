@@ -6,7 +6,7 @@
 
 export const TEXTURE_WIDTH = 2048;
 export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | color
-export const FACE_TEXELS = 4; // rows of the frame in camera space | strain, selected
+export const FACE_TEXELS = 5; // rows of the frame in camera space | color, selected | light
 export const SURFACE_TEXELS = 4; // normal, roughness | irradiance, occlusion | corners | weights
 export const VERTEX_TEXELS = 3; // position | normal | irradiance of the world and of skin around
 export const MAP_SIZE = 512;
@@ -27,12 +27,11 @@ ivec2 texel(int index) {
 /** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
 const SH = '{{harmonics}}'.split('; ');
 
-// Of the coefficients of splats' colors by view and by strain, how many there are of each, and the
-// texels that a splat needs for them.
-/** @type {(arrays: Arrays) => [number, number, number]} */
-export function tailSizes({ sh, strain_color }) {
-  const [view, strain] = [sh?.shape[1] ?? 0, strain_color?.shape[1] ?? 0];
-  return [view / 3, strain / 3, Math.ceil((view + strain) / 4)];
+// How many harmonics splats' colors have besides the constant one, and the texels for them.
+/** @type {(arrays: Arrays) => [number, number]} */
+export function tailSizes({ sh }) {
+  const size = sh?.shape[1] ?? 0;
+  return [size / 3, Math.ceil(size / 4)];
 }
 
 /** @param {number} k */
@@ -54,17 +53,14 @@ function harmonicsSum(count, direction, sum, factors = [1, 1, 1]) {
   }`;
 }
 
-// Add what is seen of the tail in a direction to the variable `byView`, and what depends on strain
-// to `byStrain`.
-/** @type {(arrays: Arrays, direction: string, byView: string, byStrain: string) => string} */
-function tailColor(arrays, direction, byView, byStrain) {
-  const [harmonics, strains, texels] = tailSizes(arrays);
+// Add what is seen of the tail in a direction to a variable.
+/** @type {(arrays: Arrays, direction: string, sum: string) => string} */
+function tailColor(arrays, direction, sum) {
+  const [harmonics, texels] = tailSizes(arrays);
   const lines = [];
   for (let t = 0; t < texels; t++)
     lines.push(`vec4 t${t} = texelFetch(uTail, texel(splat * ${texels} + ${t}), 0);`);
-  lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', byView));
-  for (let k = 0; k < strains; k++)
-    lines.push(`${byStrain} += face.${'xyz'[k]} * ${tailTriple(harmonics + k)};`);
+  lines.push(`vec3 toward = normalize(${direction});`, harmonicsSum(harmonics, 'toward', sum));
   return lines.join('\n  ');
 }
 
@@ -139,12 +135,12 @@ void main() {
   vToUnit = mat2(vec2(axis.x, -axis.y) / deviation.x, -axis.yx / deviation.y);
   pixel += reach.x * axis + reach.y * vec2(-axis.y, axis.x);
 
-  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb;
   vec4 face = texelFetch(uFaces, texel(at + 3), 0);
+  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + face.rgb;
   if (uShowSelection && face.w < 0.5) {
     color = vec3(0.25 + 0.4 * dot(color, vec3(0.299, 0.587, 0.114)));
   } else {
-  ${isLit ? lit : tailColor(arrays, 'uToWorld * center', 'color', 'color')}
+  ${isLit ? lit : tailColor(arrays, 'uToWorld * center', 'color')}
   }
   vColor = vec4(max(color, 0.0), opacity);
   gl_Position = vec4(2.0 * pixel.x / uSize.x - 1.0, 1.0 - 2.0 * pixel.y / uSize.y, 0.0, 1.0);
@@ -240,12 +236,12 @@ void main() {
     arriving += light;
     highlight += light * ggx(normal, towardSun, view, pow(roughness, 4.0));
   }
-  vec3 byView = vec3(0.0), byStrain = vec3(0.0);
-  int triangle = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w);
-  vec4 face = texelFetch(uFaces, texel(triangle * ${FACE_TEXELS} + 3), 0);
-  ${tailColor(arrays, 'point - uEye', 'byView', 'byStrain')}
-  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb + byStrain;
-  vec3 recorded = color + byView;
+  int face = int(texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS}), 0).w) * ${FACE_TEXELS};
+  vec3 color = texelFetch(uSplats, texel(splat * ${SPLAT_TEXELS} + 3), 0).rgb;
+  color += texelFetch(uFaces, texel(face + 3), 0).rgb;
+  vec3 recorded = color;
+  ${tailColor(arrays, 'point - uEye', 'recorded')}
+  color -= texelFetch(uFaces, texel(face + 4), 0).rgb;
   vec3 inward = -surface.xyz / max(length(surface.xyz), 1e-12);
   ${harmonicsSum(tailSizes(arrays)[0], 'inward', 'color', VIEW_MEANS)}
   vec4 albedo = vec4(color, surface.a);
