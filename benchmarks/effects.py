@@ -1,19 +1,22 @@
 """Benchmark of effect plans: effects decided automatically against all effects, at the same number
 of iterations.
 
-    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3] [--only full
-    static one-camera] python benchmarks/effects.py CAPTURE … --each python benchmarks/effects.py
-    CAPTURE … --switch strain-color view-color [--only full uneven]
+    python benchmarks/effects.py CAPTURE [--flame FILE] [--iterations 500] [--seeds 3]
+        [--only full static one-camera]
+    python benchmarks/effects.py CAPTURE … --each
+    python benchmarks/effects.py CAPTURE … --switch strain-color view-color [--together]
+        [--picture FILE] [--only full uneven]
 
 The first derives two captures from CAPTURE, its first training timestep and its middle training
 camera, trains each with the effects decided by Auto and with all that can be on, and says whether
 Auto is within 0.1 dB of all, in less time. --each trains with all effects but one, for what each of
-them costs. --switch trains with one effect on and off, the others decided by Auto, for what it
-brings; the capture "uneven" has the channels of each training camera multiplied by 0.9 to 1.1.
+them costs. --switch trains with each effect on and off, or with --together all of them, the others
+decided by Auto, for what it brings; --picture writes ground truth, off and on of two unseen
+timesteps. The capture "uneven" has the channels of each training camera multiplied by 0.9 to 1.1.
 Prints tables in Markdown: PSNR of the held-out view, means over seeds ± their standard deviation,
-and milliseconds of an iteration. Selection is left to Auto: it is another way to train, not
-something more to compute. Each seed trains all variants of a capture in another order. Run it on an
-idle machine.
+milliseconds of an iteration, and LPIPS with STGA_LPIPS (docs/dependencies.md). Selection is left to
+Auto: it is another way to train, not something more to compute. Each seed trains all variants of a
+capture in another order. Run it on an idle machine.
 """
 
 import argparse
@@ -29,14 +32,17 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from stga_addon.avatar.file import read_avatar
+from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.development.benchmark.statistics import Spread, spread_of
+from stga_addon.development.demo.run import side_by_side
+from stga_addon.render.render import render_avatar, to_uint8
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import RULES, plan_effects
-from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.evaluate.metrics import Quality, evaluate_avatar
 from stga_addon.training.run.folder import Run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
@@ -48,16 +54,21 @@ MAX_LOSS_DB = 0.1
 """Of the automatic plan against all effects."""
 
 Choices = dict[str, str]
+Result = tuple[Capture, Avatar, dict[str, Quality], float, str]
+"""Of `trained`."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a variant over seeds: PSNR in dB by split, milliseconds per iteration, effects that
-    were on."""
+    """Result of a variant over seeds: PSNR in dB and LPIPS by split, milliseconds per iteration,
+    effects that were on, and the first avatar with the capture as it was refined."""
 
     psnr: Mapping[str, Spread]
+    lpips: Mapping[str, Spread]
     pace: Spread
     on: str
+    avatar: Avatar
+    capture: Capture
 
 
 def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]) -> Path:
@@ -140,9 +151,9 @@ def trained(
     choices: Choices,
     seed: int = 0,
     matched: bool = False,
-) -> tuple[Capture, dict[str, float], float, str]:
-    """The capture as it was refined, PSNR by split, milliseconds of an iteration, and the effects
-    that were on."""
+) -> tuple[Capture, Avatar, dict[str, Quality], float, str]:
+    """The capture as it was refined, the avatar, its quality by split, milliseconds of an
+    iteration, and the effects that were on."""
     settings, plan = plan_effects(
         capture, make_settings(iterations=iterations, seed=seed, effects=choices)
     )
@@ -153,10 +164,11 @@ def trained(
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder))
     splits = [split for split in ("val", "test") if shown.views.get(split)]
-    psnr = {split: evaluate_avatar(avatar, shown, split, matched=matched).psnr for split in splits}
+    found = {split: evaluate_avatar(avatar, shown, split, True, matched) for split in splits}
     return (
         shown,
-        psnr,
+        avatar,
+        found,
         1000 * seconds / iterations,
         ", ".join(decision.effect for decision in plan if decision.on),
     )
@@ -170,16 +182,15 @@ def compare(
     variants: Mapping[str, Choices],
 ) -> dict[str, Outcome]:
     """Variant -> its result."""
-    found: dict[str, list[tuple[dict[str, float], float, str]]] = {name: [] for name in variants}
+    found: dict[str, list[Result]] = {name: [] for name in variants}
     for seed in range(seeds):
         for name in random.Random(seed).sample(list(variants), len(variants)):
             # Exposure matched for all variants, so that those with and without the effect
             # `exposure` compare.
-            _, psnr, pace, on = trained(
-                capture, flame, iterations, variants[name], seed, matched=True
-            )
-            found[name].append((psnr, pace, on))
-            scores = ", ".join(f"{split} {value:.2f} dB" for split, value in psnr.items())
+            result = trained(capture, flame, iterations, variants[name], seed, matched=True)
+            found[name].append(result)
+            _, _, quality, pace, on = result
+            scores = ", ".join(f"{split} {each.psnr:.2f} dB" for split, each in quality.items())
             print(
                 f"{capture.root.name}, {name}, seed {seed}: {scores}, {pace:.1f} ms: {on}",
                 file=sys.stderr,
@@ -187,9 +198,32 @@ def compare(
     return {name: _outcome(runs) for name, runs in found.items()}
 
 
-def _outcome(runs: Sequence[tuple[dict[str, float], float, str]]) -> Outcome:
-    psnr = {split: spread_of([scores[split] for scores, _, _ in runs]) for split in runs[0][0]}
-    return Outcome(psnr, spread_of([pace for _, pace, _ in runs]), runs[0][2])
+def _outcome(runs: Sequence[Result]) -> Outcome:
+    def spread(name: str) -> dict[str, Spread]:
+        by_split = {split: [getattr(run[2][split], name) for run in runs] for split in runs[0][2]}
+        return {
+            split: spread_of(values) for split, values in by_split.items() if None not in values
+        }
+
+    shown, avatar, _, _, on = runs[0]
+    return Outcome(
+        spread("psnr"), spread("lpips"), spread_of([run[3] for run in runs]), on, avatar, shown
+    )
+
+
+def write_picture(path: Path, on: Outcome, off: Outcome) -> None:
+    """Ground truth, off and on of two unseen timesteps, in the view of the camera in the middle."""
+    views = on.capture.views["test"]
+    cameras = sorted({view.camera_index for view in views})
+    middle = [view for view in views if view.camera_index == cameras[len(cameras) // 2]]
+    pictures = []
+    for view in (middle[0], middle[-1]):
+        pictures.append(read_image(view))
+        for each in (off, on):
+            mesh = each.capture.mesh(view.timestep)
+            image = render_avatar(each.avatar, mesh, view.camera, each.avatar.background)
+            pictures.append(to_uint8(image))
+    Image.fromarray(side_by_side(pictures)).save(path)
 
 
 def cell(value: Spread, decimals: int) -> str:
@@ -214,6 +248,8 @@ def main() -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--each", action="store_true")
     what.add_argument("--switch", nargs="+", choices=tuple(EFFECTS), metavar="EFFECT")
+    parser.add_argument("--together", action="store_true")
+    parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     table = each if options.each else switch if options.switch else auto_and_all
     names = options.only or (DIFFERING if table is auto_and_all else ("full",))
@@ -292,26 +328,39 @@ def changes(effect: str) -> bool:
 
 def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
     """One row per effect and capture: quality with the effect against without."""
-    row("capture", "effect", "decided", "on against off, val", "test", "ms")
-    row(*["---"] * 6)
+    row("capture", "effect", "decided", "val, off → on", "test", "LPIPS, test", "ms")
+    row(*["---"] * 7)
     for name, capture in opened.items():
         _, plan = plan_effects(capture, make_settings(iterations=options.iterations, effects={}))
         decided = {
             decision.effect: f"{'on' if decision.on else 'off'}: {decision.reason}"
             for decision in plan
         }
-        for effect in options.switch:
-            variants = {choice: {effect: choice} for choice in ("on", "off")}
+        together = [tuple(options.switch)] if options.together else [(n,) for n in options.switch]
+        for effects in together:
+            variants = {choice: dict.fromkeys(effects, choice) for choice in ("on", "off")}
             on, off = compare(
                 capture, options.flame, options.iterations, options.seeds, variants
             ).values()
             gains = [
-                f"{on.psnr[split].mean - off.psnr[split].mean:+.2f}" if split in on.psnr else ""
+                f"{cell(off.psnr[split], 2)} → {cell(on.psnr[split], 2)}"
+                if split in on.psnr
+                else ""
                 for split in ("val", "test")
             ]
+            change = [cell(each.lpips["test"], 4) for each in (off, on) if "test" in each.lpips]
+            reasons = "; ".join(decided[effect] for effect in effects)
+            pace = f"{on.pace.mean - off.pace.mean:+.1f}"
             row(
-                name, f"`{effect}`", decided[effect], *gains, f"{on.pace.mean - off.pace.mean:+.1f}"
+                name,
+                ", ".join(f"`{n}`" for n in effects),
+                reasons,
+                *gains,
+                " → ".join(change),
+                pace,
             )
+            if options.picture:
+                write_picture(options.picture, on, off)
 
 
 if __name__ == "__main__":
