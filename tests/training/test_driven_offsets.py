@@ -1,12 +1,14 @@
 """Training of driven offsets: gradient, step, run folder."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.file import Avatar
+from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION
 from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
@@ -14,6 +16,9 @@ from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import trained_strain_range
+from stga_addon.training.run.folder import Run
+from stga_addon.training.run.session import train
+from stga_addon.training.settings import Rates
 
 from .toys import quick_settings
 
@@ -159,3 +164,38 @@ def test_local_iterations_leave_other_triangles_alone(toy: Capture) -> None:
         assert state.steps[:200].max() > 0
         assert not state.steps[200:].any()
         assert not state.value[200:].any()
+
+
+def test_extremes_show_no_color_that_training_did_not(toy: Capture, tmp_path: Path) -> None:
+    """Catches heads that glow where a slider or a turn goes further than any trained timestep:
+    without its range, the same avatar does."""
+    still = squeezed(toy)
+
+    def mesh(timestep: int) -> np.ndarray:
+        turn = Rotation.from_rotvec(np.random.default_rng(timestep).normal(0, 0.2, 3))
+        return np.asarray(still.mesh(timestep) @ turn.as_matrix().T)
+
+    capture = replace(still, mesh=mesh)
+    colors = "strain_color", "normal_color"
+    rates = Rates(strain_color=0.2)
+    settings = quick_settings(
+        "global", iterations=120, lattice=0, driven_offsets=colors, rates=rates
+    )
+    avatar = read_avatar(train(capture, tmp_path, Run(toy.root, None, "vhap", settings)))
+    trained = sorted({view.timestep for view in capture.views["train"]})
+    seen = np.stack([avatar.frames(mesh(timestep)).color for timestep in trained])
+    lowest, highest = seen.min(0), seen.max(0)
+    spread = (highest - lowest).max()
+
+    def beyond(shown: Avatar) -> float:
+        """Largest distance of a triangle's color from those that training saw."""
+        head = np.asarray(toy.neutral)
+        turns = [Rotation.from_rotvec(np.pi / 2 * axis) for axis in (*np.eye(3), *-np.eye(3))]
+        posed = [head @ turn.as_matrix().T for turn in turns]
+        posed += [head + 5 * (still.mesh(timestep) - head) for timestep in trained]
+        found = np.stack([shown.frames(each).color for each in posed])
+        return float(np.maximum(found - highest, lowest - found).max())
+
+    assert spread > 0.1
+    assert beyond(avatar) < 0.6 * spread
+    assert beyond(replace(avatar, strain_range=None)) > spread
