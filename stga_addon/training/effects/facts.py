@@ -65,18 +65,19 @@ class CaptureFacts:
         drifts = self.drifts.gain >= evidence.MIN_EXPOSURE_LEVELS
         return colors / self.drift[:, None] if drifts else colors
 
-    def signal_dependence(self, name: str) -> dict[str, Evidence]:
-        """Of colors on a signal of their triangle, in the range that the other views would train:
-        in "frames" that are left out, as unseen expressions, and in "cameras" that are, as other
-        views of known expressions; a single camera is not left out."""
+    @cached_property
+    def strain_dependence(self) -> dict[str, Evidence]:
+        """Of colors on the strain around their triangle, in the range that the other views would
+        train: in "frames" that are left out, as unseen expressions, and in "cameras" that are, as
+        other views of known expressions; a single camera is not left out."""
         samples = self.samples
-        signal = samples.signals[name]
+        strain = samples.signals["smoothed_strain"]
         folds = {"frames": evidence.consecutive_folds(samples.timestep)}
         if self.cameras > 1:
             folds["cameras"] = evidence.scattered_folds(samples.camera)
         return {
             kind: evidence.linear_evidence(
-                self.matched_colors, signal, own, rest=np.zeros_like(signal[0])
+                self.matched_colors, strain, own, rest=np.zeros_like(strain[0])
             )
             for kind, own in folds.items()
         }

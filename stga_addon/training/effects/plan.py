@@ -32,6 +32,8 @@ MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_SIGNAL_CHANGE = 1e-5
 """Of strain or a unit normal; less is rounding."""
+MIN_TURN_DEG = 2.0
+"""Root mean square over frames and triangles, from which colors follow where skin faces."""
 MAX_PIXEL_WIDTH_RATIO = 1.25
 """Of pixels at the head; above it, splats narrower than a pixel look different to each camera."""
 FINE_SPLAT_PIXELS = 4.0
@@ -178,19 +180,28 @@ def selection(facts: CaptureFacts) -> Verdict:
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
 
-def driven(facts: CaptureFacts, signal: str, what: str) -> Verdict:
-    """On where colors that follow a signal gain enough in the mean of frames and cameras that were
+def strain(facts: CaptureFacts) -> Verdict:
+    """On where colors that follow strain gain enough in the mean of frames and cameras that were
     left out: of what a head shows, unseen expressions and unseen views count alike."""
-    if facts.signal_change(signal) < MIN_SIGNAL_CHANGE:
-        return Verdict(False, f"{what} is the same in every training frame", fixed=True)
+    if facts.signal_change("smoothed_strain") < MIN_SIGNAL_CHANGE:
+        return Verdict(False, "the mesh has the same shape in every training frame", fixed=True)
     if facts.timesteps < MIN_TIMESTEPS_FOR_STRAIN:
-        reason = f"{facts.timesteps} frames are too few to tell what follows {what}"
+        reason = f"{facts.timesteps} frames are too few to tell what follows deformation"
         return Verdict(False, reason)
-    left_out = facts.signal_dependence(signal)
+    left_out = facts.strain_dependence
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
     figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
     is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
-    return Verdict(is_on, f"colors that follow {what} bring {figures}")
+    return Verdict(is_on, f"colors that follow deformation bring {figures}")
+
+
+def normal_color(facts: CaptureFacts) -> Verdict:
+    """On where skin turns enough in a light that stays. What left-out frames show of it in sampled
+    colors is less than what trainings gain (docs/experiments.md)."""
+    change = facts.signal_change("normal")
+    turn = np.degrees(3**0.5 * change)  # by component before
+    reason = f"triangles turn by {turn:.1f}° (root mean square over frames)"
+    return Verdict(bool(turn > MIN_TURN_DEG), reason, fixed=change < MIN_SIGNAL_CHANGE)
 
 
 def relight(facts: CaptureFacts) -> Verdict:
@@ -272,14 +283,11 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
     return Verdict(outside > MAX_OUTSIDE_SHARE, reason)
 
 
-_STRAIN = partial(driven, signal="smoothed_strain", what="the deformation around a triangle")
 RULES: dict[str, Rule] = {
     "view-color": view_color, "exposure": exposure, "antialiasing": antialiasing,
     "background": background, "hull-points": hull_points, "depth-limits": depth_limits,
     "density": density, "selection": selection,
-    "strain-color": _STRAIN,
-    "normal-color": partial(driven, signal="normal", what="where a triangle faces"),
-    "strain-position": _STRAIN,
+    "strain-color": strain, "normal-color": normal_color, "strain-position": strain,
     "relight": relight, "world": world, "teeth": teeth, "torso": torso,
     "neck": partial(turning, joints=[1]), "jaw": partial(turning, joints=[2]),
     "eyes": partial(turning, joints=[3, 4]), "dynamic-offsets": dynamic_offsets,

@@ -34,11 +34,6 @@ def sliding(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> n
     return 30 * np.sin(12 * (place[:, 0] + 0.3 * np.minimum(deformed[:, 0] + deformed[:, 1], 0)))
 
 
-def shade(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Matt, in a light from above that does not turn with the ball."""
-    return np.asarray(60 * deformed[:, 3:] @ np.array([0.2, 0.9, 0.3]))
-
-
 def gloss(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.ndarray:
     """A light beside the cameras, mirrored where the ball is polished."""
     mirrored = direction - 2 * np.einsum("fi,fi->f", direction, place)[:, None] * place

@@ -37,7 +37,7 @@ ITERATIONS = 12
 
 def train(capture, out, monkeypatch, choice):
     """Train with all effects on or off; how often each was called, and the checkpoint."""
-    names = dict.fromkeys((*CALLS, "view-color", "antialiasing"), choice)
+    names = dict.fromkeys((*CALLS, "normal-color", "view-color", "antialiasing"), choice)
     wanted = make_settings(iterations=ITERATIONS, effects=names, warm_up_share=0.0)
     settings, plan = plan_effects(capture, wanted)
     if settings.density_interval:
