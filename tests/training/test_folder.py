@@ -119,7 +119,7 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 def meta(**changes: Any) -> np.ndarray:
     values = {
-        "version": checkpoint_files.VERSION,
+        "version": checkpoint_files.VERSIONS[-1],
         **{k: v for k, v in vars(make_checkpoint()).items() if k not in ("state", "tracking")},
         **changes,
     }
@@ -172,6 +172,24 @@ def test_damaged_checkpoints(tmp_path: Path, says: str) -> None:
     np.savez(path, **{k: v for k, v in {**arrays, **DAMAGES[says]}.items() if v is not None})
     with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{says}"):
         checkpoint_files.read_checkpoint(tmp_path)
+
+
+def test_checkpoints_of_version_3(tmp_path: Path) -> None:
+    """Catches an older run that can neither be resumed nor says why, and strain colors of its
+    splats that are dropped in silence."""
+    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
+    path = tmp_path / "checkpoint.npz"
+    with np.load(path) as data:
+        arrays = {**data, "meta": meta(version=3)}
+    tables = "parameters", "first", "second", "average"
+    for size in (0, 3):
+        older = {f"{table}/strain_color": np.zeros((12, size, 3), np.float32) for table in tables}
+        np.savez(path, **arrays, **older)
+        if size == 0:
+            assert checkpoint_files.read_checkpoint(tmp_path).iteration == 34
+        else:
+            with pytest.raises(checkpoint_files.OlderCheckpointError, match="of their own"):
+                checkpoint_files.read_checkpoint(tmp_path)
 
 
 def test_checkpoint_at_its_limits(tmp_path: Path) -> None:

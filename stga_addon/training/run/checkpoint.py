@@ -28,7 +28,8 @@ from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
-VERSION = 4
+VERSIONS = 3, 4
+"""Read; the last is written. In version 3, splats may have strain colors of their own."""
 TRACKING, IDENTITY = "tracking/parameters", "identity"
 STRAIN_RANGE = "strain_range.npz"
 """`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
@@ -92,18 +93,28 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     if checkpoint.tracking is not None:
         arrays[TRACKING] = checkpoint.tracking
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
-    arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
+    arrays["meta"] = _packed(json.dumps({"version": VERSIONS[-1], **values}))
     write_npz(folder / CHECKPOINT, arrays)
 
 
+class OlderCheckpointError(StgaError):
+    """Of a run whose avatar can be read, but whose training cannot go on where it was."""
+
+
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """Raises StgaError where there is none, or it is damaged."""
+    """Raises StgaError where there is none, or it is damaged, and OlderCheckpointError."""
     path = folder / CHECKPOINT
     arrays = read_npz(path)
     try:
         meta = _meta(arrays.pop("meta"))
-        if meta.pop("version") != VERSION:
+        version = meta.pop("version")
+        if version not in VERSIONS:
             raise StgaError(f"{path}: was written by another version")
+        if version == VERSIONS[0]:
+            older = [arrays.pop(name) for name in [*arrays] if name.endswith("/strain_color")]
+            if any(array.size for array in older):
+                text = "its splats have strain colors of their own, as in version 0.2.0"
+                raise OlderCheckpointError(f"{path}: {text}; train into another folder")
         tracking = arrays.pop(TRACKING, None)
         if tracking is not None:
             timesteps, parameters = tracking.shape

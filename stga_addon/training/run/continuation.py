@@ -4,6 +4,7 @@ of all others."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -22,7 +23,7 @@ from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState, state_of_avatar, with_offsets
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
-from .checkpoint import read_checkpoint, require_trained_range
+from .checkpoint import OlderCheckpointError, read_checkpoint, require_trained_range
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
 
@@ -94,8 +95,11 @@ def starting_state(
     avatar = read_avatar(folder / AVATAR)
     require_trained_range(folder / AVATAR, avatar)
     state = state_of_avatar(avatar)
+    kept = None
     if (folder / CHECKPOINT).exists():
-        kept = read_checkpoint(folder).state
+        with suppress(OlderCheckpointError):
+            kept = read_checkpoint(folder).state
+    if kept is not None:
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
         ours = {**vars(avatar.splats), **avatar.driven_offsets}
         theirs = {**vars(kept.splats(averaged=True)), **offsets}
