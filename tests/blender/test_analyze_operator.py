@@ -40,7 +40,7 @@ def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
     out = tmp_path / "run"
     bpy.ops.stga.train(directory=str(out), iterations=3, effects=effects, preset=chosen.preset)
     run = read_run(out)
-    assert run.settings.strain_color
+    assert "strain_color" in run.settings.driven_offsets
     assert run.settings.preset == "draft"
     assert run.settings.lattice == PRESETS["draft"].changes["lattice"]
     choices = {decision.effect: decision.choice for decision in run.effect_plan}
