@@ -223,7 +223,7 @@ def write_picture(path: Path, on: Outcome, off: Outcome) -> None:
             mesh = each.capture.mesh(view.timestep)
             image = render_avatar(each.avatar, mesh, view.camera, each.avatar.background)
             pictures.append(to_uint8(image))
-    Image.fromarray(side_by_side(pictures)).save(path)
+    Image.fromarray(side_by_side(pictures)).save(path, quality=92)
 
 
 def cell(value: Spread, decimals: int) -> str:

@@ -25,7 +25,7 @@ from ...files import replacing, write_json
 from ...jobs.export import capture_views
 from ...jobs.train import Train
 from ...raster.cpu.precompile import begin_compiling
-from ...render.render import render_avatar, to_uint8
+from ...render.render import render, render_avatar, to_uint8
 from ...selection import SelectionOptions, select_capture
 from ...training.evaluate.metrics import evaluate_avatar
 from ...training.run.folder import AVATAR, RUN
@@ -204,7 +204,10 @@ def selection_picture(
     luminance = 0.5 + SH_C0 * sh[:, 0] @ np.array([0.299, 0.587, 0.114], np.float32)
     sh[gray] = 0
     sh[gray, 0] = ((0.25 + 0.4 * luminance[gray]) - 0.5)[:, None] / SH_C0
-    return render_avatar(replace(avatar, splats=replace(splats, sh=sh)), mesh, camera)
+    frames = avatar.frames(mesh)
+    frames = replace(frames, color=frames.color * selected[:, None])
+    splats = replace(splats, sh=sh)
+    return render(splats, camera, frames=frames, antialiased=avatar.antialiased)
 
 
 def side_by_side(pictures: list[np.ndarray]) -> np.ndarray:
