@@ -19,7 +19,7 @@ on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and
 the rounding."""
 # from this z on, the perpendicular of a unit vector is sought in the x direction
 UPRIGHT_COSINE = 0.8
-NOTHING = np.zeros((1, 0), np.float32)
+NO_COLUMNS = np.zeros((1, 0), np.float32)
 """Of `FaceFrames.deformation` and `color` where nothing needs or drives them."""
 
 
@@ -36,8 +36,8 @@ class FaceFrames:
     origin: np.ndarray
     rotation: np.ndarray
     scale: np.ndarray
-    deformation: np.ndarray = field(default_factory=lambda: NOTHING)
-    color: np.ndarray = field(default_factory=lambda: NOTHING)
+    deformation: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
+    color: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
 
     @cached_property
     def quaternion(self) -> np.ndarray:
@@ -83,7 +83,7 @@ def face_frames(
         scale = (edge + np.where(no_edge, side, height)) / 2
     else:
         raise ValueError(f"embedding convention {convention!r} is not one of {CONVENTIONS}")
-    deformed = NOTHING
+    deformed = NO_COLUMNS
     if strain is not None:
         first_squared, second_squared = triangles.squared
         products = first_squared, _dot(to_p1, to_p2), second_squared

@@ -221,8 +221,8 @@ def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
     limits = arrays.get("strain_range")
     if limits is not None:
         check_array(path, "strain_range", limits, "float32", (faces, *known))
-        rest = np.broadcast_to(TRAINED_RANGE[:, STRAIN_COMPONENTS:], limits.shape)
-        limits = arrays["strain_range"] = np.concatenate([limits, rest], axis=2)
+        of_normal = np.broadcast_to(TRAINED_RANGE[:, STRAIN_COMPONENTS:], limits.shape)
+        limits = arrays["strain_range"] = np.concatenate([limits, of_normal], axis=2)
     colors = arrays.pop("strain_color", np.zeros((count, 0, 3), np.float32))
     if not colors.size:
         return
@@ -235,7 +235,8 @@ def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
     if limits is not None:
         rest = at_rest(limits)[face, :STRAIN_COMPONENTS]
         arrays["sh"][:, 0] += np.einsum("ns,nsc->nc", rest, colors) / np.float32(SH_C0)
-    area = np.sort(arrays["log_scale"], axis=1)[:, 1:].sum(1) - np.log1p(np.exp(-arrays["opacity"]))
+    area = np.sort(arrays["log_scale"], axis=1)[:, 1:].sum(1)  # its logarithm
+    area -= np.logaddexp(0, -arrays["opacity"])
     weight = np.exp(area - area.max())
     share = weight / np.maximum(np.bincount(face, weight, faces), np.finfo(np.float32).tiny)[face]
     parts = (share[:, None] * colors.reshape(count, -1)).T

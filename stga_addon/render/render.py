@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..avatar.embedding import NOTHING, WORLD, FaceFrames
+from ..avatar.embedding import NO_COLUMNS, WORLD, FaceFrames
 from ..avatar.file import Avatar
 from ..avatar.splats import SH_C0, Splats
 from ..capture.camera import Camera
@@ -79,7 +79,7 @@ def render_colors(
 ) -> np.ndarray:  # fmt: skip
     """`render_avatar` with sRGB colors (N, 3), as `light.relight` finds them, not its own."""
     sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
-    pose = replace(avatar.frames(mesh), color=NOTHING), avatar.antialiased
+    pose = replace(avatar.frames(mesh), color=NO_COLUMNS), avatar.antialiased
     splats = replace(avatar.splats, sh=sh)
     return render(splats, camera, background, *pose, composer, behind)
 

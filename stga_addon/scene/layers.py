@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..avatar.embedding import NOTHING, FaceFrames
+from ..avatar.embedding import NO_COLUMNS, FaceFrames
 from ..avatar.splats import SH_C0, Splats
 from ..capture.color import linear_to_srgb
 from ..light.relight import Relighter
@@ -70,7 +70,7 @@ class SceneLayer:
         if self.relit is not None:
             assert eye is not None
             splats = self.relit.splats(self.eye_in_avatar(eye))
-            frames = replace(frames, color=NOTHING)
+            frames = replace(frames, color=NO_COLUMNS)
         visible = 1 / (1 + np.exp(-splats.opacity)) >= settings.opacity_threshold
         visible &= random_percentage(len(splats)) < settings.percentage
         if self.frozen is not None:

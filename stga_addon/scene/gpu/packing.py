@@ -171,7 +171,7 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
     for layer, first, row in zip(layers, static.rows, rows, strict=True):
         settings = layer.settings
         row[0] = first if settings.view_dependent else (*first[:3], 0)
-        row[1] = layer.antialiased, 0, settings.size, settings.opacity_threshold
+        row[1] = layer.antialiased, settings.size, settings.opacity_threshold, 0
         # From directions in camera space to those of training: without scale and reflection.
         u, _, v = np.linalg.svd((camera.world_to_camera @ layer.to_world)[:3, :3])
         row[2:5, :3] = (u @ v).T

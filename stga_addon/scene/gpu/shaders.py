@@ -11,7 +11,7 @@ Textures of `packing.py`, each 2048 texels wide and read by texel index:
              second, …), then color and whether frozen, then color where the scene lights them
     table    the view: focal lengths and principal point; width, height, number of clip planes; 6
              clip planes; per layer: first color, first splat, colors per splat, degree;
-             antialiased, 0, size, opacity threshold; three rows of the matrix to directions,
+             antialiased, size, opacity threshold, 0; three rows of the matrix to directions,
              with percentage, show selection, selected only
 Where the scene lights splats, as `light.relight.Relighter` does:
     surface   per splat: recorded sRGB without what depends on the view, roughness; irradiance of
@@ -251,7 +251,7 @@ void main()
   vec4 turn2 = TEXEL(table, row + 4), face_color = TEXEL(frames, 3 * faces + face);
   float opacity = axis0.w;
   bool frozen = face_color.w > 0.5;
-  if (opacity < display.w || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
+  if (opacity < display.z || axis1.w >= turn0.w || (frozen && turn2.w > 0.5)) {
     return;
   }
   vec4 r0 = TEXEL(frames, face), r1 = TEXEL(frames, faces + face);
@@ -268,15 +268,15 @@ void main()
   vec2 least = -principal / focal - margin, most = (image.xy - principal) / focal + margin;
   vec2 slope = clamp(p.xy / p.z, least, most), zoom = focal / p.z;
   vec3 u = zoom.x * (r0.xyz - slope.x * r2.xyz), v = zoom.y * (r1.xyz - slope.y * r2.xyz);
-  vec3 a = display.z * vec3(dot(u, axis0.xyz), dot(u, axis1.xyz), dot(u, axis2.xyz));
-  vec3 b = display.z * vec3(dot(v, axis0.xyz), dot(v, axis1.xyz), dot(v, axis2.xyz));
+  vec3 a = display.y * vec3(dot(u, axis0.xyz), dot(u, axis1.xyz), dot(u, axis2.xyz));
+  vec3 b = display.y * vec3(dot(v, axis0.xyz), dot(v, axis1.xyz), dot(v, axis2.xyz));
   float xx = dot(a, a) + LOW_PASS_PX2, xy = dot(a, b), yy = dot(b, b) + LOW_PASS_PX2;
   vec3 minors = cross(a, b); /* the determinant without cancellation */
   float sharp = dot(minors, minors), determinant = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2);
   if (display.x > 0.5) {
     opacity *= sqrt(sharp / determinant);
   }
-  if (!(opacity >= MIN_ALPHA) || !(determinant < 1e30) || display.z <= 0.0) {
+  if (!(opacity >= MIN_ALPHA) || !(determinant < 1e30) || display.y <= 0.0) {
     return;
   }
   vec3 toward = normalize(p);

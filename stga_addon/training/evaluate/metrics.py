@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion, prewitt, uniform_filter
 
-from ...avatar.embedding import NOTHING
+from ...avatar.embedding import NO_COLUMNS
 from ...avatar.file import Avatar
 from ...avatar.splats import SH_C0, Splats
 from ...capture.images import read_image, read_mask, read_view
@@ -378,7 +378,7 @@ def triangle_residuals(
         # The gradient with respect to a color is the sum of blending weights times that with
         # respect to the image.
         v_image = np.stack([difference, np.ones_like(difference), np.zeros_like(difference)])
-        frames = frames._replace(color=NOTHING)
+        frames = frames._replace(color=NO_COLUMNS)
         output = render(gray, frames=frames, degree=0)
         rows, _ = render_backward(
             output, gray, splats.face, frames, v_image, gradients, buffers=buffers

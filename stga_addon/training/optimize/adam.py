@@ -65,6 +65,7 @@ def step_offsets(
     so its gradient is their sum.
     """
     totals: dict[str, np.ndarray] = {}  # by target
+    listed = np.zeros(0, np.int32)  # triangles with a trained splat
     for name, state in states.items():
         offset, count = OFFSETS[name], len(state.steps)
         if offset.target not in totals:
@@ -74,8 +75,9 @@ def step_offsets(
             total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
             sum_by_triangle(rows, face, by_splat, total, trained)
             totals[offset.target] = np.float32(per_unit) * total
+            listed = np.flatnonzero(trained).astype(np.int32)
         gradient = signal(offset.signal)[:, :, None] * totals[offset.target][:, None, :]
         rate = np.full(gradient[0].size, offset.rate_share * rates[offset.rate], np.float32)
         arrays = (state.value, gradient, state.first, state.second, state.average)
         tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rate])
-        adam_rows(np.flatnonzero(trained).astype(np.int32), state.steps, (tables,), options)
+        adam_rows(listed, state.steps, (tables,), options)

@@ -252,10 +252,8 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     arrays = read_npz(path)
     if not np.array_equal(arrays.get(IDENTITY, ()), identity):
         raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
-    found, shape = (
-        arrays.get("strain_range", np.zeros(0)),
-        (len(capture.faces), *TRAINED_RANGE.shape),
-    )
+    found = arrays.get("strain_range", np.zeros(0))
+    shape = len(capture.faces), *TRAINED_RANGE.shape
     check_array(path, "strain_range", found, "float32", shape)
     if not _is_trained_range(found):
         text = "is not within the range that is trained; remove it"

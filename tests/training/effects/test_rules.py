@@ -126,7 +126,8 @@ def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on):
     """Catches an effect left off for a small loss in one kind of view although it gains much in the
     other, one that is on for what only one kind gains, and a figure that does not show a loss."""
     errors = {"frames": Evidence(*frames), "cameras": Evidence(*cameras)}
-    facts = SimpleNamespace(signal_change=lambda name: 0.1, timesteps=10, strain_dependence=errors)
+    change = {"smoothed_strain": 0.1}.__getitem__
+    facts = SimpleNamespace(signal_change=change, timesteps=10, strain_dependence=errors)
     verdict = rules.strain(facts)
     assert [f"{gain:+.2f}" for gain in gains(verdict)] == gained.split()
     assert verdict.on == on
@@ -134,7 +135,8 @@ def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on):
 
 def test_few_frames_tell_nothing_of_unseen_ones():
     """Catches a figure of 0 levels as the reason where nothing could be left out."""
-    verdict = rules.strain(SimpleNamespace(signal_change=lambda name: 0.1, timesteps=3))
+    change = {"smoothed_strain": 0.1}.__getitem__
+    verdict = rules.strain(SimpleNamespace(signal_change=change, timesteps=3))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert verdict.reason.startswith("3 frames are too few to tell what")
 
@@ -146,7 +148,7 @@ def test_color_that_follows_the_normal(painted):
     turn = float(re.search(r"turn by (.*)°", plan["normal-color"].reason)[1])
     assert plan["normal-color"].on == (turn > rules.MIN_TURN_DEG)
     for change, on in ((0.09, True), (0.02, False)):
-        facts = SimpleNamespace(signal_change=lambda name, change=change: change)
+        facts = SimpleNamespace(signal_change={"normal": change}.__getitem__)
         verdict = rules.normal_color(facts)
         assert (verdict.on, verdict.fixed) == (on, False)
         assert f"turn by {np.degrees(3**0.5 * change):.1f}°" in verdict.reason
