@@ -121,14 +121,26 @@ def add_screen_gradients(work, rows, screen_gradient, total, count):
 
 @jit
 def sum_by_triangle(rows, face, gradient, total, trained):
-    """Add gradient (N, 3) of the listed rows (M,) to the total (F, 3) of their triangles, marked in
-    trained (F,)."""
+    """Add the first three columns of gradient (N, D) of the listed rows (M,) to the total (F, 3) of
+    their triangles, marked in trained (F,)."""
     for n in range(len(rows)):
         i = rows[n]
         f = face[i]
         trained[f] = True
         for c in range(3):
             total[f, c] += gradient[i, c]
+
+
+@jit
+def offset_gradient(triangles, signal, total, per_unit, out):
+    """Write to the listed triangles (L,) of out (F, 9) the gradient of a driven offset's
+    coefficients: per_unit · signal (F, 3) ⊗ total (F, 3)."""
+    for n in range(len(triangles)):
+        f = triangles[n]
+        for k in range(3):
+            factor = per_unit * signal[f, k]
+            for c in range(3):
+                out[f, 3 * k + c] = factor * total[f, c]
 
 
 @jit

@@ -8,7 +8,13 @@ from ...avatar.offsets import COLOR, OFFSETS
 from ...avatar.splats import MAX_SH_DEGREE, SH_C0
 from ...capture.camera import Camera
 from ...raster.cpu.layout import Parameters
-from ...raster.cpu.optimizer import AdamOptions, AdamTables, adam_rows, sum_by_triangle
+from ...raster.cpu.optimizer import (
+    AdamOptions,
+    AdamTables,
+    adam_rows,
+    offset_gradient,
+    sum_by_triangle,
+)
 from ..settings import TrainingSettings
 from .state import OffsetState, TrainState
 
@@ -68,16 +74,16 @@ def step_offsets(
     listed = np.zeros(0, np.int32)  # triangles with a trained splat
     for name, state in states.items():
         offset, count = OFFSETS[name], len(state.steps)
+        is_color = offset.target == COLOR
+        by_splat, per_unit = (gradients.sh, 1 / SH_C0) if is_color else (gradients.xyz, 1.0)
         if offset.target not in totals:
-            by_splat, per_unit = gradients.xyz, 1.0
-            if offset.target == COLOR:
-                by_splat, per_unit = np.ascontiguousarray(gradients.sh[:, 0]), 1 / SH_C0
-            total, trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
-            sum_by_triangle(rows, face, by_splat, total, trained)
-            totals[offset.target] = np.float32(per_unit) * total
+            totals[offset.target], trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
+            by_splat = by_splat.reshape(len(by_splat), -1)
+            sum_by_triangle(rows, face, by_splat, totals[offset.target], trained)
             listed = np.flatnonzero(trained).astype(np.int32)
-        gradient = signal(offset.signal)[:, :, None] * totals[offset.target][:, None, :]
-        rate = np.full(gradient[0].size, offset.rate_share * rates[offset.rate], np.float32)
-        arrays = (state.value, gradient, state.first, state.second, state.average)
-        tables = AdamTables._make([*(array.reshape(count, -1) for array in arrays), rate])
-        adam_rows(listed, state.steps, (tables,), options)
+        arrays = (state.value, np.empty_like(state.value), state.first, state.second, state.average)
+        tables = [array.reshape(count, -1) for array in arrays]
+        total, gradient = totals[offset.target], tables[1]
+        offset_gradient(listed, signal(offset.signal), total, np.float32(per_unit), gradient)
+        rate = np.full(gradient.shape[1], offset.rate_share * rates[offset.rate], np.float32)
+        adam_rows(listed, state.steps, (AdamTables._make([*tables, rate]),), options)

@@ -74,7 +74,8 @@ class FrameStore:
             assert self.strain is not None
             frames, entry = self.of(timestep), self._latest(timestep)
             if name not in entry.signals:
-                entry.signals[name] = SIGNALS[name](self.strain, frames)
+                # Numba compiles for arrays without gaps.
+                entry.signals[name] = np.ascontiguousarray(SIGNALS[name](self.strain, frames))
             return entry.signals[name]
 
         return signal
