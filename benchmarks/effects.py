@@ -323,7 +323,7 @@ def each(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:
 def changes(effect: str) -> bool:
     """Whether the effect changes training; those of Blender's rig do not."""
     known = EFFECTS[effect]
-    return bool(known.switch or known.off or known.offset) or effect == "exposure"
+    return bool(known.switch or known.off or known.offsets) or effect == "exposure"
 
 
 def switch(opened: Mapping[str, Capture], options: argparse.Namespace) -> None:

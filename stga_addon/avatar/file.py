@@ -14,7 +14,7 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
 from ..files import parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
-from .offsets import OFFSETS, SIGNALS, moved_frames
+from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
 from .splats import ARRAYS, SH_C0, Splats
 from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
@@ -37,6 +37,8 @@ _LIGHT_ARRAYS = {
 }
 """Field -> shape, -1: vertices."""
 _PREFIX = "light_"
+MIN_COLOR_CHANGE, MIN_SHIFT_M, MIN_GROWTH = 1 / 255, 2e-4, 0.02
+"""Of splats that follow a signal: what never changes them by as much is not kept."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,28 @@ class Avatar:
         """Without what is the capture's light in it (`DrivenOffset.of_light`)."""
         kept = {n: each for n, each in self.driven_offsets.items() if not OFFSETS[n].of_light}
         return self if len(kept) == len(self.driven_offsets) else replace(self, driven_offsets=kept)
+
+    @property
+    def pruned(self) -> "Avatar":
+        """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
+        MIN_SHIFT_M or a share of MIN_GROWTH anywhere in its `strain_range`."""
+        basis, kept = self._strain, {}
+        if basis is None:
+            return self
+        rest = at_rest(basis.range)
+        farthest = rest + np.abs(basis.range - rest[:, None]).max(1)
+        plain = face_frames(self.neutral, self.faces, self.neutral, self.convention)
+        frames = replace(plain, deformation=farthest)
+        least = {COLOR: MIN_COLOR_CHANGE, POSITION: MIN_SHIFT_M / frames.scale, SCALE: MIN_GROWTH}
+        for name, coefficients in self.driven_offsets.items():
+            offset = OFFSETS[name]
+            signal = np.abs(SIGNALS[offset.signal](basis, frames))
+            change = offset_of(np.abs(coefficients), signal).max(1)
+            if not signal.any():  # it does not come from the deformation
+                change[:] = np.inf
+            shows = (change >= least[offset.target])[:, None, None]
+            kept[name] = np.where(shows, coefficients, np.float32(0))
+        return replace(self, driven_offsets=kept)
 
     def frames(self, mesh: np.ndarray) -> FaceFrames:
         """The triangles' local frames on a posed mesh (V, 3), moved and colored by the driven

@@ -16,7 +16,7 @@ SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
 }
 """By name: (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the
 frames; 0 where it is at rest. "normal": the change of the unit normal, world axes."""
-POSITION, COLOR = "position", "color"
+POSITION, SCALE, COLOR = "position", "scale", "color"
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,8 @@ class DrivenOffset:
 
     name        of the coefficients (F, 3, 3) in settings, avatar files and checkpoints
     signal      what drives it, of SIGNALS
-    target      POSITION: by a vector in the triangle's own axes and unit; COLOR: sRGB
+    target      POSITION: by a vector in the triangle's own axes and unit; SCALE: that unit, by the
+                exponential of the first component; COLOR: sRGB
     rate, rate_share  learning rate: which of `Rates`, and a share of it
     of_light    whether it is the capture's light, which other light takes the place of
     """
@@ -40,14 +41,16 @@ class DrivenOffset:
 
 _ROWS = (
     DrivenOffset("strain_position", "smoothed_strain", POSITION, "xyz", 0.5),
+    DrivenOffset("strain_scale", "smoothed_strain", SCALE, "log_scale", 0.5),
     DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
     DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
     DrivenOffset("older_strain_color", "strain", COLOR, "strain_color", 1.0),
 )
 OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
 """By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
-compressed bulges and darkens; skin that turns in a light that stays gets brighter or darker. The
-last is read from avatars of version 0.2.0, and trained where their runs are continued."""
+compressed bulges and darkens, and splats on what is stretched grow; skin that turns in a light that
+stays gets brighter or darker. The last is read from avatars of version 0.2.0, and trained where
+their runs are continued."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
@@ -58,9 +61,9 @@ def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:
 def moved_frames(
     frames: FaceFrames, coefficients: Mapping[str, np.ndarray], signal: Callable[[str], np.ndarray]
 ) -> FaceFrames:
-    """The frames, moved and colored by every driven offset of which there are coefficients; signal:
-    name of SIGNALS -> (F, 3)."""
-    color = np.zeros((len(frames.scale), 3), np.float32)
+    """The frames, moved, scaled and colored by every driven offset of which there are coefficients;
+    signal: name of SIGNALS -> (F, 3)."""
+    color, unit = np.zeros((len(frames.scale), 3), np.float32), frames.scale
     for name, values in coefficients.items():
         offset = OFFSETS[name]
         change = offset_of(values, signal(offset.signal))
@@ -68,7 +71,10 @@ def moved_frames(
             color += change
             frames = replace(frames, color=color)
             continue
+        if offset.target == SCALE:
+            frames = replace(frames, scale=frames.scale * np.exp(change[:, 0].astype(np.float64)))
+            continue
         # In one type: einsum takes several times as long where it has to convert.
         turned = np.einsum("fij,fj->fi", frames.rotation, change.astype(np.float64))
-        frames = replace(frames, origin=frames.origin + frames.scale[:, None] * turned)
+        frames = replace(frames, origin=frames.origin + unit[:, None] * turned)
     return frames

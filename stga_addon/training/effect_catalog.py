@@ -15,7 +15,7 @@ class Effect:
     title, price  for everybody: two or three words, and one of "free", "slower" and "larger"
     switch        the setting that is true where it is on, and false where it is off
     on, off       other changes to `TrainingSettings`
-    offset        the driven offset (`avatar.offsets.OFFSETS`) that it trains, if any
+    offsets       the driven offsets (`avatar.offsets.OFFSETS`) that it trains
     added_later   whether a continuation may switch it on in a run that went without: only where it
                   adds coefficients, which leave the splats as they were while they are zero
     """
@@ -27,7 +27,7 @@ class Effect:
     switch: str = ""
     on: Mapping[str, Any] = field(default_factory=dict)
     off: Mapping[str, Any] = field(default_factory=dict)
-    offset: str | None = None
+    offsets: tuple[str, ...] = ()
     added_later: bool = False
 
 
@@ -58,12 +58,13 @@ _EFFECTS = (
            "none: local iterations are cheaper than global ones",
            on={"strategy": "selective"}, off={"strategy": "global"}),
     Effect("strain-color", "Color of wrinkles", "slower",
-           f"9 coefficients a triangle, {_STRAIN}", offset="strain_color", added_later=True),
+           f"9 coefficients a triangle, {_STRAIN}", offsets=("strain_color",), added_later=True),
     Effect("normal-color", "Shade of turned skin", "slower",
            "9 coefficients a triangle, and the normals of every frame",
-           offset="normal_color", added_later=True),
+           offsets=("normal_color",), added_later=True),
     Effect("strain-position", "Shape of wrinkles", "slower",
-           f"9 coefficients a triangle, {_STRAIN}", offset="strain_position", added_later=True),
+           f"12 coefficients a triangle, {_STRAIN}",
+           offsets=("strain_position", "strain_scale"), added_later=True),
     Effect(RELIGHT, "Other lighting", "slower",
            "seconds after training, and 30 bytes a vertex in the avatar file"),
     Effect(WORLD, "Room behind", "slower",

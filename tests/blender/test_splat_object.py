@@ -8,9 +8,9 @@ import mathutils
 import numpy as np
 import pytest
 
-from stga_addon.avatar.embedding import CONVENTIONS, to_world
+from stga_addon.avatar.embedding import CONVENTIONS, face_areas, to_world
 from stga_addon.avatar.file import Avatar
-from stga_addon.avatar.offsets import OFFSETS, POSITION
+from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.avatar.strain import at_rest, edge_neighbors
 from stga_addon.errors import StgaError
@@ -218,8 +218,12 @@ def driven_avatar(
     lowest, highest = [[-2, -0.3], [-0.3, -0.02]], [[-0.3, 2], [0.02, 0.3]]
     ends = [rng.uniform(*np.repeat(each, 3, 0).T, (len(faces), 6)) for each in (lowest, highest)]
     moves = 0.004 if convention == "stga" else 0.3
-    units = [moves if OFFSETS[name].target == POSITION else 0.5 for name in names]
+    sizes = {POSITION: moves, SCALE: 0.1, COLOR: 0.5}
+    units = [sizes[OFFSETS[name].target] for name in names]
     values = [rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32) for unit in units]
+    for each, unit in zip(values, units, strict=True):
+        if unit == sizes[SCALE]:  # nodes keep the size of what has no area in the neutral mesh
+            each[face_areas(neutral, faces) == 0] = 0
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
     avatar = replace(avatar, splats=splats, neutral=neutral.astype(np.float32), faces=faces)
     limits, offsets = np.stack(ends, 1).astype(np.float32), dict(zip(names, values, strict=True))

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION
+from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
 from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam
@@ -29,7 +29,7 @@ def squeezed(toy: Capture) -> Capture:
     return replace(toy, mesh=lambda timestep: toy.neutral * scales[timestep])
 
 
-SIZES = {POSITION: 1e-3, COLOR: 0.1}
+SIZES = {POSITION: 1e-3, SCALE: 0.1, COLOR: 0.1}
 """Of coefficients."""
 
 
@@ -85,8 +85,8 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy: Capture, name: str) 
         np.testing.assert_allclose(gradient[face, component, axis], slope, rtol=0.1)
     rate = offset.rate_share * getattr(trainer.settings.rates, offset.rate)
     moved = (stepped - before)[strongest]
-    # Adam's first step is as long as the rate
-    np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.05)
+    # Adam's first step is nearly as long as the rate
+    np.testing.assert_allclose(np.abs(moved).max((1, 2)), rate, rtol=0.1)
     assert (np.sign(moved) == -np.sign(gradient[strongest])).all()
 
 
@@ -104,11 +104,12 @@ def test_the_step_is_adam_in_float64() -> None:
         smoothed = rng.normal(0, 1, (faces, 3)).astype(np.float32)
         if number == 2:
             gradient[rows[face[rows] == 3]] = np.inf
-        adam.step_offsets(
-            {offset.name: state}, rows, face, SimpleNamespace(xyz=gradient),
-            {offset.signal: smoothed}.__getitem__, {offset.rate: rate},
-            adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon)),
-        )  # fmt: skip
+        splats = SimpleNamespace(
+            driven_offsets={offset.name: state}, face=face, gradients=SimpleNamespace(xyz=gradient)
+        )
+        options = adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon))
+        signal, rates = {offset.signal: smoothed}.__getitem__, {offset.rate: rate}
+        adam.step_offsets(splats, rows, signal, rates, options)
         for f in np.unique(face[rows]):
             steps[f] += 1
             summed = sum(gradient[i].astype(np.float64) for i in rows if face[i] == f)

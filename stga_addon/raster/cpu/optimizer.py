@@ -120,15 +120,23 @@ def add_screen_gradients(work, rows, screen_gradient, total, count):
 
 
 @jit
-def sum_by_triangle(rows, face, gradient, total, trained):
+def sum_by_triangle(rows, face, gradient, total):
     """Add the first three columns of gradient (N, D) of the listed rows (M,) to the total (F, 3) of
-    their triangles, marked in trained (F,)."""
+    their triangles."""
     for n in range(len(rows)):
         i = rows[n]
-        f = face[i]
-        trained[f] = True
         for c in range(3):
-            total[f, c] += gradient[i, c]
+            total[face[i], c] += gradient[i, c]
+
+
+@jit
+def sum_growth(rows, face, xyz, v_xyz, v_log_scale, total):
+    """Add to the first column of total (F, 3), of the listed rows' (M,) triangles, the gradient of
+    the logarithm of their frames' scale, from that of their splats' (N, 3)."""
+    for n in range(len(rows)):
+        i = rows[n]
+        for c in range(3):
+            total[face[i], 0] += xyz[i, c] * v_xyz[i, c] + v_log_scale[i, c]
 
 
 @jit

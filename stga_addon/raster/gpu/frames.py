@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...avatar import embedding
-from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.offsets import OFFSETS
 from ...avatar.strain import AVERAGING_ROUNDS, STRAIN_COMPONENTS, StrainBasis
 from ...capture.camera import Camera
 from .device import Device, Recording
@@ -96,7 +96,7 @@ class Embedding:
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:
         """Record the frames of the mesh that was uploaded last; returns their table.
 
-        coefficients: driven offset -> table (F, 3, 3): the frames are moved and colored by them as
+        coefficients: driven offset -> table (F, 3, 3): the frames are changed by them as
         in `Avatar.frames`.
         """
         tables = self._tables
@@ -107,9 +107,8 @@ class Embedding:
             strain = tables["strain_from_rest"]
             found = strain, self._smoothed.record(work, strain), tables["normal_change"]
             self.signals = dict(zip(SIGNALS, found, strict=True))
-        for name, table in coefficients.items():
+        for name in sorted(coefficients, key=list(OFFSETS).index):  # scale after position
             driving = self.signals[OFFSETS[name].signal]
-            kernel = "frames.color" if OFFSETS[name].target == COLOR else "frames.shift"
-            given = {**tables, "coefficients": table, "driving": driving}
-            work.dispatch(kernel, self._count, given)
+            given = {**tables, "coefficients": coefficients[name], "driving": driving}
+            work.dispatch(f"frames.move_{OFFSETS[name].target}", self._count, given)
         return frames

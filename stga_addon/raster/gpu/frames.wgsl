@@ -203,7 +203,7 @@ fn driven(f: u32) -> vec3f {
 
 // Add what is driven to a triangle's color.
 @compute @workgroup_size(WORKGROUP)
-fn color(thread: Thread) {
+fn move_color(thread: Thread) {
   let f = thread_number(thread);
   if f >= pose.triangles {
     return;
@@ -216,7 +216,7 @@ fn color(thread: Thread) {
 
 // Move a triangle's origin by what is driven, in the triangle's axes and unit.
 @compute @workgroup_size(WORKGROUP)
-fn shift(thread: Thread) {
+fn move_position(thread: Thread) {
   let f = thread_number(thread);
   if f >= pose.triangles {
     return;
@@ -226,5 +226,18 @@ fn shift(thread: Thread) {
   for (var axis = 0u; axis < 3u; axis++) {
     let row = at + FRAME_MATRIX + 3u * axis;
     frames[at + FRAME_ORIGIN + axis] += dot(vec3f(frames[row], frames[row + 1u], frames[row + 2u]), moved);
+  }
+}
+
+// Scale a triangle's frame by the exponential of the first component of what is driven, about its origin.
+@compute @workgroup_size(WORKGROUP)
+fn move_scale(thread: Thread) {
+  let f = thread_number(thread);
+  if f >= pose.triangles {
+    return;
+  }
+  let growth = exp(driven(f).x);
+  for (var c = 0u; c < 9u; c++) {
+    frames[f * FRAME_STRIDE + FRAME_MATRIX + c] *= growth;
   }
 }

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.splats import SH_C0
 from ..cpu.layout import Parameters
 from ..cpu.optimizer import AdamOptions
@@ -17,7 +17,8 @@ from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
 KERNELS = (
-    "frames.compose frames.average_strain frames.smooth_strain frames.shift frames.color"
+    "frames.compose frames.average_strain frames.smooth_strain"
+    " frames.move_position frames.move_scale frames.move_color"
     " project.mark_focus project.forward project.backward"
     " tiles.mark_touched tiles.choose_rendered tiles.count_pairs tiles.add_pairs tiles.fill_pairs"
     " tiles.find_ranges blend.forward blend.backward image_loss.gradient image_loss.total"
@@ -166,7 +167,9 @@ def step_offsets(
 def offset_constants(name: str) -> dict[str, float]:
     """The constants of `step_offset` for a driven offset."""
     offset = OFFSETS[name]
-    by_splat = {"TARGET": SH, "PER_UNIT": 1 / SH_C0} if offset.target == COLOR else {"TARGET": XYZ}
+    by_splat = {"TARGET": XYZ, "PER_UNIT": 1.0, "IS_SCALE": float(offset.target == SCALE)}
+    if offset.target == COLOR:
+        by_splat |= {"TARGET": SH, "PER_UNIT": 1 / SH_C0}
     return by_splat | {"RATE": RATES.index(offset.rate), "RATE_SHARE": offset.rate_share}
 
 

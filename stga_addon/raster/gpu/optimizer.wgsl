@@ -22,6 +22,7 @@ var<storage> splats_of: array<u32>;
 
 // Of a driven offset: where the splats' gradient that trains it begins in a row, by how much of it, and its learning rate.
 override TARGET: u32 = 0u;
+override IS_SCALE: bool = false; // then it is that of the logarithm of the triangle's scale
 override PER_UNIT: f32 = 1.0;
 override RATE: u32 = 0u;
 override RATE_SHARE: f32 = 1.0;
@@ -226,7 +227,14 @@ fn step_offset(thread: Thread) {
     let i = splats_of[n];
     if wanted[i] != 0u {
       let at = i * splat_stride() + TARGET;
-      total += vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
+      let gradient = vec3f(gradients[at], gradients[at + 1u], gradients[at + 2u]);
+      if IS_SCALE {
+        let sizes = i * splat_stride() + LOG_SCALE;
+        total.x += dot(splat_vec3(i * splat_stride() + XYZ), gradient) + gradients[sizes] + gradients[sizes + 1u]
+          + gradients[sizes + 2u];
+      } else {
+        total += gradient;
+      }
       is_wanted = true;
     }
   }

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ...avatar.embedding import CONVENTIONS, MIN_AREA_RATIO, UPRIGHT_COSINE
-from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.strain import AVERAGING_ROUNDS, MIN_SQUARED_NORMAL, STRAIN_COMPONENTS, STRAIN_GAIN
 from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
@@ -211,7 +211,7 @@ components. What follows others is displayed as trained only."""
 
 @cache
 def driven(name: str, convention: str) -> NodeGroup:
-    """The group that moves or colors triangles by a driven offset, as
+    """The group that moves, scales or colors triangles by a driven offset, as
     `avatar.offsets.moved_frames`: a mesh from FRAMES with the signal to the same mesh."""
 
     def build(nodes: Nodes, mesh: Any) -> Any:
@@ -219,6 +219,13 @@ def driven(name: str, convention: str) -> NodeGroup:
         signal = nodes.components(nodes.attribute(_SIGNAL.format(offset.signal)))
         names = [stored.DRIVEN_OFFSET.format(name, index) for index in range(len(signal))]
         target, change = FACE_COLOR, _weighted(nodes, names, signal)
+        if offset.target == SCALE:
+            log_scale, _, _ = nodes.components(change)
+            if convention == "stga":  # whose size is an area
+                log_scale = nodes.math("MULTIPLY", log_scale, 2.0)
+            size = nodes.attribute(_FRAME_SIZE, "FLOAT")
+            size = nodes.math("MULTIPLY", size, nodes.math("EXPONENT", log_scale))
+            return nodes.store(mesh, _FRAME_SIZE, size, "FLOAT", "FACE")
         if offset.target != COLOR:
             target = _FRAME_ORIGIN
             change, _, _ = _in_space(nodes, nodes.attribute, change, convention)

@@ -352,8 +352,8 @@ def _switched(
     changed = {**effect.on, **verdict.changes} if on else dict(effect.off)
     if effect.switch:
         changed[effect.switch] = on
-    if effect.offset is not None:
-        offsets = {*settings.driven_offsets} - {effect.offset} | ({effect.offset} if on else set())
+    if effect.offsets:
+        offsets = {*settings.driven_offsets} - {*effect.offsets} | {*(effect.offsets if on else ())}
         changed["driven_offsets"] = tuple(name for name in OFFSETS if name in offsets)
     return replace(settings, **changed)
 

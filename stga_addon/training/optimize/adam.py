@@ -4,19 +4,19 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ...avatar.offsets import COLOR, OFFSETS
+from ...avatar.offsets import COLOR, OFFSETS, SCALE
 from ...avatar.splats import MAX_SH_DEGREE, SH_C0
 from ...capture.camera import Camera
-from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import (
     AdamOptions,
     AdamTables,
     adam_rows,
     offset_gradient,
     sum_by_triangle,
+    sum_growth,
 )
 from ..settings import TrainingSettings
-from .state import OffsetState, TrainState
+from .state import TrainState
 
 PLAIN = AdamOptions(*map(np.float32, (0.9, 0.999, 1e-15, 0.0, 1.0)))
 """3D Gaussian Splatting's, without an average."""
@@ -56,34 +56,39 @@ def step(
 
 
 def step_offsets(
-    states: Mapping[str, OffsetState],
+    state: TrainState,
     rows: np.ndarray,
-    face: np.ndarray,
-    gradients: Parameters,
     signal: Callable[[str], np.ndarray],
     rates: Mapping[str, float],
     options: AdamOptions,
 ) -> None:
-    """Adam step of the triangles face (N,) of the listed splats rows (M,), which have these
+    """Adam step of the driven offsets of the triangles of the listed splats rows (M,), which have
     gradients.
 
     signal: name of SIGNALS -> (F, 3); rates: the splats'. A triangle changes all its splats alike,
     so its gradient is their sum.
     """
-    totals: dict[str, np.ndarray] = {}  # by target
-    listed = np.zeros(0, np.int32)  # triangles with a trained splat
-    for name, state in states.items():
-        offset, count = OFFSETS[name], len(state.steps)
-        is_color = offset.target == COLOR
-        by_splat, per_unit = (gradients.sh, 1 / SH_C0) if is_color else (gradients.xyz, 1.0)
+    if not state.driven_offsets:
+        return
+    face, gradients = state.face, state.gradients
+    count = len(next(iter(state.driven_offsets.values())).steps)
+    trained = np.zeros(count, bool)
+    trained[face[rows]] = True
+    listed, totals = np.flatnonzero(trained).astype(np.int32), dict[str, np.ndarray]()  # by target
+    for name, own in state.driven_offsets.items():
+        offset = OFFSETS[name]
         if offset.target not in totals:
-            totals[offset.target], trained = np.zeros((count, 3), np.float32), np.zeros(count, bool)
-            by_splat = by_splat.reshape(len(by_splat), -1)
-            sum_by_triangle(rows, face, by_splat, totals[offset.target], trained)
-            listed = np.flatnonzero(trained).astype(np.int32)
-        arrays = (state.value, np.empty_like(state.value), state.first, state.second, state.average)
+            total = totals[offset.target] = np.zeros((count, 3), np.float32)
+            if offset.target == SCALE:
+                moved = state.parameters.xyz, gradients.xyz, gradients.log_scale
+                sum_growth(rows, face, *moved, total)
+            else:
+                by_splat = gradients.sh if offset.target == COLOR else gradients.xyz
+                sum_by_triangle(rows, face, by_splat.reshape(len(face), -1), total)
+        arrays = (own.value, np.empty_like(own.value), own.first, own.second, own.average)
         tables = [array.reshape(count, -1) for array in arrays]
         total, gradient = totals[offset.target], tables[1]
-        offset_gradient(listed, signal(offset.signal), total, np.float32(per_unit), gradient)
+        per_unit = np.float32(1 / SH_C0 if offset.target == COLOR else 1)
+        offset_gradient(listed, signal(offset.signal), total, per_unit, gradient)
         rate = np.full(gradient.shape[1], offset.rate_share * rates[offset.rate], np.float32)
-        adam_rows(listed, state.steps, (AdamTables._make([*tables, rate]),), options)
+        adam_rows(listed, own.steps, (AdamTables._make([*tables, rate]),), options)

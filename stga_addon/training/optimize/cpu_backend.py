@@ -1,13 +1,14 @@
 """Training backend on the CPU (Numba kernels), and its image loss (STGA, training)."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
 import numpy as np
 
 from ...avatar.embedding import FaceFrames, frame_backward
-from ...avatar.offsets import COLOR, OFFSETS, offset_of
+from ...avatar.offsets import OFFSETS, POSITION, SCALE, offset_of
 from ...capture.model import View
 from ...raster.cpu import optimizer, rasterize
 from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, change_background, image_loss
@@ -100,10 +101,9 @@ class CpuBackend:
             batch.view, target, batch.background, batch.sh_degree, focus
         )
         options = adam.adam_options(settings, batch.view.camera)
-        adam.step_offsets(  # before the limits' gradients are added
-            state.driven_offsets, rows, face, gradients, self._frames.signals(batch.view.timestep),
-            batch.rates, options,
-        )  # fmt: skip
+        signals = self._frames.signals(batch.view.timestep)
+        # before the limits' gradients are added
+        adam.step_offsets(state, rows, signals, batch.rates, options)
         # what keeps splats near what they cover, and unbound ones out of the air
         if settings.scale_weight:
             log_scale, weight = state.parameters.log_scale, settings.scale_weight
@@ -185,16 +185,22 @@ class CpuBackend:
         (V, 3) with respect to the timestep's mesh; nothing is stepped."""
         store, state, timestep = self._frames, self.state, shots[0][0].timestep
         frames, splats, face = store.of(timestep), state.parameters, state.face
+        change = {POSITION: np.zeros((len(frames.scale), 3)), SCALE: np.zeros((1, 3))}
         for name, offset in state.driven_offsets.items():
-            if OFFSETS[name].target != COLOR:
-                shift = offset_of(offset.value, store.signals(timestep)(OFFSETS[name].signal))
-                splats = splats._replace(xyz=splats.xyz + shift[face])
+            target, signal = OFFSETS[name].target, OFFSETS[name].signal
+            if target in change:
+                change[target] = offset_of(offset.value, store.signals(timestep)(signal))
+        # around the mesh's own origins, in the unit of the scaled frames
+        growth = np.exp(change[SCALE][:, :1].astype(np.float64))
+        shift = (change[POSITION] / growth).astype(np.float32)
+        splats = splats._replace(xyz=splats.xyz + shift[face])
+        scaled = replace(frames, scale=frames.scale * growth[:, 0])
         total, by_frame = 0.0, np.zeros((len(frames.scale), 7))
         for (view, image), weight in zip(shots, weights, strict=True):
             rows, _, loss = self._backward(view, image, background, sh_degree, None)
             assert loss is not None
             total += weight * loss
-            by_frame += weight * frame_gradient(splats, face, state.gradients, rows, frames)
+            by_frame += weight * frame_gradient(splats, face, state.gradients, rows, scaled)
         mesh, faces = store.mesh(timestep), store.capture.faces
         return total, frame_backward(mesh, faces, frames, by_frame)
 

@@ -182,10 +182,11 @@ class GpuBackend:
                 work, rendering, splats, camera, v_image, self._gradients
             )
             given = {name: rendering[name] for name in ("view", "wanted")}
-            given["gradients"], signals = self._gradients, self._embedding.signals
+            given |= {"gradients": self._gradients, "splats": splats.rows}
+            signals = self._embedding.signals
             optimizer.step_offsets(work, self._triangles, self._offsets, signals, **given)
             limited = bool(settings.scale_weight or settings.distance_weight)
-            given |= {"splats": splats.rows, "face": splats.face, "screen": screen}
+            given |= {"face": splats.face, "screen": screen}
             optimizer.optimize(work, splats.count, splats.stride, limited, self._tables, **given)
             counts = rasterize.counts_buffer(self.device)
             queued.readback.copy_from(work, (counts, COUNTS), (loss, 1))

@@ -86,10 +86,8 @@ def _step() -> None:
     adam.step(state, rows, rates)
     screen, total = state.screen_gradient, state.gradient_count
     optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
-    adam.step_offsets(
-        with_offsets(state, OFFSETS, 2).driven_offsets, rows, face, gradients,
-        lambda name: np.zeros((2, 3), np.float32), rates, adam.PLAIN,
-    )  # fmt: skip
+    state, signal = with_offsets(state, OFFSETS, 2), np.zeros((2, 3), np.float32)
+    adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
 
 
 def _two_splats() -> TrainState:

@@ -318,7 +318,7 @@ class _Session:
             principal_point=self.run.principal_point,
             strain_range=self.strain_range,
             driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
-        )
+        ).pruned
 
     def _measure_refined_strain(self) -> None:
         """Of the training timesteps, whose meshes refined tracking has moved."""

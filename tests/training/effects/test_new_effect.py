@@ -47,7 +47,7 @@ def toy_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the recipe asks for: a file of its own (`growth`), and a row in each table."""
     monkeypatch.setitem(SIGNALS, NAME, growth)
     monkeypatch.setitem(OFFSETS, NAME, DrivenOffset(NAME, NAME, POSITION, "xyz", 1.0))
-    effect = Effect("toy-growth", "Head grows", "larger", "6 numbers", "", {}, {}, NAME, True)
+    effect = Effect("toy-growth", "Head grows", "larger", "6 numbers", "", {}, {}, (NAME,), True)
     monkeypatch.setitem(EFFECTS, effect.name, effect)
     reason = "the head grows"
     monkeypatch.setitem(RULES, effect.name, lambda facts: Verdict(facts.timesteps > 1, reason))
@@ -60,7 +60,7 @@ def capture(toy: Capture) -> Capture:
 
 
 def planned(capture: Capture) -> Run:
-    others = [each.name for each in EFFECTS.values() if each.offset not in (None, NAME)]
+    others = [each.name for each in EFFECTS.values() if each.offsets not in ((), (NAME,))]
     choices = dict.fromkeys((*others, "view-color", "exposure"), "off")
     settings = quick_settings(
         "global", lattice=1, iterations=30, effects={**choices, "tracking": "auto"}

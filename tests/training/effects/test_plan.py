@@ -51,7 +51,7 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
     capture = open_capture(root)
     settings = make_settings(iterations=1, effects={} if choice == "auto" else {effect: choice})
     settings, plan = plan_effects(capture, settings)
-    offset = EFFECTS[effect].offset
+    (offset,) = EFFECTS[effect].offsets
     assert offset not in settings.driven_offsets
     monkeypatch.setitem(planning.RULES, effect, lambda facts: Verdict(True, "two takes say so"))
     extended, later = add_effects(capture, settings, plan)

@@ -199,12 +199,14 @@ function symmetricProduct(a, b, factor, out, at) {
 // Three numbers a triangle, by name, which its splats may follow.
 const SIGNALS = { strain: Strain, smoothed_strain: SmoothedStrain, normal: NormalChange };
 
-/** @typedef {{ signal: keyof SIGNALS, target: 'position' | 'color' | 'light' }} Offset */
+/** @typedef {{ signal: keyof SIGNALS, target: 'position' | 'scale' | 'color' | 'light' }} Offset */
 // What coefficients (faces, 9) of that name in a data file change: for each component of the signal
-// a vector in the frame, or a color; 'light': one that is the light of the capture.
+// a vector in the frame, the logarithm of its scale (and two zeros), or a color; 'light': one that
+// is the light of the capture.
 /** @type {Record<string, Offset>} */
 export const OFFSETS = {
   strain_position: { signal: 'smoothed_strain', target: 'position' },
+  strain_scale: { signal: 'smoothed_strain', target: 'scale' },
   strain_color: { signal: 'smoothed_strain', target: 'color' },
   normal_color: { signal: 'normal', target: 'light' },
   older_strain_color: { signal: 'strain', target: 'color' },
@@ -244,7 +246,7 @@ export class FaceFrames {
     });
     const zeros = () => new Float64Array(3 * this.count);
     // Of a triangle's splats; positions in its own axes and unit.
-    this.change = { position: zeros(), color: zeros(), light: zeros() };
+    this.change = { position: zeros(), scale: zeros(), color: zeros(), light: zeros() };
   }
 
   // Follow the posed vertices (3·V).
@@ -266,8 +268,11 @@ export class FaceFrames {
     }
     for (let f = 0, to = 0; f < change.position.length; f += 3) {
       const [x, y, z] = [change.position[f], change.position[f + 1], change.position[f + 2]];
-      for (const end = to + 12; to < end; to += 4)
+      const growth = Math.exp(change.scale[f]);
+      for (const end = to + 12; to < end; to += 4) {
         world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
+        for (let k = to; k < to + 3; k++) world[k] *= growth;
+      }
     }
   }
 
