@@ -9,10 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE
+from stga_addon.avatar.offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS
+from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.checkpoint import trained_strain_range
@@ -126,6 +128,34 @@ def test_the_step_is_adam_in_float64() -> None:
     for found, expected in ((state.value, value), (state.first, first), (state.average, average)):
         np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-6)
     np.testing.assert_allclose(state.second, second, rtol=2e-4)
+
+
+def test_tracking_follows_splats_that_move_and_grow(
+    toy: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a gradient of the mesh that takes driven splats to be where they are at rest, or as
+    large: against differences of the loss, the signal held. It lacks what splats do at the edge
+    where they are cut off."""
+    held = np.full((len(toy.faces), 3), [0.7, 0.7, 0], np.float32)
+    monkeypatch.setitem(SIGNALS, "smoothed_strain", lambda basis, frames: held)
+    trainer = make_trainer(squeezed(toy), "strain_position", "strain_scale")
+    offsets, view = trainer.state.driven_offsets, toy.views["train"][0]
+    offsets["strain_scale"].value[:] = np.diag([-1, 0, 0])  # half as large
+    offsets["strain_position"].value[:, 1] = 0.005 * np.eye(3)[2]  # outwards
+    backend = CpuBackend(trainer.settings, trainer.frames, trainer.state)
+    target, black = read_view(view)[1], np.zeros(3, np.float32)
+    mesh = trainer.frames.mesh(view.timestep).copy()
+
+    def loss(posed: np.ndarray) -> tuple[float, np.ndarray]:
+        trainer.frames.clear()
+        trainer.frames.mesh(view.timestep, posed)
+        return backend.mesh_gradient([(view, target)], [1.0], black, 0)
+
+    _, gradient = loss(mesh)
+    for move in (*np.eye(3)[:, None], mesh - mesh.mean(0)):
+        step = 3e-4 / abs(move).max()
+        slope = (loss(mesh + step * move)[0] - loss(mesh - step * move)[0]) / (2 * step)
+        assert (gradient * move).sum() == pytest.approx(slope, rel=0.15, abs=0.015)
 
 
 def test_training_draws_what_the_avatar_draws(toy: Capture) -> None:
