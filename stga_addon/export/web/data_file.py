@@ -198,7 +198,8 @@ STEPS = {
     "color": 0.004,
     "sh": 0.005,
     # Signals of driven offsets are at most 2 in each of three components: half a step of each moves
-    # a splat by 0.75 µm along an axis (MOVED_STEP_M), or changes its color by 0.19 / 255.
+    # a splat by 0.75 µm along an axis (MOVED_STEP_M), or changes its color by 0.19 / 255, or its
+    # size by 0.07 %.
     "strain_scale": 2.0**-12,
     "strain_color": 2.0**-12,
     "normal_color": 2.0**-12,

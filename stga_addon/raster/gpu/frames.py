@@ -96,8 +96,8 @@ class Embedding:
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:
         """Record the frames of the mesh that was uploaded last; returns their table.
 
-        coefficients: driven offset -> table (F, 3, 3): the frames are changed by them as
-        in `Avatar.frames`.
+        coefficients: driven offset -> table (F, 3, 3): the frames are changed by them as in
+        `Avatar.frames`.
         """
         tables = self._tables
         frames = tables["frames"] = self._device.buffer("frames", self._count * FRAME_STRIDE)
