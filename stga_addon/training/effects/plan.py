@@ -28,6 +28,9 @@ MIN_STRAIN_GAIN_DB = 0.35
 """Mean gain of sampled colors, in frames and in cameras that are left out, from which splats follow
 deformation: with less, trainings with and without differ by no more than their noise
 (docs/experiments.md)."""
+MIN_TRACKED_STRAIN_GAIN_DB = -0.35
+"""The same of a capture by `stga track`, whose mesh lies beside what is seen by so much that colors
+sampled there show nothing of what trainings gain."""
 MIN_TIMESTEPS_FOR_STRAIN = 4
 """With fewer, leaving out one and its neighbors leaves no two to fit a dependence to."""
 MIN_SIGNAL_CHANGE = 1e-5
@@ -191,8 +194,11 @@ def strain(facts: CaptureFacts) -> Verdict:
     left_out = facts.strain_dependence
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
     figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
-    is_on = sum(gains.values()) / len(gains) >= MIN_STRAIN_GAIN_DB
-    return Verdict(is_on, f"colors that follow deformation bring {figures}")
+    reason, least = f"colors that follow deformation bring {figures}", MIN_STRAIN_GAIN_DB
+    if is_tracked(facts.capture.root):
+        least = MIN_TRACKED_STRAIN_GAIN_DB
+        reason += ", and trainings more where `stga track` made the capture"
+    return Verdict(sum(gains.values()) / len(gains) >= least, reason)
 
 
 def normal_color(facts: CaptureFacts) -> Verdict:

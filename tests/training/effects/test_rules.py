@@ -111,26 +111,32 @@ def test_what_moves_over_triangles_with_strain(painted):
 
 
 @pytest.mark.parametrize(
-    ("frames", "cameras", "gained", "on"),
+    ("frames", "cameras", "gained", "on", "on_tracked"),
     [
         # much gained in other views, little lost in other expressions
-        ((10, 10.4), (10, 8), "-0.34 +1.94", True),
-        ((10, 8), (10, 10.4), "+1.94 -0.34", True),
-        ((10, 12), (10, 9.5), "-1.58 +0.45", False),
-        ((10, 9.5), (10, 12), "+0.45 -1.58", False),
+        ((10, 10.4), (10, 8), "-0.34 +1.94", True, True),
+        ((10, 8), (10, 10.4), "+1.94 -0.34", True, True),
+        ((10, 12), (10, 9.5), "-1.58 +0.45", False, False),
+        ((10, 9.5), (10, 12), "+0.45 -1.58", False, False),
         # 1.1 levels of 30 are nothing that can be seen
-        ((30, 29.98), (30, 29.98), "+0.01 +0.01", False),
+        ((30, 29.98), (30, 29.98), "+0.01 +0.01", False, True),
     ],
 )
-def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on):
+def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on, on_tracked, tmp_path):
     """Catches an effect left off for a small loss in one kind of view although it gains much in the
-    other, one that is on for what only one kind gains, and a figure that does not show a loss."""
+    other, one that is on for what only one kind gains, a figure that does not show a loss, and
+    tracked takes whose samples are taken for as exact as a capture's own."""
     errors = {"frames": Evidence(*frames), "cameras": Evidence(*cameras)}
     change = {"smoothed_strain": 0.1}.__getitem__
-    facts = SimpleNamespace(signal_change=change, timesteps=10, strain_dependence=errors)
-    verdict = rules.strain(facts)
+    capture = SimpleNamespace(root=tmp_path)
+    known = {"signal_change": change, "timesteps": 10, "strain_dependence": errors}
+    verdict = rules.strain(SimpleNamespace(capture=capture, **known))
     assert [f"{gain:+.2f}" for gain in gains(verdict)] == gained.split()
     assert verdict.on == on
+    for path in (tmp_path / LANDMARKS_FOLDER / PLACES_FILE, tmp_path / REPORT_FILE):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    assert rules.strain(SimpleNamespace(capture=capture, **known)).on == on_tracked
 
 
 def test_few_frames_tell_nothing_of_unseen_ones():
