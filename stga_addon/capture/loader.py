@@ -39,7 +39,7 @@ class ViewLoader:
              camera is scaled too
     prepare  (view, image, mask) -> image and mask to yield instead, applied once per image read;
              None: those read
-    mesh     timestep -> mesh (V, 3), read in the thread as well; None yields no meshes
+    mesh     timestep -> mesh (V, 3) or None, read in the thread as well; None yields no meshes
     queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded
              images that are kept for later epochs; memory does not depend on the sequence's length
     waited_s seconds that the consumer has waited so far
@@ -52,7 +52,7 @@ class ViewLoader:
         self, views: Iterable[View], scale: Callable[[int], float] = lambda position: 1.0,
         background: tuple[int, int, int] = WHITE, queue_bytes: int = 16 << 20,
         cache_bytes: int = 224 << 20, prepare: Preparation | None = None,
-        mesh: Callable[[int], np.ndarray] | None = None,
+        mesh: Callable[[int], np.ndarray | None] | None = None,
     ) -> None:  # fmt: skip
         self.waited_s = 0.0
         self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh

@@ -14,13 +14,22 @@ from stga_addon.capture.loader import ViewLoader
 from stga_addon.capture.model import Capture, evenly_spread
 from stga_addon.capture.open import open_capture
 from stga_addon.training.evaluate.metrics import Residuals
-from stga_addon.training.optimize.frames import CACHED_TIMESTEPS, FrameStore
+from stga_addon.training.optimize import frames
+from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
 from stga_addon.training.run.session import train
 
 from .test_run import make_run
 from .toys import assert_same_state
+
+KEPT = 12
+
+
+@pytest.fixture(autouse=True)
+def few_timesteps_are_kept(toy: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = frames.BYTES_PER_TRIANGLE * len(toy.faces)
+    monkeypatch.setattr(frames, "CACHE_BYTES", (KEPT + 0.5) * size)
 
 
 def no_residuals(*arguments: Any) -> Residuals:
@@ -31,7 +40,7 @@ def test_no_mesh_is_read_on_the_training_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches training that waits for mesh files, and numbers that depend on it."""
-    timesteps = range(2 * CACHED_TIMESTEPS)
+    timesteps = range(2 * KEPT)
     opened = open_capture(factory.write_mesh_capture(tmp_path / "capture", timesteps, range(2)))
     read: list[tuple[int, bool]] = []
 
@@ -84,10 +93,10 @@ def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
     for _ in range(3):
         store.of(1)
     assert read == [1]
-    for timestep in range(2, CACHED_TIMESTEPS + 2):
+    for timestep in range(2, KEPT + 2):
         store.of(timestep)
     store.of(1)
-    assert read == [1, *range(2, CACHED_TIMESTEPS + 2), 1]
+    assert read == [1, *range(2, KEPT + 2), 1]
     store.clear()
     store.mesh(1)
     store.of(1)

@@ -13,8 +13,9 @@ from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 
-CACHED_TIMESTEPS = 12
-"""Timesteps kept in memory: about 1 MB each for 10,000 triangles."""
+CACHE_BYTES, BYTES_PER_TRIANGLE = 256e6, 170
+"""Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
+Without them, posing the mesh takes as long as a third of an iteration."""
 
 
 @dataclass
@@ -25,7 +26,7 @@ class _Timestep:
 
 
 class FrameStore:
-    """Meshes (V, 3) and face frames by timestep, float64; the latest CACHED_TIMESTEPS are kept.
+    """Meshes (V, 3) and face frames by timestep, float64; those of the latest CACHE_BYTES are kept.
 
     strain    `strain_basis` of the neutral mesh, None if nothing depends on strain
     units     (F,) float32: the length that a triangle's limits are multiples of, in local units
@@ -49,6 +50,7 @@ class FrameStore:
         if convention != "gaussian_avatars":
             areas = face_areas(capture.neutral, capture.faces)
             self.units = np.asarray(np.sqrt(2 * areas), np.float32)
+        self._most = int(CACHE_BYTES / BYTES_PER_TRIANGLE / len(capture.faces))
         self._cached: dict[int, _Timestep] = {}
 
     def scale_limits(self, settings: TrainingSettings) -> np.ndarray:
@@ -88,6 +90,11 @@ class FrameStore:
         """(V, 3) of the timestep's frames; read: the capture's, if it has been read already."""
         return self._latest(timestep, read).mesh
 
+    def unread_mesh(self, timestep: int) -> np.ndarray | None:
+        """(V, 3) of the capture; None where the timestep's frames are kept: for another thread, so
+        that none is read again."""
+        return None if timestep in self._cached else np.asarray(self.capture.mesh(timestep))
+
     def clear(self) -> None:
         """Forget all meshes and frames, because what they are computed from has changed."""
         self._cached.clear()
@@ -114,6 +121,6 @@ class FrameStore:
             mesh = read if moved is None else moved
             entry = _Timestep(np.asarray(self.capture.mesh(timestep)) if mesh is None else mesh)
         self._cached[timestep] = entry  # dictionaries keep insertion order, so the oldest is first
-        if len(self._cached) > CACHED_TIMESTEPS:
+        if len(self._cached) > max(1, self._most):
             del self._cached[next(iter(self._cached))]
         return entry

@@ -226,8 +226,8 @@ class _Session:
             return coarse if share < settings.coarse_share else full
 
         prepare = image_preparation(capture, settings)
-        # refined meshes change with every step
-        mesh = capture.mesh if self.trainer.tracking is None else None
+        # refined meshes change halfway
+        mesh = self.trainer.frames.unread_mesh if self.trainer.tracking is None else None
         return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
 
     def _track(self, tracking: RefinedTracking, timesteps: list[int]) -> None:
