@@ -24,6 +24,7 @@ from stga_addon.jobs.train import Extend, Prepared, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.optimize.trainer import EXTEND_LOCAL_SHARE, Strategy
 from stga_addon.training.run import continuation
+from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
 from stga_addon.training.run.folder import Run, open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
@@ -192,8 +193,9 @@ def test_what_follows_strain_can_begin_with_a_further_take(
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
     assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
     avatar = read_avatar(tmp_path / "new" / "avatar.npz")
-    assert avatar.driven_offsets["strain_color"].any()
-    assert avatar.driven_offsets["strain_position"].any()
+    trained = read_checkpoint(tmp_path / "new").state.driven_offsets
+    assert set(avatar.driven_offsets) == set(trained) == set(follows["driven_offsets"])
+    assert all(offset.value.any() for offset in trained.values())
     assert avatar.strain_range is not None
     assert (
         avatar.strain_range[:, 0] > TRAINED_RANGE[0]

@@ -257,13 +257,12 @@ export class FaceFrames {
     for (const signal of Object.values(signals)) signal.update(sides);
     for (const sum of Object.values(change)) sum.fill(0);
     for (const { coefficients, signal, target } of offsets) {
-      const [sum, { values }] = [change[target], signal];
-      for (let f = 0; f < sum.length; f += 3) {
-        for (let k = f, from = 3 * f; k < f + 3; k++, from += 3) {
-          sum[f] += values[k] * coefficients[from];
-          sum[f + 1] += values[k] * coefficients[from + 1];
-          sum[f + 2] += values[k] * coefficients[from + 2];
-        }
+      const [sum, { values }, c] = [change[target], signal, coefficients];
+      for (let f = 0, k = 0; f < sum.length; f += 3, k += 9) {
+        const [x, y, z] = [values[f], values[f + 1], values[f + 2]];
+        sum[f] += x * c[k] + y * c[k + 3] + z * c[k + 6];
+        sum[f + 1] += x * c[k + 1] + y * c[k + 4] + z * c[k + 7];
+        sum[f + 2] += x * c[k + 2] + y * c[k + 5] + z * c[k + 8];
       }
     }
     for (let f = 0, to = 0; f < change.position.length; f += 3) {
@@ -271,7 +270,9 @@ export class FaceFrames {
       const growth = Math.exp(change.scale[f]);
       for (const end = to + 12; to < end; to += 4) {
         world[to + 3] += world[to] * x + world[to + 1] * y + world[to + 2] * z;
-        for (let k = to; k < to + 3; k++) world[k] *= growth;
+        world[to] *= growth;
+        world[to + 1] *= growth;
+        world[to + 2] *= growth;
       }
     }
   }
