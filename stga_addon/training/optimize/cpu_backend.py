@@ -189,7 +189,8 @@ class CpuBackend:
         for name, offset in state.driven_offsets.items():
             target, signal = OFFSETS[name].target, OFFSETS[name].signal
             if target in change:
-                change[target] = offset_of(offset.value, store.signals(timestep)(signal))
+                more = offset_of(offset.value, store.signals(timestep)(signal))
+                change[target] = change[target] + more
         # around the mesh's own origins, in the unit of the scaled frames
         growth = np.exp(change[SCALE][:, :1].astype(np.float64))
         shift = (change[POSITION] / growth).astype(np.float32)
