@@ -37,7 +37,7 @@ _LIGHT_ARRAYS = {
 }
 """Field -> shape, -1: vertices."""
 _PREFIX = "light_"
-MIN_COLOR_CHANGE, MIN_SHIFT_M, MIN_GROWTH = 1 / 255, 2e-4, 0.02
+MIN_COLOR_CHANGE, MIN_SHIFT_M, MIN_SCALE_CHANGE = 1 / 255, 2e-4, 0.02
 """Of splats that follow a signal: what never changes them by as much is not kept."""
 
 
@@ -116,9 +116,9 @@ class Avatar:
         return self if len(kept) == len(self.driven_offsets) else replace(self, driven_offsets=kept)
 
     @property
-    def pruned(self) -> "Avatar":
+    def without_invisible_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
-        MIN_SHIFT_M or a share of MIN_GROWTH anywhere in its `strain_range`."""
+        MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`."""
         basis, kept = self._strain, {}
         if basis is None:
             return self
@@ -126,7 +126,8 @@ class Avatar:
         farthest = rest + np.abs(basis.range - rest[:, None]).max(1)
         plain = face_frames(self.neutral, self.faces, self.neutral, self.convention)
         frames = replace(plain, deformation=farthest)
-        least = {COLOR: MIN_COLOR_CHANGE, POSITION: MIN_SHIFT_M / frames.scale, SCALE: MIN_GROWTH}
+        shift = MIN_SHIFT_M / frames.scale
+        least = {COLOR: MIN_COLOR_CHANGE, SCALE: MIN_SCALE_CHANGE, POSITION: shift}
         for name, coefficients in self.driven_offsets.items():
             offset = OFFSETS[name]
             signal = np.abs(SIGNALS[offset.signal](basis, frames))

@@ -70,11 +70,10 @@ def moved_frames(
         if offset.target == COLOR:
             color += change
             frames = replace(frames, color=color)
-            continue
-        if offset.target == SCALE:
+        elif offset.target == SCALE:
             frames = replace(frames, scale=frames.scale * np.exp(change[:, 0].astype(np.float64)))
-            continue
-        # In one type: einsum takes several times as long where it has to convert.
-        turned = np.einsum("fij,fj->fi", frames.rotation, change.astype(np.float64))
-        frames = replace(frames, origin=frames.origin + unit[:, None] * turned)
+        else:
+            # In one type: einsum takes several times as long where it has to convert.
+            turned = np.einsum("fij,fj->fi", frames.rotation, change.astype(np.float64))
+            frames = replace(frames, origin=frames.origin + unit[:, None] * turned)
     return frames

@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.file import (
     MIN_COLOR_CHANGE,
+    MIN_SCALE_CHANGE,
     MIN_SHIFT_M,
     Avatar,
     read_avatar,
     write_avatar,
 )
 from stga_addon.avatar.lattice import lattice_splats
+from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import (
     AVERAGING_ROUNDS,
@@ -303,24 +305,23 @@ def test_positions_stay_near_where_the_mesh_is_torn() -> None:
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-@pytest.mark.parametrize("name", ["strain_color", "normal_color", "strain_position"])
+@pytest.mark.parametrize("name", OFFSETS)
 def test_only_what_shows_is_kept(name: str, convention: str) -> None:
     """Catches coefficients that are taken for invisible by another range, signal or unit than poses
     have, and visible ones that are looked for in too small a unit."""
     neutral, rng = sheet(), np.random.default_rng(4)
     limits = rng.random((len(FACES), 2, 6)).astype(np.float32) * [[-2], [0.5]]
     unit = face_frames(neutral, FACES, neutral, convention).scale
-    is_color, shares = name.endswith("color"), []
-    color_or_meters = np.ones(len(FACES)) if is_color else 10 * unit
+    shares, divisor = [], 10 * unit if name == "strain_position" else 1.0
     for exponent in np.linspace(-3, 1, 41):
-        sizes = 10**exponent * rng.random(len(FACES)) / color_or_meters
+        sizes = 10**exponent * rng.random(len(FACES)) / divisor
         coefficients = sizes[:, None, None] * rng.normal(0, 0.2, (len(FACES), 3, 3))
         whole = Avatar(
             colored(neutral).splats, convention, neutral.astype(np.float32), FACES,
             strain_range=limits.astype(np.float32),
             driven_offsets={name: coefficients.astype(np.float32)},
         )  # fmt: skip
-        pruned = whole.pruned
+        pruned = whole.without_invisible_offsets
         is_kept = pruned.driven_offsets[name].any((1, 2))
         np.testing.assert_array_equal(
             pruned.driven_offsets[name][is_kept], whole.driven_offsets[name][is_kept]
@@ -329,10 +330,10 @@ def test_only_what_shows_is_kept(name: str, convention: str) -> None:
         for _ in range(20):
             posed = (neutral * rng.uniform(0.4, 1.5, 3)) @ Rotation.random(rng=rng).as_matrix()
             ours, theirs = pruned.frames(posed), whole.frames(posed)
-            if is_color:
-                assert abs(ours.color - theirs.color).max() < MIN_COLOR_CHANGE
-            else:
-                away = np.linalg.norm(ours.origin - theirs.origin, axis=1)
-                assert (away < np.sqrt(3) * MIN_SHIFT_M * ours.scale / unit).all()
+            assert abs(ours.color - theirs.color).max(initial=0) < MIN_COLOR_CHANGE
+            assert abs(np.log(ours.scale / theirs.scale)).max() < MIN_SCALE_CHANGE
+            plain = face_frames(posed, FACES, neutral, convention)
+            away = np.linalg.norm(ours.origin - theirs.origin, axis=1)
+            assert (away < np.sqrt(3) * MIN_SHIFT_M * plain.scale / unit).all()
     assert shares[0] < 0.3
     assert shares[-1] == 1

@@ -221,8 +221,9 @@ def driven_avatar(
     sizes = {POSITION: moves, SCALE: 0.1, COLOR: 0.5}
     units = [sizes[OFFSETS[name].target] for name in names]
     values = [rng.normal(0, unit, (len(faces), 3, 3)).astype(np.float32) for unit in units]
-    for each, unit in zip(values, units, strict=True):
-        if unit == sizes[SCALE]:  # nodes keep the size of what has no area in the neutral mesh
+    for name, each in zip(names, values, strict=True):
+        if OFFSETS[name].target == SCALE:
+            # Nodes keep the size of what has no area in the neutral mesh.
             each[face_areas(neutral, faces) == 0] = 0
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
     avatar = replace(avatar, splats=splats, neutral=neutral.astype(np.float32), faces=faces)

@@ -130,7 +130,7 @@ def sum_by_triangle(rows, face, gradient, total):
 
 
 @jit
-def sum_growth(rows, face, xyz, v_xyz, v_log_scale, total):
+def sum_scale_gradient(rows, face, xyz, v_xyz, v_log_scale, total):
     """Add to the first column of total (F, 3), of the listed rows' (M,) triangles, the gradient of
     the logarithm of their frames' scale, from that of their splats' (N, 3)."""
     for n in range(len(rows)):

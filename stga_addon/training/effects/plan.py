@@ -197,7 +197,7 @@ def strain(facts: CaptureFacts) -> Verdict:
     reason, least = f"colors that follow deformation bring {figures}", MIN_STRAIN_GAIN_DB
     if is_tracked(facts.capture.root):
         least = MIN_TRACKED_STRAIN_GAIN_DB
-        reason += ", and trainings more where `stga track` made the capture"
+        reason += "; a training gains more than they show of a capture by `stga track`"
     return Verdict(sum(gains.values()) / len(gains) >= least, reason)
 
 

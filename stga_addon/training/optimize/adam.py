@@ -13,7 +13,7 @@ from ...raster.cpu.optimizer import (
     adam_rows,
     offset_gradient,
     sum_by_triangle,
-    sum_growth,
+    sum_scale_gradient,
 )
 from ..settings import TrainingSettings
 from .state import TrainState
@@ -81,7 +81,7 @@ def step_offsets(
             total = totals[offset.target] = np.zeros((count, 3), np.float32)
             if offset.target == SCALE:
                 moved = state.parameters.xyz, gradients.xyz, gradients.log_scale
-                sum_growth(rows, face, *moved, total)
+                sum_scale_gradient(rows, face, *moved, total)
             else:
                 by_splat = gradients.sh if offset.target == COLOR else gradients.xyz
                 sum_by_triangle(rows, face, by_splat.reshape(len(face), -1), total)

@@ -102,8 +102,8 @@ def starting_state(
     if kept is not None:
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
         ours = {**vars(avatar.splats), **avatar.driven_offsets}
-        offsets = dict(replace(avatar, driven_offsets=offsets).pruned.driven_offsets)
-        theirs = {**vars(kept.splats(averaged=True)), **offsets}
+        latest = replace(avatar, driven_offsets=offsets).without_invisible_offsets
+        theirs = {**vars(kept.splats(averaged=True)), **latest.driven_offsets}
         alike = (np.array_equal(array, theirs[name]) for name, array in ours.items())
         if ours.keys() == theirs.keys() and all(alike):
             parameters = Parameters(*(array.copy() for array in kept.average))

@@ -227,7 +227,7 @@ class _Session:
 
         prepare = image_preparation(capture, settings)
         # refined meshes change halfway
-        mesh = self.trainer.frames.unread_mesh if self.trainer.tracking is None else None
+        mesh = self.trainer.frames.mesh_unless_kept if self.trainer.tracking is None else None
         return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
 
     def _track(self, tracking: RefinedTracking, timesteps: list[int]) -> None:
@@ -318,7 +318,7 @@ class _Session:
             principal_point=self.run.principal_point,
             strain_range=self.strain_range,
             driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
-        ).pruned
+        ).without_invisible_offsets
 
     def _measure_refined_strain(self) -> None:
         """Of the training timesteps, whose meshes refined tracking has moved."""
