@@ -16,7 +16,7 @@ from .format import format_duration
 from .training.evaluate import forecast as forecasts
 from .training.evaluate.forecast import DETAIL, UNMATCHED, curve_of, detail_curve
 from .training.run.folder import read_run
-from .training.run.metrics_log import METRICS, read_metrics
+from .training.run.metrics_log import METRICS, TRACKING_GAIN, read_metrics
 
 # imported when a chart is drawn: it takes half a second, and the command line starts without it
 if TYPE_CHECKING:
@@ -96,6 +96,10 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         if all(psnr < target for _, psnr in curve):
             text = forecasts.explain_missed_target(curve, target)
         lines.append(f"{text} (exposure fitted)" if forecasts.is_exposure_fitted(metrics) else text)
+    gain = next((line[TRACKING_GAIN] for line in metrics if TRACKING_GAIN in line), None)
+    if gain is not None:
+        verb, then = ("gain", "") if gain > 0 else ("lose", ", so heads stay as they were tracked")
+        lines.append(f"tracking by the avatar: views left out {verb} {abs(gain):.2f} dB{then}")
     plateau = forecasts.flat_since(metrics)
     if plateau is not None:
         helps = "more time does not help with these settings"

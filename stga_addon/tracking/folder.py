@@ -40,6 +40,13 @@ def is_written(out: Path) -> bool:
     return any((out / name).exists() for name in files) and not (out / KEPT_FOLDER).exists()
 
 
+def is_in_order(out: Path) -> bool | None:
+    """Whether the timesteps of a tracked capture follow each other in time; None where no report
+    says so."""
+    report = read_json(out / REPORT_FILE) if (out / REPORT_FILE).is_file() else None
+    return report.get("in_order") if isinstance(report, dict) else None
+
+
 def is_flame(out: Path) -> bool:
     """Whether the tracked capture has FLAME's layout, and needs the model file to be opened."""
     return (out / CANONICAL_NAME).exists()

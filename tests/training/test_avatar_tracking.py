@@ -24,6 +24,7 @@ from stga_addon.flame.forward import parameters_gradient
 from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.report import report_run
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.avatar_tracking import (
     AvatarTracking,
@@ -32,6 +33,7 @@ from stga_addon.training.optimize.avatar_tracking import (
 )
 from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
+from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
 from stga_addon.training.run.folder import Run, read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
@@ -225,6 +227,39 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
     before, after = millimeters(capture, true), millimeters(refined, true)
     assert np.median(after[:-1] / before[:-1]) < 0.6
     assert quality[True] > quality[False] + 1.0
+    assert re.search(r"left out gain [1-9]\.\d\d dB", "\n".join(report_run(tmp_path / "True")))
+
+
+@pytest.mark.parametrize("held_out", ["camera", "timesteps"])
+def test_tracking_is_undone_where_what_is_left_out_loses(
+    held_out: str, right: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches tracking that is judged by images that it has fitted, by the wrong sign, or kept
+    where the heads were right before; here it moves them by 4 mm."""
+    capture, given = right[0], []
+    if held_out == "timesteps":
+        capture = replace(capture, views={**capture.views, "val": ()})
+        monkeypatch.setattr(session, "LEFT_OUT_INTERVAL", 2)
+
+    def astray(
+        avatar: Avatar, settings: TrainingSettings, shown: Capture, timesteps: list[int], *_: Any
+    ) -> AvatarTracking:
+        assert shown.flame is not None
+        given.append((tuple(timesteps), {view.camera_index for view in shown.views["train"]}))
+        assert list(shown.views) == ["train"]
+        values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
+        values[:, -3:] += 0.004
+        none = np.zeros((len(values), 3))
+        return AvatarTracking(tuple(timesteps), values, none[:, 0], none, none[:, 0], np.eye(1))
+
+    monkeypatch.setattr(session, "track_by_avatar", astray)
+    train(capture, tmp_path, make_run(capture))
+    tracked = TIMESTEPS[:-1] if held_out == "camera" else (0, 3)
+    assert given == [(tracked, {0, 1, 2, 3})]  # and no timesteps of other splits afterwards
+    checkpoint, before = read_checkpoint(tmp_path), RefinedTracking(capture, "stga").parameters
+    np.testing.assert_array_equal(checkpoint.tracking, before)
+    said = "\n".join(report_run(tmp_path))
+    assert re.search(r"left out lose \d\.\d\d dB, so heads stay as they were tracked", said)
 
 
 def test_stopped_and_resumed_is_the_unbroken_run(

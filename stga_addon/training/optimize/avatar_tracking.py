@@ -121,6 +121,11 @@ class RefinedTracking:
         self._person = replace(with_identity(self.sequence), frame=self.frame)
         self._torso = torso_shapes(self._person.model)
 
+    @property
+    def has_moved(self) -> bool:
+        """Whether parameters differ from the capture's."""
+        return not np.array_equal(self.parameters[:, :-SHIFT_SIZE], self.tracked)
+
     def frame(self, timestep: int) -> FlameFrame:
         values, source = self.parameters[self._row[timestep]], self._source(timestep)
         offset = torso_offset(self._torso, values[-SHIFT_SIZE:], source.dynamic_offset)

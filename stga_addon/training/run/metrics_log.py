@@ -12,6 +12,8 @@ from ...files import file_size, replacing
 METRICS = "metrics.jsonl"
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
+TRACKING_GAIN = "tracking_gain_db"
+"""Field of PSNR that views left out of tracking by the avatar gained by it."""
 FORECAST = ("seconds", "psnr", "error", "ahead", "gain")
 """Fields of a line's forecast, where it has one."""
 

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,19 +17,21 @@ from time import perf_counter
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
+from ...capture.images import read_view
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, View, evenly_spread
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
 from ...schema import to_json
 from ...selection import select_capture
+from ...tracking.folder import is_in_order
 from ..evaluate import lpips, metrics
 from ..evaluate.evaluator import Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
 from ..evaluate.metrics import RESIDUAL_SCALE, triangle_residuals
-from ..optimize.avatar_tracking import RefinedTracking, track_by_avatar
+from ..optimize.avatar_tracking import MAX_HEIGHT_PX, RefinedTracking, track_by_avatar
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
@@ -39,7 +41,7 @@ from . import checkpoint as checkpoints
 from . import folder as folders
 from .continuation import continued_evaluation_views, continued_order, starting_state
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
-from .metrics_log import METRICS, append_metrics, cut_metrics, read_metrics
+from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics, read_metrics
 
 _log = logging.getLogger(__name__)
 CHECKPOINT_S = 30.0
@@ -48,6 +50,9 @@ CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
 TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
 """Of the budget, after which the avatar tracks its head; what that may take of seconds."""
+LEFT_OUT_INTERVAL, LEFT_OUT_VIEWS = 12, 24
+"""Where no camera is held out, every how many timesteps one is left out of that tracking; views
+that say whether it is kept."""
 Selection = Mapping[int, np.ndarray]
 """timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
@@ -123,6 +128,7 @@ class _Session:
     losses        of the last global iterations
     began         the clock at which the run would have begun, had it never been interrupted
     speed         iterations per second since this process began to train
+    tracking_gain TRACKING_GAIN, of which the next evaluation is to tell
     interrupts    the first Ctrl-C
     """
 
@@ -137,6 +143,7 @@ class _Session:
     losses: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT_LOSSES))
     began: float = 0.0
     speed: float = 0.0
+    tracking_gain: dict[str, float] = field(default_factory=dict)
     interrupts: list[int] = field(default_factory=list)
 
     def work(self) -> None:
@@ -163,8 +170,8 @@ class _Session:
                 tracking, views = self.trainer.tracking, self.capture.views
                 every = {view.timestep for own in views.values() for view in own}
                 unseen = every - {view.timestep for view in views["train"]}
-                if tracking is not None and tracking.rounds == 1 and unseen:
-                    self._track(tracking, sorted(unseen))
+                if tracking is not None and tracking.has_moved and tracking.rounds == 1 and unseen:
+                    self._track(tracking, self.capture, sorted(unseen))
             # LPIPS takes long, so a run that is stopped goes without
             self._evaluate(perceptual=self._is_finished())
             self._write_checkpoint()
@@ -190,8 +197,7 @@ class _Session:
                 is_due = self._spent().share >= TRACKING_START_SHARE
                 if tracking is not None and is_due and not tracking.rounds:
                     begin = perf_counter()
-                    timesteps = {view.timestep for view in self.capture.views["train"]}
-                    self._track(tracking, sorted(timesteps))
+                    self._refine(tracking)
                     self.elapsed_s += perf_counter() - begin
                     if not tracking.rounds:
                         break
@@ -230,20 +236,64 @@ class _Session:
         mesh = self.trainer.frames.mesh_unless_kept if self.trainer.tracking is None else None
         return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
 
-    def _track(self, tracking: RefinedTracking, timesteps: list[int]) -> None:
-        """Track timesteps by the avatar, one round more; none where the report says to stop."""
+    def _refine(self, tracking: RefinedTracking) -> None:
+        """Let the avatar track the training timesteps; undone where views that are left out of it
+        do not gain."""
+        views = self.capture.views["train"]
+        timesteps = sorted({view.timestep for view in views})
+        left_out = [
+            view for view in self.capture.views.get("val", ()) if view.timestep in timesteps
+        ]
+        tracked, before = timesteps, tracking.parameters
+        if not left_out and is_in_order(self.capture.root) is not False:
+            between = timesteps[LEFT_OUT_INTERVAL // 2 :: LEFT_OUT_INTERVAL]
+            left_out = [view for view in views if view.timestep in between]
+            tracked = [timestep for timestep in timesteps if timestep not in between]
+        left_out = evenly_spread(left_out, LEFT_OUT_VIEWS)
+        error = self._squared_error(left_out)
+        self._track(tracking, replace(self.capture, views={"train": views}), tracked, timesteps)
+        if tracking.rounds and left_out:
+            gain = 10 * math.log10(error / self._squared_error(left_out))
+            self.tracking_gain = {TRACKING_GAIN: round(gain, 3)}
+            if gain <= 0:
+                tracking.parameters = before
+                self.trainer.frames.clear()
+
+    def _squared_error(self, views: Sequence[View]) -> float:
+        """Mean over the views, of images as high as the avatar tracks in."""
+        settings, share = self.run.settings, self._spent().share
+        prepare, errors = image_preparation(self.capture, settings), []
+        red, green, blue = (round(255 * channel) for channel in settings.background)
+        for view in views:
+            scale = min(1.0, MAX_HEIGHT_PX / view.camera.height)
+            small, image, mask = read_view(view, scale, (red, green, blue))
+            if prepare is not None:
+                image, _ = prepare(small, image, mask)
+            drawn = self.trainer.render(small, share)
+            errors.append(np.square(drawn - image.transpose(2, 0, 1) / 255).mean())
+        return float(np.mean(errors)) if errors else math.nan
+
+    def _track(
+        self,
+        tracking: RefinedTracking,
+        capture: Capture,
+        tracked: list[int],
+        changed: list[int] | None = None,
+    ) -> None:
+        """Track timesteps of a capture by the avatar, one round more; none where the report says to
+        stop. changed: to which they give their change, those between them included."""
 
         def stops(done: int, total: int) -> bool:
             told = self._tell(f"Tracking by the avatar: {done} of {total}")
             return told or bool(self.interrupts)
 
-        settings, capture = self.run.settings, tracking.refined(self.capture)
+        settings, capture = self.run.settings, tracking.refined(capture)
         seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
         try:
-            found = track_by_avatar(self._avatar(), settings, capture, timesteps, seconds, stops)
+            found = track_by_avatar(self._avatar(), settings, capture, tracked, seconds, stops)
         except Cancelled:
             return
-        tracking.take(found, timesteps)
+        tracking.take(found, changed or tracked)
         self.trainer.frames.clear()
         tracking.rounds += 1
 
@@ -266,11 +316,13 @@ class _Session:
             "splats": len(self.trainer),
             **({"loss": float(np.mean(self.losses))} if self.losses else {}),
             **quality,
+            **self.tracking_gain,
             "evaluation_s": round(now - begin, 3),
             "wall_s": round(now - self.began, 3),
             "peak_memory_mb": metrics.peak_memory_mb(),
         }
         append_metrics(self.folder, self.evaluator.record(is_kept, line, self._spent()))
+        self.tracking_gain = {}
 
     def _spent(self) -> Spent:
         settings, iterations = self.run.settings, self.trainer.iteration
