@@ -10,9 +10,9 @@ from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 
-LANDMARK_SIGMA_M = 0.002
-"""Standard deviation of a landmark over people and views; coefficients have a standard deviation of
-1."""
+LANDMARK_SIGMA_M, WEIGHT_SIGMA = 0.002, 0.35
+"""Standard deviations of a landmark over people and views, and of an expression that is a weight
+from 0 to 1, as ARKit's are; coefficients of principal components have one of 1."""
 SCALE_SIGMA = 0.3  # Of the capture's scale, relative: the first guess comes from the average head
 JOINT_SIGMA_RAD = {
     "root": (3.0, 3.0, 3.0),
@@ -280,7 +280,8 @@ def parameter_precision(head: HeadModel) -> np.ndarray:
         for name, present in zip(JOINTS, head.joints, strict=True)
     ]
     rigid = np.concatenate([*joints, (TRANSLATION_SIGMA_M,) * TRANSLATION_SIZE])
-    return np.concatenate([np.ones(head.model.n_expression), rigid**-2.0])
+    sigma = WEIGHT_SIGMA if head.model.expression_names else 1.0
+    return np.concatenate([np.full(head.model.n_expression, sigma**-2.0), rigid**-2.0])
 
 
 def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
