@@ -8,7 +8,7 @@ import pytest
 
 from stga_addon.jobs import monitor_state as states
 from stga_addon.jobs.monitor_state import RequestState
-from stga_addon.jobs.table import DISMISSIBLE, JOBS, Kind
+from stga_addon.jobs.table import DISMISSIBLE, Kind
 from stga_addon.worker.status import WorkerSnapshot, WorkerState, WorkerStatus
 
 RUN = Path("run")
@@ -49,8 +49,7 @@ def loads(effects: list[states.Effect]) -> list[Path]:
 
 @pytest.mark.parametrize("kind", Kind)
 def test_a_running_request_of_any_kind(kind):
-    """Catches a kind whose progress is not seen, that no timer follows, or a second request beside
-    a running one."""
+    """Catches progress that is not seen or followed, and a second request beside a running one."""
     state, effects = after(
         START, state=RequestState(kind, Path("old"), JOB, error="old", stopped=True)
     )
@@ -71,8 +70,7 @@ def test_a_running_request_of_any_kind(kind):
 @pytest.mark.parametrize("kind", Kind)
 @pytest.mark.parametrize("end", ENDS)
 def test_any_end_of_any_kind_stops_the_timer(kind, end):
-    """Catches a timer that runs for ever, a result shown twice, a failure or a cancelled request
-    that is shown, and an option of the command line that the panel has not."""
+    """Catches a timer that runs for ever, and a result shown twice or after a failure."""
     state, _ = after(
         START,
         status(WorkerState.WORKING),
@@ -94,8 +92,7 @@ def test_any_end_of_any_kind_stops_the_timer(kind, end):
 
 @pytest.mark.parametrize("kind", Kind)
 def test_cancel(kind):
-    """Catches a cancel that throws work away, or that waits for what nobody needs; nothing is
-    cancelled where nothing is."""
+    """Catches a cancel that throws work away, waits for what nobody needs, or hits what is idle."""
     idle, effects = after(states.CancelAsked(), state=RequestState(kind))
     assert not {states.StopWorker(JOB), states.KillWorker(JOB), states.RemoveFiles(JOB)} & set(
         effects
@@ -134,8 +131,7 @@ def test_a_result_that_cannot_be_shown(kind):
 
 @pytest.mark.parametrize("kind", [Kind.TRACKING, *TRANSIENT])
 def test_a_result_waits_until_the_scene_is_free(kind):
-    """Catches a mesh that is changed in Edit Mode, and a cancel that cannot stop what waits for its
-    end."""
+    """Catches a mesh changed in Edit Mode, and a cancel that cannot stop what waits for its end."""
     state, effects = after(START, status(WorkerState.FINISHED), state=RequestState(kind))
     for _ in range(3):
         assert not any(isinstance(effect, states.Show) for effect in effects)
@@ -145,8 +141,7 @@ def test_a_result_waits_until_the_scene_is_free(kind):
 
 
 def test_the_next_video_replaces_the_last_one():
-    """Catches a temporary folder for each video, and a recording that is removed when its worker
-    starts."""
+    """Catches a folder left for each video, and a recording removed when its worker starts."""
     first, _ = after(START, status(WorkerState.FINISHED), state=RequestState(Kind.VIDEO))
     _, effects = after(states.Started(RUN, Path("next")), state=first)
     assert states.RemoveFiles(JOB) in effects
@@ -154,23 +149,11 @@ def test_the_next_video_replaces_the_last_one():
     assert states.RemoveFiles(JOB) not in effects
 
 
-def test_every_request_of_blender_has_a_kind():
-    """Catches a field that a request does not have."""
-    for request, job in JOBS.items():
-        assert (job.kind is None) == (job.subject == "")
-        assert (
-            job.kind is None
-            or job.subject in request.__dataclass_fields__
-            or hasattr(request, job.subject)
-        )
-
-
 # Trainings
 
 
 def test_each_preview_is_loaded_once():
-    """Catches previews that are read again at every check, later ones that are not shown, splats
-    that keep changing although live preview is off, and a preview that is lost by turning it on."""
+    """Catches previews read again, not shown, lost, or shown although live preview is off."""
     state, effects = after(START, status(WorkerState.WORKING, preview=1, live_preview=False))
     assert not loads(effects)
     state, effects = after(status(WorkerState.WORKING, preview=1), state=state)
@@ -188,8 +171,7 @@ def test_each_preview_is_loaded_once():
 
 @pytest.mark.parametrize("end", [WorkerState.FINISHED, WorkerState.CANCELLED])
 def test_result_is_shown_once(end):
-    """Catches a result that is not shown, shown again at every check or where that is off, or that
-    undo cannot take back."""
+    """Catches a result that is not shown, shown again or unwanted, or not undoable."""
     state, effects = after(START, status(end, show_result=False))
     assert not loads(effects)
     assert {states.StoreAvatar(AVATAR), states.Store(RUN, True)} <= set(effects)
@@ -221,9 +203,7 @@ def test_result_waits_for_the_preview_that_is_being_built():
 
 
 def test_undo():
-    """Catches a training that nobody can cancel because an undo step took the scene back to before
-    it began, an undo of the shown splats that the next check reverts, a dismissed training that
-    returns as one whose folder is missing, and a selection that undo cannot take back."""
+    """Catches a training that undo takes from the scene for good, and undone splats that return."""
     state, _ = after(START, status(WorkerState.WORKING))
     assert after(states.SceneRead(None, False), state=state) == (state, [states.Store(RUN, False)])
     assert after(states.SceneRead(RUN, False), state=state) == (state, [])
@@ -238,8 +218,7 @@ def test_undo():
 
 
 def test_loaded_file_continues():
-    """Catches a worker that is not found again after reopening, and a result that is shown again
-    then."""
+    """Catches a worker that is not found after reopening, and a result that is shown again."""
     loaded = RequestState(Kind.TRAINING, RUN, JOB)
     assert after(status(WorkerState.WORKING), state=loaded)[0].interval_s == states.CHECK_INTERVAL_S
     assert loads(after(status(WorkerState.FINISHED), state=loaded)[1]) == [AVATAR]
@@ -259,8 +238,7 @@ def test_moved_run_folder():
 
 
 def test_unexpected_error_stops_until_the_next_start_or_check():
-    """Catches a timer that ends silently, one that repeats the same traceback, and one that never
-    recovers."""
+    """Catches a timer that ends silently, repeats a traceback, or never recovers."""
     state, effects = after(
         START, status(WorkerState.WORKING, preview=1), states.Failed("a bug", stops=True)
     )
@@ -280,8 +258,7 @@ def made(state: WorkerState, **files: int) -> states.StatusRead:
 
 
 def test_head_previews_and_avatar_appear_once_each():
-    """Catches a head that is imported anew at every look or never, a preview that has no head to be
-    shown on, and an avatar of another folder."""
+    """Catches a head imported anew or never, and an avatar of another folder."""
     making = RequestState(Kind.AVATAR)
     state, _ = after(START, made(WorkerState.WORKING), state=making)
     assert state.loading is None
@@ -310,8 +287,7 @@ def test_head_previews_and_avatar_appear_once_each():
     [(Kind.TRAINING, "metrics", RUN), (Kind.AVATAR, "picture", RUN / "run")],
 )
 def test_the_curve_or_picture_is_read_when_it_grows(kind, file, run):
-    """Catches a curve, or a picture of the tracking, that is read at every check, or never
-    again."""
+    """Catches a curve or picture that is read at every check, or never again."""
     state, _ = after(START, made(WorkerState.WORKING), state=RequestState(kind))
     for stamp in (1, 2):
         state, effects = after(made(WorkerState.WORKING, **{file: stamp}), state=state)
@@ -321,7 +297,6 @@ def test_the_curve_or_picture_is_read_when_it_grows(kind, file, run):
 
 @pytest.mark.parametrize("end", [WorkerState.CANCELLED, WorkerState.FAILED])
 def test_what_was_never_made_is_not_shown(end):
-    """Catches an error about a missing avatar after the tracking was cancelled, and a head imported
-    from an old one."""
+    """Catches an error about a missing avatar after a cancel, and a head of an old capture."""
     state, effects = after(START, made(end, capture=1), state=RequestState(Kind.AVATAR))
     assert (state.loading, loads(effects), state.interval_s) == (None, [], None)

@@ -13,7 +13,7 @@ from typing import Any, get_args
 import av
 import numpy as np
 import pytest
-from capture.factory import ball, edit, write_avatar_of, write_mesh_capture
+from capture.factory import edit, write_avatar_of, write_mesh_capture
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
@@ -23,7 +23,7 @@ from stga_addon.files import read_npz
 from stga_addon.format import describe_figures
 from stga_addon.jobs import perform as jobs
 from stga_addon.jobs.export import Export
-from stga_addon.jobs.perform import perform, perform_in_folder, write_request
+from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
@@ -83,8 +83,7 @@ def asked(request: Train | Resume | Refine) -> Path:
 
 
 def test_every_request_is_tried() -> None:
-    """Catches a request, or a result, that is added without being in the tables here or without
-    work."""
+    """Catches a request or result that is missing in the tables here, or has no work."""
     assert {type(request) for request in REQUESTS} == set(JOBS)
     assert {type(result) for result in RESULTS} == set(get_args(Result))
 
@@ -111,8 +110,7 @@ def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> Non
 
 
 def test_refusals(tmp_path: Path, capture: Path) -> None:
-    """Catches a run that is overwritten, and one resumed that is not there: both before a worker is
-    started."""
+    """Catches a run overwritten, or resumed where none is, only after a worker was started."""
     run = tmp_path / "run"
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
         jobs.check_request(Resume(run))
@@ -130,21 +128,6 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
         jobs.check_request(Track(Path("f"), Path("m"), capture))
 
 
-def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
-    """Catches a run continued with another principal point: reading the capture is left to the
-    worker."""
-    pytest.importorskip("torch")
-    run = tmp_path / "run"
-    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
-    folder = asked(Resume(run, principal_point="opencv"))
-    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
-        perform_in_folder(folder)
-    assert inspect_worker(folder).status.error.startswith(
-        f"{run}: was trained with principal point"
-    )
-    assert not (run / "avatar.npz").exists()
-
-
 DAMAGES: dict[str, Any] = {
     "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device":
         "toaster",
@@ -156,8 +139,7 @@ TEXTS = "[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000
 
 @pytest.mark.parametrize("name", [*DAMAGES, *TEXTS], ids=lambda name: name[:20])
 def test_damaged_requests(tmp_path: Path, name: str) -> None:
-    """Catches a traceback, or a guess, where a request was damaged, comes from another version, or
-    is JSON of another form."""
+    """Catches a traceback or a guess for a request that is damaged or of another version."""
     write_request(tmp_path, REQUESTS[0])
     if name in DAMAGES:
         edit(tmp_path / jobs.REQUEST, lambda values: values.update({name: DAMAGES[name]}))
@@ -188,8 +170,7 @@ def test_figures_in_short_lines() -> None:
 
 
 def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
-    """Catches a time left that is that of an average over slow and fast work, or of work that an
-    interrupted call had done before and that is only read now."""
+    """Catches an average over slow and fast work, and work that was done in an earlier call."""
     now = 0.0
     left = TimeLeft(lambda: now)
     assert math.isnan(left.after(0.0))
@@ -206,8 +187,7 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
 
 @pytest.mark.slow
 def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capture):
-    """Catches a render farm whose pictures or files differ from those that were looked at before:
-    option by option, `stga render` and `stga export` ask for what the requests say."""
+    """Catches a farm whose files differ from those of `stga render` and `stga export`."""
     pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz", is_colored=True)
     cameras = capture / "transforms_val.json"
@@ -297,8 +277,7 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Pa
 
 @pytest.mark.slow
 def test_a_request_continues_what_it_began(tmp_path, capture):
-    """Catches a cancel that throws work away, a job that fails, or trains anew, when it is started
-    again, and figures that the panel never gets."""
+    """Catches a cancel that throws work away, a job that trains anew, and lost figures."""
     pytest.importorskip("torch")
     request = training(tmp_path / "run", capture, iterations=40)
     folder = asked(request)
@@ -339,8 +318,7 @@ def iteration_of(progress: Progress) -> float:
 
 @pytest.mark.slow
 def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
-    """Catches a preview that never comes, cannot be read, or changes what is trained, and a
-    training that ends because it could not be written."""
+    """Catches a preview that never comes, changes the training, or ends it where disks are full."""
     pytest.importorskip("torch")
     monkeypatch.setattr("stga_addon.worker.status.PREVIEW_INTERVAL_S", 0.0)
     run, quiet, previews = tmp_path / "run", tmp_path / "quiet", []
@@ -368,8 +346,8 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
 
 @pytest.mark.slow
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
-    """Catches a worker whose failure only its log shows, and a command that ends well although
-    nothing was trained."""
+    """Catches a failure that only the log shows, and a command that ends well although it
+    failed."""
     pytest.importorskip("torch")
     assert main(["perform", str(tmp_path / "nothing")]) == 2
     assert "holds no request" in capsys.readouterr().err
@@ -397,39 +375,3 @@ def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path)
         seen.status.error
         == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
     )
-
-
-def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> None:
-    """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
-    folder = jobs.request_folder(tmp_path / "run")
-    folder.mkdir(parents=True)
-    for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
-        (folder / name).write_text("mine")
-    jobs.remove_request(folder)
-    assert len(list(folder.iterdir())) == 3  # no request
-    asked(training(tmp_path / "run", capture))
-    for name in jobs.FILES:
-        (folder / name).touch()
-    jobs.remove_request(folder)
-    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.slow
-def test_a_worker_refines_and_resumes(tmp_path: Path, capture: Path) -> None:
-    """Catches a worker that trains anew, or ignores the painted region, where a run is to be
-    continued."""
-    pytest.importorskip("torch")
-    perform(training(tmp_path / "run", capture))
-    weights = np.zeros(len(ball()[1]), np.float32)
-    weights[:40] = 1.0
-    refined = tmp_path / "run_2"
-    perform_in_folder(
-        asked(Refine(refined, tmp_path / "run", weights=weights, iterations=4, device="cpu"))
-    )
-    before, after = (
-        read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined)
-    )
-    unchanged = (before.sh == after.sh).all((1, 2))
-    assert unchanged[before.face >= 40].all()
-    assert not unchanged[before.face < 40].all()
-    perform_in_folder(asked(Resume(refined, capture, principal_point="opencv", device="cpu")))
