@@ -1,5 +1,4 @@
-"""The folder of the head that Blender has open: what is written is read back, and damage is one
-sentence."""
+"""The folder of the head that Blender has open: what is written is read back."""
 
 from pathlib import Path
 

@@ -1,5 +1,4 @@
-"""Rendering a .blend file's frames with a program in place of Blender;
-`tests/batch/test_blender.py` has a real one."""
+"""Rendering frames with a program in place of Blender (tests/batch/test_blender.py: a real one)."""
 
 import os
 import signal

@@ -1,5 +1,4 @@
-"""Requests: what is written down, what is refused, and that a worker does what the same process
-would."""
+"""Requests: what is written down, what is refused, and what a worker does."""
 
 import math
 import re
@@ -20,7 +19,6 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.format import describe_figures
 from stga_addon.jobs import perform as jobs
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import perform_in_folder, write_request
@@ -128,12 +126,9 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
         jobs.check_request(Track(Path("f"), Path("m"), capture))
 
 
-DAMAGES: dict[str, Any] = {
-    "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device":
-        "toaster",
-    "settings": {}, "principal_point": "up", "selection": {"x": {"array": "selection.0"}},
-    "unknown": 1,
-}  # fmt: skip
+DAMAGES: dict[str, Any] = {"format": "stga-job", "version": 0, "kind": "Paint", "run": 5}
+DAMAGES |= {"capture": None, "device": "toaster", "settings": {}, "principal_point": "up"}
+DAMAGES |= {"selection": {"x": {"array": "selection.0"}}, "unknown": 1}
 TEXTS = "[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000
 
 
@@ -149,24 +144,6 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
         jobs.read_request(tmp_path)
     expected = rf"{name}|not a request that this version reads"
     assert name in TEXTS or re.search(expected, str(caught.value))
-
-
-def test_figures_in_short_lines() -> None:
-    """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
-    assert describe_figures({}) == []
-    figures = {
-        "iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0,
-    }  # fmt: skip
-    assert describe_figures(figures) == [
-        "12.3 it/s   2.1 min left",
-        "PSNR 30.00 dB",
-        "61\u202f234 splats",
-    ]
-    tracked = {"left_s": 31.0, "error_px": 1.92, "unexplained": 0.043}
-    assert describe_figures(tracked) == [
-        "31 s left",
-        "1.9 px off landmarks   4% of the face unexplained",
-    ]
 
 
 def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
@@ -192,33 +169,28 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz", is_colored=True)
     cameras = capture / "transforms_val.json"
     given = [str(avatar), "--capture", str(capture)]
-    turned = [
-        "--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu",
-    ]  # fmt: skip
+    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1"]
+    turned += ["--device", "cpu"]
+    turn = {"turntable": 120.0, "camera": 1, "fps": 8.0, "seconds": 0.5, "device": "cpu"}
+    black = {"cameras": cameras, "background": (0.0, 0.0, 0.0)}
     asked_for: dict[str, tuple[list[str], Any]] = {
         "pictures": (
             ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
-            Render(
-                avatar, tmp_path / "pictures", cameras=cameras, capture=capture,
-                background=(0.0, 0.0, 0.0)
-            )
+            Render(avatar, tmp_path / "pictures", capture=capture, **black),
         ),
         "film.mp4": (
             ["render", *given, *turned, "--video"],
-            Render(
-                avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture=capture,
-                device="cpu"
-            )
+            Render(avatar, tmp_path / "film.mp4", True, capture=capture, **turn),
         ),
         "plys": (
             ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
-            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3))
+            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
         ),
         "page.stga": (
             ["export", *given, "--format", "web", "--fps", "30", "--out"],
-            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0)
+            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
         ),
-    }  # fmt: skip
+    }
     for name, (words, request) in asked_for.items():
         folder = tmp_path / f"{name}_job"
         write_request(folder, request)
@@ -248,9 +220,8 @@ def film(path: Path) -> np.ndarray:
 
 def contents(path: Path) -> dict[str, bytes]:
     """Name -> bytes of the files of a folder, or of one file."""
-    return {
-        file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))
-    }
+    files = path.glob("[!.]*") if path.is_dir() else (path,)
+    return {file.name: file.read_bytes() for file in files}
 
 
 @pytest.mark.slow
@@ -346,8 +317,7 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
 
 @pytest.mark.slow
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
-    """Catches a failure that only the log shows, and a command that ends well although it
-    failed."""
+    """Catches a failure that only the log shows, and a command that ends well in spite of it."""
     pytest.importorskip("torch")
     assert main(["perform", str(tmp_path / "nothing")]) == 2
     assert "holds no request" in capsys.readouterr().err
@@ -371,7 +341,5 @@ def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path)
     process = start_worker(folder, str(python), jobs.worker_arguments(folder))
     assert process.wait(60) == 2
     seen = inspect_worker(folder, process)
-    assert (
-        seen.status.error
-        == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
-    )
+    says = f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
+    assert seen.status.error == says

@@ -40,8 +40,7 @@ def takes_long(seconds, step):
 
 
 def is_own(value, function, step):
-    """A value and a function of the package as it is called here; errors where they are
-    another's."""
+    """A value and a function of the package as it is called here, or an error."""
     if (type(value).__module__, function.__module__) != (
         "stga_addon.progress",
         "stga_addon.format",
@@ -56,8 +55,7 @@ PARTS = [(first, first + 3) for first in range(0, 21, 3)]
 
 
 def test_results_are_those_of_one_process_in_order():
-    """Catches parts lost, exchanged or done twice, what libraries print, and new helpers per
-    task."""
+    """Catches parts lost, exchanged or doubled, prints among answers, and new helpers per task."""
     pids = set()
     with Helpers(3) as helpers:
         for _ in range(2):
@@ -199,8 +197,7 @@ messages.flush()
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_only_messages_reach_standard_output(closed: bool) -> None:
-    """Catches output of libraries between the messages, and a closed standard error that ends
-    it."""
+    """Catches output of libraries between messages, and a closed standard error that ends it."""
     done = subprocess.run([sys.executable, "-c", CLAIM.format(closed=closed)], capture_output=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == b"message"

@@ -32,8 +32,7 @@ def hold(path: Path) -> AbstractContextManager[object]:
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    """Catches a worker alive for ever after kill -9, and a probe that leaves a file or misses
-    it."""
+    """Catches a worker alive for ever after kill -9, and a probe that leaves a file."""
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
     assert not path.exists()
@@ -100,9 +99,9 @@ def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         pass
 
 
-@pytest.fixture
-def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Storage that answers as an NFS without its lock service does."""
+def test_storage_without_locks(tmp_path, monkeypatch):
+    """Catches workers that cannot run there, count as lost, or are two in one folder: storage that
+    answers as an NFS without its lock service does."""
     fcntl = pytest.importorskip("fcntl")
 
     def flock(descriptor: int, operation: int) -> None:
@@ -111,10 +110,6 @@ def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", flock)
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     monkeypatch.setattr(lock, "EXPIRY_S", 1.0)
-
-
-def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches workers that cannot run there, count as lost, or are two in one folder."""
     folder, path = tmp_path / "job", tmp_path / "job/worker.lock"
     lease = path.with_name("worker.lock.lease")
     with status_writer(folder) as writer:

@@ -57,13 +57,10 @@ main()
 @pytest.fixture
 def start(tmp_path, monkeypatch):
     """Start the worker above as a module, in a status folder that is returned with the process."""
-    packages = tmp_path / "packages"
-    packages.mkdir()
-    (packages / "counting.py").write_text(WORKER)
-    path = os.pathsep.join([str(ROOT), str(packages)])
-    monkeypatch.setattr(
-        launch, "worker_environment", lambda variables, python: {**variables, "PYTHONPATH": path}
-    )
+    (tmp_path / "counting.py").write_text(WORKER)
+    path = os.pathsep.join([str(ROOT), str(tmp_path)])
+    environment = lambda variables, python: {**variables, "PYTHONPATH": path}  # noqa: E731
+    monkeypatch.setattr(launch, "worker_environment", environment)
     running: list[subprocess.Popen[bytes]] = []
 
     def run(action: str = "work") -> tuple[Path, "subprocess.Popen[bytes]"]:
@@ -97,12 +94,10 @@ def test_worker_is_cancelled(start):
     assert (snapshot.status.message, snapshot.status.detail) == ("counting", "on time")
     assert list(snapshot.status.figures) == ["n"]
     if os.name != "nt":
-        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(
-            os.getpriority(os.PRIO_PROCESS, 0) + 5, 19
-        )
-    with pytest.raises(
-        StgaError, match=f"another worker is running here \\(process {process.pid}\\)"
-    ):
+        nicer = min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == nicer
+    message = rf"another worker is running here \(process {process.pid}\)"
+    with pytest.raises(StgaError, match=message):
         prepare_status_folder(folder)
     with pytest.raises(StgaError, match="another worker"):
         status.remove_status_folder(folder)
@@ -118,17 +113,18 @@ def test_worker_is_cancelled(start):
     assert inspect_worker(folder) == status.WorkerSnapshot()
 
 
-@pytest.mark.parametrize(
-    ("action", "code", "error"),
-    [
-        ("sentence", 1, "capture: is not a folder"),
-        ("bug", 1, "ValueError: a bug"),
-        ("exit", 7, "Worker exited with status 7: a line of the log"),
-    ],
-)
-def test_failures_are_reported(start, action, code, error):
+FAILURES = {
+    "sentence": (1, "capture: is not a folder"),
+    "bug": (1, "ValueError: a bug"),
+    "exit": (7, "Worker exited with status 7: a line of the log"),
+}
+
+
+@pytest.mark.parametrize("action", FAILURES)
+def test_failures_are_reported(start, action):
     """Catches a user's mistake with a traceback, and a crash whose report lacks it, or the log."""
     folder, process = start(action)
+    code, error = FAILURES[action]
     assert process.wait(20) == code
     snapshot = inspect_worker(folder, process)
     assert snapshot.state == (WorkerState.LOST if action == "exit" else WorkerState.FAILED)
@@ -155,9 +151,7 @@ def test_killed_worker_is_lost(start):
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell closes the descriptors")
 @pytest.mark.parametrize("action", ["done", "sentence"])
-@pytest.mark.parametrize(
-    "streams", [">&- 2>&-", "<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"]
-)
+@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"])
 def test_final_status_without_output_streams(tmp_path, streams, action):
     """Catches a worker without a final status where its output is closed, full or broken."""
     script = WORKER.replace('print("a line of the log", flush=True)', "time.sleep(0.2)")
@@ -183,11 +177,13 @@ def test_only_own_files_are_removed(tmp_path):
     (tmp_path / "file").write_text("")
     status.remove_status_folder(tmp_path / "file")
     assert (tmp_path / "file").exists()
-    for python in (str(tmp_path / "nowhere/python"), "null\0character"):
-        prepare_status_folder(tmp_path / "new")
-        with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
-            start_worker(tmp_path / "new", python, [])
-        assert not (tmp_path / "new").exists()
+    for folder, left in ((tmp_path / "new", []), (tmp_path / "job", ["notes.txt"])):
+        for python in (str(tmp_path / "nowhere/python"), "null\0character"):
+            prepare_status_folder(folder)
+            with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
+                start_worker(folder, python, [])
+            assert folder.exists() == bool(left)
+            assert [path.name for path in folder.glob("*")] == left
     for use in (prepare_status_folder, status.request_cancel):
         with pytest.raises(StgaError, match=r"file.*cannot be written"):
             use(tmp_path / "file" / "status")
