@@ -14,7 +14,7 @@ from stga_addon.flame.teeth import flame_model as bundled_model
 from stga_addon.flame.teeth import with_teeth
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.rig.head import import_head, rig_of
 from stga_addon.scene.rig.keyframes import is_of_parts
 from stga_addon.scene.rig.motion import sample_motion
 
@@ -26,10 +26,6 @@ TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its ori
 @pytest.fixture
 def source(tmp_path):
     return tmp_path / "motion.npz"
-
-
-def rig_of(head):
-    return next(thing for thing in head.parent.children if thing.get(tags.KIND) == tags.RIG)
 
 
 def assert_parity(head, sequence: FlameSequence, atol: float = TOLERANCE) -> None:
