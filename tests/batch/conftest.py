@@ -1,5 +1,4 @@
-"""What batches are compared with: the same requests, carried out one after another in this
-process."""
+"""What batches are compared with: the same requests, one after another in this process."""
 
 from collections.abc import Callable
 from functools import cache

@@ -18,8 +18,7 @@ def finished(job: Job) -> tuple[WorkerState | None, str]:
 
 
 class SimulatedEngine(Engine):
-    """Ends each job at the next question, with the state and error of `outcome`; None: its worker
-    was killed."""
+    """Ends each job at the next question as `outcome` says; None: its worker was killed."""
 
     interval_s = 0.0
 

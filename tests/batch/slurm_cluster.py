@@ -1,5 +1,4 @@
-"""A SLURM cluster of two nodes on this host, for tests: munged, slurmctld and two slurmd with files
-of their own."""
+"""A SLURM cluster of two nodes on this host: munged, slurmctld and two slurmd."""
 
 import os
 import pwd
@@ -112,8 +111,7 @@ class Cluster:
                 continue
 
     def start_delayed(self) -> None:
-        """Start what waits for its time only: SLURM holds back jobs of a lost node for two
-        minutes."""
+        """Start what waits for its time only: SLURM holds back a lost node's jobs for minutes."""
         waiting = self._run(
             "squeue", "--noheader", "--states=PENDING", "--format=%i %r"
         ).splitlines()

@@ -1,9 +1,7 @@
-"""Frames of an animation on workers, by a real Blender, which the command in STGA_BLENDER starts
-(docs/blender.md)."""
+"""Frames of an animation on workers, by a real Blender (STGA_BLENDER, docs/blender.md)."""
 
 import os
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 
 pytest.importorskip("numba")
 
+from blender.zips import output_of
 from capture.factory import write_avatar_of, write_mesh_capture
 from PIL import Image
 
@@ -52,17 +51,11 @@ memory_gb = 1
     f"{last}]\n"
     for first, last in ((0, 1), (2, 3), (4, 4))
 )
-COMMAND = """
-import sys
-from stga_addon.cli.main import main
-sys.exit(main(["batch", sys.argv[1], "--engine", "ray"]))
-"""
 
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with an animated head in a .blend file, and pictures of it by one Blender: frames 0
-    to 4 in `whole`."""
+    """A folder with an animated head in a .blend file, and its frames 0 to 4 in `whole`."""
     folder = tmp_path_factory.mktemp("shot")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("BLENDER_USER_RESOURCES", str(folder / "profile"))
@@ -85,10 +78,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def blender(*arguments: object) -> None:
-    done = subprocess.run(
-        [*BLENDER, *map(str, arguments)], capture_output=True, text=True, timeout=600, cwd=ROOT
-    )
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    output_of([*BLENDER, *arguments], timeout=600, cwd=ROOT)
 
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:
@@ -113,23 +103,10 @@ def plan_of(shot: Path, engine: str) -> Path:
 
 
 def test_frames_through_the_local_engine(shot: Path) -> None:
-    """Catches frames that a worker's Blender renders with another engine, leaves out, or renders
-    again."""
+    """Catches frames that a worker's Blender renders by another engine, leaves out, or repeats."""
     plan = read_plan(plan_of(shot, "local"))
     batch, _ = carry_out(plan, LocalEngine(2, 8.0))
     assert {entry.state for entry in batch.entries.values()} == {JobState.FINISHED}, batch.failures
     check(shot, "local")
     batch, _ = carry_out(plan, LocalEngine(2, 8.0))
     assert {entry.state for entry in batch.entries.values()} == {JobState.KEPT}
-
-
-def test_frames_through_ray(shot: Path) -> None:
-    """Catches a Ray worker that finds neither Blender nor the training Python."""
-    pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    command = [sys.executable, "-c", COMMAND, str(plan_of(shot, "ray"))]
-    variables = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    done = subprocess.run(
-        command, env=variables, capture_output=True, text=True, timeout=500, cwd=ROOT
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    check(shot, "ray")

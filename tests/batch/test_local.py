@@ -1,5 +1,4 @@
-"""The engine of this machine with real workers: results, kills, Ctrl-C, the command and its
-report."""
+"""The engine of this machine with real workers: results, kills, Ctrl-C, the report."""
 
 import os
 import random
@@ -42,23 +41,19 @@ def killer(jobs, kills, ended, killed, resumable):
     while len(killed) < kills and not ended.wait(chance.uniform(0.2, 1.5)):
         folders = {job.name: job.request_folder for job in jobs}
         alive = {name: lock_owner(folder / LOCK_FILE) for name, folder in folders.items()}
-        found = [
-            (name, process) for name, process in alive.items() if process and killed.count(name) < 4
-        ]
-        if len(killed) % 2:
-            found = [
-                (name, process)
-                for name, process in found
-                if (folders[name].parent / CHECKPOINT).exists()
-            ]
+        has_checkpoint = {
+            name: (folder.parent / CHECKPOINT).exists() for name, folder in folders.items()
+        }
+        found = [name for name in alive if alive[name] and killed.count(name) < 4]
+        found = [name for name in found if has_checkpoint[name] or len(killed) % 2 == 0]
         if found:
-            name, process = chance.choice(found)
+            name = chance.choice(found)
             try:
-                os.kill(process, signal.SIGKILL)
+                os.kill(alive[name], signal.SIGKILL)
             except ProcessLookupError:
                 continue
             killed.append(name)
-            resumable += [name] if (folders[name].parent / CHECKPOINT).exists() else []
+            resumable += [name] if has_checkpoint[name] else []
 
 
 @pytest.mark.nightly
@@ -87,8 +82,7 @@ def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypa
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a batch whose failure nobody sees, Ctrl-C that loses work, and a report that needs
-    more than itself."""
+    """Catches a failure nobody sees, Ctrl-C that loses work, and a report that needs more files."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path))
     report = (tmp_path / "runs/report.html").read_text()
@@ -102,16 +96,12 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
-    """Catches options that are forgotten where captures are given, or silently ignored where a plan
-    is."""
+    """Catches options that are forgotten for captures, or silently ignored for a plan."""
     monkeypatch.setattr("stga_addon.jobs.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
     capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
-    options = [
-        "--iterations", "2", "--device", "cpu", "--threads", "1", "--principal-point", "opencv",
-        "--seed", "5",
-    ]  # fmt: skip
-    assert main(["batch", capture, "--out", out, *options]) == 0
+    options = "--iterations 2 --device cpu --threads 1 --principal-point opencv --seed 5"
+    assert main(["batch", capture, "--out", out, *options.split()]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out
     run = read_run(tmp_path / "out/train-capture")
     found = run.principal_point, run.settings.iterations, run.settings.seed, run.device
@@ -126,8 +116,7 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
 
 
 def test_commands_carry_out_the_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches commands that a shell elsewhere cannot run, jobs in another order than theirs, and
-    finished ones."""
+    """Catches commands that a shell elsewhere cannot run, in another order, or of finished jobs."""
     write_mesh_capture(tmp_path / "a capture")
     look = '[job.{}]\nrequest = "select"\ncapture = "a capture"\nafter = {}\n'
     plan = tmp_path / "plan.toml"

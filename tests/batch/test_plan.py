@@ -59,8 +59,7 @@ def plan_of(base: Path, text: str = PLAN) -> Plan:
 
 
 def test_jobs_of_a_plan(base: Path) -> None:
-    """Catches fields that do not reach a request, and a job that begins before what it reads is
-    there."""
+    """Catches fields that do not reach a request, and a job before what it reads is there."""
     plan, runs = plan_of(base), base / "runs"
     jobs = {job.name: job for job in plan.jobs}
     assert [*jobs] == ["tracked", "anna", "anna-val", "smile"]
@@ -85,32 +84,21 @@ def test_jobs_of_a_plan(base: Path) -> None:
     assert smile.minutes == 2
 
 
-def test_captures_make_a_plan(base: Path) -> None:
-    """Catches captures that do not come out as `stga train` would train them: with a preset, its
-    iterations."""
-    captures = [base / "footage/anna", base / "footage/ben"]
-    plan = plan_of_captures(captures, base / "out", {"preset": "draft"}, {"device": "cpu"})
-    assert [job.name for job in plan.jobs] == ["train-anna", "train-ben"]
-    request = plan.jobs[1].request
-    assert isinstance(request, Train)
-    settings = request.settings
-    assert (settings.preset, settings.seconds, settings.lattice) == ("draft", None, 1)
-    assert settings.effects == {}
-    found = request.run, request.capture, request.device
-    assert found == (base / "out/train-ben", captures[1], "cpu")
-
-
 def test_names_of_captures(base: Path) -> None:
-    """Catches captures that cannot be trained together because of how their folders are called."""
+    """Catches captures that cannot be trained together, or not as `stga train` would train them."""
     folders = ["anna/take", "ben/take", "_anna", "_é_ben", "film/東京", "film/大阪", "c 1"]
     for name in folders:
         (base / name).mkdir(parents=True)
     paths = [base / name for name in folders]
-    plan = plan_of_captures(paths, base / "out", {"preset": "draft"}, {})
+    plan = plan_of_captures(paths, base / "out", {"preset": "draft"}, {"device": "cpu"})
     names = ["anna-take", "ben-take", "anna", "ben", "film", "film_2", "c-1"]
     assert {job.name: job.request.capture for job in plan.jobs} == {
         f"train-{name}": base / folder for name, folder in zip(names, folders, strict=True)
     }
+    first, settings = plan.jobs[0].request, plan.jobs[0].request.settings
+    assert (first.run, first.device) == (base / "out/train-anna-take", "cpu")
+    assert (settings.preset, settings.seconds, settings.lattice) == ("draft", None, 1)
+    assert settings.effects == {}
 
 
 ONE = '[job.one]\nrequest = "train"\ncapture = "footage/anna"\nsettings = { iterations = 3 }\n'
@@ -170,9 +158,8 @@ def changed(before: dict[str, str], after: dict[str, str]) -> set[str]:
     return {name for name in before if before[name] != after[name]}
 
 
-def test_what_changed_is_done_again(base: Path) -> None:
-    """Catches work that is repeated although nothing changed, and results of old inputs or settings
-    that are kept."""
+def test_what_changed_is_done_again(base):
+    """Catches work repeated although nothing changed, and results of old inputs kept."""
     before = job_digests(plan_of(base))
     same = plan_of(base, PLAN.replace("threads = 2", "threads = 1"))
     assert changed(before, job_digests(same)) == set()
@@ -183,11 +170,6 @@ def test_what_changed_is_done_again(base: Path) -> None:
     assert changed(before, job_digests(plan_of(base))) == set()
     after = job_digests(plan_of(base, PLAN.replace("iterations = 5", "iterations = 6")))
     assert changed(before, after) == {"smile"}
-
-
-def test_a_run_counts_by_its_content(base: Path) -> None:
-    """Catches an evaluation that is repeated because it wrote its figures into the run that it
-    read."""
     run = base / "run"
     run.mkdir()
     for name in ("run.json", "avatar.npz"):
@@ -201,8 +183,7 @@ def test_a_run_counts_by_its_content(base: Path) -> None:
 
 
 def test_texts_that_name_files(base: Path) -> None:
-    """Catches a region file or a folder of mattes that is looked for where the worker happens to
-    run, or whose change goes unnoticed; and names that are taken for files."""
+    """Catches a file looked for where the worker runs, or whose change goes unnoticed."""
     text = """
 out = "runs"
 """ + "".join(
@@ -229,8 +210,7 @@ out = "runs"
 
 
 def test_options_inside_a_request(tmp_path):
-    """Catches renderings and exports that a plan cannot ask for, because their options of a motion
-    have no plain default; and options that are left out counted as missing."""
+    """Catches requests that a plan cannot ask for, because options have no plain default."""
     text = """
 out = "runs"
 [job.film]

@@ -1,13 +1,12 @@
-"""The Ray engine on a cluster that is started here, with its token; skipped by name where Ray is
-not installed."""
+"""The Ray engine on a cluster that is started here; skipped where Ray is not installed."""
 
 import os
 import secrets
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from blender.zips import output_of
 from capture.factory import write_mesh_capture
 
 from stga_addon.errors import StgaError
@@ -93,19 +92,14 @@ docs/batch.md."""
 
 def run_script(script: str, *arguments: object, **variables: str) -> list[str]:
     """Lines that a script prints in a process of its own, which Ray leaves its settings to."""
-    command = [sys.executable, "-c", script, str(ROOT), *map(str, arguments)]
-    done = subprocess.run(
-        command, env={**ray_variables(), **variables}, capture_output=True, text=True, timeout=1200,
-        cwd=ROOT,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
-    return done.stdout.splitlines()
+    command = [sys.executable, "-c", script, ROOT, *arguments]
+    environment = {**ray_variables(), **variables}
+    return output_of(command, env=environment, timeout=1200, cwd=ROOT).splitlines()
 
 
 @pytest.mark.nightly
 def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: TrainedHere) -> None:
-    """Catches a cluster with a token that cannot be used, jobs that are lost with a node or train
-    something else, and two workers on one."""
+    """Catches a token that cannot be used, jobs lost or changed, and two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     seeds, iterations = max(1, KILLS // 2), max(ITERATIONS, 200 * KILLS)
@@ -124,8 +118,7 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
 
 @pytest.mark.slow
 def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
-    """Catches a cluster that anyone on this machine may use, and jobs that are not carried out
-    there."""
+    """Catches a cluster that anyone on this machine may use, and jobs not carried out there."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     write_mesh_capture(tmp_path / "capture")
     assert run_script(BATCH, tmp_path)[-1] == str([("look", "finished", "")])
@@ -133,8 +126,7 @@ def test_a_cluster_of_this_machine_is_its_users(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_ctrl_c_through_ray(tmp_path: Path) -> None:
-    """Catches Ctrl-C that Ray's tasks do not hear, or that takes the cluster away before they have
-    saved."""
+    """Catches Ctrl-C that tasks do not hear, or that takes the cluster before they have saved."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
     tiny_plan(tmp_path)

@@ -1,5 +1,4 @@
-"""Running batches on an engine that does no work: order, failures, kills, and what a second start
-does."""
+"""Batches on an engine that does no work: order, failures, kills, and a second start."""
 
 import errno
 import json
@@ -19,13 +18,12 @@ from stga_addon.jobs.batch import engines
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
 from stga_addon.jobs.batch.plan import Ended, Job, Resources, make_plan
-from stga_addon.jobs.batch.report import plan_lines, table_lines
 from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.progress import Progress
 from stga_addon.worker import lock
-from stga_addon.worker.status import StatusWriter, WorkerState, WorkerStatus, inspect_worker
+from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
 
@@ -39,8 +37,7 @@ def states(batch: Batch) -> dict[str, JobState]:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
-    """Catches work that is repeated, and work that is not although its input or its result has
-    changed."""
+    """Catches work repeated, and work not done though its input or result has changed."""
     plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
     engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
     batch, _ = carry_out(plan, engine)
@@ -111,8 +108,7 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
-    """Catches a failure that stops other actors' jobs, or is passed on as if the next job had
-    failed by itself."""
+    """Catches a failure that stops other jobs, or is passed on as if the next had failed itself."""
 
     def outcome(job: Job) -> tuple[WorkerState, str]:
         failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
@@ -153,8 +149,7 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
-    """Catches times and forecasts that grow with a cluster's queue, and with the pauses of a
-    batch."""
+    """Catches times and forecasts that grow with a cluster's queue or a batch's pauses."""
     queue_s, work_s, waited = 0.8, 0.2, []
 
     class Queued(SimulatedEngine):
@@ -178,8 +173,7 @@ def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
-    """Catches an interrupted batch that starts further jobs, or forgets those that were
-    finished."""
+    """Catches an interrupted batch that starts further jobs, or forgets finished ones."""
     plan = empty_jobs(tmp_path, 4)
 
     def outcome(job: Job) -> tuple[WorkerState, str]:
@@ -198,8 +192,7 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
-    """Catches a batch that moves or overwrites a folder which no job of a batch wrote, or starts
-    the jobs after it."""
+    """Catches a batch that moves what no job wrote, or starts the jobs after it."""
     plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
@@ -227,8 +220,7 @@ def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
 
 
 def test_room_on_this_machine(tmp_path: Path) -> None:
-    """Catches more workers than the machine has processors or memory for, and one that never
-    fits."""
+    """Catches more workers than there are processors or memory, and one that never fits."""
     engine = LocalEngine(cores=4, memory_gb=8.0)
 
     def job(name: str, **needs: float) -> Job:
@@ -253,8 +245,7 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     ],
 )
 def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, ending, is_lost):
-    """Catches a killed worker that is not tried again on Windows, where a kill is an exit status
-    like others."""
+    """Catches a killed worker not tried again on Windows, where a kill is an exit status."""
     monkeypatch.setattr(engines, "IS_WINDOWS", windows)
     python = tmp_path / "python"
     python.write_text(f"#!/bin/sh\n{ending}\n")
@@ -267,31 +258,6 @@ def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, 
         time.sleep(0.01)
     assert ended[job.name].snapshot.state == WorkerState.LOST
     assert ended[job.name].is_lost == is_lost
-
-
-def test_tables(tmp_path: Path) -> None:
-    """Catches a table whose counts, shares or minutes are not those of the jobs."""
-    plan = empty_jobs(tmp_path, 30)
-    batch = Batch(plan)
-    for entry in [*batch.entries.values()][:10]:
-        entry.forecast_s = 60.0
-    assert plan_lines(batch, 5)[-1].startswith(
-        "30 jobs, 30 to do; 10 min of work, about 2 min on this machine; of 20 "
-    )
-    entries = list(batch.entries.values())
-    for number, entry in enumerate(entries):
-        entry.state = JobState.FINISHED if number < 20 else JobState.FAILED
-        entry.status = WorkerStatus(seconds=10.0)
-    for entry in entries[20:24]:
-        entry.state = JobState.RUNNING
-    figures = {"psnr": 31.25}
-    entries[20].machine = "node7"
-    entries[20].status = WorkerStatus("working", 0.25, "Training", figures=figures, seconds=30.0)
-    lines = table_lines(batch)
-    assert lines[0].startswith("20 of 30 jobs finished, 4 running, 6 failed; about 90 s left")
-    assert "node7" in lines[1]
-    assert "[#####...............]  25%  31.25 dB  90 s left  Training" in lines[1]
-    assert len(lines) == 11
 
 
 # The lease
@@ -308,8 +274,7 @@ def _hold(folder: str, held: Any) -> None:
 
 @pytest.mark.parametrize("locks", ["work", "fail"])
 def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
-    """Catches two batches that write into each other's jobs, also where the storage knows no file
-    locks."""
+    """Catches two batches in one folder, also where the storage knows no file locks."""
     if locks == "fail":
 
         def no_lock(path: Path) -> None:
@@ -339,8 +304,7 @@ def test_two_batches_cannot_take_one_folder(tmp_path, locks, monkeypatch):
 
 
 def test_a_lease_that_was_taken_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a batch that goes on in a folder which another machine's batch took while this one
-    was suspended."""
+    """Catches a batch that goes on in a folder which another took while it was suspended."""
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     plan = empty_jobs(tmp_path, 1)
 
@@ -377,11 +341,7 @@ JOBS = int(os.environ.get("STGA_BATCH_JOBS", 2000))
 
 @pytest.mark.slow
 def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
-    """Catches time or memory that grows faster than the number of jobs.
-
-    Processor time, in a process of its own, whose peak no other test has raised; that of getrusage
-    is inherited.
-    """
+    """Catches time or memory that grows faster than the number of jobs, in a process of its own."""
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
     tests, few = Path(__file__).resolve().parents[1], JOBS // 8

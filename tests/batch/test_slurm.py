@@ -39,8 +39,7 @@ def on_cluster(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> Cluster:
 
 @pytest.mark.needs("slurm")
 def test_same_results_through_slurm(on_cluster, tmp_path, trained_here):
-    """Catches jobs that begin before those they come after, or train something else than on this
-    machine; and a killed worker whose job is lost."""
+    """Catches jobs before those they come after, other results, and a killed worker's job lost."""
     there = tiny_plan(tmp_path)
     machines: set[str] = set()
     killed: list[int] = []
@@ -67,8 +66,7 @@ def test_same_results_through_slurm(on_cluster, tmp_path, trained_here):
 @pytest.mark.nightly
 @pytest.mark.needs("slurm")
 def test_jobs_of_a_dead_node_resume_elsewhere(on_cluster, tmp_path, trained_here, monkeypatch):
-    """Catches a job that is lost with its machine, or is another one when it was resumed on the
-    next."""
+    """Catches a job lost with its machine, or another one when resumed on the next."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
     there = tiny_plan(tmp_path)
     killed: list[str] = []
@@ -98,8 +96,7 @@ def test_jobs_of_a_dead_node_resume_elsewhere(on_cluster, tmp_path, trained_here
 @pytest.mark.nightly
 @pytest.mark.needs("slurm")
 def test_ctrl_c_through_slurm(on_cluster: Cluster, tmp_path: Path) -> None:
-    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they have
-    saved."""
+    """Catches Ctrl-C that leaves trainings to the queue, or takes them away before they saved."""
     tiny_plan(tmp_path)
     check_interrupted(tmp_path, *interrupt_batch(tmp_path, "--engine", "slurm"))
 
@@ -123,12 +120,7 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, programs: dict[str, 
 
 
 def test_what_waits_in_the_queue_is_submitted_once(tmp_path, monkeypatch):
-    """Catches a batch that ends because squeue failed once, and jobs that the next start submits
-    again while they wait.
-
-    Programs of the names of SLURM's stand in for it: a queue in which nothing begins, and which is
-    down at first.
-    """
+    """Catches a batch that ends where squeue fails once, and jobs submitted again."""
     queue, down, calls = tmp_path / "queue", tmp_path / "down", tmp_path / "calls"
     programs = {
         "sbatch": f'echo "$@" >>{calls}; n=$(wc -l <{calls}); '
@@ -172,8 +164,7 @@ def test_what_waits_in_the_queue_is_submitted_once(tmp_path, monkeypatch):
 
 
 def test_arrays_wait_for_earlier_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an array that waits for itself, as where a request reads what another of its kind
-    writes; and a job that is in no array, in two, or in one of more jobs than SLURM takes."""
+    """Catches an array that waits for itself, and a job in none, in two, or in too large a one."""
     calls = tmp_path / "calls"
     programs = {"sbatch": f'echo "$@" >>{calls}; wc -l <{calls}', "squeue": "", "scancel": ""}
     stand_in(tmp_path, monkeypatch, programs)

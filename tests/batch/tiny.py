@@ -33,25 +33,17 @@ SETTINGS = {"strategy": "selective", "hull_points": False}
 
 
 def tiny_plan(base: Path, seeds: int = 2, iterations: int = ITERATIONS) -> Plan:
-    """Trainings of one capture with several seeds, and an evaluation after each; results into
-    `base`/runs."""
+    """Trainings of one capture with several seeds, and an evaluation after each."""
     if not (base / "capture").exists():
         write_mesh_capture(base / "capture", (0, 1, 3, 4), range(4))
-    train = {
-        "request": "train", "capture": "capture", "principal_point": "opencv", "device": "cpu",
-        "minutes": 0.1,
-    }  # fmt: skip
+    train = {"request": "train", "capture": "capture", "principal_point": "opencv"}
+    train |= {"device": "cpu", "minutes": 0.1}
     jobs: dict[str, Any] = {}
     for seed in range(seeds):
-        jobs[f"train-seed{seed}"] = {
-            **train,
-            "settings": {**SETTINGS, "iterations": iterations, "seed": seed},
-        }
-        jobs[f"evaluate-seed{seed}"] = {
-            "request": "evaluate",
-            "run": f"runs/train-seed{seed}",
-            "minutes": 0.1,
-        }
+        settings = {**SETTINGS, "iterations": iterations, "seed": seed}
+        jobs[f"train-seed{seed}"] = {**train, "settings": settings}
+        look = {"request": "evaluate", "run": f"runs/train-seed{seed}", "minutes": 0.1}
+        jobs[f"evaluate-seed{seed}"] = look
     resources = {"threads": 1, "memory_gb": 0.5}
     return make_plan({"out": "runs", "resources": resources, "job": jobs}, base, "plan")
 
@@ -102,8 +94,7 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
 
 
 def check_interrupted(base: Path, code: int, output: str) -> None:
-    """What `interrupt_batch` has to leave: the failure of one job, and a checkpoint of the
-    other."""
+    """What `interrupt_batch` has to leave: one job's failure, and the other's checkpoint."""
     assert code == 130, output
     assert "train-good: stopped" in output
     assert re.search(r"train-bad: failed: .*bad", output)

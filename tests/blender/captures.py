@@ -5,6 +5,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from flame.small_head import small_head, write_flame
 
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import FlameFrame
@@ -45,17 +46,11 @@ def mesh_capture(
     def mesh(timestep: int) -> np.ndarray:
         return neutral + np.random.default_rng([seed, timestep]).normal(0, 0.02, neutral.shape)
 
-    return Capture(
-        root=root,
-        layout="mesh",
-        faces=faces,
-        neutral=neutral,
-        views=views or {},
-        timesteps=tuple(timesteps),
-        regions={"mouth": np.arange(len(faces)) % 3 == 0},
-        mesh=mesh,
-        expression_mesh=lambda timestep, zero_pose: mesh(timestep),
-    )
+    regions = {"mouth": np.arange(len(faces)) % 3 == 0}
+    head = {"faces": faces, "neutral": neutral, "regions": regions, "mesh": mesh}
+    still = lambda timestep, zero_pose: mesh(timestep)  # noqa: E731
+    times = {"timesteps": tuple(timesteps), "expression_mesh": still}
+    return Capture(root=root, layout="mesh", views=views or {}, **head, **times)
 
 
 def flame_model(
@@ -114,3 +109,15 @@ def motion_capture(sequence: FlameSequence, source: Path) -> Capture:
         expression_mesh=lambda timestep, zero_pose: expression_mesh(sequence, timestep, zero_pose),
         flame=sequence,
     )
+
+
+def import_small_head(folder: Path, **motion: np.ndarray) -> FlameSequence:
+    """The small head in the scene, by an importer's files in the folder, with a motion of its own;
+    its identity as a sequence without frames."""
+    model = small_head(0)
+    write_flame(model, folder / "flame.npz")
+    shape = np.linspace(-0.5, 0.5, model.n_identity)
+    np.savez(folder / "own.npz", shape=shape, **motion)
+    files = {"filepath": str(folder / "own.npz"), "flame": str(folder / "flame.npz")}
+    bpy.ops.stga.import_motion(**files)
+    return FlameSequence(model, shape, None, (), {}.__getitem__)

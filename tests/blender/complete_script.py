@@ -9,9 +9,6 @@ leave while the worker trains.
 import json
 import os
 import sys
-import threading
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -20,25 +17,6 @@ RESULT, WAIT, BUDGET = sys.argv[sys.argv.index("--") + 1 :]
 module = next(name for name in bpy.context.preferences.addons.keys() if name.endswith(".stga"))  # noqa: SIM118
 own_python = sys.modules[f"{module}.stga_addon.worker.training_python"].own_python
 seen: dict[str, object] = {"version": bpy.app.version_string, "python": sys.version.split()[0]}
-
-
-def watch(job: Path, clicked: float) -> None:
-    """Note when each stage of the training began, and when its first preview was there."""
-    stages: dict[str, float] = {}
-    seen["stages"] = stages
-    while not (job / "preview.npz").exists():
-        with suppress(OSError, ValueError):  # not written yet
-            stages.setdefault(
-                json.loads((job / "status.json").read_text())["message"], time.monotonic() - clicked
-            )
-        time.sleep(0.05)
-    seen["preview_s"] = time.monotonic() - clicked
-
-
-def timed(name: str, action: object, **options: object) -> None:
-    begin = time.monotonic()
-    action(**options)  # type: ignore[operator]
-    seen[name] = time.monotonic() - begin
 
 
 def write() -> None:
@@ -51,11 +29,10 @@ def leave(worker: int) -> None:
     os._exit(0)
 
 
-timed("open_demo_s", bpy.ops.stga.open_demo)
+bpy.ops.stga.open_demo()
 settings = bpy.context.scene.stga
 run = Path(settings.run_folder)
 seen["run"] = str(run)
-threading.Thread(target=watch, args=(run / "job", time.monotonic()), daemon=True).start()
 name, value = BUDGET.split("=")
 budget = {name: float(value) if name == "minutes" else int(value)}
 if WAIT == "0":
@@ -64,7 +41,7 @@ if WAIT == "0":
     sys.modules[f"{module}.operators.request"].start_worker = lambda *given: leave(
         start(*given).pid
     )
-timed("train_s", bpy.ops.stga.train, directory=str(run), python=own_python(), **budget)
-timed("show_s", bpy.ops.stga.show_avatar, filepath=settings.avatar)
+bpy.ops.stga.train(directory=str(run), python=own_python(), **budget)
+bpy.ops.stga.show_avatar(filepath=settings.avatar)
 seen["splats"] = len(settings.splats.data.vertices)
 write()

@@ -20,9 +20,18 @@ def chosen(head):
     return bpy.context.scene.stga
 
 
-def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
-    """Catches an empty analysis, choices that are lost by analyzing again, and ones that training
-    does not get."""
+def test_effect_choices(chosen, extension, tmp_path):
+    """Catches choices of another capture, that are lost, or cannot be and show nowhere."""
+    row = chosen.effects.add()
+    row.name, row.choice = "jaw", "on"
+    with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
+        bpy.ops.stga.analyze_capture()
+    assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
+    assert "Traceback" not in error_of(extension, Kind.ANALYSIS)
+    chosen.preset_timing = '{"draft": 1}'
+    chosen.head = chosen.head
+    assert not chosen.effects
+    assert not chosen.preset_timing
     row = chosen.effects.add()  # as an earlier analysis leaves it
     row.name, row.choice = "strain-color", "on"
     bpy.ops.stga.analyze_capture()
@@ -47,21 +56,6 @@ def test_effect_choices_reach_the_run(chosen, extension, tmp_path):
     assert choices["strain-color"] == "on"
 
 
-def test_choices_are_of_one_capture(chosen, extension):
-    """Catches results that are shown for another capture, and an impossible choice that shows
-    nowhere, or as a traceback."""
-    row = chosen.effects.add()
-    row.name, row.choice = "jaw", "on"
-    with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
-        bpy.ops.stga.analyze_capture()
-    assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
-    assert "Traceback" not in error_of(extension, Kind.ANALYSIS)
-    chosen.preset_timing = '{"draft": 1}'
-    chosen.head = chosen.head
-    assert not chosen.effects
-    assert not chosen.preset_timing
-
-
 WORKER = """
 import json, pathlib, shutil, sys, time
 FOLDER = pathlib.Path(sys.argv[-1])
@@ -75,8 +69,7 @@ def answer(**values):
 
 
 def write_interpreter(path: Path, body: str) -> str:
-    """A program that stands in for the Python of the training Python, given the folder of a
-    request."""
+    """A program that stands in for the training Python, given the folder of a request."""
     path.write_text(f"#!{sys.executable}\n{WORKER}{body}\n")
     path.chmod(0o755)
     return str(path)
@@ -109,18 +102,6 @@ def tick_until_done(extension, kind: Kind = Kind.ANALYSIS) -> None:
     raise AssertionError("the analysis did not end")
 
 
-def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
-    """Catches a worker that waits for ever because nobody reads its pipes before it ends: they hold
-    some 64 kB."""
-    rows = {"effect": "jaw", "choice": "auto", "on": True, "reason": "x" * 200_000, "cost": ""}
-    answer = f"answer(kind='Analyzed', plan=[{rows}], seconds={{}})"
-    analyze(f"sys.stderr.write('warning ' * 100_000); {answer}")
-    assert not bpy.ops.stga.analyze_capture.poll()
-    tick_until_done(extension)
-    assert [row.name for row in chosen.effects] == ["jaw"]
-    assert len(chosen.effects[0].reason) == 200_000
-
-
 @pytest.mark.parametrize(
     ("body", "sentence"),
     [
@@ -132,8 +113,7 @@ def test_long_output_does_not_block_the_worker(chosen, extension, analyze):
     ],
 )
 def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentence):
-    """Catches a timer that ends with a traceback, and a panel that says nothing; earlier results
-    stay."""
+    """Catches a timer that ends with a traceback, and a panel that says nothing."""
     chosen.effects.add().name = "jaw"
     analyze(body)
     tick_until_done(extension)
@@ -141,20 +121,17 @@ def test_failed_analysis_is_a_sentence(chosen, extension, analyze, body, sentenc
     assert extension.operators.monitor.tick() is None
 
 
-def test_analysis_can_be_cancelled(chosen, extension, analyze):
-    """Catches an analysis that nobody can stop, and one that goes on after it was cancelled."""
+def test_analysis_can_be_cancelled(chosen, extension, analyze, monkeypatch, tmp_path):
+    """Catches an analysis that nobody can stop, and a folder left for each attempt that fails."""
     assert not bpy.ops.stga.cancel.poll()
     analyze("time.sleep(600)")
+    assert not bpy.ops.stga.analyze_capture.poll()
     begin = time.monotonic()
     bpy.ops.stga.cancel(request="analysis")
     assert time.monotonic() - begin < 60
     assert bpy.ops.stga.analyze_capture.poll()
     assert extension.operators.monitor.tick() is None
     assert error_of(extension, Kind.ANALYSIS) == ""
-
-
-def test_a_worker_that_cannot_be_started_leaves_nothing(chosen, extension, monkeypatch, tmp_path):
-    """Catches a temporary folder that is left behind for each attempt."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     python = str(tmp_path / "none")
     monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)

@@ -1,25 +1,19 @@
 """Apply Motion as a script calls it, and what leaves Blender again."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from capture.factory import ball, flame_parameters, write_flame_capture, write_mesh_capture
 
-from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.display.splat_object import evaluated_splats
 from stga_addon.scene.rig.head import rig_of
 from stga_addon.training.optimize.avatar_tracking import RefinedTracking
 from stga_addon.training.run.folder import with_refined_tracking, write_tracking
-
-from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
@@ -69,29 +63,6 @@ def at(frame: int) -> np.ndarray:
     return evaluated_vertices(the_head())
 
 
-def show_avatar(folder: Path, scene: Reenacted) -> Avatar:
-    """Trained on this person: its neutral mesh is the one of the tracked identity."""
-    neutral = open_capture(scene.folder, scene.model_file).neutral
-    avatar = write_ball_avatar(folder / "a.npz", neutral, order=0)
-    bpy.ops.stga.show_avatar(filepath=str(folder / "a.npz"))
-    return avatar
-
-
-def test_a_file_from_a_start_frame(scene):
-    """Catches the other's identity, a shifted frame, a scene that stops too early, and a recording
-    of 48 images a second that plays at half its speed in a scene of 24."""
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10)
-    for row in range(5):
-        np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
-    assert bpy.context.scene.frame_end == 14
-    bpy.context.scene.render.fps = 24
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48)
-    for frame, row in ((1, 0), (2, 2), (3, 4)):
-        np.testing.assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
-    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48, speed=0.5)
-    np.testing.assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
-
-
 def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> None:
     """A run's file, whose parameters are disturbed."""
     tracking = RefinedTracking(capture, "stga")
@@ -102,8 +73,7 @@ def write_refined(folder: Path, capture: Capture, rng: np.random.Generator) -> N
 
 @pytest.mark.parametrize("place", ["action", "strip"])
 def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
-    """Catches a head that misses where its avatar was trained, and what was tracked beside
-    parameters lost, also after another motion."""
+    """Catches a head that misses where its avatar was trained, also after another motion."""
     rng = np.random.default_rng(7)
     folder, model = write_flame_capture(tmp_path / "own")
     for path in (folder / "flame_param").glob("*.npz"):
@@ -124,18 +94,6 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
         np.testing.assert_allclose(at(10 + 2 * timestep), shown.mesh(timestep), atol=2 * TOLERANCE)
 
 
-def test_tooltips_say_whose_motion(extension):
-    """Catches two buttons that differ but explain themselves alike, or not at all."""
-    operator = extension.operators.apply_motion.ApplyMotion
-    refined_tracking = operator.description(bpy.context, SimpleNamespace(own_offsets=True))
-    assert "refined by training" in refined_tracking
-    # Where this is empty, Blender shows the operator's own.
-    assert operator.description(bpy.context, SimpleNamespace(own_offsets=False)) == ""
-    own = bpy.ops.stga.apply_motion.get_rna_type().description
-    assert "another person" in own
-    assert "refined" not in own
-
-
 def test_undo(scene):
     """Catches a motion that undo leaves half of: actions, bindings, frame range."""
     actions, before = sorted(bpy.data.actions.keys()), at(1)
@@ -149,14 +107,24 @@ def test_undo(scene):
     np.testing.assert_array_equal(at(1), before)
 
 
-def test_parts_and_strength(scene):
-    """Catches switches that are not wired to what they say."""
+def test_a_file_its_parts_and_its_frames(scene):
+    """Catches switches without effect, the other's identity, a shifted frame, and another speed."""
     chosen = {"jaw": False, "eyes": False, "neck": False, "head": False, "strength": 0.5}
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=0, **chosen)
     own = vars(scene.own.frame(1)) | {"expr": scene.other["expr"][1] / 2}
     np.testing.assert_allclose(at(1), scene.mesh(**own), atol=TOLERANCE)
     with pytest.raises(RuntimeError, match="no part is chosen"):
         bpy.ops.stga.apply_motion(filepath=str(scene.file), **chosen, expression=False)
+    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=10)
+    for row in range(5):
+        np.testing.assert_allclose(at(10 + row), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+    assert bpy.context.scene.frame_end == 14
+    bpy.context.scene.render.fps = 24
+    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48)
+    for frame, row in ((1, 0), (2, 2), (3, 4)):
+        np.testing.assert_allclose(at(frame), scene.mesh(**scene.theirs(row)), atol=TOLERANCE)
+    bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, fps=48, speed=0.5)
+    np.testing.assert_allclose(at(4), scene.mesh(**scene.theirs(3)), atol=TOLERANCE)
 
 
 def test_a_capture_and_another_head(scene, tmp_path):
@@ -211,34 +179,3 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
     needed = r"has no FLAME rig.*splats follow whatever moves its mesh"
     with pytest.raises(RuntimeError, match=needed):
         bpy.ops.stga.apply_motion(filepath=str(scene.file))
-
-
-def test_splats_follow_what_is_keyframed_by_hand(scene, tmp_path):
-    """Catches splats that sliders, bones and identity do not move at once."""
-    avatar = show_avatar(tmp_path, scene)
-    rig, keys = rig_of(the_head()), the_head().data.shape_keys.key_blocks
-    rig.animation_data.action = the_head().data.shape_keys.animation_data.action = None
-    for frame, amount in ((30, 0.0), (40, 1.0)):
-        keys["expr_001"].value, keys["identity_000"].value = 2 * amount, 3 * amount
-        keys["expr_001"].keyframe_insert("value", frame=frame)
-        keys["identity_000"].keyframe_insert("value", frame=frame)
-        turn = (np.cos(0.2 * amount), np.sin(0.2 * amount), 0, 0)
-        rig.pose.bones["jaw"].rotation_quaternion = turn
-        rig.pose.bones["jaw"].keyframe_insert("rotation_quaternion", frame=frame)
-    bpy.context.scene.frame_set(40)
-    frame = vars(scene.own.frame(0)) | dict.fromkeys(
-        ("rotation", "neck_pose", "translation"), np.zeros(3)
-    )
-    expr = np.array([keys["expr_000"].value, 2.0])
-    frame |= {"expr": expr, "jaw_pose": np.array([0.4, 0, 0])}
-    shape = scene.own.shape + 3 * np.eye(4)[0]
-    for bone in rig.pose.bones:
-        if bone.name in ("root", "neck", "left_eye", "right_eye"):
-            bone.matrix_basis.identity()
-    expected = flame_forward(scene.own.model, shape, FlameFrame(**frame), scene.own.static_offset)
-    xyz, _, scale = evaluated_splats(bpy.context.scene.stga.splats)
-    posed = to_world(avatar.splats, avatar.frames(expected))
-    np.testing.assert_allclose(xyz, posed.xyz, atol=1e-5)
-    # Canonical areas stay those of the person who was trained: another identity stretches the
-    # splats with the skin.
-    np.testing.assert_allclose(scale, np.exp(posed.log_scale), rtol=2e-3)

@@ -27,11 +27,8 @@ def video(tmp_path: Path) -> Path:
 def asked(extension, monkeypatch):
     """The requests that the operator starts, which are not carried out."""
     requests: list[object] = []
-    monkeypatch.setattr(
-        extension.operators.track,
-        "start",
-        lambda scene, request, python: requests.append(request),
-    )
+    start = lambda scene, request, python: requests.append(request)  # noqa: E731
+    monkeypatch.setattr(extension.operators.track, "start", start)
     return requests
 
 
@@ -43,8 +40,7 @@ def begin(requests):
 
 
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
-    """Catches a second way to an avatar, with other settings than `stga avatar VIDEO`, and a
-    dropped video that nothing tells of until its head arrives, minutes later."""
+    """Catches other settings than `stga avatar VIDEO`, and a drop without a word."""
     out, opened = tmp_path / "out", list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
     monkeypatch.setattr(extension.operators.monitor, "show_panel", show_panel)
@@ -62,8 +58,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
 
 
 def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
-    """Catches an avatar of one video continued with another or begun anew each time, and a folder
-    far from the file that shows it."""
+    """Catches an avatar continued with another video or begun anew, and a folder far away."""
 
     def make(path: Path) -> Path:
         bpy.ops.stga.avatar_from_video(filepath=str(path))
@@ -103,9 +98,7 @@ def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
-    """Catches a head or splats that do not arrive, a run that the Train panel does not continue,
-    splats on a head that is not the refined one, and a tracking that shows nothing while it
-    runs."""
+    """Catches a head, splats, picture or run that does not arrive, or is another's."""
     pytest.importorskip("torch")
     video = tmp_path / "head.mp4"
     write_head_video(video, 6)

@@ -10,7 +10,7 @@ import pytest
 from capture.factory import write_flame_capture, write_mesh_capture
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.file import Avatar, read_avatar
+from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.export.ply import read_ply
 from stga_addon.scene.arrays import evaluated_vertices
@@ -33,15 +33,8 @@ def save_and_open(path: Path) -> None:
     bpy.ops.wm.open_mainfile(filepath=str(path))
 
 
-def show_avatar(path: Path, capture) -> Avatar:
-    avatar = write_ball_avatar(path, capture.neutral, order=0)
-    bpy.ops.stga.show_avatar(filepath=str(path))
-    return avatar
-
-
 def test_the_open_head_stands_in_for_the_capture(stga, tmp_path, capfd):
-    """Catches a parser that asks for less than it needs, a command on nothing, or on the open head
-    although another is named."""
+    """Catches a parser that asks for less than it needs, and a command on another head."""
     with pytest.raises(SystemExit, match="2"):
         stga("info")
     assert "CAPTURE" in capfd.readouterr().err
@@ -59,16 +52,25 @@ def test_the_open_head_stands_in_for_the_capture(stga, tmp_path, capfd):
     assert "is not a folder" in capfd.readouterr().err
 
 
-def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
-    """Catches an export of the tracked frames where the head in the file is animated otherwise."""
+@pytest.fixture
+def here(extension):
+    """Run a command in this process, on the head of the open file; returns the exit code."""
+    command = import_module(f"{extension.__name__}.stga_addon.cli.main")
+    head = extension.operators.command_line._open_head
+    return lambda *arguments: command.main([str(argument) for argument in arguments], head())
+
+
+@pytest.mark.slow
+def test_what_the_open_head_plays(stga, here, tmp_path):
+    """Catches an export or rendering that misses avatar or capture, or has the tracked motion where
+    the head in the file is animated otherwise."""
     folder, model = write_flame_capture(tmp_path / "capture")
-    capture = open_capture(folder, model)
     bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    avatar = show_avatar(tmp_path / "a.npz", capture)
-    head = bpy.context.scene.stga.head
-    keys = head.data.shape_keys
+    avatar = write_ball_avatar(tmp_path / "a.npz", open_capture(folder, model).neutral, order=0)
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    keys = bpy.context.scene.stga.head.data.shape_keys
     keys.animation_data.action = None
-    keys.key_blocks["expr_001"].value = 4.0
+    keys.key_blocks["expr_001"].value = 9.0
     save_and_open(tmp_path / "head.blend")
     assert stga("export", "--format", "ply-sequence", "--out", tmp_path / "plys") == 0
     pair = ("--format", "gaussian-avatars", "--out", tmp_path / "pair")
@@ -80,34 +82,13 @@ def test_export_of_the_open_head_is_what_it_plays(stga, tmp_path):
     expected = to_world(avatar.splats, frames).xyz
     np.testing.assert_allclose(read_ply(tmp_path / "plys/00002.ply").xyz, expected, atol=1e-6)
     with np.load(tmp_path / "pair/flame_param.npz") as pair:
-        np.testing.assert_allclose(pair["expr"][:, 1], 4.0)
+        np.testing.assert_allclose(pair["expr"][:, 1], 9.0)
         assert len(pair["expr"]) == 4
-
-
-@pytest.fixture
-def here(extension):
-    """Run a command in this process, on the head of the open file; returns the exit code."""
-    command = import_module(f"{extension.__name__}.stga_addon.cli.main")
-    head = extension.operators.command_line._open_head
-    return lambda *arguments: command.main([str(argument) for argument in arguments], head())
-
-
-@pytest.mark.slow
-def test_render_of_the_open_head(stga, here, tmp_path):
-    """Catches a render verb that misses avatar or capture, or draws another motion."""
-    pytest.importorskip("numba")
-    folder, model = write_flame_capture(tmp_path / "capture")
-    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
-    show_avatar(tmp_path / "a.npz", open_capture(folder, model))
-    head = bpy.context.scene.stga.head
-    head.data.shape_keys.animation_data.action = None
-    head.data.shape_keys.key_blocks["expr_001"].value = 9.0
-    save_and_open(tmp_path / "head.blend")
-    cameras = folder / "transforms_val.json"
-    assert here("render", "--cameras", cameras, "--out", tmp_path / "here") == 0
-    assert stga("render", "--cameras", cameras, "--out", tmp_path / "there") == 0
-    given = ("--capture", folder, "--flame", model, "--cameras", cameras)
-    assert stga("render", tmp_path / "a.npz", *given, "--out", tmp_path / "tracked") == 0
+    cameras = ("--cameras", folder / "transforms_val.json", "--out")
+    assert here("render", *cameras, tmp_path / "here") == 0
+    assert stga("render", *cameras, tmp_path / "there") == 0
+    given = (tmp_path / "a.npz", "--capture", folder, "--flame", model)
+    assert stga("render", *given, *cameras, tmp_path / "tracked") == 0
     pictures, there, tracked = (
         [path.read_bytes() for path in sorted((tmp_path / name).glob("*.png"))]
         for name in ("here", "there", "tracked")
@@ -130,8 +111,7 @@ def test_missing_training_python(stga, extension, head, tmp_path, monkeypatch, c
 
 @pytest.mark.parametrize("command", ["train", "track", "avatar"])
 def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monkeypatch, command):
-    """Catches a command in Blender's Python although another was chosen, and a farm's variable that
-    overrules an operator's Python."""
+    """Catches a command in Blender's Python, or a farm's, although another was chosen."""
     chosen = tmp_path / "python"
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
@@ -148,8 +128,7 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
 
 @pytest.mark.slow
 def test_training_is_the_panels(stga, here, head, tmp_path):
-    """Catches a headless run, or a worker of the panel's, that ignores painted groups or settings:
-    with the same seed, all give the same numbers."""
+    """Catches a headless run or worker that ignores painted groups or settings."""
     pytest.importorskip("torch")
     bpy.ops.stga.select(threshold=0.0005)
     head.vertex_groups["stga_3"].remove(list(range(60)))

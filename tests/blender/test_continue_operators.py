@@ -1,5 +1,4 @@
-"""Refine and Extend from Blender: what is painted or selected reaches the worker, and the preview
-stays in place."""
+"""Refine and Extend from Blender: what is painted or selected reaches the worker."""
 
 import tempfile
 
@@ -44,9 +43,7 @@ def run(tmp_path):
 
 
 def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extension):
-    """Catches a region of other triangles, a selection as it was before Edit Mode, a vertex group
-    used although faces are selected, settings of the panel that are lost, and a preview in a second
-    object over the first one."""
+    """Catches another region or selection, lost settings, and a preview in a second object."""
     bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
     shown = bpy.context.scene.stga.splats
     chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
@@ -88,8 +85,7 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
 
 
 def test_residuals_are_shown_on_the_head(head, run, extension):
-    """Catches a heat map of other triangles than those with the error, and unknown ones that are
-    shown as bad."""
+    """Catches a heat map of other triangles, and unknown ones shown as bad."""
     residual = np.full(len(head.data.polygons), 0.01, np.float32)
     residual[7], residual[9] = 0.2, np.nan
     extension.stga_addon.training.run.folder.write_residuals(run, residual)
@@ -127,8 +123,7 @@ def worker(extension, monkeypatch, tmp_path):
 
 
 def test_what_an_extension_would_train_is_selected(head, run, extension, worker, tmp_path):
-    """Catches a selection of other frames or triangles than the worker found, and a failure that
-    shows nowhere."""
+    """Catches other frames or triangles than the worker found, and a silent failure."""
     selection = {timestep: np.arange(len(head.data.polygons)) < 40 for timestep in (0, 3)}
     selection[3] = ~selection[3]
     worker(answer(extension, tmp_path, selection))
@@ -149,8 +144,7 @@ def test_what_an_extension_would_train_is_selected(head, run, extension, worker,
 def test_selection_of_another_head_or_cancelled_changes_nothing(
     head, run, extension, worker, monkeypatch, tmp_path
 ):
-    """Catches a selection written to the head imported meanwhile, and files that a cancelled
-    command leaves."""
+    """Catches a selection of a head imported meanwhile, and files that a cancel leaves."""
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -177,8 +171,7 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
 def test_selection_waits_for_the_end_of_edit_mode(
     head, run, extension, worker, monkeypatch, tmp_path
 ):
-    """Catches a result lost because the head is edited, a failure held back, and an old error
-    beside a new command."""
+    """Catches a result lost in Edit Mode, a failure held back, and an old error."""
     worker(answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)}))
     monitor = extension.operators.monitor
     monkeypatch.setattr(monitor, "has_timer", lambda: True)
@@ -207,8 +200,7 @@ def test_selection_waits_for_the_end_of_edit_mode(
 
 @pytest.mark.slow
 def test_refine_and_extend_end_to_end(head, tmp_path):
-    """Catches a job that the worker does not understand, and an avatar that is not that of the
-    continued run."""
+    """Catches a job that the worker does not understand, and an avatar of another run."""
     pytest.importorskip("torch")
     run = tmp_path / "run"
     bpy.ops.stga.train(directory=str(run), iterations=6, device="cpu")

@@ -10,16 +10,18 @@ import bpy
 import numpy as np
 import pytest
 from driving.live import wire
-from flame.small_head import small_head, write_flame
 
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
 from stga_addon.driving.performance import ARKIT_SHAPES, Performance
 from stga_addon.driving.read_performance import read_performance
 from stga_addon.flame.forward import flame_forward
-from stga_addon.flame.sequence import FlameSequence, read_motion
+from stga_addon.flame.sequence import read_motion
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
+
+from .captures import import_small_head
+from .test_splat_object import active_camera
 
 pytestmark = [pytest.mark.usefixtures("extension"), pytest.mark.slow]
 TOLERANCE_M = 2e-5
@@ -28,19 +30,12 @@ TOLERANCE_M = 2e-5
 @pytest.fixture
 def live(tmp_path: Path, extension) -> SimpleNamespace:
     """The small head, driven by packets that the test sends."""
-    model = small_head(0)
-    write_flame(model, tmp_path / "flame.npz")
-    shape = np.linspace(-0.5, 0.5, model.n_identity)
-    rng = np.random.default_rng(4)
+    expr = np.random.default_rng(4).normal(0, 0.3, (5, 10))
     jaw = np.linspace([0, 0, 0], [0.2, 0, 0], 5)
-    np.savez(tmp_path / "own.npz", expr=rng.normal(0, 0.3, (5, 10)), jaw_pose=jaw, shape=shape)
-    bpy.ops.stga.import_motion(
-        filepath=str(tmp_path / "own.npz"), flame=str(tmp_path / "flame.npz")
-    )
+    own = import_small_head(tmp_path, expr=expr, jaw_pose=jaw)
     settings = bpy.context.scene.stga.drive
     settings.port, settings.takes = wire.free_port(), str(tmp_path / "takes")
-    own = FlameSequence(model, shape, None, (), {}.__getitem__)
-    recorded = read_motion(tmp_path / "own.npz", model)
+    recorded = read_motion(tmp_path / "own.npz", own.model)
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sessions = extension.operators.drive
 
@@ -87,7 +82,7 @@ def half(seed: int) -> dict[str, float]:
 
 
 def test_the_head_follows_and_comes_back(live):
-    """Catches a pose that is not a file's, unwanted keyframes, and a head that stays posed."""
+    """Catches another pose than a file's, keyframes, a head left posed, and sliders added."""
     bpy.context.scene.frame_set(1)
     before, actions = mesh(), sorted(bpy.data.actions.keys())
     bpy.ops.stga.drive_live()
@@ -103,6 +98,15 @@ def test_the_head_follows_and_comes_back(live):
     assert sorted(bpy.data.actions.keys()) == actions
     assert live.sessions.session() is None
     assert not bpy.ops.stga.stop_live.poll()
+    bpy.ops.stga.add_arkit_controls()
+    slider = the_head().data.shape_keys.key_blocks["jawOpen"]
+    slider.value = 0.25
+    bpy.ops.stga.drive_live()
+    weights = half(1)
+    live.send(weights, 1, head=TURN)
+    assert_shows(live, weights)
+    bpy.ops.stga.stop_live()
+    assert slider.value == 0.25
 
 
 def test_a_rendered_animation_keeps_its_own_pose(live):
@@ -122,8 +126,7 @@ def test_a_rendered_animation_keeps_its_own_pose(live):
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = 1, 3
     scene.render.resolution_x = scene.render.resolution_y = 4
-    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    scene.collection.objects.link(scene.camera)
+    active_camera()
     scene.render.filepath = str(live.takes / "image_")
     bpy.utils.register_class(Recorder)
     try:
@@ -136,22 +139,8 @@ def test_a_rendered_animation_keeps_its_own_pose(live):
         np.testing.assert_allclose(rendered[number], wanted, atol=TOLERANCE_M)
 
 
-def test_sliders_rest_meanwhile(live):
-    """Catches sliders of the face that add up with what is received, or are left at zero."""
-    bpy.ops.stga.add_arkit_controls()
-    slider = the_head().data.shape_keys.key_blocks["jawOpen"]
-    slider.value = 0.25
-    bpy.ops.stga.drive_live()
-    weights = half(1)
-    live.send(weights, 1, head=TURN)
-    assert_shows(live, weights)
-    bpy.ops.stga.stop_live()
-    assert slider.value == 0.25
-
-
 def test_record_with_a_calibrated_face(live):
-    """Catches a take that is not what the head did, has the resting face in it, is not kept as a
-    file, or is lost with Esc."""
+    """Catches a take of something else, with the resting face, not kept, or lost with Esc."""
     bpy.ops.stga.drive_live()
     live.send({"jawOpen": 0.2}, 0)
     bpy.ops.stga.calibrate_live()

@@ -1,12 +1,12 @@
 """Enabling the extension in a Python that has what Blender's own has: bpy and numpy."""
 
-import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from .zips import result_of
 
 pytest.importorskip("bpy")
 
@@ -55,21 +55,14 @@ def test_enabling_needs_numpy_alone_and_no_time(tmp_path: Path) -> None:
     The time is that of the processor, and compared with other work of the same process: a busy or
     slow machine does not count. The first start compiles bytecode.
     """
-    variables = {
-        name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"
-    }
-    variables["PYTHONPYCACHEPREFIX"] = str(tmp_path)
+    variables = {**os.environ, "PYTHONPYCACHEPREFIX": str(tmp_path)}
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)
     share = float("inf")
     for _ in range(3):
         if share < MAX_ENABLE_WORK:
             break
-        command = [sys.executable, "-c", ENABLE, str(ROOT)]
-        done = subprocess.run(
-            command, env=variables, capture_output=True, text=True, cwd=ROOT / "tests"
-        )
-        line = next((line for line in done.stdout.splitlines() if line.startswith("RESULT ")), None)
-        assert line is not None, done.stderr[-2000:]
-        share, panels = json.loads(line.removeprefix("RESULT "))
+        command = [sys.executable, "-c", ENABLE, ROOT]
+        share, panels = result_of(command, env=variables, cwd=ROOT / "tests")
         assert "STGA_PT_show" in panels
     print(f"enabling took as long as {share:.1f} compilations")
     assert share < MAX_ENABLE_WORK

@@ -1,6 +1,4 @@
-"""The render engine against `render_avatar`, through files that Blender writes; what it refuses,
-and leaves behind after a failure. Several objects: test_gpu_renderer.py, test_linked_display.py and
-tests/render/test_compose.py."""
+"""The render engine against `render_avatar`, through files that Blender writes, and its errors."""
 
 import threading
 from dataclasses import replace
@@ -75,6 +73,13 @@ def camera_at(lens: float = 60.0, **data: object):
     return camera
 
 
+def add_sun(energy: float = 1.0):
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.rotation_euler = energy, (1.2, 0.0, 0.4)
+    bpy.context.scene.collection.objects.link(sun)
+    return sun
+
+
 def textured(avatar: Avatar, scale: float = -6.0) -> Avatar:
     """Visible splats in muted colors."""
     rng = np.random.default_rng(5)
@@ -146,8 +151,7 @@ def driven() -> Avatar:
     [(driven, 1.0), (lambda: textured(avatar_of("gaussian_avatars"), -1), 0.0)],
 )
 def test_image_equals_render_avatar(make, background, tmp_path):
-    """Catches another camera, color, order or pose than `stga render`'s, alpha that does not match
-    the color, and parts of an avatar that the engine leaves out."""
+    """Catches another camera, color, order or pose than `stga render`'s, and parts left out."""
     avatar = make()
     shown, head = show(avatar)
     camera, mesh = expected_camera(camera_at(), shown), evaluated_vertices(head)
@@ -170,9 +174,7 @@ def with_light(avatar: Avatar) -> Avatar:
 
 @pytest.mark.parametrize("device", ["GPU", "CPU"])
 def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
-    """Catches an avatar that is not lit by the scene, from another side, or in another mode than
-    the panel's; one as recorded of which a single bit changes because it could be lit; and a
-    machine without a GPU context that gets another image, or none."""
+    """Catches another light or mode than the scene's, and pixels as recorded that change at all."""
     if device == "CPU":
         monkeypatch.setattr(engine, "SplatRenderer", no_context)
     avatar = textured(avatar_of("stga"))
@@ -183,9 +185,7 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
         bpy.data.objects.remove(old)
     avatar = with_light(avatar)
     shown, head = show(avatar)
-    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    sun.data.energy, sun.rotation_euler = 4.0, (1.2, 0.0, 0.4)
-    bpy.context.scene.collection.objects.link(sun)
+    sun = add_sun(4.0)
     recorded = render(tmp_path)
     assert unlit["A"].max() > 0.5
     for name, values in unlit.items():
@@ -246,8 +246,7 @@ def test_render_region(crop, tmp_path):
 
 @pytest.mark.parametrize("is_linked", [True, False])
 def test_world_color_is_the_background(tmp_path, is_linked):
-    """Catches a background blended in linear light: splats were trained in sRGB; and one of a world
-    whose output has no shader, which Cycles renders black."""
+    """Catches a background blended in linear light, and one of a world without a shader."""
     scene = bpy.context.scene
     scene.render.film_transparent = False
     scene.world = bpy.data.worlds.new("world")
@@ -341,8 +340,7 @@ def test_only_visible_objects_are_rendered(tmp_path):
 
 
 def test_animation(tmp_path):
-    """Catches splats that stay where they were on the first frame, and a keyframed *Disable in
-    Renders* read too early."""
+    """Catches splats that stay where they were, and a keyframed *Disable in Renders* ignored."""
     shown, _ = show(textured(avatar_of("stga")))
     camera_at()
     for frame, hidden in ((1, False), (5, True), (9, False)):
@@ -389,21 +387,17 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
         render(tmp_path)
 
 
-@pytest.mark.parametrize("kind", ["ORTHO", "PANO", None])
-def test_unsupported_cameras_are_refused(kind):
-    """Catches a perspective image from a camera of another type."""
-    if kind is not None:
-        camera_at(type=kind)
-    message = "no camera" if kind is None else "camera: is not a perspective camera"
-    with pytest.raises(RuntimeError, match=message):
-        bpy.ops.render.render()
-
-
-def test_heads_that_cannot_be_followed_are_named():
-    """Catches splats scattered over a subdivided mesh or one that is being edited, and a
-    traceback."""
+def test_what_cannot_be_rendered_is_named():
+    """Catches an image of another camera, splats scattered over an edited mesh, and a traceback."""
     shown, head = show(avatar_of("stga", 10))
-    camera_at()
+    with pytest.raises(RuntimeError, match="no camera"):
+        bpy.ops.render.render()
+    camera = camera_at()
+    for kind in ("ORTHO", "PANO"):
+        camera.data.type = kind
+        with pytest.raises(RuntimeError, match="camera: is not a perspective camera"):
+            bpy.ops.render.render()
+    camera.data.type = "PERSP"
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
     message = "head: is in Edit Mode; head splats is drawn again when you leave it"
@@ -444,19 +438,6 @@ def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, m
     combined = [values for name, values in passes.items() if "Combined" in name]
     assert len(combined) == 4
     assert all(values.shape == (HEIGHT, WIDTH) and not values.any() for values in combined)
-
-
-def test_panels_drop_the_engine_on_unregister():
-    """Catches panels that still list the engine after it was unregistered."""
-
-    def panels() -> list[type]:
-        every = bpy.types.Panel.__subclasses__()
-        return [each for each in every if engine.ENGINE in getattr(each, "COMPAT_ENGINES", ())]
-
-    assert panels()
-    engine.unregister()
-    assert not panels()
-    engine.register(no_python)
 
 
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-import pytest
 from capture.factory import write_flame_capture
 from export.web.web_data import posed_mesh, read_web_data
 from flame.small_head import small_head, write_flame
@@ -21,8 +20,7 @@ BLENDER_TOLERANCE_M = 1e-5
 """Float32 skinning in Blender, steps of the file's blend shapes and weights."""
 
 
-@pytest.fixture
-def demo_head(extension, tmp_path: Path):
+def demo_head(tmp_path: Path):
     """The small FLAME head in the scene with an avatar; the capture it was imported from."""
     folder, _ = write_flame_capture(tmp_path / "capture", timesteps=(0, 1, 2))
     model = folder / "demo.npz"
@@ -56,8 +54,23 @@ def assert_plays(header: dict, arrays: dict[str, np.ndarray]) -> None:
         assert np.abs(found - evaluated_vertices(scene.stga.head)).max() < BLENDER_TOLERANCE_M
 
 
-def test_timeline_and_camera(demo_head, tmp_path):
-    """Catches the capture's motion, frames or camera where the scene has others."""
+def test_sliders_motion_and_camera(extension, tmp_path):
+    """Catches another slider, joint, motion or camera, and blend shapes in a page without."""
+    flame = demo_head(tmp_path).flame
+    header, arrays = exported(tmp_path)
+    names = [f"expr_{component:03d}" for component in range(flame.model.n_expression)]
+    assert sorted(slider["name"] for slider in header["sliders"]) == names
+    rng = np.random.default_rng(0)
+    expressions = rng.normal(0, 0.7, flame.model.n_expression)
+    pose = rng.normal(0, 0.2, (len(JOINTS), 3))
+    turns = (pose[0], pose[1], pose[2], arrays["translation"][0], pose[3:].ravel())
+    wanted = FlameFrame(expressions, *turns)
+    expected = flame_forward(flame.model, flame.shape, wanted, flame.static_offset)
+    found = posed_mesh(header, arrays, expressions, pose, 0)
+    assert np.abs(found - expected).max() < BLENDER_TOLERANCE_M
+    header, arrays = exported(tmp_path, motion_only=True)
+    assert (header["sliders"], header["joints"]) == ([], ["root"])
+    assert_plays(header, arrays)
     scene = bpy.context.scene
     head = scene.stga.head
     jaw = rig_of(head).pose.bones["jaw"]
@@ -74,26 +87,3 @@ def test_timeline_and_camera(demo_head, tmp_path):
     camera = np.reshape(header["views"][0]["world_to_camera"], (4, 4))
     head_to_camera = np.array(scene.camera.matrix_world.inverted() @ head.matrix_world)
     np.testing.assert_allclose(camera, np.diag([1, -1, -1, 1]) @ head_to_camera, atol=1e-5)
-
-
-def test_sliders_are_flames(demo_head, tmp_path):
-    """Catches a slider of another shape, and correctives or joints that do not follow."""
-    header, arrays = exported(tmp_path)
-    flame = demo_head.flame
-    names = [f"expr_{component:03d}" for component in range(flame.model.n_expression)]
-    assert sorted(slider["name"] for slider in header["sliders"]) == names
-    rng = np.random.default_rng(0)
-    expressions = rng.normal(0, 0.7, flame.model.n_expression)
-    pose = rng.normal(0, 0.2, (len(JOINTS), 3))
-    turns = (pose[0], pose[1], pose[2], arrays["translation"][0], pose[3:].ravel())
-    wanted = FlameFrame(expressions, *turns)
-    expected = flame_forward(flame.model, flame.shape, wanted, flame.static_offset)
-    found = posed_mesh(header, arrays, expressions, pose, 0)
-    assert np.abs(found - expected).max() < BLENDER_TOLERANCE_M
-
-
-def test_motion_only_leaves_flame_out(demo_head, tmp_path):
-    """Catches blend shapes in a page without them, or another motion in it."""
-    header, arrays = exported(tmp_path, motion_only=True)
-    assert (header["sliders"], header["joints"]) == ([], ["root"])
-    assert_plays(header, arrays)

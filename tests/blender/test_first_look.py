@@ -26,12 +26,8 @@ def head(extension, tmp_path):
 
 
 def viewports() -> list:
-    return [
-        area.spaces.active
-        for screen in bpy.data.screens
-        for area in screen.areas
-        if area.type == "VIEW_3D"
-    ]  # fmt: skip
+    areas = [area for screen in bpy.data.screens for area in screen.areas]
+    return [area.spaces.active for area in areas if area.type == "VIEW_3D"]
 
 
 def test_viewports_look_at_the_head(head):
@@ -67,8 +63,7 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
-    """Catches a first look from within the default cube, an artist's cube removed, and one that
-    every import hides again."""
+    """Catches a first look from within the default cube, and an artist's cube hidden."""
     bpy.ops.mesh.primitive_cube_add()
     cube, folder = bpy.context.object, str(write_mesh_capture(tmp_path / "capture"))
     cube.location.x = float(moved)
@@ -82,8 +77,7 @@ def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved)
 
 
 def test_pose_the_jaw_and_back(head, tmp_path):
-    """Catches bones that stay hidden, another bone that is selected, no way back, the jaw of a head
-    whose jaw no bone moves, and a traceback where a head has no rig."""
+    """Catches hidden bones, another bone selected, no way back, and a traceback without a rig."""
     layer = bpy.context.view_layer
     (bones,) = layers_of(head.parent, tags.RIG, layer)
     assert bones.hide_viewport
@@ -104,17 +98,12 @@ def test_pose_the_jaw_and_back(head, tmp_path):
         bpy.ops.stga.pose_head()
 
 
-@pytest.fixture
-def shown(extension, tmp_path):
-    """The splats of an avatar on a mesh capture's head."""
+def test_images_by_other_engines(extension, tmp_path):
+    """Catches a missing avatar, points, quads edge-on, and limits changed needlessly."""
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
-    return bpy.context.scene.stga.splats
-
-
-def test_images_by_cycles_show_as_trained_by_quads(shown, tmp_path):
-    """Catches images by Blender's engines where an avatar is missing, or points."""
+    shown = bpy.context.scene.stga.splats
     scene, path = bpy.context.scene, tmp_path / "image.png"
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
     scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(path)
@@ -126,11 +115,6 @@ def test_images_by_cycles_show_as_trained_by_quads(shown, tmp_path):
     assert images[QUADS][..., :3].max() > 50
     np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
-
-
-def test_preview_for_other_engines(shown, tmp_path):
-    """Catches quads that face no camera, F12 in Cycles with holes, limits lowered or raised
-    needlessly, and displays without limits."""
     scene, cycles = bpy.context.scene, bpy.context.scene.cycles
     other = bpy.data.scenes.new("other").cycles
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (64, 64)

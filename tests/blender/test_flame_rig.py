@@ -14,7 +14,7 @@ from stga_addon.flame.teeth import flame_model as bundled_model
 from stga_addon.flame.teeth import with_teeth
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.rig.head import import_head, rig_of
 from stga_addon.scene.rig.keyframes import is_of_parts
 from stga_addon.scene.rig.motion import sample_motion
 
@@ -26,10 +26,6 @@ TOLERANCE = 2e-6  # meters; float32 skinning of a head half a meter from its ori
 @pytest.fixture
 def source(tmp_path):
     return tmp_path / "motion.npz"
-
-
-def rig_of(head):
-    return next(thing for thing in head.parent.children if thing.get(tags.KIND) == tags.RIG)
 
 
 def assert_parity(head, sequence: FlameSequence, atol: float = TOLERANCE) -> None:
@@ -84,7 +80,7 @@ def test_small_rotations_and_offsets_do_not_snap(source):
 
 
 def test_correctives_of_moving_joints_only(source):
-    """Fails when still joints get keys and drivers, or rotating ones lose theirs."""
+    """Fails when still joints get keys, drivers or helper bones, or rotating ones lose theirs."""
     sequence = flame_sequence(flame_model())
     poses = {"neck_pose": np.full(3, 1e-3), "eyes_pose": np.zeros(6)}
     still = changed(sequence, lambda full: poses)
@@ -98,18 +94,14 @@ def test_correctives_of_moving_joints_only(source):
     directions[:, :, :9] = 0  # the neck's
     assert_parity(head, replace(still, model=replace(sequence.model, posedirs=directions)))
     assert_parity(import_head(motion_capture(still, source)), still)
-
-
-def test_drivers_need_no_python_and_no_cycle(source, capfd):
-    """Fails when drivers count as scripts (refused from others) or have no order."""
-    head = import_head(motion_capture(flame_sequence(flame_model()), source))
-    at_frame(head, 5)
-    for owner in (rig_of(head), head.data.shape_keys):
-        assert owner.animation_data.drivers
-        for curve in owner.animation_data.drivers:
-            assert curve.driver.is_simple_expression
-            assert curve.is_valid
-    assert "cycle" not in "".join(capfd.readouterr()).lower()
+    model = flame_model()
+    model.shapedirs[model.j_regressor.any(axis=0)] = 0
+    sequence = flame_sequence(model)
+    head = import_head(motion_capture(sequence, source))
+    assert [bone.name for bone in rig_of(head).data.bones] == list(JOINTS)
+    assert not rig_of(head).animation_data.drivers
+    assert {group.name for group in head.vertex_groups} == set(JOINTS)
+    assert_parity(head, sequence)
 
 
 def test_between_frames_the_head_turns_and_does_not_shrink(source):
@@ -146,8 +138,7 @@ def test_all_components_have_sliders(source):
 
 
 def test_the_published_topology_with_teeth(source, shared_data):
-    """Fails when parity of a hundred random vertices is lost at FLAME's own size, and when identity
-    sliders leave the joints where they are, or count from FLAME's mean face."""
+    """Fails when parity is lost at FLAME's size, or identity sliders leave joints."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
         template, identity, faces = data["v_template"], data["shapedirs"], data["faces"]
     small = flame_model(vertices=len(template), components=20, identity=0)
@@ -172,21 +163,8 @@ def test_the_published_topology_with_teeth(source, shared_data):
     assert_parity(head, sequence)
 
 
-def test_fixed_joints_have_no_helper_bones(source):
-    """Fails when joints that no slider displaces get helper bones."""
-    model = flame_model()
-    model.shapedirs[model.j_regressor.any(axis=0)] = 0
-    sequence = flame_sequence(model)
-    head = import_head(motion_capture(sequence, source))
-    assert [bone.name for bone in rig_of(head).data.bones] == list(JOINTS)
-    assert not rig_of(head).animation_data.drivers
-    assert {group.name for group in head.vertex_groups} == set(JOINTS)
-    assert_parity(head, sequence)
-
-
 def test_what_a_rig_cannot_hold_is_reported(source):
-    """Fails when dynamic_offset is dropped, spares the joints, or comes without warning, and when
-    clamped coefficients change the mesh without one."""
+    """Fails when dynamic_offset is dropped or spares joints, or clamping comes without warning."""
     sequence, said = flame_sequence(flame_model(), dynamic=True), []
     head = import_head(motion_capture(sequence, source), warn=said.append)
     assert_parity(head, sequence)
@@ -199,8 +177,7 @@ def test_what_a_rig_cannot_hold_is_reported(source):
 
 
 def test_importing_again_replaces_the_rig(source):
-    """Fails when a second import duplicates rig, modifier or drivers, or leaves unused actions, and
-    when making bones leaves another object active or a stray one behind."""
+    """Fails when a second import duplicates or leaves data, or another object becomes active."""
     mine = bpy.data.objects.new("mine", None)
     bpy.context.scene.collection.objects.link(mine)
     bpy.context.view_layer.objects.active = mine
@@ -220,22 +197,28 @@ def test_importing_again_replaces_the_rig(source):
     assert set(bpy.data.objects) == {mine, head, head.parent, rig, shape}
 
 
-def test_a_saved_rig_shows_the_same(source, tmp_path):
-    """Fails when a joint, corrective, weight, rotation or translation is not FLAME's, regions are
-    lost, and when drivers, keyframes or bindings do not survive saving and opening."""
+def test_a_saved_rig_shows_the_same(source, tmp_path, capfd):
+    """Fails when a joint, corrective, weight, rotation or translation is not FLAME's, when drivers
+    are scripts (refused from others) or cycles, and when anything does not survive saving."""
     sequence = flame_sequence(flame_model())
     regions = {"mouth": np.arange(len(sequence.model.faces)) % 3 == 0}
-    name = import_head(replace(motion_capture(sequence, source), regions=regions)).name
+    head = import_head(replace(motion_capture(sequence, source), regions=regions))
+    name = head.name
+    for owner in (rig_of(head), head.data.shape_keys):
+        assert owner.animation_data.drivers
+        for curve in owner.animation_data.drivers:
+            assert curve.driver.is_simple_expression
+            assert curve.is_valid
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "rig.blend"))
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "rig.blend"))
     assert_parity(bpy.data.objects[name], sequence)
+    assert "cycle" not in "".join(capfd.readouterr()).lower()
     assert tags.REGION_PREFIX + "mouth" in bpy.data.objects[name].data.attributes
 
 
 def test_the_bundled_head_has_arkits_sliders(source):
-    """Fails when shape keys of the bundled head have numbers, move other vertices, lose their
-    keyframes to another part or do not come back as its coefficients."""
+    """Fails when the bundled head's keys have numbers, or do not come back as its coefficients."""
     sequence = flame_sequence(bundled_model(None))
     head = import_head(motion_capture(sequence, source))
     names = [key.name for key in head.data.shape_keys.key_blocks[1:]]

@@ -1,10 +1,12 @@
 """The GPU display without a window: what it draws, from where, and what it leaves."""
 
+from pathlib import Path
+
 import bpy
 import numpy as np
 import pytest
 
-from stga_addon.avatar.embedding import WORLD
+from stga_addon.avatar.embedding import WORLD, to_world
 from stga_addon.capture.camera import look_at
 from stga_addon.scene.display.splat_attributes import avatar_attributes
 from stga_addon.scene.display.splat_nodes import POINTS
@@ -26,7 +28,7 @@ from stga_addon.scene.render import viewport_display
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from stga_addon.scene.render.viewport_display import GpuDisplay, region_view
 
-from .test_splat_object import animated_head, avatar_of, random_splats
+from .test_splat_object import FRAMES, animated_head, avatar_of, random_splats
 
 
 class Region:
@@ -47,8 +49,7 @@ class Region:
 
 @pytest.mark.parametrize("is_perspective", [True, False])
 def test_depth_of_a_view(is_perspective):
-    """Catches splats beside where Blender draws them, hidden by, or hiding, wrong objects, and
-    another clip range."""
+    """Catches splats beside where Blender draws them, wrong occlusion, and another clip range."""
     region = Region(is_perspective)
     view, (a, b, c, d) = region_view(region, 300, 200)
     point = np.array([0.05, 0.02, -0.4, 1.0])
@@ -103,8 +104,7 @@ def test_cache_follows_new_splats_and_shapes():
 
 
 def test_an_error_ends_the_display(monkeypatch, capsys):
-    """Catches points that viewports draw over the GPU's picture, an error that is raised in every
-    redraw, and splats that are gone from then on."""
+    """Catches points over the GPU's picture, an error in every redraw, and splats gone for good."""
     shown = show_world_splats(random_splats(1, 10), "scan")
 
     def kinds() -> set[str]:
@@ -123,3 +123,79 @@ def test_an_error_ends_the_display(monkeypatch, capsys):
     assert display_mode(shown) == POINTS
     assert "POINTCLOUD" in kinds()
     bpy.app.timers.unregister(viewport_display.show_points)
+
+
+def positions(layer: SceneLayer) -> np.ndarray:
+    """(N, 3) world positions of the layer's splats."""
+    local = to_world(layer.splats, layer.frames).xyz
+    return local @ layer.to_world[:3, :3].T + layer.to_world[:3, 3]
+
+
+def shown_at(frame: int, cache: SplatCache) -> np.ndarray:
+    """World positions of the one visible layer."""
+    bpy.context.scene.frame_set(frame)
+    (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+    return positions(layer)
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> tuple[Path, list[np.ndarray]]:
+    """A .blend file with a moving head and splats in "anna", and their places at FRAMES."""
+    avatar = avatar_of("stga", 300)
+    head = animated_head(avatar.neutral, avatar.faces)
+    shown = show_avatar(avatar, head)
+    collection = bpy.data.collections.new("anna")
+    bpy.context.scene.collection.children.link(collection)
+    for thing in (head.parent, head, shown):
+        bpy.context.scene.collection.objects.unlink(thing)
+        collection.objects.link(thing)
+    expected = [shown_at(frame, SplatCache()) for frame in FRAMES]
+    assert np.abs(expected[0] - expected[1]).max() > 1e-3, "the head does not move"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return tmp_path / "library.blend", expected
+
+
+def linked_collection(path: Path):
+    with bpy.data.libraries.load(str(path), link=True) as (_, target):
+        target.collections = ["anna"]
+    return target.collections[0]
+
+
+@pytest.mark.parametrize("is_instance", [False, True])
+def test_linked_heads_are_followed(library, is_instance):
+    """Catches linked or instanced splats that are missing, stand still, or are elsewhere."""
+    path, expected = library
+    scene, cache, linked = bpy.context.scene, SplatCache(), linked_collection(path)
+    if is_instance:
+        instance = bpy.data.objects.new("anna", None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", linked
+        instance.location, instance.scale = (1, 2, 3), (2, 2, 2)
+        scene.collection.objects.link(instance)
+    else:
+        scene.collection.children.link(linked)
+    for frame, there in zip(FRAMES, expected, strict=True):
+        placed = 2 * there + [1, 2, 3] if is_instance else there
+        np.testing.assert_allclose(shown_at(frame, cache), placed, atol=1e-5)
+
+
+def test_overridden_heads_are_followed(library):
+    """Catches splats of an override that follow the library's head."""
+    path, expected = library
+    scene = bpy.context.scene
+    linked = linked_collection(path)
+    scene.collection.children.link(linked)
+    linked.override_hierarchy_create(scene, bpy.context.view_layer)
+    if linked.name in scene.collection.children:
+        scene.collection.children.unlink(linked)
+    things = bpy.context.view_layer.objects
+    own = {thing.name: thing for thing in things if thing.override_library is not None}
+    assert set(own) == {"root", "head", "head splats"}
+    cache = SplatCache()
+    for frame, positions_there in zip(FRAMES, expected, strict=True):
+        np.testing.assert_allclose(shown_at(frame, cache), positions_there, atol=1e-6)
+    own["root"].location = (0.5, 0, 0)
+    np.testing.assert_allclose(shown_at(FRAMES[0], cache), expected[0] + [0.5, 0, 0], atol=1e-6)
+    own["head"].scale = (2, 2, 2)  # and its splats, which stay where they are, follow its surface
+    there = shown_at(FRAMES[0], cache) - [0.5, 0, 0]
+    np.testing.assert_allclose(np.ptp(there, axis=0), 2 * np.ptp(expected[0], axis=0), rtol=0.01)

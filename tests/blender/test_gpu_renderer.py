@@ -180,8 +180,7 @@ def test_other_splats_in_the_compact_format() -> None:
 
 
 def relit_layers(mode: str) -> list[SceneLayer]:
-    """A ball and a plate under four kinds of light and a world, with an object that throws a
-    shadow; beside it one as recorded."""
+    """A ball and a plate under four lights, a world and a caster; beside it one as recorded."""
     avatar = with_driven(lit_avatar(degree=1), *OFFSETS)
     mesh = avatar.neutral.astype(np.float64) * [1.05, 0.97, 1.0]
     eye = np.ones(3)
@@ -212,8 +211,7 @@ def relit_layers(mode: str) -> list[SceneLayer]:
 @needs_gpu
 @pytest.mark.parametrize("mode", ["scene", "mix", "kept"])
 def test_light_of_the_scene(mode):
-    """Catches a light, shadow, highlight, bounce or share of recorded colors that the GPU computes
-    otherwise than `Relighter`, and a layer as recorded that is lit, too."""
+    """Catches light that the GPU computes otherwise than `Relighter`, and a lit recorded layer."""
     layers, camera = relit_layers(mode), look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
     (image,) = drawn([(layers, View(camera))])
     expected = compose([one.posed(camera.position) for one in layers], camera)
@@ -236,8 +234,7 @@ def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> Non
 
 @needs_gpu
 def test_shadow_maps() -> None:
-    """Catches surfaces that hide what is nearer to a sun or a lamp, near, far, or drawn later, and
-    depth that does not run straight across a large triangle."""
+    """Catches surfaces that hide what is nearer to a light, and depth bent over large triangles."""
     shown = relit_layers("scene")[1]
     relit, far = shown.relit, Light("point", np.ones(3), (30, 50, 20))
     assert relit is not None

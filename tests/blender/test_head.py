@@ -20,8 +20,7 @@ def block_counts() -> dict[str, int]:
 
 
 def test_each_frame_evaluates_to_its_timestep(tmp_path):
-    """Fails when a key is off by a frame, leaks into others, is shifted by gaps, or does not
-    survive saving and opening."""
+    """Fails when a key is off by a frame, leaks into others, or is not saved."""
     capture = mesh_capture(tmp_path, timesteps=(2, 3, 7, 8))
     head = import_head(capture)
     if SLOTTED_ACTIONS:  # their layers are what artists see
@@ -62,8 +61,7 @@ def test_axes_faces_and_regions(tmp_path):
 
 
 def test_second_import_replaces_the_first(tmp_path):
-    """Fails when a second import duplicates the head, leaves data, or breaks references; and when
-    edit mode writes the old mesh back over the new one."""
+    """Fails when a second import duplicates or keeps the head or its rig, or breaks references."""
     first = import_head(mesh_capture(tmp_path))
     first.modifiers.new("artist's own", "SMOOTH").iterations = 0
     follower = bpy.data.objects.new("follower", None)
@@ -83,10 +81,6 @@ def test_second_import_replaces_the_first(tmp_path):
     assert [modifier.name for modifier in second.modifiers] == ["artist's own"]
     np.testing.assert_allclose(at_frame(second, 2), changed.mesh(2), atol=1e-7)
     assert list(second[tags.TIMESTEPS]) == [1, 2]
-
-
-def test_rig_is_removed_with_the_capture_s_flame_parameters(tmp_path):
-    """Fails when a folder that now has meshes keeps FLAME's armature."""
     source = tmp_path / "capture"
     import_head(motion_capture(flame_sequence(flame_model()), source))
     capture = mesh_capture(source)

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -52,45 +53,40 @@ def state_of_file() -> dict[str, list[str]]:
     return {kind: sorted(block.name for block in getattr(bpy.data, kind)) for kind in kinds.split()}
 
 
-def test_a_motion_file_is_a_rig(tmp_path, model):
-    """Catches a motion that can be imported and then not worked with, because there is no folder
-    around it."""
-    path = write_motion(tmp_path / "tracked_flame_params_30.npz")
-    bpy.ops.stga.import_motion(filepath=str(path), flame=str(model))
-    scene, capture = bpy.context.scene, open_capture(path, model)
-    assert (scene.frame_start, scene.frame_end) == (0, 3)
-    for timestep in capture.timesteps:
-        scene.frame_set(timestep)
-        found = evaluated_vertices(scene.stga.head)
-        np.testing.assert_allclose(found, capture.mesh(timestep), atol=2e-6)
-    bpy.ops.stga.select(threshold=0.001)
-
-
 @pytest.mark.parametrize("kind", ["capture", "flame", "motion", "meshes"])
 def test_importing_again_doubles_nothing(tmp_path, model, kind):
-    """Catches a second head, rig, camera, action or image for the same source, and an import of the
-    one mesh that was clicked."""
-    folder, ops = tmp_path / "source", bpy.ops.stga
-    write = {"capture": write_mesh_capture, "flame": write_flame_capture, "motion": write_motion}
-    written = {**write, "meshes": write_meshes}[kind](folder)
-    bring = {
-        "capture": partial(ops.import_capture, directory=str(folder)),
-        "flame": partial(ops.import_capture, directory=str(folder), flame=str(model)),
-        "motion": partial(ops.import_motion, filepath=f"{folder}.npz", flame=str(model)),
-        "meshes": partial(ops.import_meshes, filepath=str(written)),
-    }[kind]
+    """Catches a second head, rig, camera, action or image, other meshes than the source's, and a
+    head that cannot be worked with because there is no folder around it."""
+    folder, ops, flame = tmp_path / "source", bpy.ops.stga, str(model)
+    if kind == "motion":
+        source = write_motion(tmp_path / "source.npz")
+        bring = partial(ops.import_motion, filepath=str(source), flame=flame)
+    elif kind == "meshes":
+        source = write_meshes(folder)
+        bring = partial(ops.import_meshes, filepath=str(source))
+    else:
+        (write_mesh_capture if kind == "capture" else write_flame_capture)(folder)
+        source, own = folder, {"flame": flame} if kind == "flame" else {}
+        bring = partial(ops.import_capture, directory=str(folder), **own)
     bring()
     once = state_of_file()
     bring()
     assert state_of_file() == once
+    scene = bpy.context.scene
     if kind == "meshes":
-        bpy.context.scene.frame_set(2)
-        found = evaluated_vertices(bpy.context.scene.stga.head)
-        np.testing.assert_allclose(found, moved(2, ball()[0]), atol=1e-6)
+        meshes = {timestep: moved(timestep, ball()[0]) for timestep in range(3)}
+    else:
+        capture = open_capture(source, model if kind != "capture" else None)
+        meshes = {timestep: capture.mesh(timestep) for timestep in capture.timesteps}
+    assert (scene.frame_start, scene.frame_end) == (0, max(meshes))
+    for timestep, mesh in meshes.items():
+        scene.frame_set(timestep)
+        np.testing.assert_allclose(evaluated_vertices(scene.stga.head), mesh, atol=2e-6)
+    ops.select(threshold=0.001)
 
 
 def test_importing_again_keeps_what_an_artist_painted(tmp_path):
-    """Catches regions, materials and selections that vanish because a capture was read again."""
+    """Catches painted regions and materials lost by another import, and others left selected."""
     folder = write_mesh_capture(tmp_path / "capture")
     bpy.ops.stga.import_capture(directory=str(folder))
     head = bpy.context.scene.stga.head
@@ -104,18 +100,13 @@ def test_importing_again_keeps_what_an_artist_painted(tmp_path):
     assert [material.name for material in head.data.materials] == ["skin"]
     bpy.context.scene.frame_set(3)
     np.testing.assert_allclose(evaluated_vertices(head), moved(3, ball()[0]), atol=1e-6)
-
-
-def test_what_came_in_is_selected(tmp_path):
-    """Catches an import that leaves an artist's other objects selected, or in edit mode, and its
-    head hard to find."""
     mesh = bpy.data.meshes.new("other")
     other = bpy.data.objects.new("other", mesh)
     bpy.context.scene.collection.objects.link(other)
     bpy.context.view_layer.objects.active = other
     other.select_set(True)
     bpy.ops.object.mode_set(mode="EDIT")
-    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
+    bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "second")))
     head = bpy.context.scene.stga.head
     assert other.mode == "OBJECT"
     assert bpy.context.selected_objects == [head]
@@ -169,3 +160,64 @@ def test_linked_heads_are_left_alone(tmp_path):
     bpy.ops.stga.import_capture(directory=str(folder))  # its own, beside the linked one
     assert bpy.context.scene.stga.head != linked
     assert bpy.context.scene.stga.head.library is None
+
+
+HANDLERS = {
+    "video": "stga.avatar_from_video",
+    "capture": "stga.import_capture",
+    "performance": "stga.apply_motion",
+    "npz": "stga.open_npz",
+    "ply": "stga.import_ply",
+}
+
+
+@pytest.mark.parametrize("name", HANDLERS)
+def test_handlers_call_operators_that_take_a_file(name):
+    """Catches a handler whose operator takes no file, and JSON dropped into the text editor."""
+    handler = getattr(bpy.types, f"STGA_FH_{name}")
+    assert handler.bl_import_operator == HANDLERS[name]
+    operator = getattr(bpy.ops.stga, HANDLERS[name].removeprefix("stga."))
+    properties = operator.get_rna_type().properties
+    assert properties["filepath"].subtype == "FILE_PATH"
+    assert properties["filepath"].is_skip_save
+    assert handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
+    assert not handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="TEXT_EDITOR")))
+    assert not handler.poll_drop(SimpleNamespace(area=None))
+
+
+def test_a_file_stands_for_its_capture(tmp_path):
+    """Catches a capture opened by one of its files only, and any file taken for one."""
+    folder = write_mesh_capture(tmp_path / "capture")
+    image = next(folder.rglob("*.png"))
+    for given in (folder / "transforms_train.json", image, folder / "demo.blend"):
+        bpy.ops.wm.read_homefile(use_empty=True)
+        bpy.ops.stga.import_capture(filepath=str(given))
+        assert bpy.context.scene.stga.head["stga_capture"] == str(folder)
+    (tmp_path / "notes.json").write_text("{}")
+    with pytest.raises(RuntimeError, match=r"notes.json: is in no capture; choose"):
+        bpy.ops.stga.import_capture(filepath=str(tmp_path / "notes.json"))
+
+
+def test_an_npz_is_opened_by_its_content(tmp_path):
+    """Catches an avatar taken for a motion, a second head, and a traceback for others."""
+    avatar, motion = tmp_path / "a.npz", write_motion(tmp_path / "smile.npz")
+    write_ball_avatar(avatar)
+    np.savez(tmp_path / "other.npz", values=np.zeros(3))
+    (tmp_path / "noise.npz").write_bytes(b"no archive")
+    for name, sentence in (
+        ("a.npz", ".*import a capture first"),
+        ("smile.npz", ".* choose your FLAME model"),
+        ("other.npz", "is neither an avatar .* nor a FLAME motion"),
+        ("noise.npz", "cannot be read as an .npz file"),
+        ("gone.npz", "cannot be read as an .npz file"),
+    ):
+        with pytest.raises(RuntimeError, match=f"^Error: .*{name}: {sentence}"):
+            bpy.ops.stga.open_npz(filepath=str(tmp_path / name))
+    folder, model = write_flame_capture(tmp_path / "capture")
+    bpy.ops.stga.import_capture(directory=str(folder), flame=str(model))
+    objects = len(bpy.data.objects)
+    bpy.ops.stga.open_npz(filepath=str(motion))
+    assert len(bpy.data.objects) == objects
+    assert [action for action in bpy.data.actions if "smile" in action.name]
+    bpy.ops.stga.open_npz(filepath=str(avatar))
+    assert bpy.context.scene.stga.splats is not None

@@ -1,8 +1,6 @@
-"""The built zip: what is in it, and that Blender's own tool agrees. `test_versions.py` installs
-it."""
+"""The built zip: what is in it, and that Blender's own tool agrees."""
 
 import os
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -15,6 +13,8 @@ from stga_addon import __version__
 from stga_addon.development.package import WHEELS, build_zip, extension_files, read_manifest
 from stga_addon.errors import StgaError
 
+from .zips import output_of
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -26,22 +26,11 @@ def blender_ext(*arguments: object, home: Path) -> str:
         "sys.argv[0] = str(tool); runpy.run_path(str(tool), run_name='__main__')\n"
     )
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home)}
-    command = [sys.executable, "-c", script, *map(str, arguments)]
-    done = subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    return done.stdout
-
-
-def test_manifest_and_package_agree():
-    """Catches a release whose parts name different versions or different wheels."""
-    manifest = read_manifest(ROOT)
-    assert manifest["version"] == __version__
-    assert manifest["wheels"] == [f"./wheels/{name}" for name in WHEELS]
+    return output_of([sys.executable, "-c", script, *arguments], cwd=home, env=environment)
 
 
 def test_blender_agrees(zip_file, tmp_path):
-    """Catches a manifest that Blender's extension platform refuses, and exclude patterns that this
-    build and Blender interpret differently."""
+    """Catches a manifest that Blender refuses, and patterns that it interprets differently."""
     assert "error" not in blender_ext("validate", zip_file, home=tmp_path).lower()
     reference = tmp_path / "reference.zip"
     paths = ("--source-dir", ROOT, "--output-filepath", reference)
@@ -50,8 +39,9 @@ def test_blender_agrees(zip_file, tmp_path):
     assert names == others
 
 
-def test_zip_holds_what_the_extension_runs(zip_file):
-    """Catches tests, docs or development in the zip, and a module left out."""
+def test_the_zip(zip_file, tmp_path):
+    """Catches tests or docs in the zip, a module left out, another version or wheel, traces of
+    this computer, and a zip of nothing."""
     names = set(zipfile.ZipFile(zip_file).namelist())
     left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
     assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
@@ -60,16 +50,11 @@ def test_zip_holds_what_the_extension_runs(zip_file):
     assert {"operators/train.py", "ui/panel.py", "stga_addon/worker/launch.py"} <= names
     wheels = {name.removeprefix("wheels/") for name in names if name.startswith("wheels/")}
     assert wheels == {*WHEELS}
-
-
-def test_equal_sources_give_an_equal_zip(zip_file, tmp_path):
-    """Catches times, order or permissions of this computer in the zip."""
     for path in extension_files(ROOT, read_manifest(ROOT)):
         assert path.is_file()
     assert build_zip(tmp_path).read_bytes() == zip_file.read_bytes()
-
-
-def test_other_folders_are_refused(tmp_path):
-    """Catches an empty zip."""
+    manifest = read_manifest(ROOT)
+    assert manifest["version"] == __version__
+    assert manifest["wheels"] == [f"./wheels/{name}" for name in WHEELS]
     with pytest.raises(StgaError, match=r"blender_manifest\.toml: cannot be read"):
         build_zip(tmp_path / "dist", root=tmp_path)

@@ -20,7 +20,9 @@ from stga_addon.scene.layers import Relit
 from stga_addon.scene.light import throw_shadow, throws_shadow
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 
+from .test_engine import add_sun
 from .test_other_engines import EEVEE, EEVEE_MARKS
+from .test_splat_object import active_camera
 
 TURN = Matrix.Rotation(0.7, 3, Vector((1, 2, 0.5)).normalized())
 PLACE = Matrix.LocRotScale(Vector((0.4, -0.2, 0.3)), TURN, (1.3,) * 3)
@@ -128,8 +130,7 @@ def check_irradiance(shown, head, limit: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAMPS)
 def test_irradiance_is_that_of_cycles(name):
-    """Catches a light in another place, unit, color or size than Blender's, and shadows of head or
-    objects that are missing, beyond 5 % of the mean."""
+    """Catches another place, unit, color, size or shadow than Blender's, beyond 5 % of the mean."""
     shown, head = shown_head()
     kind, location, energy, properties = LAMPS[name]
     lamp(kind, location, energy, **properties)
@@ -244,9 +245,7 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     lamp("SUN", (0.4, -0.2, 2.0), 3.0)
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))
     scene = bpy.context.scene
-    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    scene.camera.location = (0.4, -0.2, 3.0)
-    scene.collection.objects.link(scene.camera)
+    active_camera((0.4, -0.2, 3.0))
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = engine, 4, False
     scene.eevee.taa_render_samples, scene.eevee.shadow_pool_size = 1, "16"
     scene.eevee.shadow_resolution_scale = 0.1
@@ -273,8 +272,7 @@ def test_shadow_onto_the_scene(engine, tmp_path):
 
 @pytest.mark.slow
 def test_estimate_light(extension, tmp_path):
-    """Catches a button whose worker is not given the run, whose light is another than training
-    finds, does not reach the splats that are shown, or reaches those of another avatar."""
+    """Catches a light other than training's, that does not reach the splats, or reaches others."""
     run, scene = tmp_path / "run", bpy.context.scene
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.train(directory=str(run), iterations=6)
@@ -283,8 +281,7 @@ def test_estimate_light(extension, tmp_path):
     bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
     shown, scene.stga.run_folder = scene.stga.splats, str(run)
     assert stored_avatar(shown).light is None
-    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    scene.collection.objects.link(sun)
+    add_sun()
     scene.stga_lighting.mode = "scene"
 
     bpy.ops.stga.estimate_light()

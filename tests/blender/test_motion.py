@@ -95,8 +95,7 @@ def test_strips_override_only_their_frames(head, own, other):
 
 
 def test_applying_to_a_head_without_animation(head, own, other):
-    """Fails when there is no action to copy or push down, the other's identity is applied, or data
-    that the chosen part does not animate gets empty actions and strips."""
+    """Fails without an action to copy, by another's identity, or with empty actions and strips."""
     for owner in owners(head):
         owner.animation_data.action = None
     apply_motion(head, retimed(other), 3, "other")
@@ -141,7 +140,7 @@ def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
 
 
 def test_sampled_motion_equals_the_keyframes(head, own):
-    """Fails when a rotation's space or the root joint's displacement is wrong."""
+    """Fails when a rotation's space or the root's place is wrong, or sculpting goes unsaid."""
     said = []
     bpy.context.scene.frame_set(3)
     read = sample_motion(head, own, range(1, 7), warn=said.append)
@@ -152,6 +151,13 @@ def test_sampled_motion_equals_the_keyframes(head, own):
     np.testing.assert_allclose(read.shape, own.shape)
     assert said == []
     assert bpy.context.scene.frame_current == 3
+    key = head.shape_key_add(name="sculpted", from_mix=False)
+    key.data[5].co.x += 0.01
+    key.value = 1.0
+    said = []
+    sample_motion(head, own, (2,), warn=said.append)
+    assert len(said) == 1
+    assert re.search(r"by up to \d+\.\d mm", said[0])
 
 
 def test_sampled_motion_includes_edits_by_hand(head, own):
@@ -177,20 +183,8 @@ def test_sampled_motion_includes_edits_by_hand(head, own):
     np.testing.assert_allclose(at_frame(head, 1), expected, atol=1e-5)
 
 
-def test_deformation_that_is_no_flame_parameter_is_reported(head, own):
-    """Fails when an export leaves out sculpted shapes without a warning."""
-    key = head.shape_key_add(name="sculpted", from_mix=False)
-    key.data[5].co.x += 0.01
-    key.value = 1.0
-    said = []
-    sample_motion(head, own, (2,), warn=said.append)
-    assert len(said) == 1
-    assert re.search(r"by up to \d+\.\d mm", said[0])
-
-
 def test_tracked_offsets(own, other, tmp_path):
-    """Fails when tracked per-frame offsets are missing from a sampled motion, or deform another
-    person's expressions."""
+    """Fails when tracked offsets are missing from a sampled motion, or deform another's."""
     tracked = flame_sequence(own.model, timesteps=range(1, 5), seed=1, dynamic=True)
     head = import_head(motion_capture(tracked, tmp_path / "own.npz"), warn=lambda sentence: None)
     said = []

@@ -1,8 +1,5 @@
 """What Blender's native splats are drawn from, against numpy; also in STGA_BLENDER."""
 
-import os
-import shlex
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +14,9 @@ from stga_addon.capture.color import linear_to_srgb
 from stga_addon.scene.layers import FROZEN_COLOR
 
 from .test_splat_object import driven_avatar, same_rotation
+from .zips import BLENDERS, output_of
 
 SCRIPT = Path(__file__).with_name("native_script.py")
-BLENDERS = filter(None, map(shlex.split, os.environ.get("STGA_BLENDER", "").split(" ; ")))
 OPTIONS = ["--background", "--python-exit-code", "1", "--python"]
 COMMANDS = [[sys.executable], *([*command, *OPTIONS] for command in BLENDERS)]
 
@@ -38,9 +35,7 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     write_avatar(tmp_path / "a.npz", avatar)
     np.save(tmp_path / "head.npy", posed)
     files = (tmp_path / name for name in ("a.npz", "head.npy", "found.npz"))
-    command = [*command, SCRIPT, "--", *files]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    output_of([*command, SCRIPT, "--", *files])
     found = np.load(tmp_path / "found.npz")
     assert found["recorded/type"] in ("", "GAUSSIAN_SPLAT")
     wanted = to_world(splats, avatar.frames(posed))

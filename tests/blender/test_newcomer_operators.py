@@ -1,5 +1,4 @@
-"""What a newcomer meets in the first hour: messages that can be read, a .blend file that knows its
-run, names of sliders."""
+"""A newcomer's first hour: messages that can be read, a .blend file that knows its run."""
 
 import shutil
 from dataclasses import replace
@@ -16,7 +15,6 @@ from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display.splat_nodes import POINTS
 from stga_addon.scene.display.splat_object import display_mode, show_avatar
 from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
-from stga_addon.training.effect_catalog import EFFECTS
 
 from .test_operators import write_ball_avatar
 from .test_panel import draw
@@ -36,8 +34,7 @@ BUTTONS = {
 
 @pytest.mark.parametrize("sentence", BUTTONS)
 def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
-    """Catches a remedy in the part that popup and status bar cut off, and an error that stays when
-    the next click succeeds."""
+    """Catches a remedy that the status bar cuts off, and an error that stays after a success."""
     monkeypatch.setattr(extension.ui.train_panel, "has_training_python", lambda context: False)
     common, reports = extension.operators.common, []
 
@@ -62,8 +59,7 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
 
 
 def test_the_file_knows_its_run(extension, head, tmp_path):
-    """Catches Resume and Show Residuals that look into an empty folder: after an avatar was shown,
-    after the file was moved along with its run, and after it was saved elsewhere."""
+    """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
     settings, folder = bpy.context.scene.stga, tmp_path / "work"
     (folder / "run").mkdir(parents=True)
     (folder / "run/run.json").write_text("{}")
@@ -84,8 +80,7 @@ def test_the_file_knows_its_run(extension, head, tmp_path):
 
 
 def test_a_file_made_without_the_panel(extension, head, tmp_path):
-    """Catches demo.blend, whose panel is empty or proposes a folder without a run, and a chosen
-    head that is replaced at loading."""
+    """Catches demo.blend with an empty panel, and a chosen head replaced at loading."""
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.json").write_text("{}")
     write_ball_avatar(tmp_path / "run/avatar.npz")
@@ -105,25 +100,8 @@ def test_a_file_made_without_the_panel(extension, head, tmp_path):
     assert bpy.context.scene.stga.head.name == "other"
 
 
-def test_effects_are_a_line_each(extension, head):
-    """Catches paragraphs of figures where a name, a state and a price were asked for, and figures
-    that cannot be found."""
-    settings = bpy.context.scene.stga
-    for name in EFFECTS:
-        row = settings.effects.add()
-        row.name, row.reason, row.cost = name, f"{name} is 13.2 mm", f"{name} takes 3 coefficients"
-    texts = draw(extension, "effects")
-    assert texts[1:] == [text for each in EFFECTS.values() for text in (each.title, each.price)]
-    assert all(len(each.title) <= 20 for each in EFFECTS.values())
-    assert {each.price for each in EFFECTS.values()} == {"free", "slower", "larger"}
-    settings.effects["jaw"].is_open = True
-    details = {"jaw: jaw is 13.2 mm", "Cost: jaw takes 3 coefficients"}
-    assert details <= set(draw(extension, "effects"))
-
-
 def test_the_chosen_row_is_that_of_the_frame(head):
-    """Catches a highlight that stays on the first row when another row, or the timeline, is
-    clicked."""
+    """Catches a highlight that stays when another row, or the timeline, is clicked."""
     bpy.ops.stga.select(threshold=0.0005)
     scene = bpy.context.scene
     for row, frame in enumerate(settings_row.frame for settings_row in scene.stga.selected_frames):
@@ -149,8 +127,7 @@ def test_a_display_is_chosen_with_a_shading_that_shows_it(extension, head, tmp_p
 
 
 def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
-    """Catches an avatar that the start-up world washes out, and an exposure that a click takes
-    back."""
+    """Catches an avatar washed out by the world, and an exposure that a click takes back."""
     avatar, scene = lit_avatar(), bpy.context.scene
     mesh = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
     scene.collection.objects.link(mesh)

@@ -55,8 +55,7 @@ def mesh_capture(tmp_path) -> Path:
 
 @pytest.fixture
 def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
-    """A mesh capture whose head is in the scene, and the avatar of avatar.npz, which is shown on
-    it."""
+    """A mesh capture whose head is in the scene with the avatar of avatar.npz."""
     bpy.ops.stga.import_capture(directory=str(mesh_capture))
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
@@ -64,8 +63,7 @@ def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
 
 
 def write_ball_avatar(path: Path, neutral: np.ndarray | None = None, **options: Any) -> Avatar:
-    """An avatar of the captures' ball, or of a mesh with its triangles, whose splats are off their
-    places in the lattice."""
+    """An avatar of the captures' ball, or of a mesh of its triangles, off the lattice."""
     vertices, faces = ball()
     vertices, faces = vertices if neutral is None else neutral, faces.astype(np.int32)
     splats = lattice_splats(vertices, faces, **{"sh_degree": 1, **options})
@@ -86,8 +84,7 @@ def operators() -> set[str]:
 
 
 def test_registration_is_all_or_nothing(extension, monkeypatch):
-    """Catches classes, menus and properties that stay behind after disabling or a failed enabling,
-    which the next enabling would trip over."""
+    """Catches what stays behind after disabling or a failed enabling."""
     menu, all_of_them = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs), operators()
     assert len(all_of_them) > 40
     extension.unregister()
@@ -105,19 +102,22 @@ def test_registration_is_all_or_nothing(extension, monkeypatch):
 
 
 def test_every_operator_explains_itself():
-    """Catches operators and properties without the tooltip that is their only manual inside
-    Blender."""
+    """Catches operators and properties without the tooltip that is their only manual, and a
+    script's `resume` that Blender remembers for the next click: what tells it not to is checked."""
     for name in operators():
-        kind = getattr(bpy.ops.stga, name.removeprefix("STGA_OT_")).get_rna_type()
+        function = name.removeprefix("STGA_OT_")
+        kind = getattr(bpy.ops.stga, function).get_rna_type()
         assert kind.description not in ("", "(undocumented operator)"), name
-        for prop in kind.properties:
-            is_described = prop.identifier == "rna_type" or prop.is_hidden or prop.description
-            assert is_described, (name, prop.identifier)
+        properties = [prop for prop in kind.properties if prop.identifier != "rna_type"]
+        for prop in properties:
+            assert prop.is_hidden or prop.description, (name, prop.identifier)
+        if function in SET_BY_PANEL:
+            remembered = {prop.identifier for prop in properties if not prop.is_skip_save}
+            assert remembered <= {*SET_BY_PANEL[function].split()}, name
 
 
 def test_options_are_those_of_the_request(extension):
-    """Catches a limit, default or choice that differs from the command line's, and 0 that is not
-    taken for "not given", or is called a value."""
+    """Catches a limit, default or choice other than the command line's, and 0 taken for a value."""
     shown = bpy.ops.stga.track_footage.get_rna_type().properties
     for name in ("focal", "start", "stop", "step"):
         field = Track.__dataclass_fields__[name]
@@ -131,18 +131,6 @@ def test_options_are_those_of_the_request(extension):
     given = {"focal": 0.0, "start": 0, "stop": 0, "step": 2, "model": "", "cameras": "/a.json"}
     read = extension.operators.common.given_values(SimpleNamespace(**given), Track, *given)
     assert read == {"start": 0, "step": 2, "cameras": Path("/a.json")}
-
-
-@pytest.mark.parametrize("name", SET_BY_PANEL)
-def test_no_hidden_state_between_calls(name):
-    """Catches a script's `resume` or `own_offsets` that Blender remembers for the next click on a
-    button.
-
-    Without a window Blender remembers nothing, so what tells it not to is checked.
-    """
-    properties = getattr(bpy.ops.stga, name).get_rna_type().properties
-    remembered = {prop.identifier for prop in properties if not prop.is_skip_save} - {"rna_type"}
-    assert remembered <= {*SET_BY_PANEL[name].split()}
 
 
 @pytest.mark.parametrize("layout", ["mesh", "flame"])
@@ -183,8 +171,7 @@ def test_from_import_to_show(tmp_path, layout):
 
 
 def test_exports(shown, tmp_path):
-    """Catches formats that Blender cannot write, exports of the neutral pose or of the wrong frame,
-    frames left out, a rate that is not the scene's, and a page whose head lies on its back."""
+    """Catches formats Blender cannot write, other frames or rates, and a head on its back."""
     usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
     capture, avatar = shown
     bpy.context.scene.render.fps = 30
@@ -219,8 +206,7 @@ def test_exports(shown, tmp_path):
 
 
 def range_export(extension, write, frames: range, stop_after: int | None = None) -> Any:
-    """What a range exported step by step ends with, as the dialog does; cancelled after some
-    steps."""
+    """What a range exported as the dialog does ends with; cancelled after some steps."""
     operator, said, shown = extension.operators.export.ExportAvatar, [], []
     context = SimpleNamespace(
         window_manager=SimpleNamespace(event_timer_remove=shown.append),
@@ -241,8 +227,7 @@ def range_export(extension, write, frames: range, stop_after: int | None = None)
 
 
 def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
-    """Catches a dialog's export that differs from a script's, one that leaves traces where it was
-    cancelled, and one whose thread fails in silence."""
+    """Catches another export than a script's, traces of a cancelled one, and a silent thread."""
     capture, avatar = shown
     bpy.context.scene.frame_set(1)
 
@@ -281,8 +266,7 @@ def test_import_ply(tmp_path):
 
 
 def test_mistakes_are_sentences(mesh_capture, tmp_path):
-    """Catches tracebacks, silence, objects left behind by an import that failed, steps that run
-    before there is anything to work on, and a capture that has moved."""
+    """Catches tracebacks, silence, objects of a failed import, and steps without a head."""
     mesh, broken = mesh_capture / "meshes/00003.obj", tmp_path / "broken.ply"
     whole = mesh.read_text()
     mesh.write_text("v 0 0 nan\n")
@@ -305,10 +289,3 @@ def test_mistakes_are_sentences(mesh_capture, tmp_path):
     mesh_capture.rename(tmp_path / "elsewhere")
     with pytest.raises(RuntimeError, match=r"capture: is not a folder"):
         bpy.ops.stga.select()
-
-
-def test_standard_view():
-    """Catches a one-click cure that does not cure: AgX turns trained colors gray."""
-    bpy.context.scene.view_settings.view_transform = "AgX"
-    bpy.ops.stga.standard_view()
-    assert bpy.context.scene.view_settings.view_transform == "Standard"

@@ -28,7 +28,7 @@ from stga_addon.scene.render.scene_splats import (
     visible_layers,
 )
 
-from .test_engine import camera_at, show, textured, with_light
+from .test_engine import add_sun, camera_at, show, textured, with_light
 from .test_panel import draw
 from .test_splat_object import active_camera, avatar_of, displayed_colors
 
@@ -71,8 +71,7 @@ def blended_in_linear_light(splats: Splats, view: Camera) -> np.ndarray:
 
 @pytest.mark.parametrize("engine", [pytest.param(EEVEE, marks=EEVEE_MARKS), "CYCLES"])
 def test_images_without_noise(engine: str, tmp_path: Path) -> None:
-    """Catches splats that are blended out of order, black holes behind the eighth splat of a pixel,
-    and transparency by chance, which a few samples show as noise."""
+    """Catches splats out of order, black holes behind the eighth, and noisy transparency."""
     scene = bpy.context.scene
     splats = overlapping_splats()
     set_input(show_world_splats(splats, "ball"), DISPLAY, QUADS)
@@ -99,14 +98,12 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     assert psnr_db >= MIN_PSNR_DB
 
 
-def test_images_of_recorded_light_say_so(
-    extension, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     """Catches F12 and animations in another light that do not say so, or do each image."""
     scene, cast = bpy.context.scene, "the light of this frame"
     shown, _ = show(with_light(textured(avatar_of("stga"))))
     camera_at()
-    scene.collection.objects.link(bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN")))
+    add_sun()
     scene.stga.splats, scene.render.engine, scene.cycles.samples = shown, "CYCLES", 1
     scene.render.resolution_x = scene.render.resolution_y = 8
     scene.render.filepath, scene.frame_start, scene.frame_end = f"{tmp_path}/", 5, 7
@@ -140,9 +137,7 @@ def test_relit_color_of_a_frame(lighting) -> None:
     avatar = with_light(textured(avatar_of("stga")))
     shown, _ = show(avatar)
     camera, before = camera_at(), displayed_colors(shown)
-    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    sun.data.energy, sun.rotation_euler = 3.0, (1.2, 0.0, 0.4)
-    bpy.context.scene.collection.objects.link(sun)
+    add_sun(3.0)
     with pytest.raises(StgaError, match="as recorded"):
         relight_frame(shown, bpy.context.scene)
     lighting.mode = "scene"

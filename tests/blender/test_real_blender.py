@@ -27,7 +27,7 @@ from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.status import WorkerState, inspect_worker
 
-from .zips import BLENDERS, OLD_VERSION, name_of, with_version
+from .zips import BLENDERS, OLD_VERSION, name_of, output_of, with_version
 
 pytestmark = [
     pytest.mark.nightly,
@@ -41,8 +41,7 @@ TIMEOUT_S = 1800.0
 
 
 def offline() -> list[str]:
-    """A prefix of commands that leaves them no network but the machine itself, where this system
-    has one."""
+    """A prefix of commands that leaves them no network but the machine itself."""
     inside = ["sh", "-c", 'ip link set lo up; exec "$@"', "sh"]
     prefixes = (["unshare", "-n", *inside], ["unshare", "-rn", *inside], [])
     return next(
@@ -53,8 +52,7 @@ def offline() -> list[str]:
 
 
 def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
-    """The complete edition for a Blender, in the folder `out`; skips the test where wheels cannot
-    be had."""
+    """The complete edition for a Blender, in `out`; skips where wheels cannot be had."""
     target = replace(target_of(command), cuda=True)
     try:
         collect_wheels(wheel_folder(target), target)
@@ -65,14 +63,12 @@ def complete_zip(command: list[str], out: Path, demo: Path) -> Path:
 
 
 def blender(command: list[str], home: Path, *arguments: object, background: bool = True) -> None:
-    """Run a Blender in a home folder of its own, without a network; with a window if not in the
-    background."""
+    """Run a Blender in a home folder of its own, without a network."""
     others = ("PYTHON", "BLENDER", "STGA", "NUMBA")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(others)}
     full = [*offline(), *command, *["--background"] * background, *map(str, arguments)]
     how = {"env": {**kept, "HOME": str(home)}, "timeout": TIMEOUT_S}
-    done = subprocess.run(full, cwd=ROOT, capture_output=True, text=True, **how)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    output_of(full, cwd=ROOT, **how)
 
 
 def install(command: list[str], home: Path, archive: Path) -> None:
@@ -82,15 +78,9 @@ def install(command: list[str], home: Path, archive: Path) -> None:
 
 
 def files_of(home: Path) -> set[str]:
-    """All files in a home folder but those that Blender itself writes: its settings, caches and
-    lists."""
-    own = (
-        ".cache/blender",
-        ".cache/mesa_shader_cache",
-        ".cache/openbox",
-        ".config/blender",
-        ".local",
-    )
+    """All files in a home folder but those that Blender itself writes."""
+    caches = ".cache/blender", ".cache/mesa_shader_cache", ".cache/openbox"
+    own = *caches, ".config/blender", ".local"
     extension = ("/user_default/stga/", "extensions/.local/lib", ".user/user_default/stga")
     names = {path.relative_to(home).as_posix() for path in home.rglob("*") if not path.is_dir()}
     # Of modules of a single file, such as typing_extensions.py, Blender leaves what its own Python
@@ -102,8 +92,7 @@ def files_of(home: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def home(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A home folder in which every Blender has the complete edition, of a version before the one
-    beside it."""
+    """A home folder in which every Blender has an old version of the complete edition."""
     folder = tmp_path_factory.mktemp("real")
     home = folder / "home"
     home.mkdir()
@@ -128,8 +117,7 @@ def script(command: list[str], home: Path, wait: bool, iterations: int) -> dict[
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
 def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> None:
-    """Catches a missing wheel, a worker that needs another Python or a network, and worse
-    avatars."""
+    """Catches a missing wheel, a worker that needs a Python or network, and worse avatars."""
     seen = script(command, home, True, ITERATIONS)
     settings = make_settings("global", iterations=ITERATIONS)
     perform(Train(tmp_path / "here", demo, settings), ignore, print)
@@ -142,8 +130,7 @@ def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("command", BLENDERS, ids=name_of)
 def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
-    """Catches an update that fails or ends a training, and one that disturbs another Blender's
-    extension."""
+    """Catches an update that fails, ends a training, or disturbs another Blender."""
     seen = script(command, home, False, UPDATE_ITERATIONS)
     run, others = Path(seen["run"]), other_profiles(home, seen["version"])
     while not (run / "job/preview.npz").exists() and inspect_worker(run / "job").state.is_alive:
@@ -165,9 +152,7 @@ def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
 def test_uninstall(home: Path) -> None:
     """Catches files that uninstalling leaves, and one that disturbs another Blender's extension."""
     for command in BLENDERS:
-        version = subprocess.run(
-            [*command, "--version"], cwd=ROOT, capture_output=True, text=True
-        ).stdout.split()[1]
+        version = output_of([*command, "--version"], cwd=ROOT).split()[1]
         others = other_profiles(home, version)
         blender(command, home, "--command", "extension", "remove", "user_default.stga")
         assert other_profiles(home, version) == others
@@ -179,8 +164,7 @@ def short(version: str) -> str:
 
 
 def other_profiles(home: Path, version: str) -> dict[str, int]:
-    """Files of the extensions of other Blender versions in the home folder, and when they were
-    changed."""
+    """Files of other Blender versions' extensions, and when they were changed."""
     profiles = [path for path in home.glob(".config/blender/*") if path.name != short(version)]
     files = [path for profile in profiles for path in (profile / "extensions").rglob("*")]
     return {str(path): path.stat().st_mtime_ns for path in files if path.is_file()}

@@ -1,28 +1,33 @@
-"""Render Video in background mode: the worker's images are those of the render engine."""
+"""Render Video in background mode, and videos that Blender draws and encodes itself."""
 
 import errno
 import gc
+import io
 import os
 import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import bpy
 import numpy as np
 import pytest
+from capture.factory import write_mesh_capture
 from PIL import Image
 
-av = pytest.importorskip("av")
+from stga_addon.avatar.file import write_avatar
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import Camera
+from stga_addon.errors import StgaError
+from stga_addon.export.ply import write_ply
+from stga_addon.jobs.table import Kind
+from stga_addon.raster.posed_splats import ComposedImage
+from stga_addon.scene.render import drawn_video
+from stga_addon.scene.render.drawn_video import DrawnVideo, png_bytes
 
-from capture.factory import write_mesh_capture  # noqa: E402
-
-from stga_addon.avatar.file import write_avatar  # noqa: E402
-from stga_addon.avatar.splats import Splats  # noqa: E402
-from stga_addon.export.ply import write_ply  # noqa: E402
-from stga_addon.jobs.table import Kind  # noqa: E402
-
-from .test_operators import write_ball_avatar  # noqa: E402
+from .test_operators import write_ball_avatar
+from .test_splat_object import active_camera
 
 
 @pytest.fixture
@@ -61,15 +66,54 @@ def engine_image(frame: int, path: Path) -> np.ndarray:
     return np.asarray(Image.open(path)).astype(int)
 
 
-def test_image_sequence_of_the_scene(shown):
-    """Catches another camera, size, frame or transparency than the engine's."""
-    scene = bpy.context.scene
-    bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png")
-    assert scene.frame_current == 1
+def around_each_image(extension, monkeypatch, before, after) -> None:
+    """Call `before()` and `after()` around the recording of every image."""
+    operator = extension.operators.render_video.RenderVideo
+    own = operator.record
+
+    def record(*arguments):
+        steps = own(*arguments)
+        yield next(steps)
+        before()
+        for _ in steps:
+            after()
+            yield
+            before()
+
+    monkeypatch.setattr(operator, "record", record)
+
+
+def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
+    """Catches another camera, size, frame, transparency or scene than the engine's, and splats of
+    every recorded frame that stay in memory until the video is rendered."""
+    own, render = bpy.context.scene, {"path": "scene", "format": "png"}
+    bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
+    assert own.frame_current == 1
     written = sorted((shown / "images").glob("*.png"))
     assert [path.name for path in written] == ["0001.png", "0002.png", "0003.png"]
+    other = bpy.data.scenes.new("other")
+    other.frame_set(7)
+    window = bpy.context.window_manager.windows[0]
+    posed, counts = extension.operators.render_video.PosedSplats, []
+
+    def count() -> None:
+        gc.collect()
+        # Not isinstance, which raises for a weak proxy whose object has gone.
+        counts.append(sum(type(each) is posed for each in gc.get_objects()))
+
+    look = lambda: setattr(window, "scene", other)  # noqa: E731
+    around_each_image(extension, monkeypatch, look, count)
+    try:
+        bpy.ops.stga.render_video(filepath=str(shown / "beside"), **render)
+        assert window.scene == other
+        assert (own.frame_current, other.frame_current) == (1, 7)
+    finally:
+        window.scene = own
+    assert len(counts) == 3
+    assert 0 < max(counts) <= 2
     for frame, path in enumerate(written):
         image = np.asarray(Image.open(path)).astype(int)
+        np.testing.assert_array_equal(image, np.asarray(Image.open(shown / "beside" / path.name)))
         expected = engine_image(frame, shown / "engine.png")
         opaque = (expected[..., 3] > 250) & (image[..., 3] > 250)
         assert opaque.mean() > 0.1
@@ -78,8 +122,7 @@ def test_image_sequence_of_the_scene(shown):
 
 
 def test_turntable_video(shown):
-    """Catches a turntable that stands still, lasts another time, or ends without the file it
-    names."""
+    """Catches a turntable that stands still, lasts another time, or ends without its file."""
     bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=1.5)
     with av.open(str(shown / "turn.mp4")) as container:
         assert container.streams.video[0].average_rate == 10
@@ -108,10 +151,8 @@ def test_turntable_of_a_ply(extension, tmp_path):
     write_ply(tmp_path / "scan.ply", Splats(**floats, **rows))
     bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"))
     scene = bpy.context.scene
-    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
-    scene.collection.objects.link(camera)
-    camera.location, camera.rotation_euler = (3, -1, 1), (np.pi / 2, 0, 0)
-    scene.camera, scene.render.resolution_percentage, scene.frame_end = camera, 5, 3
+    active_camera((3, -1, 1)).rotation_euler = (np.pi / 2, 0, 0)
+    scene.render.resolution_percentage, scene.frame_end = 5, 3
     bpy.ops.stga.render_video(filepath=str(tmp_path / "turn"), format="png", seconds=0.5)
     paths = sorted((tmp_path / "turn").glob("*.png"))
     images = [np.asarray(Image.open(path)).astype(int) for path in paths]
@@ -121,9 +162,7 @@ def test_turntable_of_a_ply(extension, tmp_path):
 
 
 def test_failures_leave_no_job(extension, shown, monkeypatch):
-    """Catches a traceback, a path that is refused only after everything was recorded, a recording
-    that keeps filling a full disk, and a job that is left behind where its worker cannot be
-    started."""
+    """Catches a traceback, a late refusal, a recording on a full disk, and a job left behind."""
     operator = extension.operators.render_video
 
     def full(*_: object) -> None:
@@ -162,56 +201,55 @@ def test_finished_jobs_end_with_the_add_on(extension, shown, temporary):
     assert not folder.exists()
 
 
-def around_each_image(extension, monkeypatch, before, after) -> None:
-    """Call `before()` and `after()` around the recording of every image."""
-    operator = extension.operators.render_video.RenderVideo
-    own = operator.record
-
-    def record(*arguments):
-        steps = own(*arguments)
-        yield next(steps)
-        before()
-        for _ in steps:
-            after()
-            yield
-            before()
-
-    monkeypatch.setattr(operator, "record", record)
+CAMERA = Camera(63, 48, 50.0, 50.0, 31.5, 24.0, np.eye(4))
 
 
-def test_a_recording_follows_its_own_scene(extension, shown, monkeypatch):
-    """Catches images of the scene in the window, and a frame moved in another."""
-    render = {"path": "scene", "format": "png"}
-    bpy.ops.stga.render_video(filepath=str(shown / "alone"), **render)
-    own, other = bpy.context.scene, bpy.data.scenes.new("other")
-    other.frame_set(7)
-    window = bpy.context.window_manager.windows[0]
-    around_each_image(extension, monkeypatch, lambda: setattr(window, "scene", other), lambda: None)
-    try:
-        bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
-        assert window.scene == other
-        assert (own.frame_current, other.frame_current) == (1, 7)
-    finally:
-        window.scene = own
-    for frame in ("0001.png", "0002.png", "0003.png"):
-        alone, beside = (
-            np.asarray(Image.open(shown / name / frame)) for name in ("alone", "images")
-        )
-        assert alone[..., 3].any()
-        assert np.array_equal(alone, beside)
+@pytest.mark.parametrize(("channels", "mode"), [(3, "RGB"), (4, "RGBA")])
+def test_png(channels: int, mode: str) -> None:
+    """Catches rows, channels or checksums that other readers take for something else."""
+    pixels = np.random.default_rng(0).integers(0, 256, (7, 5, channels), np.uint8)
+    with Image.open(io.BytesIO(png_bytes(pixels))) as image:
+        assert image.mode == mode
+        np.testing.assert_array_equal(np.asarray(image), pixels)
 
 
-def test_a_recording_keeps_the_last_frame_only(extension, shown, monkeypatch):
-    """Catches splats of every recorded frame that stay in memory until the video is rendered."""
-    posed, counts = extension.operators.render_video.PosedSplats, []
+def drawn(monkeypatch: pytest.MonkeyPatch, video: DrawnVideo, shades: list[float]) -> None:
+    for shade in shades:
+        rgb = np.full((3, CAMERA.height, CAMERA.width), shade, np.float32)
+        picture = ComposedImage(rgb, np.ones((CAMERA.height, CAMERA.width), np.float32), None)
+        monkeypatch.setattr(drawn_video, "draw_image", lambda *_, shown=picture: shown)
+        video.add([], CAMERA)
 
-    def count() -> None:
-        gc.collect()
-        # Not isinstance, which raises for a weak proxy whose object has gone.
-        counts.append(sum(type(each) is posed for each in gc.get_objects()))
 
-    around_each_image(extension, monkeypatch, lambda: None, count)
-    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
-    bpy.ops.stga.render_video(filepath=str(shown / "images"), path="scene", format="png")
-    assert len(counts) == 5
-    assert 0 < max(counts) <= 2
+@pytest.mark.slow
+def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
+    """Catches colors, an order, a size or a rate in the video that is not the images'."""
+    scenes = len(bpy.data.scenes)
+    (tmp_path / "drawn").mkdir()
+    video = DrawnVideo(tmp_path / "drawn", tmp_path / "out.mp4", None)
+    shades = [0.1, 0.4, 0.7, 0.9]
+    drawn(monkeypatch, video, shades)
+    video.encode(24.0)
+    with av.open(str(tmp_path / "out.mp4")) as container:
+        stream = container.streams.video[0]
+        assert float(stream.average_rate) == pytest.approx(24.0)
+        means = [
+            frame.to_ndarray(format="rgb24")[8:40, 8:56].mean() / 255
+            for frame in container.decode(stream)
+        ]
+        assert (stream.width, stream.height) == (64, 48)
+    np.testing.assert_allclose(means, shades, atol=0.03)
+    assert len(bpy.data.scenes) == scenes
+
+
+def test_images_without_a_training_python(monkeypatch, tmp_path) -> None:
+    """Catches images that are not written, and a GPU that fails without a sentence."""
+    for name in ("drawn", "out"):
+        (tmp_path / name).mkdir()
+    video = DrawnVideo(tmp_path / "drawn", tmp_path / "out", (0.0, 0.0, 0.0))
+    drawn(monkeypatch, video, [0.2, 0.6])
+    video.encode(24.0)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0001.png", "0002.png"]
+    monkeypatch.setattr(drawn_video, "draw_image", lambda *_: None)
+    with pytest.raises(StgaError, match="no GPU context"):
+        video.add([], CAMERA)

@@ -4,7 +4,6 @@ import functools
 import http.server
 import json
 import os
-import subprocess
 import threading
 import tomllib
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ from stga_addon.development.package import ROOT
 from stga_addon.development.repository import INDEX, PAGE, write_repository
 from stga_addon.errors import StgaError
 
-from .zips import BLENDERS, OLD_VERSION, name_of, with_version
+from .zips import BLENDERS, OLD_VERSION, name_of, output_of, with_version
 
 pytestmark = pytest.mark.skipif(
     not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"
@@ -46,18 +45,12 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
 def extension(blender: list[str], profile: Path, *arguments: str) -> str:
     command = [*blender, "--background", "--online-mode", "--command", "extension", *arguments]
     variables = {**os.environ, "BLENDER_USER_RESOURCES": str(profile)}
-    done = subprocess.run(
-        command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    return done.stdout
+    return output_of(command, cwd=ROOT, env=variables, timeout=600)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("blender", BLENDERS, ids=name_of)
-def test_install_and_update(
-    blender: list[str], zips: tuple[Path, Path], served: tuple[Path, str], tmp_path
-) -> None:
+def test_install_and_update(blender, zips, served, tmp_path):
     """Catches an index that Blender cannot read, and an update that fails."""
     (folder, address), profile, (old, new) = served, tmp_path / "profile", zips
     index = write_repository([old], folder / "stga", blender)

@@ -1,14 +1,18 @@
-"""Choosing what is selected as a whole, counting it, and seeing it."""
+"""Selections: written as vertex groups and read back, chosen as a whole, counted, and seen."""
 
 import bpy
 import numpy as np
 import pytest
 
 from stga_addon.capture.open import open_capture
-from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection
+from stga_addon.errors import StgaError
+from stga_addon.scene import tags
+from stga_addon.scene.arrays import evaluated_vertices, mesh_triangles, read_values
+from stga_addon.scene.rig.head import import_head
+from stga_addon.scene.vertex_groups import HEAT, SHARE, read_selection, write_selection
 from stga_addon.selection import SelectionOptions, select_capture
 
-from .captures import closure
+from .captures import closure, flame_model, flame_sequence, mesh_capture, motion_capture
 from .test_operators import write_ball_avatar
 
 pytestmark = pytest.mark.usefixtures("extension")
@@ -33,9 +37,7 @@ def paint_chin(head, capture) -> np.ndarray:
 
 
 def test_regions_that_are_selected_as_a_whole(head, tmp_path):
-    """Catches a painted region that is ignored or taken triangle by triangle, a tick in the panel
-    that the selection does not hear of, and a misspelt or unpainted region that silently selects
-    nothing."""
+    """Catches a painted region ignored or taken in part, and unknown ones."""
     capture = open_capture(tmp_path / "capture")
     region = paint_chin(head, capture)
     alone = select_capture(capture, SelectionOptions(threshold=0.0005))[3]
@@ -60,18 +62,22 @@ def test_regions_that_are_selected_as_a_whole(head, tmp_path):
 
 
 def test_the_table_counts_what_each_frame_trains(head, tmp_path):
-    """Catches counts of the rule instead of the groups, of six splats a triangle always, or of
-    another head."""
+    """Catches counts of the rule instead of the groups, of six a triangle, or of another head."""
     bpy.ops.stga.select(threshold=0.0005)
     chosen = read_selection(head)
     assert rows() == [(t, int(faces.sum()), 6 * int(faces.sum())) for t, faces in chosen.items()]
     avatar = write_ball_avatar(tmp_path / "a.npz", order=4)
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
     per_face = np.bincount(avatar.splats.face, minlength=len(avatar.faces))
-    head.vertex_groups["stga_3"].remove(list(range(80)))
+    head.vertex_groups["stga_3"].add(list(range(80)), 0.4, "REPLACE")
+    head.vertex_groups["stga_3"].add(list(range(80, 120)), 0.6, "REPLACE")
     bpy.ops.stga.count_selected()
     painted = read_selection(head)
-    assert painted[3].sum() < chosen[3].sum()
+    corners = np.array([polygon.vertices[:] for polygon in head.data.polygons])
+    inside = np.zeros(len(head.data.vertices), bool)
+    inside[np.unique(corners[chosen[3]])], inside[80:120], inside[:80] = True, True, False
+    np.testing.assert_array_equal(painted[3], inside[corners].all(1))
+    assert painted[3].sum() != chosen[3].sum()
     assert rows() == [
         (t, int(faces.sum()), int(per_face[faces].sum())) for t, faces in painted.items()
     ]
@@ -93,8 +99,7 @@ def heat(head, name: str, kind: str, size: int) -> np.ndarray:
 
 
 def test_heat_map(head, tmp_path):
-    """Catches colors on the wrong triangles or of yesterday's selection, a heat map that the splats
-    cover, and a head that does not look as before once they are gone."""
+    """Catches colors of other triangles or an old selection, and a head left changed."""
     with pytest.raises(RuntimeError, match="no frame selects a triangle yet"):
         bpy.ops.stga.heat_map()
     head.data.materials.append(bpy.data.materials.new("skin"))
@@ -119,3 +124,63 @@ def test_heat_map(head, tmp_path):
         bpy.ops.stga.heat_map(show=show)
         assert head.hide_get() != show
         assert bpy.context.scene.stga.splats.hide_get() == show
+
+
+def test_only_selection_groups_change(tmp_path):
+    """Fails when old timesteps or other groups go or stay wrongly, or vertices, faces or data
+    change."""
+    sequence = flame_sequence(flame_model(), timesteps=(1, 2))
+    head = import_head(motion_capture(sequence, tmp_path / "motion.npz"))
+    bones = {group.name: [head.vertex_groups[group.name].weight(3)] for group in head.vertex_groups}
+    faces = len(sequence.model.faces)
+    write_selection(head, {1: np.ones(faces, bool), 2: np.ones(faces, bool)})
+    write_selection(head, {2: np.arange(faces) < 4, 1: np.zeros(faces, bool)})
+    names = [group.name for group in head.vertex_groups]
+    assert [name for name in names if tags.group_timestep(name) is not None] == ["stga_2"]
+    assert {name: [head.vertex_groups[name].weight(3)] for name in bones} == bones
+    read = read_selection(head)
+    assert not read[1].any()
+    assert read[2].sum() == 4
+    assert tags.group_timestep("stga_12") == 12
+    others = "stga_012", "stga_", "stga_-1", "stga_1_0", "stga_region_nose", "12", "jaw", "stga_٣"
+    assert not [name for name in others if tags.group_timestep(name) is not None]
+    mesh = head.data
+    keys = mesh.shape_keys.key_blocks
+    head.active_shape_key_index = len(keys) - 1
+    keys[-1].value = 0.5
+    own = mesh.attributes.new("own", "FLOAT", "CORNER")
+    own.data.foreach_set("value", np.arange(len(mesh.loops), dtype=np.float32))
+    write_selection(head, {1: np.ones(len(mesh.polygons), bool)})
+
+    def state() -> dict[str, np.ndarray]:
+        found = {key.name: read_values(key.data, "co", 3) for key in keys}
+        found |= {"": read_values(mesh.vertices, "co", 3), "shown": evaluated_vertices(head)}
+        found["edges"] = read_values(mesh.edges, "vertices", 2, np.int32)
+        own = read_values(mesh.attributes["own"].data, "value", 1)
+        return found | {"own": own, "faces": mesh_triangles(mesh)}
+
+    before = state()
+    write_selection(head, {2: np.arange(len(mesh.polygons)) < 4})
+    after = state()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert head.active_shape_key_index == len(keys) - 1
+
+
+def test_edit_mode_and_wrong_sizes_are_refused(tmp_path):
+    """Fails when a group has another frame or vertices, or a selection is written in part."""
+    capture = mesh_capture(tmp_path, timesteps=(2, 3, 7))
+    head = import_head(capture)
+    chosen = np.random.default_rng(0).random((3, len(capture.faces))) < 0.2
+    write_selection(head, dict(zip(capture.timesteps, chosen, strict=True)))
+    before = read_selection(head)
+    for selected, found in zip(chosen, before.values(), strict=True):
+        np.testing.assert_array_equal(found, closure(selected, capture.faces))
+    write_selection(head, before)
+    with pytest.raises(StgaError, match=r"timestep 3 has shape \(5,\)"):
+        write_selection(head, {2: np.ones(len(capture.faces), bool), 3: np.ones(5, bool)})
+    bpy.context.view_layer.objects.active = head
+    bpy.ops.object.mode_set(mode="EDIT")
+    with pytest.raises(StgaError, match="edit mode"):
+        write_selection(head, {})
+    bpy.ops.object.mode_set(mode="OBJECT")
+    np.testing.assert_equal(read_selection(head), before)

@@ -109,8 +109,7 @@ def assert_follows(shown, head, avatar: Avatar) -> np.ndarray:
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_splats_follow_the_animated_head(convention, tmp_path):
-    """Catches wrong axes, corner or unit, a head's transform ignored, and trees that fail once
-    saved."""
+    """Catches wrong axes, corner or unit, a transform ignored, and trees that fail once saved."""
     avatar = avatar_of(convention)
     head = animated_head(avatar.neutral, avatar.faces)
     head.location = (0.1, 0.2, 0.3)
@@ -172,8 +171,7 @@ def active_camera(location=(0.0, 0.0, 0.0)):
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_colors_follow_the_active_camera(degree):
-    """Catches harmonics of another order, sign or space, and colors that stay while the camera
-    moves."""
+    """Catches harmonics of another order, sign or space, and colors that stay."""
     harmonics = pytest.importorskip("stga_addon.raster.cpu.splat_block")
     avatar = avatar_of("stga", 400)
     sh = np.random.default_rng(3).normal(0, 0.3, (400, (degree + 1) ** 2, 3)).astype(np.float32)
@@ -236,9 +234,7 @@ def driven_avatar(
 )
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_splats_follow_the_deformation(convention, names, tmp_path):
-    """Catches strain averaged over other triangles or too few times, not relative to rest, normals
-    in other axes or beyond their range, and coefficients of another triangle, in other axes or
-    another unit, or that a saved file loses: against numpy on the deformed mesh."""
+    """Catches strain, normals or coefficients other than numpy's, or that a saved file loses."""
     avatar, is_all = driven_avatar(convention, names), len(names) == len(OFFSETS)
     splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1])
     avatar = replace(avatar, splats=splats, antialiased=is_all)
@@ -297,8 +293,7 @@ def test_updated_splats_follow_strain_anew():
 
 
 def test_world_splats():
-    """Catches world-space splats that are transformed like embedded ones, sRGB shown where Blender
-    expects scene-linear, and colors outside 0…1."""
+    """Catches splats taken for embedded ones, sRGB for linear, and colors beyond 0…1."""
     sh = np.linspace(-3, 3, 900, dtype=np.float32).reshape(300, 1, 3)
     splats = replace(random_splats(1, 300, degree=0), sh=sh)
     shown = show_world_splats(splats, "scan")
@@ -329,8 +324,7 @@ def test_names_of_trees_are_told_apart():
 
 
 def test_display_inputs():
-    """Catches inputs that are not wired: threshold, percentage and quads; and splats scattered over
-    a mesh they were not trained on."""
+    """Catches inputs that are not wired, and splats on a mesh they were not trained on."""
     avatar = avatar_of("stga", 2000)
     with pytest.raises(StgaError, match="trained on"):
         show_avatar(avatar, animated_head(avatar.neutral, avatar.faces[::-1]))
@@ -406,9 +400,7 @@ TREES = [("stga", 3, ("normal_color",)), (None, 0, ()), ("gaussian_avatars", 3, 
 
 @pytest.mark.parametrize("kind", TREES)
 def test_trees_are_built_one_node_group_at_a_time(kind):
-    """Catches what blocks the UI when a live preview first appears: several groups built in one
-    call, a large tree (build time is quadratic), and groups that are built again; and strain nodes,
-    which cost playback time, for splats that do not follow strain."""
+    """Catches what blocks the UI, groups built again, and needless strain nodes."""
     built, options = [], splat_nodes.TreeOptions(*kind)
     while splat_nodes.build_next_node_group(options):
         built.append(len(bpy.data.node_groups))

@@ -1,5 +1,4 @@
-"""The Track panel's way: footage, worker, import, the cameras' images, a head posed by hand, and
-solved again."""
+"""The Track panel's way: footage, worker, import, a head posed by hand, and solved again."""
 
 import sys
 from math import radians
@@ -38,14 +37,6 @@ def mesh_at(frame):
     return evaluated_vertices(bpy.context.scene.stga.head).astype(float)
 
 
-@pytest.fixture
-def tracked(extension, take, tmp_path, monkeypatch):
-    """A scene with the tracked head, by a worker."""
-    monkeypatch.setenv("STGA_PYTHON", sys.executable)
-    assert track(take, tmp_path / "capture") == {"FINISHED"}
-    return tmp_path / "capture"
-
-
 def look_through(cameras):
     """Catches a view without the image that it is compared with, or of another size."""
     window = bpy.context.window_manager.windows[0]
@@ -62,9 +53,11 @@ def look_through(cameras):
         assert (space.region_3d.view_perspective, space.shading.show_xray) == ("PERSP", False)
 
 
-def test_the_whole_way_of_the_panel(tracked, extension):
-    """Catches a capture that is not imported, a pose that is lost, or a key that the solution does
-    not pass through."""
+def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
+    """Catches a capture not imported, a lost pose, or a key that the solution misses."""
+    monkeypatch.setenv("STGA_PYTHON", sys.executable)
+    tracked = tmp_path / "capture"
+    assert track(take, tracked) == {"FINISHED"}
     scene, settings = bpy.context.scene, bpy.context.scene.stga
     head = settings.head
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
@@ -120,8 +113,7 @@ def test_exported_shape_keys_as_head_model(extension, take, tmp_path):
 
 
 def test_mistakes_are_one_sentence(extension, take, tmp_path):
-    """Catches a traceback, a failure that leaves the panel waiting, and a capture of another
-    tracker whose parameters would be overwritten."""
+    """Catches a traceback, a panel that waits, and another tracker's capture overwritten."""
     for more, expected in (
         ({"model": "/nowhere/head.npz"}, "/nowhere/head.npz: cannot be read"),
         ({"footage": "/nowhere"}, "/nowhere: is neither a folder nor a video"),
@@ -137,8 +129,7 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path):
 
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
-    """Catches a result that never arrives where Blender was closed, or its file saved, while the
-    worker ran."""
+    """Catches a result lost where Blender was closed, or its file saved, meanwhile."""
     out, settings = tmp_path / "capture", bpy.context.scene.stga
     asked(extension, take, out)
     settings.tracking_capture = str(out)

@@ -5,9 +5,7 @@ The versions are Pythons with that bpy, named by environment variables; one that
 Where they have no torch, the Python that runs the tests trains for them.
 """
 
-import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -25,6 +23,8 @@ from stga_addon.export.ply import read_ply
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.sequence import read_motion
 from stga_addon.worker.training_python import missing_packages
+
+from .zips import result_of
 
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python
 # that has it)
@@ -97,8 +97,4 @@ def run(python: str, archive: Path, folder: Path) -> dict[str, object]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     environment = kept | {"BLENDER_USER_RESOURCES": str(folder / "profile")}
     script = str(Path(__file__).with_name("workflow.py"))
-    command = [python, script, str(archive), str(folder), TRAINING_PYTHON]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    line = next(line for line in done.stdout.splitlines() if line.startswith("RESULT "))
-    return json.loads(line.removeprefix("RESULT "))
+    return result_of([python, script, archive, folder, TRAINING_PYTHON], env=environment)

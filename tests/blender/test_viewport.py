@@ -68,8 +68,7 @@ def _stopped_timer() -> Iterator[None]:
 
 
 def test_views_are_rendered_from_their_latest_request():
-    """Catches a queue of views that have passed by, a view that stays coarse, and one that is
-    rendered again and again."""
+    """Catches a queue of passed views, a view that stays coarse, or is rendered again."""
     recorder = Recorder(waits=True)
     requests = [request(float(x)) for x in range(20)]
     assert all(map(recorder.renderer.request, requests))
@@ -134,8 +133,7 @@ def test_viewports_are_redrawn_from_the_main_thread():
 
 @pytest.mark.parametrize("freed", [False, True])
 def test_a_closed_viewport_ends_its_thread(freed):
-    """Catches a thread that refines a view nobody sees, an engine kept alive by the timer, and a
-    timer that fails."""
+    """Catches a thread nobody sees, an engine kept by the timer, and a timer that fails."""
     recorder, engine = Recorder(waits=True), Engine(freed)
     recorder.renderer.request(request())
     recorder.started.wait()

@@ -1,9 +1,13 @@
-"""Real Blenders, and built zips that say that they are of another version, for tests of updates."""
+"""Real Blenders, built zips that say that they are of another version, and what programs print."""
 
+import json
 import os
 import shlex
+import subprocess
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from stga_addon import __version__
 
@@ -27,3 +31,17 @@ def with_version(archive: Path, version: str, out: Path) -> Path:
             is_manifest = entry.filename == "blender_manifest.toml"
             made.writestr(entry, data.replace(own, other, 1) if is_manifest else data)
     return out
+
+
+def output_of(command: Sequence[object], **options: Any) -> str:
+    """What a program prints, which must not fail."""
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, **options)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+def result_of(command: Sequence[object], **options: Any) -> Any:
+    """The JSON after RESULT of what a program prints."""
+    lines = output_of(command, **options).splitlines()
+    line = next(line for line in lines if line.startswith("RESULT "))
+    return json.loads(line.removeprefix("RESULT "))

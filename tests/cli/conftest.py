@@ -17,12 +17,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def trained(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of ten iterations without hull seeds (the paper's schedule), with a threshold of its
-    own."""
-    out, options = (
-        tmp_path_factory.mktemp("runs") / "run",
-        "--iterations 10 --schedule paper --threshold 0.005",
-    )
+    """A run of ten iterations of the paper's schedule, with a threshold of its own."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    options = "--iterations 10 --schedule paper --threshold 0.005"
     assert main(["train", str(root), "--out", str(out), *options.split()]) == 0
     return out
 

@@ -9,23 +9,19 @@ from command_line import stga
 
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
-from stga_addon.cli.main import main
 from stga_addon.files import read_json, write_json
 from stga_addon.tracking import write_capture
 from stga_addon.tracking.torso import FollowedTorso
 
 
 def make(take, out, *more):
-    arguments = [
-        "--model", str(take / "head.npz"), "--out", str(out), "--landmarks", str(take / "points"),
-    ]  # fmt: skip
-    return stga("avatar", take / "footage", *arguments, "--iterations 6", *more)
+    files = "--model", take / "head.npz", "--out", out, "--landmarks", take / "points"
+    return stga("avatar", take / "footage", *files, "--iterations 6", *more)
 
 
 @pytest.fixture(scope="module")
 def made(take, tmp_path_factory):
-    """An avatar made in two calls, of which the first was interrupted as the capture was written;
-    and what it said."""
+    """An avatar made in two calls, the first interrupted as the capture was written."""
     pytest.importorskip("bpy", reason="bpy is not installed")
     out = tmp_path_factory.mktemp("made") / "out"
 
@@ -39,9 +35,8 @@ def made(take, tmp_path_factory):
         # What takes the longest, and is thrown away here
         patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
         patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
-        patch.setattr(
-            "stga_addon.tracking.track.follow_torso", lambda fit, own, *_: FollowedTorso(fit, own)
-        )
+        follow = lambda fit, own, *_: FollowedTorso(fit, own)  # noqa: E731
+        patch.setattr("stga_addon.tracking.track.follow_torso", follow)
         assert make(take, out) == 130
     assert not (out / "run").exists()
     printed = StringIO()
@@ -50,21 +45,17 @@ def made(take, tmp_path_factory):
     return out, printed.getvalue().splitlines()
 
 
-def test_one_summary_at_the_end(made):
-    """Catches a step that is not reported, or reported twice."""
-    _, lines = made
+def test_a_finished_avatar(made, take):
+    """Catches a summary without a step, links of the .blend file that lead nowhere, and a second
+    call that tracks or trains anew."""
+    out, lines = made
     summary = lines[lines.index("") + 1 :]
     begins = "footage: cameras 5, timesteps 5", "tracking: ", "report: ", "avatar: ", "blender: "
     for begin in (*begins, "time: "):
         assert sum(line.startswith(begin) for line in summary) == 1, begin
     assert "interpolated: 2" in summary[0]
-
-
-def test_the_blend_file_shows_the_avatar_on_the_head(made, take):
-    """Catches a file whose links lead nowhere once it is opened."""
     import bpy
 
-    out, _ = made
     assert open_capture(out / "capture", take / "head.npz").timesteps == (0, 1, 2, 3, 4)
     bpy.ops.wm.open_mainfile(filepath=str(out / "avatar.blend"))
     (head,) = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
@@ -73,12 +64,6 @@ def test_the_blend_file_shows_the_avatar_on_the_head(made, take):
     assert head["stga_capture"] == str(out / "capture")
     assert (out / splats["stga_avatar"].removeprefix("//")).is_file()
     assert len(splats.data.vertices) > 100
-
-
-def test_a_finished_avatar_is_not_made_again(made, take):
-    """Catches a second call that tracks or trains from the beginning, also of what a version made
-    that noted less."""
-    out, _ = made
     inputs = read_json(out / "inputs.json")
     for name in ("sync", "world", "meshes"):
         del inputs[name]
@@ -106,24 +91,16 @@ def test_other_inputs_are_refused(made, take, capsys, more, expected):
     assert re.search(expected, capsys.readouterr().err)
 
 
-def test_a_mistyped_footage_leaves_nothing_behind(take, tmp_path, capsys):
-    """Catches a folder that remembers the mistake, and refuses the mended command as one of other
-    inputs."""
-    mistyped = [
-        "avatar", str(tmp_path / "nowhere"), "--model", str(take / "head.npz"), "--out",
-        str(tmp_path / "out"),
-    ]  # fmt: skip
-    assert main(mistyped) == 2
+def test_a_wrong_folder_is_left_as_it_is(take, tmp_path, capsys):
+    """Catches a folder that remembers a mistake, and somebody's run taken for a part of it."""
+    files = "--model", take / "head.npz", "--out", tmp_path / "out"
+    assert stga("avatar", tmp_path / "nowhere", *files) == 2
     assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
-    assert main(mistyped) == 2
+    assert stga("avatar", tmp_path / "nowhere", *files) == 2
     assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_a_folder_of_something_else_is_left_alone(take, tmp_path, capsys):
-    """Catches a run or capture of the user's that is taken for a part of this avatar."""
-    (tmp_path / "out/run").mkdir(parents=True)
+    (tmp_path / "out/run").mkdir()
     assert make(take, tmp_path / "out") == 2
     said = "holds something else (inputs.json is missing); give another --out"
     assert said in capsys.readouterr().err

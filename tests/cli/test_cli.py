@@ -13,15 +13,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from capture import factory
+from capture.factory import edit, write_avatar_of, write_flame_capture, write_mesh_capture
 from command_line import stga
+from export.web.web_data import read_web_data
 from PIL import Image
 
-from stga_addon import __version__
 from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli import commands
-from stga_addon.cli.main import main, make_parser
+from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
@@ -46,8 +47,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a threshold that is ignored, timesteps without a line, and masks written under
-    another timestep."""
+    """Catches a threshold that is ignored, and masks or lines of another timestep."""
     out = tmp_path / "selection.npz"
     assert main(["select", str(root), "--threshold", "0.0008", "--out", str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -65,34 +65,14 @@ def test_select(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert all("0.0%" in line for line in capsys.readouterr().out.splitlines()[1:])
 
 
-def test_train(trained: Path, root: Path) -> None:
-    """Catches options that do not reach the run, and the paper's settings with jaw and eyes left
-    in, because a threshold replaced the whole selection."""
+def test_train_and_eval(trained, root, capsys):
+    """Catches options that do not reach the run, and figures of another split or training."""
     run = read_run(trained)
     assert run.capture == root.resolve()
     assert (run.settings.iterations, run.settings.seconds) == (10, None)
     assert run.settings.global_interval == 20
     assert run.settings.selection == SelectionOptions(threshold=0.005, zero_pose="all")
     assert len(read_avatar(trained / "avatar.npz").splats) >= 15 * 320
-
-
-def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
-    """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
-    out = tmp_path / "run"
-    arguments = [
-        "train", str(root), "--out", str(out), "--budget", "0.2s", "--strategy", "gaussian-avatars",
-    ]  # fmt: skip
-    assert main(arguments) == 0
-    first = read_checkpoint(out)
-    assert 0.2 <= first.elapsed_s < 1.5
-    assert main([*arguments, "--resume"]) == 0
-    again = read_checkpoint(out)
-    assert (again.iteration, again.elapsed_s) == (first.iteration, first.elapsed_s)
-
-
-def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches figures of another split, and figures that differ from those of the training's last
-    evaluation."""
     for split, views in (("val", 2), ("test", 3), ("train", 4)):
         assert main(["eval", str(trained), "--split", split]) == 0
         assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
@@ -103,44 +83,45 @@ def test_eval(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert measured == pytest.approx(best, rel=0.02)
 
 
-def test_render_a_run(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches pictures that are missing, misnamed, upside down or of another frame or
-    background."""
-    for split, names in (
-        ("val", ["00000_02.png", "00001_02.png"]),
-        ("test", [f"00003_{c:02d}.png" for c in CAMERAS]),
+def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
+    """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
+    out, options = tmp_path / "run", "--budget 0.2s --strategy gaussian-avatars"
+    assert stga("train", root, "--out", out, options) == 0
+    first = read_checkpoint(out)
+    assert 0.2 <= first.elapsed_s < 1.5
+    assert stga("train", root, "--out", out, options, "--resume") == 0
+    again = read_checkpoint(out)
+    assert (again.iteration, again.elapsed_s) == (first.iteration, first.elapsed_s)
+
+
+def test_render_a_run_an_avatar_and_a_ply(trained, root, tmp_path):
+    """Catches pictures that are missing, misnamed, upside down, or of another frame or mesh, and a
+    PLY that needs a capture or differs."""
+    ply = tmp_path / "frame.ply"
+    assert stga("export", trained, "--format ply --timestep 1 --out", ply) == 0
+    val = ["00000_02.png", "00001_02.png"]
+    for name, split, names, source in (
+        ("run", "val", val, [trained]),
+        ("test", "test", [f"00003_{c:02d}.png" for c in CAMERAS], [trained]),
+        ("avatar", "val", val, [trained / "avatar.npz", "--capture", root]),
+        ("ply", "val", val, [ply]),
     ):
-        out = tmp_path / split
         cameras = root / f"transforms_{split}.json"
-        assert main(["render", str(trained), "--cameras", str(cameras), "--out", str(out)]) == 0
-        assert pictures(out) == names
-    drawn = pixels(tmp_path / "val" / "00000_02.png")
+        assert stga("render", *source, "--cameras", cameras, "--out", tmp_path / name) == 0
+        assert pictures(tmp_path / name) == names
+    drawn = pixels(tmp_path / "run" / "00000_02.png")
     assert drawn.shape == (60, 40, 3)
     assert (drawn[0] == 255).all()
-    # Ten steps from gray: the ball stands where its silhouette says, in something that is not
-    # white.
+    # Ten steps from gray: the ball stands where its silhouette says, in something not white.
     dark = (drawn < 230).any(axis=2)
     assert np.mean(dark == factory.silhouette()) > 0.9
     middle = np.average(np.arange(60), weights=dark.sum(axis=1))
     assert middle == pytest.approx(factory.CY - 0.5, abs=1.5)
-
-
-def test_render_an_avatar_and_a_ply(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches an avatar that is not driven by the frame's own mesh, and a PLY that needs a capture
-    or differs."""
-    cameras = ["--cameras", str(root / "transforms_val.json")]
-    for name, source in (
-        ("run", [trained]),
-        ("avatar", [trained / "avatar.npz", "--capture", root]),
-    ):
-        assert main(["render", *map(str, source), *cameras, "--out", str(tmp_path / name)]) == 0
-    ply = tmp_path / "frame.ply"
-    assert stga("export", trained, "--format ply --timestep 1 --out", ply) == 0
-    assert main(["render", str(ply), *cameras, "--out", str(tmp_path / "ply")]) == 0
-    for name in ("00000_02.png", "00001_02.png"):
-        drawn = [pixels(tmp_path / kind / name) for kind in ("run", "avatar")]
-        np.testing.assert_array_equal(*drawn)
-    right, baked = (pixels(tmp_path / kind / "00001_02.png").astype(int) for kind in ("run", "ply"))
+    for name in val:
+        np.testing.assert_array_equal(
+            *(pixels(tmp_path / kind / name) for kind in ("run", "avatar"))
+        )
+    right, baked = (pixels(tmp_path / kind / val[1]).astype(int) for kind in ("run", "ply"))
     assert np.abs(right - baked).max() <= 1
 
 
@@ -150,13 +131,12 @@ def test_names_of_a_long_capture() -> None:
     begin = process_time()
     assert unique_names(paths) == [Path(path).name for path in paths]
     assert process_time() - begin < 5
-    assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == [
-        "a.png", "a_2.png", "a_2_2.png", "a_3.png",
-    ]  # fmt: skip
+    names = ["a.png", "a_2.png", "a_2_2.png", "a_3.png"]
+    assert unique_names(["a.png", "a.png", "a_2.png", "a.png"]) == names
 
 
-def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
-    """Catches a PLY of another frame than asked for, and one in local coordinates."""
+def test_export_of_frames(trained, root, tmp_path, capsys):
+    """Catches a PLY of another frame or in local coordinates, and a range cut in silence."""
     avatar, capture = read_avatar(trained / "avatar.npz"), open_capture(root)
     meshes = {None: avatar.neutral, 3: capture.mesh(3)}
     for timestep, mesh in meshes.items():
@@ -170,11 +150,6 @@ def test_export_ply(trained: Path, root: Path, tmp_path: Path) -> None:
     posed, neutral = (read_ply(tmp_path / f"{name}.ply").xyz for name in ("3", "None"))
     assert np.abs(posed - neutral).max() > 0.002
     assert np.linalg.norm(neutral, axis=1).mean() == pytest.approx(0.1, abs=0.01)
-
-
-def test_export_says_which_frames_there_are(trained, tmp_path, capsys):
-    """Catches a range that is cut to the capture's without a message, a message about one that is
-    not, and frames numbered from zero instead of by their timestep."""
     sequence = ["export", str(trained), "--format", "ply-sequence"]
     for span, said in (("1:999999", True), ("0:3", False), ("0:2", False)):
         assert main([*sequence, "--frames", span, "--out", str(tmp_path / span[2:])]) == 0
@@ -196,26 +171,20 @@ def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_of_a_flame_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an exported pair without motion, and a run that cannot be measured any more because
-    its FLAME file is elsewhere now."""
-    root, model = factory.write_flame_capture(tmp_path / "flame")
+def test_files_that_have_moved(tmp_path, capsys, trained, root):
+    """Catches a run lost with its FLAME file's or capture's old place, or measured on another."""
+    tracked, model = factory.write_flame_capture(tmp_path / "flame")
     out, pair, elsewhere = tmp_path / "run", tmp_path / "pair", tmp_path / "elsewhere.npz"
-    options = ["--flame", str(model), "--iterations", "2", "--strategy", "gaussian-avatars"]
-    assert main(["train", str(root), "--out", str(out), *options]) == 0
-    assert main(["export", str(out), "--format", "gaussian-avatars", "--out", str(pair)]) == 0
+    options = "--flame", model, "--iterations 2 --strategy gaussian-avatars"
+    assert stga("train", tracked, "--out", out, *options) == 0
+    assert stga("export", out, "--format gaussian-avatars --out", pair) == 0
     assert pictures(pair) == ["flame_param.npz", "point_cloud.ply"]
     with np.load(pair / "flame_param.npz") as data:
         assert len(data["expr"]) >= 3
     model.rename(elsewhere)
     assert "cannot be read" in refused(capsys, "eval", out)
     assert main(["eval", str(out), "--flame", str(elsewhere)]) == 0
-
-
-def test_eval_with_a_capture_that_has_moved(trained, root, tmp_path, capsys):
-    """Catches a run that cannot be evaluated where its capture lies elsewhere, and one measured on
-    another capture."""
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    run = Path(shutil.copytree(trained, tmp_path / "copy"))
     moved = Path(shutil.copytree(root, tmp_path / "moved"))
     factory.edit(run / "run.json", lambda document: document.update(capture=str(tmp_path / "gone")))
     assert "gone" in refused(capsys, "eval", run)
@@ -247,8 +216,7 @@ NONSENSE_OPTIONS = [
     ("command", "option", "value"), NONSENSE_OPTIONS, ids=lambda text: ascii(text)[:20]
 )
 def test_option_values_without_meaning(root, tmp_path, capsys, command, option, value):
-    """Catches a traceback from deep inside, a run that trains nothing, for ever or everything, a
-    selection of nothing or everything, one of two budgets that is ignored, and a long sentence."""
+    """Catches a traceback, a run of nothing or for ever, and one of two budgets ignored."""
     *others, name = option.split()
     out = [f"--out={tmp_path / 'run'}"] if name != "--out" else []
     with pytest.raises(SystemExit, match="2"):
@@ -259,39 +227,7 @@ def test_option_values_without_meaning(root, tmp_path, capsys, command, option, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_image_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches an error in the loader's thread that hangs the training or ends in a traceback."""
-    root = factory.write_mesh_capture(tmp_path / "capture", TIMESTEPS, CAMERAS)
-    Image.new("RGB", (41, 60)).save(root / "images" / "00001_01.png")
-    out = tmp_path / "run"
-    message = refused(
-        capsys, "train", root, "--out", out, "--iterations", 30, "--strategy", "gaussian-avatars"
-    )
-    assert "00001_01.png: the image has 41 x 60 pixels" in message
-    assert not (out / "run.lock").exists()
-
-
 # The entry point
-
-
-def commands_of(parser: argparse.ArgumentParser) -> set[str]:
-    return set(
-        next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices
-    )
-
-
-def test_every_command_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a command that the parser lost, and an extension without `development` whose parser
-    needs it."""
-    shipped = {
-        "train", "refine", "presets", "render", "eval", "select", "export", "info", "perform",
-    }  # fmt: skip
-    shipped |= {"avatar", "batch", "drive", "extend", "relight", "track"}
-    assert commands_of(make_parser()) == shipped | {"benchmark", "demo"}
-    monkeypatch.setattr("stga_addon.cli.main.find_spec", lambda *_: None)
-    for name in ("benchmark", "demo"):
-        monkeypatch.delitem(commands.COMMANDS, name)
-    assert commands_of(make_parser()) == shipped
 
 
 WITHOUT = """
@@ -304,13 +240,10 @@ NUMPY_ALONE = "torch numba wgpu trimesh scipy PIL tqdm matplotlib platformdirs b
 
 
 def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -> None:
-    """Catches an import by which a capture can only be looked at where it could be trained, or by
-    which `select` and `export` need more than the numpy of Blender's own Python; and a capture
-    asked for where none is needed."""
+    """Catches an import that looking at a capture, selecting or exporting cannot do without."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
-    exported = [
-        "export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(tmp_path / "a.ply"),
-    ]  # fmt: skip
+    ply = tmp_path / "a.ply"
+    exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(ply)]
     known = "162 vertices, 320 triangles", "40 x 60", "view-color"
     for missing, arguments, says in (
         ("torch numba wgpu", ["info", str(root)], known),
@@ -322,12 +255,11 @@ def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -
         done = subprocess.run(command, capture_output=True, text=True, cwd=here)
         assert (done.returncode, done.stderr) == (0, "")
         assert all(part in done.stdout for part in says)
-    assert len(read_ply(tmp_path / "a.ply")) == len(read_avatar(trained / "avatar.npz").splats)
+    assert len(read_ply(ply)) == len(read_avatar(trained / "avatar.npz").splats)
 
 
 def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
-    """Catches a traceback after Ctrl-C, and an unexpected exception reported as the user's
-    mistake."""
+    """Catches a traceback after Ctrl-C, and a bug reported as the user's mistake."""
 
     def fails_with(error: BaseException) -> None:
         def run(options: argparse.Namespace, head: object) -> None:
@@ -353,19 +285,6 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
 # In a process of its own
 
 
-def test_as_a_module(tmp_path: Path) -> None:
-    """Catches a broken entry point, and an exit code or stream that gets lost."""
-    missing = tmp_path / "none"
-    says = f"stga: {missing}: is not a folder; expected that of a capture\n"
-    for arguments, expected in (
-        (["--version"], (0, f"{__version__}\n", "")),
-        (["info", str(missing)], (2, "", says)),
-    ):
-        command = [sys.executable, "-m", "stga_addon", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-        assert (done.returncode, done.stdout, done.stderr) == expected
-
-
 @pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
 def test_damaged_folder_of_the_open_head(tmp_path, capsys, monkeypatch, content):
     """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
@@ -375,9 +294,8 @@ def test_damaged_folder_of_the_open_head(tmp_path, capsys, monkeypatch, content)
     assert "head.json" in refused(capsys, "select")
 
 
-def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a refinement that is put into the run's own folder, one that cannot be evaluated or
-    refined again, and one that says nothing about what it gained."""
+def test_refine_and_extend(trained, tmp_path, capsys, root):
+    """Catches runs in another's folder, that end there, or say nothing of the gain."""
     runs = Path(shutil.copytree(trained, tmp_path / "anna"))
     assert stga("refine", runs, "--region mouth --frames 1-3 --iterations 6") == 0
     printed = capsys.readouterr().out
@@ -387,19 +305,52 @@ def test_refine(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert read_checkpoint(tmp_path / "anna_3").iteration == 3
     assert main(["refine", str(tmp_path / "anna_3"), "--resume"]) == 0
     assert main(["eval", str(tmp_path / "anna_3")]) == 0
-
-
-def test_extend(trained, root, tmp_path, capsys):
-    """Catches an extended run that cannot be evaluated, rendered or extended again, and one that
-    does not say what it learned and forgot."""
-    runs = Path(shutil.copytree(trained, tmp_path / "anna"))
     take = Path(shutil.copytree(root, tmp_path / "smile"))
     assert main(["extend", str(runs), str(take), "--iterations", "6"]) == 0
     printed = capsys.readouterr().out
     assert "take 1: " in printed
     assert "take 2: " in printed
-    out = tmp_path / "anna_2"
+    out = tmp_path / "anna_4"
     assert main(["eval", str(out)]) == 0
     assert main(["refine", str(out), "--region", "mouth", "--iterations", "3"]) == 0
     assert main(["extend", str(out), "--resume"]) == 0
     assert "is a take of this run already" in refused(capsys, "extend", out, take)
+
+
+def test_frames_cameras_and_selection_of_a_capture(tmp_path):
+    """Catches frames, cameras or rates other than asked for, and a page that needs a capture."""
+    capture = open_capture(write_mesh_capture(tmp_path / "capture"))
+    avatar_file = write_avatar_of(capture, tmp_path / "anna.npz", order=2, sh_degree=1)
+    first, last = capture.timesteps[1], capture.timesteps[-1]
+    words = ["--capture", str(capture.root), "--frames", f"{first}:{last}", "--fps", "30"]
+    assert stga("export", avatar_file, "--format web", *words, "--out", tmp_path / "a.stga") == 0
+    header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())
+    frames = len(capture.timesteps) - 1
+    assert (header["title"], header["fps"]) == ("anna", 30)
+    assert len(arrays["pose"]) == len(arrays["selection"]) == frames
+    cameras = {view.camera_index for views in capture.views.values() for view in views}
+    assert {view["name"] for view in header["views"]} == {f"Camera {index}" for index in cameras}
+    edit(tmp_path / "capture/transforms_train.json", lambda document: document.update(fps=60))
+    words = ["--capture", str(tmp_path / "capture"), "--out"]
+    assert stga("export", avatar_file, "--format web", *words, tmp_path / "a.stga") == 0
+    assert read_web_data((tmp_path / "a.stga").read_bytes())[0]["fps"] == 60
+    assert stga("export", avatar_file, "--format web --out", tmp_path / "a.html") == 0
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert "<title>anna</title>" in text
+    assert "{{" not in text.partition('<script type="module">')[0]
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    assert stga("export", avatar_file, "--format usd", *words, tmp_path / "a.usdc") == 0
+    assert usd.Stage.Open(str(tmp_path / "a.usdc")).GetTimeCodesPerSecond() == 60
+
+
+def test_what_is_left_of_flame_is_said(tmp_path, capsys):
+    """Catches an export that does not say what of FLAME is in the page."""
+    root, model = write_flame_capture(tmp_path / "flame")
+    avatar = write_avatar_of(open_capture(root, model), tmp_path / "anna.npz", sh_degree=1)
+    words = "export", avatar, "--format web --capture", root, "--flame", model
+    assert stga(*words, "--motion-only --out", tmp_path / "a.stga") == 0
+    said = "Contains the triangles and the posed meshes of a FLAME head: FLAME's licence"
+    assert said in capsys.readouterr().out
+    assert stga(*words, "--out", tmp_path / "a.stga") == 0
+    said = "--motion-only leaves them out, but not the meshes of the take."
+    assert said in capsys.readouterr().out

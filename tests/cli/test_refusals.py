@@ -116,20 +116,13 @@ REFUSALS = [
 def refusable(root, trained, tmp_path_factory):
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
-    names = {
-        name: folder / name
-        for name in ("broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o")
-    }
-    names |= {
-        "run": Path(shutil.copytree(trained, folder / "run")),
-        "avatar": folder / "run" / "avatar.npz",
-    }
-    names |= {
-        "root": Path(shutil.copytree(root, folder / "ball")),
-        "folder": folder,
-        "later": folder / "ball" / "a.json",
-    }
-    names["cameras"] = names["root"] / "transforms_val.json"
+    own = "broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o", "run"
+    names = {name: folder / name for name in own} | {"root": folder / "ball", "folder": folder}
+    shutil.copytree(trained, names["run"])
+    shutil.copytree(root, names["root"])
+    inside = {"avatar": "run/avatar.npz", "later": "ball/a.json"}
+    inside["cameras"] = "ball/transforms_val.json"
+    names |= {name: folder / path for name, path in inside.items()}
     for name in ("broken", "bare", "coarse"):
         shutil.copytree(root, names[name])
     factory.write_mesh_capture(names["cameras5"], TIMESTEPS, range(5))
@@ -137,12 +130,11 @@ def refusable(root, trained, tmp_path_factory):
     for split in ("train", "test"):
         (names["bare"] / f"transforms_{split}.json").unlink()
     shutil.copytree(trained, names["moved"])
-    factory.edit(
-        names["moved"] / "run.json", lambda document: document.update(capture=str(names["bare"]))
-    )
-    factory.edit(
-        names["run"] / "run.json", lambda document: document.update(capture=str(names["root"]))
-    )
+    for name, capture in (("moved", "bare"), ("run", "root")):
+        path = str(names[capture])
+        factory.edit(
+            names[name] / "run.json", lambda document, path=path: document.update(capture=path)
+        )
     sphere = trimesh.creation.icosphere(1, factory.RADIUS)
     for path in (names["coarse"] / "meshes").iterdir():
         factory.write_mesh(path, np.array(sphere.vertices), np.array(sphere.faces))
@@ -161,13 +153,15 @@ def refusable(root, trained, tmp_path_factory):
 
 @pytest.mark.parametrize(("command", "says"), REFUSALS, ids=[command for command, _ in REFUSALS])
 def test_refusals(refusable, capsys, command, says):
-    """Catches a traceback, an option that does nothing, talk of something else, and a command that
-    fails but has made a folder, or overwritten a run or a recording."""
-    before = {path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()}
+    """Catches a traceback, talk of something else, and files that a refused command leaves."""
+
+    def files() -> dict[Path, bytes]:
+        found = refusable["folder"].rglob("*")
+        return {path: path.read_bytes() for path in found if path.is_file()}
+
+    before = files()
     assert says.format(**refusable) in refused(capsys, *command.format(**refusable).split())
-    assert {
-        path: path.read_bytes() for path in refusable["folder"].rglob("*") if path.is_file()
-    } == before
+    assert files() == before
     assert not refusable["o"].exists()
     assert not refusable["none"].exists()
 

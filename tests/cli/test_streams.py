@@ -1,6 +1,6 @@
-"""Standard streams of the command line: closed pipes, full devices, ASCII, closed descriptors,
-interruption."""
+"""Standard streams: closed pipes, full devices, ASCII, progress, interruption."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 from capture import factory
+
+from stga_addon.cli.commands import ProgressBar
+from stga_addon.progress import Progress
 
 STGA = f'"{sys.executable}" -m stga_addon'
 ROOT = Path(__file__).parents[2]
@@ -21,8 +24,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a bash command line in which `stga` is the command line and PIPESTATUS[0] is its exit
-    code."""
+    """Run a bash command line in which `stga` is the command line; its exit code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
         ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT,
@@ -51,8 +53,7 @@ def test_full_device(capture: Path) -> None:
     "environment", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}]
 )
 def test_ascii_streams(tmp_path: Path, environment: dict[str, str]) -> None:
-    """Catches a UnicodeEncodeError for a folder's name, in what is printed and in the error
-    sentence."""
+    """Catches a UnicodeEncodeError for a folder's name, in the output and in an error."""
     capture = factory.write_mesh_capture(tmp_path / "Käthe−²")
     done = shell(f"stga info {capture}", PYTHONUTF8="0", **environment)
     assert (done.returncode, done.stderr) == (0, "")
@@ -80,8 +81,7 @@ assert codes == [0, 0, 2] and all(os.path.samestat(os.fstat(number), null) for n
 
 
 def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
-    """Catches a progress bar that cannot do without stderr, and files that get the descriptor of a
-    closed stream."""
+    """Catches a progress bar that needs stderr, and files that get a closed stream's descriptor."""
     done = shell(f"\"{sys.executable}\" -c '{THREE}' {capture} {tmp_path} <&- >&- 2>&-")
     assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
     assert (tmp_path / "run/avatar.npz").exists()
@@ -91,16 +91,11 @@ def test_closed_descriptors(capture: Path, tmp_path: Path) -> None:
 
 
 def test_interrupted_training_keeps_its_exit_code(capture: Path, tmp_path: Path) -> None:
-    """Catches a progress bar that breaks without a terminal, and a traceback or another exit code
-    than 130 after Ctrl-C."""
+    """Catches a bar that needs a terminal, and a traceback or other code after Ctrl-C."""
     out = tmp_path / "run"
-    command = [
-        sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out), "--budget",
-        "60s",
-    ]  # fmt: skip
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-m", "stga_addon", "train", str(capture), "--out", str(out)]
+    how = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([*command, "--budget", "60s"], **how)
     end = time.monotonic() + 60
     while not (out / "run.json").exists() and time.monotonic() < end:
         time.sleep(0.1)
@@ -129,7 +124,38 @@ raise SystemExit(main.main(["info", "capture"]))
 
 
 def test_interruption_says_nothing_of_what_was_half_made() -> None:
-    """Catches the traceback of a library's destructor below the sentence, where Ctrl-C came while
-    it made an object."""
+    """Catches the traceback of a destructor where Ctrl-C came while a library made an object."""
     done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
     assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
+
+
+def test_messages_have_lines_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+    """Catches a sentence glued to the end of the bar."""
+    with ProgressBar() as bar:
+        bar.report(Progress(0.5, "Training"))
+        logging.getLogger("stga_addon").warning("the GPU failed")
+        bar.say("a warning")
+        bar.report(Progress(0.6, "Training"))
+    written = capsys.readouterr()
+    lines = (written.err + "\n" + written.out).replace("\r", "\n").splitlines()
+    assert {"the GPU failed", "a warning"} <= {line.strip() for line in lines}
+
+
+FITTED = {"psnr": 31.0, "psnr_unmatched": 25.0}
+
+
+@pytest.mark.parametrize(
+    ("figures", "shown", "guesses"),
+    [
+        (FITTED, "PSNR 31.00 dB (exposure fitted)   25.00 dB", True),
+        ({"left_s": 31.0}, "31 s left", False),
+    ],
+)
+def test_figures(capsys, figures, shown, guesses):
+    """Catches a fitted PSNR that is not called so, and the bar's guess beside the work's."""
+    with ProgressBar() as bar:
+        for share in (0.0, 0.5):
+            bar.report(Progress(share, "Landmarks", figures=lambda: figures))
+    written = capsys.readouterr().err
+    assert shown in written
+    assert ("<" in written) == guesses

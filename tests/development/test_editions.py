@@ -1,5 +1,4 @@
-"""The editions' wheels, manifests and files, and the repository's page; Blender's part is in
-tests/blender."""
+"""The editions' wheels, manifests and files; Blender's part is in tests/blender."""
 
 import os
 import re
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from stga_addon.development.editions import SMALL, Edition, complete, edition_manifest
+from stga_addon.development.editions import SMALL, complete, edition_manifest
 from stga_addon.development.package import ROOT, build_zip, main, read_manifest, wheel_folder
 from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
 from stga_addon.errors import StgaError
@@ -37,8 +36,7 @@ def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: s
 
 
 def wheel_set(folder: Path, target: Target) -> list[Path]:
-    """A wheel of the pinned version for each package that training needs; torch and numba with
-    their dependencies."""
+    """A wheel of the pinned version for each package that training needs."""
     pins = {pin.split("==")[0]: pin.split("==")[1] for key in ("", "3.11") for pin in PINS[key]}
     tag = NATIVE[target.platform].format(target.python.replace(".", ""))
     extra = {
@@ -54,8 +52,7 @@ def wheel_set(folder: Path, target: Target) -> list[Path]:
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
 def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
-    """Catches wheels of another system or Python in a zip, and a missing or too old dependency, on
-    every target."""
+    """Catches wheels of another system or Python, and a missing or too old dependency."""
     wheels = wheel_set(tmp_path, target)
     check_wheels(wheels, target)
     for other in TARGETS:
@@ -74,12 +71,8 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only PyPI's torch for Linux needs CUDA")
-def test_only_when_told_to_does_a_zip_have_cuda(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches a zip of gigabytes that nothing uses, also by a wheel of an earlier build; a CPU
-    build that pip's configuration sees and that is not taken; and a refusal that does not say how
-    to go on."""
+def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys):
+    """Catches gigabytes that nothing uses, and a refusal without a remedy."""
     monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
     wheels, offered, index = wheel_folder(LINUX), tmp_path / "offered", tmp_path / "index"
     for folder in (wheels, offered, index):
@@ -125,19 +118,8 @@ def test_only_when_told_to_does_a_zip_have_cuda(
     assert refusal() == said
 
 
-def test_markers_are_those_of_the_target(tmp_path: Path) -> None:
-    """Catches dependencies of this computer in the zip of another system: pip evaluates markers
-    where it runs."""
-    wheel = make_wheel(
-        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"',
-        'dll; os_name == "nt"', 'old; python_version < "3.12"', 'more; extra == "more"',
-    )  # fmt: skip
-    assert needs(wheel, LINUX) == ["cuda", "old"]
-    assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]
-
-
-def test_manifest_of_an_edition() -> None:
-    """Catches a zip that Blender offers on another platform or to a Blender with another Python."""
+def test_manifest_of_an_edition(tmp_path):
+    """Catches a zip for another platform or Python, or with this computer's dependencies."""
     manifest = read_manifest(ROOT)
     for target in TARGETS:
         made = tomllib.loads(edition_manifest(manifest, complete(target), ["a.whl"]))
@@ -148,14 +130,17 @@ def test_manifest_of_an_edition() -> None:
         edition_manifest(manifest, SMALL, [Path(name).name for name in manifest["wheels"]])
     )
     assert small == {name: value for name, value in manifest.items() if name != "build"}
+    wheel = make_wheel(
+        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"',
+        'dll; os_name == "nt"', 'old; python_version < "3.12"', 'more; extra == "more"',
+    )  # fmt: skip
+    assert needs(wheel, LINUX) == ["cuda", "old"]
+    assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]
 
 
 @pytest.mark.parametrize("edition", [SMALL, complete(LINUX)], ids=["small", "complete"])
-def test_no_way_to_install_packages(
-    edition: Edition, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches code in a zip that installs packages, downloads something, or runs what it
-    downloaded."""
+def test_no_way_to_install_packages(edition, tmp_path, monkeypatch):
+    """Catches code in a zip that installs packages, downloads, or runs what it downloaded."""
     monkeypatch.setattr("stga_addon.development.package.edition_wheels", lambda folder, edition: [])
     forbidden = re.compile(r"\bpip\b|ensurepip|\"venv\"|urllib|http\.client|import requests\b")
     assert forbidden.search((ROOT / "stga_addon/development/wheels.py").read_text()), (

@@ -28,8 +28,7 @@ SAMPLES = 400
 
 
 def generated_flame(shared_data: Path, components: int) -> FlameModel:
-    """FLAME 2023 Open's template and 60 identity components, a jaw and eyes, and expressions
-    (`with_expressions`)."""
+    """FLAME 2023 Open with 60 identity components, a jaw, eyes, and generated expressions."""
     model = _with_eyes(open_flame(shared_data))
     return with_expressions(replace(model, posedirs=0 * model.posedirs), components)
 
@@ -64,8 +63,7 @@ def with_expressions(model: FlameModel, components: int) -> FlameModel:
 
 
 def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 52) weights as of a face in motion: a third of the shapes, no opposites, a third with
-    closed lips."""
+    """(count, 52) weights as of a face in motion: no opposites, a third with closed lips."""
     weights = rng.random((count, COUNT)) * (rng.random((count, COUNT)) < 1 / 3)
     for pair in OPPOSITES:
         chosen = rng.integers(0, 2, count)

@@ -34,8 +34,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> dict[str, Path]:
-    """The small head's model, an avatar of another identity of it, and ten frames in which head and
-    jaw turn left and the jaw opens."""
+    """The small head's model, an avatar of it, and a take that turns and opens the jaw."""
     folder = tmp_path_factory.mktemp("drive")
     model = small_head(0)
     write_flame(model, folder / "flame.npz")
@@ -59,8 +58,8 @@ def files(tmp_path_factory) -> dict[str, Path]:
 
 
 def test_convert_there_and_back(files, tmp_path, capsys):
-    """Catches a motion that `read_motion` refuses, another rate, a mirror that does not exchange
-    sides, and a strength that changes no CSV, or a motion twice."""
+    """Catches an unreadable or refitted motion, another rate, and a mirror or strength without
+    effect."""
     out, back, flame = tmp_path / "motion.npz", tmp_path / "back.csv", files["flame.npz"]
     assert stga("drive", files["take.csv"], "--flame", flame, "--fps", 60, "--out", out) == 0
     model = small_head(0)
@@ -82,12 +81,7 @@ def test_convert_there_and_back(files, tmp_path, capsys):
         np.testing.assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
     assert stga("drive", out, "--out", tmp_path / "x.npz") == 2
     assert "holds FLAME parameters already" in capsys.readouterr().err
-
-
-def test_the_bundled_heads_motion_needs_no_model(files, tmp_path):
-    """Catches a performance that asks for a FLAME file, a motion that does not know whose it is,
-    and weights that are fitted although they are the head's own coefficients."""
-    out, back = tmp_path / "motion.npz", tmp_path / "back.csv"
+    out, back = tmp_path / "bundled.npz", tmp_path / "bundled.csv"
     assert stga("drive", files["take.csv"], "--out", out) == 0
     assert stga("drive", out, "--out", back) == 0
     given, found = read_performance(files["take.csv"]), read_performance(back)
@@ -120,9 +114,7 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
 
 @pytest.mark.parametrize("misfit", [0.1, 0.8])
 def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit):
-    """Catches a motion that is not what the avatar tracked, another rate or head, turns that get
-    lost in ARKit's shapes, somebody else's avatar that is believed, and folders that stay. Given:
-    what tracking finds."""
+    """Catches another motion, rate or head than tracked, a stranger's avatar, and folders left."""
     root, run, video, steps = tmp_path / "capture", tmp_path / "run", tmp_path / "face.mp4", []
     write_flame_capture(root)
     rng = np.random.default_rng(0)

@@ -1,7 +1,5 @@
 """A performance from a video, with given scores in place of the networks'."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -36,19 +34,12 @@ def network(monkeypatch):
     monkeypatch.setattr(FaceNetworks, "score", score)
 
 
-@pytest.fixture
-def video(tmp_path: Path) -> Path:
-    """Ten frames at 25 a second, the sixth black."""
-    path = tmp_path / "face.mp4"
-    with video_writer(path, 25) as append:
+def test_a_video_becomes_a_performance(network, tmp_path):
+    """Catches another rate, a missing face taken for a resting one, and an absolute rotation."""
+    video = tmp_path / "face.mp4"  # ten frames at 25 a second, the sixth black
+    with video_writer(video, 25) as append:
         for number in range(10):
             append(np.full((64, 64, 3), 0 if number == 5 else 60 + 10 * number, np.uint8))
-    return path
-
-
-def test_a_video_becomes_a_performance(network, video, tmp_path):
-    """Catches another rate or time, a frame without a face that is taken as a face at rest, names
-    in another order, and a rotation that is not relative to the first frame."""
     assert main(["drive", str(video), "--out", str(tmp_path / "a.csv")]) == 0
     take = read_performance(tmp_path / "a.csv")
     assert take.fps == pytest.approx(25, rel=1e-4)

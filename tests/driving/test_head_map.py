@@ -1,5 +1,4 @@
-"""ARKit's shapes on a head of any mesh, against its own masks, the face networks, and a nonlinear
-solver."""
+"""ARKit's shapes on a head of any mesh, against masks, face networks, and a solver."""
 
 from dataclasses import replace
 
@@ -44,8 +43,7 @@ def demo():
 
 @pytest.fixture(scope="module")
 def rich():
-    """The small head with 48 expressions that reach most shapes, of another identity, and its
-    map."""
+    """The small head with 48 expressions that reach most shapes, and its map."""
     model = with_expressions(small_head(0), 48)
     sequence = sequence_of(model, np.random.default_rng(0).normal(0, 0.5, model.n_identity))
     return sequence, head_map(sequence, "rich")
@@ -84,8 +82,7 @@ def test_points_lie_where_the_masks_are(demo):
 
 @pytest.mark.slow
 def test_points_agree_with_the_detector(shared_data):
-    """Catches a registration that slides along the face: the networks' landmarks on pictures of the
-    same head."""
+    """Catches a registration that slides along the face: the networks' landmarks on pictures."""
     pytest.importorskip("cv2")
     from stga_addon.tracking.correspondence import calibrate
     from stga_addon.tracking.face_networks import FaceNetworks
@@ -100,8 +97,7 @@ def test_points_agree_with_the_detector(shared_data):
 
 
 def test_directions(demo):
-    """Catches a jaw that closes, left for right, eyes that look the other way, and a tongue that
-    does anything."""
+    """Catches a jaw, lips, eyes or tongue that move the other way, or at all."""
     sequence, found = demo
     model, rest = sequence.model, posed(*demo, weights_of())
     row = {number: index for index, number in enumerate(np.flatnonzero(found.used))}
@@ -147,8 +143,7 @@ def test_combinations_against_a_free_fit(rich):
 
 
 def test_there_and_back(rich, tmp_path):
-    """Catches weights lost on the way to a FLAME motion and back to a file: within 0.01 where the
-    head tells them apart."""
+    """Catches weights lost on the way to a FLAME motion and back, beyond 0.01."""
     sequence, found = rich
     weights = random_poses(40, np.random.default_rng(5)) * 0.8
     head = np.random.default_rng(6).normal(0, 0.2, (40, 3))

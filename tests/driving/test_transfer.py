@@ -23,8 +23,7 @@ FRAME = FlameFrame(np.zeros(4), ZERO, ZERO, ZERO, ZERO, np.zeros(6))
 
 
 def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
-    """Quiet for a third of the time, on top of a bias that the person's own face leaves in the
-    coefficients."""
+    """Quiet for a third of the time, on top of what a face leaves in the coefficients."""
     time = np.arange(count)
     moves = np.where(time < count // 3, 0, np.sin(time))[:, None] * [2.0, -1.0, 0.5, 0.0]
     return [
@@ -34,9 +33,7 @@ def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
 
 
 def test_the_performers_own_face_is_left_out():
-    """Catches a neutral taken from the middle of speech, one that keeps the other person's face,
-    and one that is sought by speed, which single expressions recorded one after another do not
-    have."""
+    """Catches a neutral from the middle of speech, or with the other's face in it."""
     bias, own = np.array([1.5, -0.7, 0.3, 2.0]), np.array([0.2, 0.0, -0.1, 0.0])
     frames = talking(bias)
     theirs = quiet_neutral(frames)
@@ -79,8 +76,7 @@ def test_a_resting_face_that_is_not_zero():
 
 
 def test_led_back_to_what_was_trained():
-    """Catches a motion that is changed where it was trained, is led beyond the range, or is cut off
-    without motion."""
+    """Catches a motion changed where it was trained, led beyond the range, or cut off."""
     trained = trained_range(talking(np.zeros(4), 200))
     inside = talking(np.zeros(4))
     for before, after in zip(inside, led_back(inside, trained), strict=True):

@@ -172,8 +172,7 @@ def bones_in_front(shown: Any) -> None:
 
 
 def shadows() -> None:
-    """The shadow maps of a sun and a lamp as the display draws them, and these lights in the
-    avatar's space."""
+    """The shadow maps of a sun and a lamp as drawn, and these lights in the avatar's space."""
     lamps = []
     for kind, place, energy in (("SUN", (0.4, -0.6, 1.0), 2.0), ("POINT", (0.3, 0.2, 0.4), 5.0)):
         data = bpy.data.lights.new(kind, kind)
@@ -227,8 +226,7 @@ def freed(held: list[Any]) -> bool:
 
 
 def pictures_per_redraw() -> int:
-    """How often one redraw of the only viewport draws: more than once where a handler was left
-    behind."""
+    """How often one redraw of the only viewport draws: more often where a handler stayed."""
     count, draw = 0, SplatRenderer.draw
 
     def counted(*arguments: Any) -> None:
@@ -243,8 +241,7 @@ def pictures_per_redraw() -> int:
 
 
 def memory(shown: Any) -> None:
-    """Textures while the display is off, and while its only object is gone; then undo brings that
-    back."""
+    """Textures while the display is off, while its object is gone, and after undo."""
     seen["drawn"] = [pictures_per_redraw()]
     held = textures()
     seen["freed"] = {"while drawn": freed(held)}
@@ -310,8 +307,7 @@ def after_load() -> None:
 
 
 def start_render() -> None:
-    """F12 in AgX, in its own thread, as an artist starts it: the view transform is measured by the
-    main thread."""
+    """F12 in AgX in its own thread, whose view transform the main thread measures."""
     scene = bpy.context.scene
     scene.render.engine, scene.view_settings.view_transform = engine.ENGINE, "AgX"
     scene.render.resolution_x = scene.render.resolution_y = 64

@@ -29,8 +29,7 @@ def drawn() -> dict[str, Layout]:
 
 
 def buttons() -> dict[str, tuple[str, dict[str, Any]]]:
-    """ "Panel: text" of each button to be seen in sidebar, menus and preferences -> its operator
-    and its options."""
+    """ "Panel: text" of each button in sidebar, menus and preferences -> operator and options."""
     menus, operators = {"Import": Layout(), "Export": Layout()}, module("operators")
     operators._import_menu(SimpleNamespace(layout=menus["Import"]), bpy.context)
     operators._export_menu(SimpleNamespace(layout=menus["Export"]), bpy.context)

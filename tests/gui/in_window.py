@@ -48,8 +48,7 @@ def picture(file: Path) -> None:
 
 
 def play(steps: Iterator[Any], result: Path, patience_s: float = 180.0) -> None:
-    """Take steps, each when the condition has come true, or the seconds are over, that the one
-    before has yielded; then write what was `seen`, and quit Blender."""
+    """Take steps, each when what the one before yielded has come true; write `seen`, and quit."""
     until, since = None, time.monotonic()
 
     def step() -> float | None:

@@ -138,8 +138,7 @@ def browser() -> Any:
 
 
 def press(state: str) -> Iterator[Any]:
-    """Press every button that is to be seen: what opens is closed, a worker is cancelled, and the
-    rest is undone."""
+    """Press every button to be seen, and undo, close or cancel what it does."""
     for what, (name, options) in drawn_panels.buttons().items():
         group, function = name.split(".")
         operator, label = getattr(getattr(bpy.ops, group), function), f"{state}, {what}"

@@ -52,8 +52,7 @@ def job_folder() -> Path:
 
 
 def first() -> Iterator[Callable[[], bool]]:
-    """Train, preview, cancel, resume, crash, report, resume, undo, save, reopen, and leave with the
-    worker at work."""
+    """Train, cancel, resume, crash, report, undo, reopen, and leave with the worker at work."""
     bpy.context.preferences.addons[extension].preferences.training_python = PYTHON
     bpy.ops.wm.save_userpref()
     bpy.ops.stga.test_python()
@@ -107,8 +106,7 @@ def first() -> Iterator[Callable[[], bool]]:
 
 
 def second() -> Iterator[Callable[[], bool]]:
-    """Find the worker that went on while Blender was closed; then a short run that ends by
-    itself."""
+    """Find the worker that went on while Blender was closed; then a short run."""
     seen["found"] = lock_owner(job_folder() / "worker.lock")
     yield is_training
     bpy.ops.stga.cancel(request="training")
@@ -126,8 +124,7 @@ def second() -> Iterator[Callable[[], bool]]:
 
 
 def videos() -> Iterator[Callable[[], bool]]:
-    """One video that is cancelled while it is recorded, one while it is rendered, and one that is
-    finished."""
+    """A video cancelled while it is recorded, one while rendered, and a finished one."""
     folder, scene = Path(BLEND).parent, bpy.context.scene
     scene.frame_set(1)
     for name in ("recording", "rendering", "finished"):
@@ -153,8 +150,7 @@ def videos() -> Iterator[Callable[[], bool]]:
 
 
 def looks_at_head() -> bool:
-    """Whether every viewport shows the head, and little else: Blender's own cube is two meters
-    high."""
+    """Whether every viewport shows the head, and little else."""
     head = chosen().head
     corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
     center, size = sum(corners, Vector()) / len(corners), (corners[6] - corners[0]).length

@@ -49,8 +49,7 @@ def has_vulkan() -> bool:
 def shown(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, Any]]:
-    """The folder with the pictures, and what display_script.py saw, by each of Blender's GPU
-    backends."""
+    """The folder with the pictures, and what display_script.py saw, by each GPU backend."""
     backend = request.param
     if backend == "vulkan" and not has_vulkan():
         pytest.skip("Blender does not start with Vulkan here: too old, or no driver")
@@ -76,8 +75,7 @@ def shown(
 
 
 def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarray, Camera]:
-    """(3, H, W) sRGB of the viewport in the screenshot, less its border, and the camera of that
-    part."""
+    """(3, H, W) sRGB of the viewport in the screenshot, less its border, and its camera."""
     with np.load(folder / "views.npz") as views:
         width, height, *lens = views[name].tolist()
         camera = Camera(int(width), int(height), *lens, views[f"{name} pose"])
@@ -111,8 +109,7 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
 
 @pytest.mark.parametrize("name", ["material agx", "engine filmic", "engine filmic points"])
 def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: str) -> None:
-    """Catches splats that AgX or Filmic changes, in a mode that goes through the scene's view
-    transform."""
+    """Catches splats that AgX or Filmic changes, in any mode."""
     folder, result = shown
     found, plain = (on_screen(folder, result, which)[0] for which in (name, "solid"))
     same_view = {which: on_screen(folder, result, which)[1] for which in (name, "solid")}
@@ -123,8 +120,7 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
 
 
 def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches a head that throws no shadow on itself, because surfaces hide what is nearer to a sun
-    or a lamp."""
+    """Catches a head that throws no shadow on itself."""
     folder, result = shown
     atlas, of = np.load(folder / "shadows.npy"), avatar(3)
     assert set(result["lights"]) == {"sun", "point"}
@@ -134,8 +130,7 @@ def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches splats that cover bones which are to be drawn in front, and holes in the splats
-    around such bones."""
+    """Catches splats that cover bones drawn in front, and holes around such bones."""
     folder, result = shown
     names = ("bone and splats", "bone", "hidden", "solid")
     both, bone, nothing, splats = (on_screen(folder, result, name)[0] for name in names)
@@ -151,8 +146,7 @@ def test_bones_in_front(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches splats where they are hidden or clipped, splats that ignore depth, and modes and
-    views without splats."""
+    """Catches splats where they are hidden or clipped, ignored depth, and modes without."""
     folder, result = shown
     assert result["problem"] == ""
     pictures = {name: on_screen(folder, result, name)[0] for name in result["pictures"]}
@@ -177,8 +171,7 @@ def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_errors_and_the_end(shown: tuple[Path, dict[str, Any]]) -> None:
-    """Catches an error in every redraw, a render thread and a main thread that wait for each other,
-    a handler or textures that outlive their use, and splats that undo does not bring back."""
+    """Catches an endless error or wait, what outlives its use, and splats lost to undo."""
     folder, result = shown
     failed, removed, problem = result["failed"]
     assert failed

@@ -20,8 +20,7 @@ MAX_MESSAGE, MAX_WORDS, MIN_POSES_PER_SECOND = 90, 3, 30
 
 
 def test_the_first_hour(tmp_path: Path) -> None:
-    """Catches a panel, button, message, undo, file or picture that misbehaves in the first hour,
-    and what only a window has."""
+    """Catches what misbehaves in the first hour, and what only a window has."""
     unpack_capture(tmp_path / "demo")
     archive, home = complete_zip(BLENDER, tmp_path / "dist", tmp_path / "demo"), tmp_path / "home"
     home.mkdir()

@@ -53,8 +53,7 @@ def play(home: Path, part: str, capture: Path, *file: object) -> dict[str, Any]:
 
 
 def test_training_in_a_window(home: Path) -> None:
-    """Catches what only a window has: timers, their end, undo, reopening, and workers that outlive
-    Blender."""
+    """Catches what only a window has: timers, undo, workers that outlive Blender."""
     capture = Path(os.environ.get("STGA_GUI_CAPTURE") or write_mesh_capture(home / "capture"))
     seen = play(home, "first", capture)
     assert seen["tested"].startswith(f"Python {sys.version.split()[0]}, torch ")

@@ -1,5 +1,4 @@
-"""The folder of the head that Blender has open: what is written is read back, and damage is one
-sentence."""
+"""The folder of the head that Blender has open: what is written is read back."""
 
 from pathlib import Path
 
@@ -39,8 +38,7 @@ def test_a_head_is_read_back(folder: Path) -> None:
 
 
 def test_damaged_folders(folder: Path) -> None:
-    """Catches a traceback for frame rates that are no positive number, names that are no frames,
-    and arrays that are gone."""
+    """Catches a traceback for rates and names that are none, and for arrays that are gone."""
     for fps in (float("inf"), float("nan"), 0, "25", None, 10**400):
         edit(folder / HEAD, lambda values, fps=fps: values.update(fps=fps))
         with pytest.raises(StgaError, match=r"head\.json: .*fps|head\.json: is not"):
@@ -75,8 +73,7 @@ MESH, MOTION = np.zeros((VERTICES, 3)), r"played: (expr|pose) has shape"
     ],
 )
 def test_what_a_head_cannot_have_played(folder, changes, expected):
-    """Catches a traceback for arrays of another head in a request, or a page whose parts are of
-    different frames."""
+    """Catches a traceback for arrays of another head, or parts of different frames."""
     root, model = folder / "capture", None
     if "motion" in changes:
         root, model = write_flame_capture(folder / "flame")

@@ -42,19 +42,14 @@ def test_check_is_described():
         describe_check("p", bare)
 
 
-def test_bare_interpreter_is_checked(tmp_path):
-    """Catches a check that itself needs a package: this interpreter has none."""
+def test_what_cannot_train_is_refused(tmp_path):
+    """Catches a check that needs a package, and a program that is waited for for ever."""
     make = [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")]
     subprocess.run(make, check=True)
     python = next(path for path in (tmp_path / "venv").glob("*/python*") if path.stem == "python")
     sentence = r"lacks numpy, torch, numba, scipy, .*av, opencv-python-headless; install"
     with pytest.raises(StgaError, match=sentence):
         check(python)
-
-
-def test_other_programs_are_refused(tmp_path):
-    """Catches a traceback where the path is missing or that of another program, and a program that
-    is waited for for ever."""
     with pytest.raises(StgaError, match="cannot be started as a Python interpreter"):
         check(tmp_path / "python")
     with pytest.raises(StgaError, match=r"is not a Python that runs this add-on \(exit status 1\)"):
@@ -67,8 +62,7 @@ def test_other_programs_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_this_interpreter_passes():
-    """Catches a check that misses installed packages, or the GPUs that training is given by
-    name."""
+    """Catches a check that misses installed packages, or the GPUs that can be named."""
     pytest.importorskip("torch")
     pytest.importorskip("wgpu")
     from stga_addon.raster.gpu.adapters import adapters
@@ -79,8 +73,7 @@ def test_this_interpreter_passes():
 
 
 def test_order_of_choices(monkeypatch):
-    """Catches a farm's variable or the preferences overruled, and a missing Python without what to
-    do."""
+    """Catches a farm's variable or the preferences overruled, and no word of what to do."""
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     monkeypatch.setattr(training_python, "missing_packages", lambda: ["torch"])
     sentence = rf"lacks torch\. Install the complete edition .* or by {PYTHON_VARIABLE}"
@@ -98,15 +91,11 @@ PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml")
 ]
 
 
-def test_environment_and_project_require_the_same():
-    """Catches a training Python with other versions than an installation by pip."""
+def test_requirements():
+    """Catches other versions than an installation by pip has, and ones that are not bounded."""
     extras = PROJECT["optional-dependencies"]
     assert sorted(REQUIREMENTS.values()) == sorted([*PROJECT["dependencies"], *extras["train"]])
     assert GPU_REQUIREMENT in extras["gpu"]
-
-
-def test_requirements_are_bounded():
-    """Catches a release of a package, with other behavior, that reaches users untested."""
     for requirement in [*REQUIREMENTS.values(), GPU_REQUIREMENT]:
         assert re.fullmatch(r"[a-z-]+>=[\d.]+,<\d+", requirement)
         assert re.fullmatch(r"[a-z-]+", package_name(requirement))

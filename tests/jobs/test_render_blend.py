@@ -1,5 +1,4 @@
-"""Rendering a .blend file's frames with a program in place of Blender;
-`tests/batch/test_blender.py` has a real one."""
+"""Rendering frames with a program in place of Blender (tests/batch/test_blender.py: a real one)."""
 
 import os
 import signal
@@ -85,8 +84,7 @@ def test_a_program_with_spaces_in_its_path(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_what_went_wrong_is_a_sentence(shot, tmp_path, monkeypatch):
-    """Catches a film that counts as finished although frames are missing, and a Blender that is not
-    there."""
+    """Catches a film that counts as finished without all frames, and a missing Blender."""
     monkeypatch.setenv("FAILS", "10")
     sentence = r"shot\.blend: frame 10 was not rendered: .*exit status 1: Error: Out of memory"
     with pytest.raises(StgaError, match=sentence):
@@ -117,8 +115,7 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
     not sys.platform.startswith("linux"), reason="Linux ends a process with the one that started it"
 )
 def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
-    """Catches two Blenders that render the same frames after a worker was killed, and half a
-    picture among the rest."""
+    """Catches two Blenders that render the same frames, and half a picture among the rest."""
     monkeypatch.setenv("PAUSE", "0.5")
     write_request(tmp_path / "job", shot)
     arguments = worker_arguments(tmp_path / "job", resume=True)

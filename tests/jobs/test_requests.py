@@ -1,5 +1,4 @@
-"""Requests: what is written down, what is refused, and that a worker does what the same process
-would."""
+"""Requests: what is written down, what is refused, and what a worker does."""
 
 import math
 import re
@@ -13,17 +12,16 @@ from typing import Any, get_args
 import av
 import numpy as np
 import pytest
-from capture.factory import ball, edit, write_avatar_of, write_mesh_capture
+from capture.factory import edit, write_avatar_of, write_mesh_capture
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.format import describe_figures
 from stga_addon.jobs import perform as jobs
 from stga_addon.jobs.export import Export
-from stga_addon.jobs.perform import perform, perform_in_folder, write_request
+from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
@@ -83,8 +81,7 @@ def asked(request: Train | Resume | Refine) -> Path:
 
 
 def test_every_request_is_tried() -> None:
-    """Catches a request, or a result, that is added without being in the tables here or without
-    work."""
+    """Catches a request or result that is missing in the tables here, or has no work."""
     assert {type(request) for request in REQUESTS} == set(JOBS)
     assert {type(result) for result in RESULTS} == set(get_args(Result))
 
@@ -111,8 +108,7 @@ def test_the_next_request_forgets_the_last(tmp_path: Path, capture: Path) -> Non
 
 
 def test_refusals(tmp_path: Path, capture: Path) -> None:
-    """Catches a run that is overwritten, and one resumed that is not there: both before a worker is
-    started."""
+    """Catches a run overwritten, or resumed where none is, only after a worker was started."""
     run = tmp_path / "run"
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
         jobs.check_request(Resume(run))
@@ -130,34 +126,15 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
         jobs.check_request(Track(Path("f"), Path("m"), capture))
 
 
-def test_the_worker_refuses_another_run(tmp_path: Path, capture: Path) -> None:
-    """Catches a run continued with another principal point: reading the capture is left to the
-    worker."""
-    pytest.importorskip("torch")
-    run = tmp_path / "run"
-    write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
-    folder = asked(Resume(run, principal_point="opencv"))
-    with pytest.raises(StgaError, match="was trained with principal point 'vhap', not 'opencv'"):
-        perform_in_folder(folder)
-    assert inspect_worker(folder).status.error.startswith(
-        f"{run}: was trained with principal point"
-    )
-    assert not (run / "avatar.npz").exists()
-
-
-DAMAGES: dict[str, Any] = {
-    "format": "stga-job", "version": 0, "kind": "Paint", "run": 5, "capture": None, "device":
-        "toaster",
-    "settings": {}, "principal_point": "up", "selection": {"x": {"array": "selection.0"}},
-    "unknown": 1,
-}  # fmt: skip
+DAMAGES: dict[str, Any] = {"format": "stga-job", "version": 0, "kind": "Paint", "run": 5}
+DAMAGES |= {"capture": None, "device": "toaster", "settings": {}, "principal_point": "up"}
+DAMAGES |= {"selection": {"x": {"array": "selection.0"}}, "unknown": 1}
 TEXTS = "[]", "3", '{"format": "stga-request", "version": 1}', "[" * 100_000
 
 
 @pytest.mark.parametrize("name", [*DAMAGES, *TEXTS], ids=lambda name: name[:20])
 def test_damaged_requests(tmp_path: Path, name: str) -> None:
-    """Catches a traceback, or a guess, where a request was damaged, comes from another version, or
-    is JSON of another form."""
+    """Catches a traceback or a guess for a request that is damaged or of another version."""
     write_request(tmp_path, REQUESTS[0])
     if name in DAMAGES:
         edit(tmp_path / jobs.REQUEST, lambda values: values.update({name: DAMAGES[name]}))
@@ -169,27 +146,8 @@ def test_damaged_requests(tmp_path: Path, name: str) -> None:
     assert name in TEXTS or re.search(expected, str(caught.value))
 
 
-def test_figures_in_short_lines() -> None:
-    """Catches a panel that shows what is not known yet, or numbers that nobody can read."""
-    assert describe_figures({}) == []
-    figures = {
-        "iteration": 900, "per_second": 12.34, "left_s": 125.0, "splats": 61234.0, "psnr": 30.0,
-    }  # fmt: skip
-    assert describe_figures(figures) == [
-        "12.3 it/s   2.1 min left",
-        "PSNR 30.00 dB",
-        "61\u202f234 splats",
-    ]
-    tracked = {"left_s": 31.0, "error_px": 1.92, "unexplained": 0.043}
-    assert describe_figures(tracked) == [
-        "31 s left",
-        "1.9 px off landmarks   4% of the face unexplained",
-    ]
-
-
 def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
-    """Catches a time left that is that of an average over slow and fast work, or of work that an
-    interrupted call had done before and that is only read now."""
+    """Catches an average over slow and fast work, and work that was done in an earlier call."""
     now = 0.0
     left = TimeLeft(lambda: now)
     assert math.isnan(left.after(0.0))
@@ -206,39 +164,33 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
 
 @pytest.mark.slow
 def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capture):
-    """Catches a render farm whose pictures or files differ from those that were looked at before:
-    option by option, `stga render` and `stga export` ask for what the requests say."""
+    """Catches a farm whose files differ from those of `stga render` and `stga export`."""
     pytest.importorskip("numba")
     avatar = write_avatar_of(open_capture(capture), tmp_path / "a.npz", is_colored=True)
     cameras = capture / "transforms_val.json"
     given = [str(avatar), "--capture", str(capture)]
-    turned = [
-        "--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1", "--device", "cpu",
-    ]  # fmt: skip
+    turned = ["--turntable", "120", "--seconds", "0.5", "--fps", "8", "--camera", "1"]
+    turned += ["--device", "cpu"]
+    turn = {"turntable": 120.0, "camera": 1, "fps": 8.0, "seconds": 0.5, "device": "cpu"}
+    black = {"cameras": cameras, "background": (0.0, 0.0, 0.0)}
     asked_for: dict[str, tuple[list[str], Any]] = {
         "pictures": (
             ["render", *given, "--cameras", str(cameras), "--background", "black", "--out"],
-            Render(
-                avatar, tmp_path / "pictures", cameras=cameras, capture=capture,
-                background=(0.0, 0.0, 0.0)
-            )
+            Render(avatar, tmp_path / "pictures", capture=capture, **black),
         ),
         "film.mp4": (
             ["render", *given, *turned, "--video"],
-            Render(
-                avatar, tmp_path / "film.mp4", True, None, 120.0, 1, 8.0, 0.5, capture=capture,
-                device="cpu"
-            )
+            Render(avatar, tmp_path / "film.mp4", True, capture=capture, **turn),
         ),
         "plys": (
             ["export", *given, "--format", "ply-sequence", "--frames", "1:3", "--out"],
-            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3))
+            Export(avatar, tmp_path / "plys", "ply-sequence", capture, frames=(1, 3)),
         ),
         "page.stga": (
             ["export", *given, "--format", "web", "--fps", "30", "--out"],
-            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0)
+            Export(avatar, tmp_path / "page.stga", "web", capture, fps=30.0),
         ),
-    }  # fmt: skip
+    }
     for name, (words, request) in asked_for.items():
         folder = tmp_path / f"{name}_job"
         write_request(folder, request)
@@ -268,9 +220,8 @@ def film(path: Path) -> np.ndarray:
 
 def contents(path: Path) -> dict[str, bytes]:
     """Name -> bytes of the files of a folder, or of one file."""
-    return {
-        file.name: file.read_bytes() for file in (path.glob("[!.]*") if path.is_dir() else (path,))
-    }
+    files = path.glob("[!.]*") if path.is_dir() else (path,)
+    return {file.name: file.read_bytes() for file in files}
 
 
 @pytest.mark.slow
@@ -297,8 +248,7 @@ def test_a_cancelled_render_keeps_its_pictures_alone(tmp_path: Path, capture: Pa
 
 @pytest.mark.slow
 def test_a_request_continues_what_it_began(tmp_path, capture):
-    """Catches a cancel that throws work away, a job that fails, or trains anew, when it is started
-    again, and figures that the panel never gets."""
+    """Catches a cancel that throws work away, a job that trains anew, and lost figures."""
     pytest.importorskip("torch")
     request = training(tmp_path / "run", capture, iterations=40)
     folder = asked(request)
@@ -339,8 +289,7 @@ def iteration_of(progress: Progress) -> float:
 
 @pytest.mark.slow
 def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
-    """Catches a preview that never comes, cannot be read, or changes what is trained, and a
-    training that ends because it could not be written."""
+    """Catches a preview that never comes, changes the training, or ends it where disks are full."""
     pytest.importorskip("torch")
     monkeypatch.setattr("stga_addon.worker.status.PREVIEW_INTERVAL_S", 0.0)
     run, quiet, previews = tmp_path / "run", tmp_path / "quiet", []
@@ -368,8 +317,7 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
 
 @pytest.mark.slow
 def test_mistakes_reach_the_folder_and_the_exit_code(tmp_path, capture, capsys):
-    """Catches a worker whose failure only its log shows, and a command that ends well although
-    nothing was trained."""
+    """Catches a failure that only the log shows, and a command that ends well in spite of it."""
     pytest.importorskip("torch")
     assert main(["perform", str(tmp_path / "nothing")]) == 2
     assert "holds no request" in capsys.readouterr().err
@@ -393,43 +341,5 @@ def test_an_interpreter_without_anything_is_named(tmp_path: Path, capture: Path)
     process = start_worker(folder, str(python), jobs.worker_arguments(folder))
     assert process.wait(60) == 2
     seen = inspect_worker(folder, process)
-    assert (
-        seen.status.error
-        == f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
-    )
-
-
-def test_removed_request_leaves_other_files(tmp_path: Path, capture: Path) -> None:
-    """Catches *Dismiss* removing a person's files along a path that a .blend file names."""
-    folder = jobs.request_folder(tmp_path / "run")
-    folder.mkdir(parents=True)
-    for name in (STATUS_FILE, LOG_FILE, "notes.txt"):
-        (folder / name).write_text("mine")
-    jobs.remove_request(folder)
-    assert len(list(folder.iterdir())) == 3  # no request
-    asked(training(tmp_path / "run", capture))
-    for name in jobs.FILES:
-        (folder / name).touch()
-    jobs.remove_request(folder)
-    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
-
-
-@pytest.mark.slow
-def test_a_worker_refines_and_resumes(tmp_path: Path, capture: Path) -> None:
-    """Catches a worker that trains anew, or ignores the painted region, where a run is to be
-    continued."""
-    pytest.importorskip("torch")
-    perform(training(tmp_path / "run", capture))
-    weights = np.zeros(len(ball()[1]), np.float32)
-    weights[:40] = 1.0
-    refined = tmp_path / "run_2"
-    perform_in_folder(
-        asked(Refine(refined, tmp_path / "run", weights=weights, iterations=4, device="cpu"))
-    )
-    before, after = (
-        read_avatar(folder / "avatar.npz").splats for folder in (tmp_path / "run", refined)
-    )
-    unchanged = (before.sh == after.sh).all((1, 2))
-    assert unchanged[before.face >= 40].all()
-    assert not unchanged[before.face < 40].all()
-    perform_in_folder(asked(Resume(refined, capture, principal_point="opencv", device="cpu")))
+    says = f"Worker exited with status 2: stga: {python} lacks the package 'numpy'"
+    assert seen.status.error == says

@@ -14,8 +14,7 @@ RADIUS = 0.1
 
 
 def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) meters and triangles (F, 3) of a ball of 10 cm, and a plate 6 cm above a part
-    of it."""
+    """Vertices and triangles of a ball of 10 cm, and a plate 6 cm above a part of it."""
     ball = trimesh.creation.icosphere(subdivisions, RADIUS)
     place = trimesh.transformations.translation_matrix((0.05, 0.16, 0.0))
     plate = trimesh.creation.box((0.12, 0.01, 0.12), place)
@@ -24,8 +23,7 @@ def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def blocked(points, direction, vertices, faces):
-    """(N,) bool: whether a ray from each point in a direction meets a triangle (Möller and
-    Trumbore), float64."""
+    """(N,) bool: whether rays from points meet a triangle (Möller and Trumbore), float64."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     first, second = b - a, c - a
     across = np.cross(direction, second)

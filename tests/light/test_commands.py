@@ -50,9 +50,9 @@ def rendered(run: Path, root: Path, out: Path, *options: str) -> np.ndarray:
         return np.asarray(image).astype(int)
 
 
-def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches a training that leaves the avatar without light, and an avatar file that loses it or
-    grows by much."""
+def test_a_run_ends_with_its_light(run, capsys, root, tmp_path):
+    """Catches a training whose avatar has no light, or has it against one's will, and a file
+    that grows by much."""
     avatar = read_avatar(run / "avatar.npz")
     assert avatar.light is not None
     assert avatar.light.transfer.shape == (len(avatar.neutral), 9)
@@ -64,10 +64,6 @@ def test_a_run_ends_with_its_light(run: Path, capsys: pytest.CaptureFixture[str]
     assert "recorded colors differ" in capsys.readouterr().out
     assert main(["info", str(without)]) == 0
     assert "stga relight" in capsys.readouterr().out
-
-
-def test_a_training_that_is_to_leave_light_as_it_is(root, tmp_path, capsys):
-    """Catches an effect that cannot be switched off, and a plan that does not name it."""
     assert main(["info", str(root), "--effect", "relight=off"]) == 0
     assert "lights of a scene" in capsys.readouterr().out
     arguments = ["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2"]
@@ -78,8 +74,7 @@ def test_a_training_that_is_to_leave_light_as_it_is(root, tmp_path, capsys):
 def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
     run, tmp_path, monkeypatch, capsys
 ):
-    """Catches a card that is ignored: twice the light is half the albedo; and a light that is
-    written into an older avatar than the one which a training saved meanwhile."""
+    """Catches a card that is ignored, and a light in an older avatar than a training's."""
     copy = tmp_path / "run"
     shutil.copytree(run, copy)
     before = (copy / "avatar.npz").read_bytes()
@@ -107,9 +102,7 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
 
 
 def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
-    """Catches a light that is estimated from images without the exposure correction that the
-    avatar's colors have: a camera of another gain, offset and white balance changes nothing,
-    against images without any."""
+    """Catches a light estimated without the exposure correction of the avatar's colors."""
     gain, offset = np.array([0.7, 0.8, 0.6]), np.array([12.0, 5.0, 8.0])
     shutil.copytree(root, tmp_path / "capture")
     for path in (tmp_path / "capture/images").glob("*_02.png"):
@@ -129,9 +122,9 @@ def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(light.irradiance, avatar.light.irradiance, rtol=0.05)
 
 
-def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
-    """Catches lights that do not reach the picture, come from the other side, and pixels that
-    change without any."""
+def test_render_under_lights(run, root, tmp_path, capsys):
+    """Catches lights that do not reach the picture or turn sides, pixels changed without any,
+    and a traceback or silence for what has no effect."""
     lights = tmp_path / "lights.toml"
     lights.write_text(LIGHTS)
     plain = rendered(run, root, tmp_path / "plain")
@@ -145,17 +138,9 @@ def test_render_under_lights(run: Path, root: Path, tmp_path: Path) -> None:
     left = rendered(run, root, tmp_path / "left", "--light", str(lights))
     brighter = (right - left)[20:40].sum((0, 2))  # rows of the ball
     assert brighter[: len(brighter) // 2 - 5].sum() < 0 < brighter[len(brighter) // 2 + 5 :].sum()
-
-
-def test_render_refuses(run, root, tmp_path, capsys):
-    """Catches a traceback for an avatar without light, and options without effect."""
-    plain = tmp_path / "plain.npz"
-    write_avatar(plain, replace(read_avatar(run / "avatar.npz"), light=None))
-    lights = tmp_path / "lights.toml"
-    lights.write_text(LIGHTS)
     cameras = ["--cameras", str(root / "transforms_val.json"), "--out", str(tmp_path / "p")]
     for source, option, value, message in (
-        ([plain, "--capture", root], "--light", lights, "stga relight RUN"),
+        ([stripped / "avatar.npz", "--capture", root], "--light", lights, "stga relight RUN"),
         ([run], "--light-turn", 90, "--light-turn: has no effect"),
         ([run], "--light", tmp_path / "none.hdr", "none.hdr"),
     ):

@@ -64,8 +64,7 @@ def test_hdr_pixels(tmp_path, packed):
 
 
 def test_an_environment_keeps_its_irradiance():
-    """Catches suns that are counted twice, solid angles of poles, and directions other than
-    Blender's."""
+    """Catches suns counted twice, solid angles of poles, and directions other than Blender's."""
     image = np.full((64, 128, 3), 0.2)
     vectors, angle = pixel_directions(64, 128)
     assert (angle * 128).sum() == pytest.approx(4 * np.pi)

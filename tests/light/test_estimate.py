@@ -1,5 +1,4 @@
-"""The estimate of a capture's light, from colors made with a known one; transfer and occlusion,
-against cast rays."""
+"""A capture's light from colors made with a known one; occlusion against cast rays."""
 
 from pathlib import Path
 
@@ -31,8 +30,7 @@ def received() -> np.ndarray:
 
 
 def recorded(received, light, turns=None):
-    """Colors (T, F, 3) of skin with spots of other colors and highlights on some triangles, and
-    transfer (T, F, 9)."""
+    """Colors (T, F, 3) of spotted skin with highlights, and transfer (T, F, 9)."""
     rng = np.random.default_rng(1)
     albedo = SKIN * rng.uniform(0.9, 1.1, (len(received), 1))
     albedo[rng.random(len(received)) < 0.15] *= 0.2
@@ -45,8 +43,7 @@ def recorded(received, light, turns=None):
 
 
 def test_a_soft_light_is_found_despite_spots_and_highlights(received):
-    """Catches light that is drawn to hair, brows and highlights, and one that turns with the head;
-    and an estimate in place of the environment that was given."""
+    """Catches light drawn to brows and highlights, that turns along, or a lamp taken for soft."""
     turn = Rotation.from_euler("y", 25, degrees=True).as_matrix()
     light = soft_light()
     found, residual = fit_light(*recorded(received, light, [np.eye(3), turn, turn.T]))
@@ -57,10 +54,6 @@ def test_a_soft_light_is_found_despite_spots_and_highlights(received):
     assert residual < HARD_RESIDUAL / 2
     known, _ = fit_light(*recorded(received, light), light)
     np.testing.assert_array_equal(known, light)
-
-
-def test_a_hard_light_is_told(received):
-    """Catches a lamp that is taken for soft light: degree 2 cannot hold its shadow's edge."""
     vertices, faces = ball_and_plate(3)
     normals = vertex_normals(vertices, faces)[faces].mean(1)
     toward = np.array([0.9, 0.1, 0.3]) / np.linalg.norm([0.9, 0.1, 0.3])
@@ -108,7 +101,7 @@ def test_harmonics_turn_with_their_axes():
 
 
 def test_transfer_and_occlusion_are_those_of_cast_rays():
-    """Catches depth maps that are mirrored, too coarse, or that let the surface shade itself."""
+    """Catches depth maps that are mirrored, coarse or shade themselves, and another solid angle."""
     vertices, faces = ball_and_plate(2)
     transfer, occlusion = transfer_of(vertices, faces, directions=48)
     normals, sky = vertex_normals(vertices, faces), even_directions(48)
@@ -120,10 +113,6 @@ def test_transfer_and_occlusion_are_those_of_cast_rays():
     assert apart.max() < 0.12 and apart.mean() < 0.008  # noqa: PT018
     assert np.abs(transfer - expected).mean() < 0.01
     assert occlusion[:162].min() < 0.7, "the plate hides no sky"
-
-
-def test_an_open_surface_receives_the_closed_form():
-    """Catches harmonics of another order or sign, and a wrong solid angle."""
     vertices, faces = ball_and_plate(3)
     transfer, occlusion = transfer_of(vertices, faces)
     normals = vertex_normals(vertices, faces)

@@ -55,8 +55,7 @@ def avatar_with(offset: tuple[float, float, float], color: float = 0.05) -> Avat
 
 
 def test_a_lash_shades_the_eye_as_cast_rays_say():
-    """Catches lashes that throw no shadow, one at another place or of another size, and one that
-    does not follow."""
+    """Catches lashes without a shadow, at another place or size, or that do not follow."""
     relighter = Relighter(avatar_with((0, 0.003, 0.006)))
     assert len(relighter.lashes.face) == 1
     corners = np.array([[0.008, 0, 0], [0, 0, -0.004], [-0.008, 0, 0], [0, 0, 0.004]])
@@ -113,8 +112,7 @@ def test_only_what_is_dark_and_stands_off_near_an_eye_is_a_lash():
 
 
 def test_splats_are_at_the_nearest_point_of_the_mesh():
-    """Catches splats that stay in a triangle that they have left, walk away from themselves, or are
-    lit on the wrong corner's side; and a walk that leaves the mesh at its border."""
+    """Catches splats that stay in a triangle they have left, or walk away or off the border."""
     avatar = lit_avatar()
     rng = np.random.default_rng(0)
     ball = avatar.faces[np.linalg.norm(avatar.neutral[avatar.faces].mean(1), axis=1) < 0.101]

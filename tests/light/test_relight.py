@@ -1,5 +1,4 @@
-"""Relit colors of an avatar whose truth is known, a ball of one albedo under a plate; and what a
-scene's light keeps of recorded colors."""
+"""Relit colors of an avatar whose truth is known, a ball of one albedo under a plate."""
 
 from dataclasses import replace
 
@@ -33,22 +32,9 @@ def turned(mesh: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_albedo_is_what_was_recorded_without_its_light(relighter):
-    """Catches a wrong factor of π, and highlights that stay in the albedo."""
+    """Catches highlights in the albedo, and units other than Blender's: albedo E / π."""
     lit = relighter.light.occlusion[relighter.corners].min(1) > 0.3
     np.testing.assert_allclose(relighter.albedo[lit], np.tile(ALBEDO, (lit.sum(), 1)), rtol=0.02)
-
-
-def normals_of(relighter):
-    """(N, 3) the neutral mesh's smooth normals at the splats."""
-    mesh, faces = relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces
-    normals = vertex_normals(mesh, faces)[relighter.corners]
-    normals = np.einsum("nk,nkc->nc", relighter.weights, normals)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-
-def test_a_sun_gives_lamberts_cosine(relighter):
-    """Catches irradiance in other units than Blender's: albedo times strength times cosine over
-    π."""
     sun = Light("sun", np.array([2.0, 2.0, 2.0]), direction=(0, 1, 0))
     lit = relighter.radiance(relighter.avatar.neutral, EYE, Lighting(lights=(sun,), specular=0))
     normals = normals_of(relighter)
@@ -57,6 +43,14 @@ def test_a_sun_gives_lamberts_cosine(relighter):
     assert down.sum() > 100
     expected = np.array(ALBEDO) * 2 * -normals[down, 1:2] / np.pi
     np.testing.assert_allclose(lit[down], expected, rtol=0.03, atol=0.004)
+
+
+def normals_of(relighter):
+    """(N, 3) the neutral mesh's smooth normals at the splats."""
+    mesh, faces = relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces
+    normals = vertex_normals(mesh, faces)[relighter.corners]
+    normals = np.einsum("nk,nkc->nc", relighter.weights, normals)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
 def test_light_that_turns_with_the_head_changes_nothing(relighter):
@@ -99,8 +93,7 @@ def test_recorded_and_mix(relighter):
 
 
 def test_only_recorded_colors_follow_the_normals(relighter):
-    """Catches light of the capture that stays in relit colors, or that recorded ones lose; and
-    colors by strain that either loses."""
+    """Catches the capture's light left in relit colors or lost in recorded ones."""
     mesh, count = relighter.avatar.neutral * [1.1, 0.8, 1.0], len(relighter.avatar.faces)
     rng, names = np.random.default_rng(5), ("strain_color", "normal_color")
     values = {n: rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32) for n in names}
@@ -123,8 +116,7 @@ def test_only_recorded_colors_follow_the_normals(relighter):
 
 
 def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypatch):
-    """Catches light that is taken away otherwise than it is given: bounce, occlusion, exposure,
-    white; also where nothing of the recorded colors is kept."""
+    """Catches light taken away otherwise than given: bounce, occlusion, exposure, white."""
     monkeypatch.setattr(relight, "UNLIKE_LIGHT", 1e-12)
     own = Lighting(relighter.light.radiance)
     mesh = relighter.avatar.neutral
@@ -138,8 +130,7 @@ def test_the_captures_own_light_gives_back_what_was_recorded(relighter, monkeypa
 
 
 def test_recorded_color_is_a_mean_over_the_directions_that_see_a_splat():
-    """Catches highlights that were baked into harmonics and count as albedo, a factor of a degree,
-    or a direction, that is not that of the mean: against sampled directions."""
+    """Catches highlights in harmonics that count as albedo: against sampled directions."""
     avatar = lit_avatar(ALBEDO, degree=3)
     sh = np.random.default_rng(0).normal(0, 0.1, avatar.splats.sh.shape).astype(np.float32)
     relighter = Relighter(replace(avatar, splats=replace(avatar.splats, sh=sh)))
@@ -169,15 +160,9 @@ def relighter_of(light: np.ndarray) -> Relighter:
     return Relighter(replace(avatar, light=replace(avatar.light, irradiance=arriving)))
 
 
-def test_the_captures_light_is_found_in_the_heads_axes():
-    """Catches light between skin and skin that is taken for the studio's, and channels that are
-    exchanged."""
-    np.testing.assert_allclose(relighter_of(studio()).recorded_light, studio(), atol=0.01)
-
-
-def test_the_captures_own_light_keeps_all_that_was_recorded():
-    """Catches highlights of the studio that are lost under it, a tint or level that is not that of
-    the light, and a head that turns away from its studio or takes the studio along."""
+def test_what_is_kept_of_recorded_colors():
+    """Catches highlights, tint or studio that are lost or turn along under their own light, and
+    recorded shades that stay or jump under another one."""
     relighter = relighter_of(studio())
     mesh = relighter.avatar.neutral.astype(np.float64)
     recorded = relighter.radiance(mesh, EYE, Lighting(mode="recorded"))
@@ -189,18 +174,7 @@ def test_the_captures_own_light_keeps_all_that_was_recorded():
     np.testing.assert_allclose(relighter.radiance(aside, EYE, along), there, rtol=0.03)
     assert share_kept(relighter, studio()) > 0.99
     assert relighter.distant_in_head(aside, Lighting(studio()))[1].share < 0.1
-
-
-def share_kept(relighter: Relighter, world: np.ndarray, *lights: Light, **options: float) -> float:
-    lighting = Lighting(world, lights, **options)
-    return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].share
-
-
-def test_another_light_and_other_highlights_keep_nothing():
-    """Catches recorded shades that shine through under a light from elsewhere, a share that jumps
-    while the light moves away, and highlights of the capture that stay although others, or none,
-    are asked for."""
-    relighter = relighter_of(studio())
+    np.testing.assert_allclose(relighter.recorded_light, studio(), atol=0.01)
     lamps = [Light("sun", np.full(3, x), direction=(1, 0.2, 0)) for x in np.linspace(0, 3, 61)]
     shares = [share_kept(relighter, studio(), lamp) for lamp in lamps]
     steps = -np.diff(shares)
@@ -210,6 +184,11 @@ def test_another_light_and_other_highlights_keep_nothing():
     assert steps.max() < 0.1
     assert share_kept(relighter, studio(), specular=0.0) == 0
     assert share_kept(relighter, studio(), roughness=0.9) == 0
+
+
+def share_kept(relighter: Relighter, world: np.ndarray, *lights: Light, **options: float) -> float:
+    lighting = Lighting(world, lights, **options)
+    return relighter.distant_in_head(relighter.avatar.neutral, lighting)[1].share
 
 
 def test_shadows_of_other_objects_stay():

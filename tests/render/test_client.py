@@ -50,29 +50,13 @@ def embedded() -> PosedSplats:
 
 
 def test_one_layer_gives_the_pixels_of_render():
-    """Catches differences between `compose` and `render`."""
+    """Catches differences between `compose` and `render`, and colors in the scene's directions."""
     splats = cloud()
     picture = compose([world(splats)], CAMERA)
     expected = render(splats, CAMERA, (1.0, 0.5, 0.0))
     behind = (1 - picture.alpha) * np.array([1.0, 0.5, 0.0])[:, None, None]
     np.testing.assert_allclose(np.clip(picture.rgb + behind, 0, 1), expected, atol=2e-6)
     assert picture.depth is None
-
-
-def test_layers_are_sorted_together():
-    """Catches layers that are composited one over the other: two halves of a cloud must make the
-    whole cloud."""
-    splats = cloud()
-    half = np.arange(len(splats)) % 2 == 0
-    whole, halves = (compose(layers, CAMERA, True) for layers in (
-        [world(splats)], [world(splats.rows(half)), world(splats.rows(~half))]
-    ))  # fmt: skip
-    np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
-    np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
-
-
-def test_moving_scene_and_camera_together_changes_nothing():
-    """Catches colors that follow the scene's directions instead of the layer's own."""
     turn = np.eye(4)
     turn[:3, :3] = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn[:3, :3] *= np.sign(np.linalg.det(turn[:3, :3]))
@@ -85,8 +69,15 @@ def test_moving_scene_and_camera_together_changes_nothing():
         np.testing.assert_allclose(picture.rgb, compose([world(splats)], CAMERA).rgb, atol=1e-4)
 
 
-def test_depth_is_the_mean_of_what_a_pixel_shows():
-    """Catches depth that is not divided by alpha."""
+def test_layers_are_sorted_together():
+    """Catches layers composited one over the other, and depth that is not divided by alpha."""
+    splats = cloud()
+    half = np.arange(len(splats)) % 2 == 0
+    whole, halves = (compose(layers, CAMERA, True) for layers in (
+        [world(splats)], [world(splats.rows(half)), world(splats.rows(~half))]
+    ))  # fmt: skip
+    np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
+    np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
     xyz, log_scale = np.array([[0, 0, 3]], np.float32), np.full((1, 3), -1, np.float32)
     splats = replace(cloud(1), xyz=xyz, log_scale=log_scale)
     depth = compose([world(splats)], CAMERA, True).depth
@@ -118,14 +109,8 @@ def test_the_server_renders_the_same(monkeypatch):
     assert subprocess.Popen.poll(server) is not None
 
 
-def test_what_is_no_message_is_refused():
-    """Catches a length read from foreign output, for which the client would wait forever."""
-    with pytest.raises(ValueError, match="begins with"):
-        receive(io.BytesIO(b"Loading something, please wait"))
-
-
-def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
-    """Catches a traceback where Blender's Python has no numba and there is no training Python."""
+def test_what_cannot_render_is_one_sentence(monkeypatch):
+    """Catches a traceback without numba, and a wait for ever for foreign output."""
 
     def nobody() -> str:
         raise StgaError("no training Python")
@@ -136,3 +121,5 @@ def test_no_interpreter_that_can_render_is_one_sentence(monkeypatch):
         RenderClient(nobody).compose([], CAMERA)
     with pytest.raises(StgaError, match="/no/such/python: cannot be started"):
         RenderClient(lambda: "/no/such/python").compose([], CAMERA)
+    with pytest.raises(ValueError, match="begins with"):
+        receive(io.BytesIO(b"Loading something, please wait"))

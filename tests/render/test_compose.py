@@ -1,5 +1,4 @@
-"""Layers rendered by the device that is there: on software Vulkan against the CPU, and what happens
-where it fails."""
+"""Layers rendered by the device that is there, and what happens where it fails."""
 
 import logging
 import subprocess
@@ -29,8 +28,7 @@ def adapter() -> str:
 
 
 def scene() -> list[PosedSplats]:
-    """Layers of different degrees and with and without triangles' color, antialiasing, and a place
-    of their own."""
+    """Layers of different degrees, places, colors and antialiasing."""
     place = np.diag([1.2, 1.2, 1.2, 1.0])
     place[:3, :3] = place[:3, :3] @ [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
     gray = cloud(70, 4)
@@ -52,11 +50,8 @@ def assert_same_picture(got: ComposedImage, want: ComposedImage) -> None:
     "layers", [scene(), [], [world(cloud(1).rows(np.zeros(1, bool)))]], ids=["three", "no", "empty"]
 )
 @pytest.mark.needs("adapter")
-def test_a_gpu_composes_the_same_picture(
-    adapter: str, layers: list[PosedSplats], with_depth: bool
-) -> None:
-    """Catches a layer drawn with another's frames, camera, degree or rows, and a depth that is a
-    color."""
+def test_a_gpu_composes_the_same_picture(adapter, layers, with_depth):
+    """Catches a layer with another's frames, camera, degree or rows, and a wrong depth."""
     want = compose(layers, CAMERA, with_depth)
     if want.alpha.max() > 0:
         assert_same_picture(gpu.compose(adapter, layers, CAMERA, with_depth), want)
@@ -67,25 +62,24 @@ def test_a_gpu_composes_the_same_picture(
 
 @pytest.mark.needs("adapter")
 def test_more_pairs_than_there_is_room_for(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an empty picture where the pairs did not fit."""
+    """Catches an empty picture where pairs did not fit, and a lost device that is kept."""
     monkeypatch.setattr("stga_addon.raster.gpu.rasterize.INITIAL_PAIR_CAPACITY", 10)
     gpu._rasterizer.cache_clear()
     assert_same_picture(gpu.compose(adapter, scene(), CAMERA, True), compose(scene(), CAMERA, True))
+    monkeypatch.setattr("stga_addon.raster.gpu.rasterize.Rasterizer.draw", lost)
+    with pytest.raises(DeviceError):
+        gpu.compose(adapter, scene(), CAMERA)
+    assert not gpu._rasterizer.cache_info().currsize, "the lost device is kept"
 
 
 def lost(*_: object) -> ComposedImage:
     raise DeviceError("Card 9000 was lost", "try again")
 
 
-@pytest.fixture
-def card(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cpu_takes_over_where_a_gpu_fails(monkeypatch, caplog):
+    """Catches a failed driver that ends an animation, or a CPU in place of a GPU asked for."""
     chosen = "gpu:Card 9000", "why"
     monkeypatch.setattr(compose_module, "choose_device", lambda wanted, task: chosen)
-
-
-def test_the_cpu_takes_over_where_a_gpu_fails(card, monkeypatch, caplog):
-    """Catches a failed driver that ends an animation, is asked again for each image, or is not
-    mentioned."""
     calls = []
     monkeypatch.setattr(gpu, "compose", lambda *given: calls.append(given) or lost())
     composer = Composer()
@@ -100,29 +94,14 @@ def test_the_cpu_takes_over_where_a_gpu_fails(card, monkeypatch, caplog):
     other = Composer()
     other.compose(scene(), CAMERA)
     assert other.failure == "gpu:Card 9000: division by zero; the CPU renders instead"
-
-
-def test_a_gpu_by_name_does_not_fall_back(card, monkeypatch):
-    """Catches a CPU that renders where a GPU was asked for, unnoticed."""
     monkeypatch.setattr(gpu, "compose", lost)
     with pytest.raises(StgaError, match=r"^--device gpu: Card 9000 was lost; try again$"):
         Composer("gpu").compose(scene(), CAMERA)
 
 
 @pytest.mark.needs("adapter")
-def test_a_lost_device_is_opened_again(adapter: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches images that all fail after the first one for which the driver was reset."""
-    with monkeypatch.context() as broken:
-        broken.setattr("stga_addon.raster.gpu.rasterize.Rasterizer.draw", lost)
-        with pytest.raises(DeviceError):
-            gpu.compose(adapter, scene(), CAMERA)
-    assert not gpu._rasterizer.cache_info().currsize
-
-
-@pytest.mark.needs("adapter")
 def test_software_renders_by_name_only(adapter: str) -> None:
-    """Catches a machine without a GPU whose pictures come from software Vulkan: they must be the
-    CPU's, bit for bit."""
+    """Catches pictures by software Vulkan instead of the CPU, bit for bit."""
     if not gpu_device.device().is_software:
         pytest.skip("the first adapter is a GPU")
     composer = Composer()

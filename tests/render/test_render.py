@@ -31,8 +31,7 @@ def one_splat(color: tuple[float, float, float]) -> Splats:
 
 
 def test_the_example_renders_a_ply_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an example that no longer runs, and a picture that does not show the splats where
-    they are."""
+    """Catches an example that no longer runs, and splats at another place."""
     monkeypatch.chdir(tmp_path)
     write_ply(Path("splats.ply"), one_splat((0.8, 0.4, 0.1)))
     example = doctest.DocTestParser().get_doctest(
@@ -47,11 +46,8 @@ def test_the_example_renders_a_ply_file(tmp_path: Path, monkeypatch: pytest.Monk
     np.testing.assert_array_equal(pixels[0, 0], [255, 255, 255])
 
 
-def test_look_at_gives_the_pose_worked_out_by_hand() -> None:
-    """Catches mirrored or exchanged axes, and a translation in world instead of camera axes.
-
-    From (3, 2, 0) towards (1, 2, 0) with +y up: forward is -x, right is -z, down is -y.
-    """
+def test_look_at_gives_the_pose_worked_out_by_hand():
+    """Catches mirrored axes: from (3, 2, 0) to (1, 2, 0), +y up, right is -z; and wrong colors."""
     camera = look_at((3, 2, 0), (1, 2, 0), width=40, height=30, focal_length=50)
     pose = [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-15)
@@ -61,20 +57,11 @@ def test_look_at_gives_the_pose_worked_out_by_hand() -> None:
     )  # fmt: skip
     with pytest.raises(ValueError, match="parallel to up"):
         look_at((0, 1, 0), (0, 0, 0), 40, 30, 50)
-
-
-def test_up_is_up_and_right_is_right() -> None:
-    """Catches an image upside down or mirrored: a splat up and to the right of the target is in
-    that quarter."""
     splats = one_splat((0, 0, 0))
     splats.xyz[0] = [0.1, 0.08, 0]  # seen from +z, +x is to the right
     image = render(splats, look_at((0, 0, 1), (0, 0, 0), 64, 48, 100))
     row, column = np.unravel_index(np.argmin(image.sum(0)), (48, 64))
     assert (row, column) == (pytest.approx(24 - 8, abs=1), pytest.approx(32 + 10, abs=1))
-
-
-def test_background_and_values_are_clipped_display_values() -> None:
-    """Catches a default background that is not white, and colors above one that leave 0…1."""
     image = render(one_splat((3.0, 0.5, 0.5)), look_at((0, 0, 1), (0, 0, 0), 64, 48, 400))
     np.testing.assert_array_equal(image[:, 0, 0], 1)
     assert image.shape == (3, 48, 64)

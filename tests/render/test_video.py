@@ -1,6 +1,7 @@
 """Videos and image sequences, decoded again by FFmpeg and Pillow."""
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -8,8 +9,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.avatar.splats import Splats
+from stga_addon.capture.camera import look_at
 from stga_addon.errors import StgaError
-from stga_addon.render.video import check_output, sequence_writer, video_writer
+from stga_addon.jobs.blender import RenderRecording
+from stga_addon.jobs.perform import perform_in_folder, write_request
+from stga_addon.raster.cpu.compose import compose
+from stga_addon.raster.posed_splats import ComposedImage, PosedSplats
+from stga_addon.render.client import pack_layers, unpack_layers
+from stga_addon.render.video import Recorder, check_output, finished, sequence_writer, video_writer
+from stga_addon.worker.status import inspect_worker, request_cancel
+
+from .test_client import embedded
 
 FPS = 12.5
 
@@ -25,8 +37,7 @@ def images(height: int = 61, width: int = 80, count: int = 10) -> list[np.ndarra
 
 
 def test_a_video_is_what_was_written(tmp_path: Path) -> None:
-    """Catches lost or doubled frames, a wrong rate, and colors converted by one matrix and tagged
-    as another."""
+    """Catches lost or doubled frames, a wrong rate, and colors tagged as of another matrix."""
     path, written = tmp_path / "a" / "video.mp4", images()
     with video_writer(path, FPS) as write:
         for image in written:
@@ -63,21 +74,21 @@ def test_frame_rates_no_video_has(tmp_path: Path, fps: float) -> None:
         pass
 
 
-def test_image_sequence(tmp_path: Path) -> None:
-    """Catches images out of order, and transparency that is lost."""
+def test_image_sequence(tmp_path):
+    """Catches images out of order, transparency that is lost, and an earlier sequence lost to a
+    rendering that failed at its first image."""
     written = [np.dstack([image, image[..., 0]]) for image in images(count=3)]
     with sequence_writer(tmp_path / "images") as write:
         for image in written:
             write(image)
-    assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == [
-        "0001.png",
-        "0002.png",
-        "0003.png",
-    ]
-    for index, image in enumerate(written):
-        np.testing.assert_array_equal(
-            np.asarray(Image.open(tmp_path / f"images/{index + 1:04d}.png")), image
-        )
+    names = ["0001.png", "0002.png", "0003.png"]
+    assert sorted(path.name for path in (tmp_path / "images").glob("*.*g")) == names
+    for name, image in zip(names, written, strict=True):
+        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "images" / name)), image)
+    before = contents(tmp_path / "images")
+    with suppress(KeyboardInterrupt), sequence_writer(tmp_path / "images"):
+        raise KeyboardInterrupt
+    assert contents(tmp_path / "images") == before
 
 
 def write_sequence(folder: Path, count: int) -> None:
@@ -92,37 +103,24 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("cut_short", [False, True])
 def test_a_sequence_replaces_an_earlier_one(tmp_path: Path, cut_short: bool) -> None:
-    """Catches images of an earlier, longer sequence that play after the new ones, and other files
-    that are removed."""
-    write_sequence(tmp_path, 4)
+    """Catches images of a longer, killed sequence that stay, and others' that do not."""
+    write = sequence_writer(tmp_path).__enter__()  # of a process that was killed
+    for image in images(count=4):
+        write(image)
     for name in ("12.png", "texture_0001.png"):
         (tmp_path / name).write_bytes(b"of others")
     with suppress(KeyboardInterrupt), sequence_writer(tmp_path) as write:
         write(images()[0])
         if cut_short:
             raise KeyboardInterrupt
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == [
-        "0001.png",
-        "12.png",
-        "texture_0001.png",
-    ]
+    left = ["0001.png", "12.png", "texture_0001.png"]
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == left
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "0001.png")), images()[0])
-
-
-def test_a_sequence_without_images_removes_none(tmp_path: Path) -> None:
-    """Catches an earlier sequence lost to a rendering that failed at its first image."""
-    write_sequence(tmp_path, 2)
-    before = contents(tmp_path)
-    with suppress(KeyboardInterrupt), sequence_writer(tmp_path):
-        raise KeyboardInterrupt
-    assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("name", ["0001.png", "0002.png", "0044.png", "0044.PNG"])
 def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
-    """Catches footage, retouched images or a camera's capitals, in the folder of an earlier
-    sequence of ours, that a sequence replaces or removes, and a refusal after something was
-    written, recorded or drawn."""
+    """Catches footage or retouched images lost, and a refusal that comes too late."""
     write_sequence(tmp_path, 2)
     (tmp_path / name).write_bytes(b"of others")
     before = contents(tmp_path)
@@ -133,12 +131,103 @@ def test_images_of_others_are_kept(tmp_path: Path, name: str) -> None:
     assert contents(tmp_path) == before
 
 
-def test_a_killed_sequence_can_be_rendered_again(tmp_path: Path) -> None:
-    """Catches images of a process that was killed, or whose disk was full, taken for those of
-    somebody else."""
-    writer = sequence_writer(tmp_path)
-    write = writer.__enter__()
-    for image in images(count=3):
-        write(image)
-    write_sequence(tmp_path, 2)
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["0001.png", "0002.png"]
+IMAGES = "recording.bin"
+CAMERA = look_at((0, 0, 2), (0, 0, 0), 32, 24, 40.0)
+
+
+def record(
+    folder: Path, output: Path, images: list[list[PosedSplats]], count: int | None = None
+) -> None:
+    """Record images and ask for them; count: how many, if others than there are."""
+    folder.mkdir()
+    recorder = Recorder(folder / IMAGES)
+    for layers in images:
+        recorder.add(layers, CAMERA)
+    recorder.close()
+    background = (1.0, 0.5, 0.0) if len(images) > 1 else None
+    count = count or len(images)
+    write_request(folder, RenderRecording(folder / IMAGES, output, count, 25.0, background))
+
+
+def layer(seed: int, to_world: np.ndarray | None = None, count: int = 40) -> PosedSplats:
+    rng = np.random.default_rng(seed)
+    floats = {"xyz": rng.normal(0, 0.3, (count, 3)), "rotation": rng.normal(size=(count, 4))}
+    floats |= {"log_scale": np.full((count, 3), -2.5), "opacity": np.ones(count)}
+    floats["sh"] = rng.normal(size=(count, 1, 3))
+    arrays = {name: values.astype(np.float32) for name, values in floats.items()}
+    splats = Splats(**arrays, face=np.zeros(count, np.int32), unbound=np.zeros(count, bool))
+    return PosedSplats(splats, WORLD, np.eye(4) if to_world is None else to_world)
+
+
+def moved(x: float) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return matrix
+
+
+def test_layers_without_what_the_reader_has() -> None:
+    """Catches splats sent again with each image, taken for others, and a field that is not sent."""
+    before = [layer(0), layer(1)]
+    after = [replace(layer(0), to_world=moved(1)), layer(2), embedded()]
+    packed = pack_layers(after, before)
+    assert "0 splats xyz" not in packed
+    assert {"1 splats xyz", "2 splats xyz"} <= set(packed)
+    for given, again in zip(after, unpack_layers(packed, before), strict=True):
+        for one, other in ((given.splats, again.splats), (given.frames, again.frames)):
+            for name, value in vars(one).items():
+                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
+        np.testing.assert_array_equal(again.to_world, given.to_world)
+        assert again.antialiased == given.antialiased
+
+
+def test_images_are_those_recorded(tmp_path: Path) -> None:
+    """Catches images of other splats, poses or cameras than recorded, and a recording left."""
+    folder, out = tmp_path / "job", tmp_path / "out"
+    images = [[layer(0)], [replace(layer(0), to_world=moved(0.3))], [layer(1), layer(0)]]
+    record(folder, out, images)
+    perform_in_folder(folder)
+    assert inspect_worker(folder).state == "finished"
+    assert not (folder / IMAGES).exists()
+    for index, layers in enumerate(images):
+        expected = finished(compose(layers, CAMERA), (1.0, 0.5, 0.0), opaque=False)
+        with Image.open(out / f"{index + 1:04d}.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), expected)
+
+
+def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
+    """Catches half a video under the name of a whole one, and a cancel that counts as a failure."""
+    pytest.importorskip("av")
+    folder = tmp_path / "job"
+    record(folder, tmp_path / "video.mp4", [[layer(0)]])
+    request_cancel(folder)
+    perform_in_folder(folder)
+    assert inspect_worker(folder).state == "cancelled"
+    assert [path.name for path in tmp_path.iterdir()] == ["job"]
+
+
+def test_backgrounds() -> None:
+    """Catches premultiplied color in a PNG with alpha, and a background before the splats."""
+    rgb, alpha = np.full((3, 1, 1), 0.25, np.float32), np.full((1, 1), 0.5, np.float32)
+    image = ComposedImage(rgb, alpha, None)
+    assert finished(image, None, opaque=False).tolist() == [[[128, 128, 128, 128]]]
+    assert finished(image, None, opaque=True).tolist() == [[[64, 64, 64]]]
+    assert finished(image, (1.0, 0.0, 0.5), opaque=True).tolist() == [[[191, 64, 128]]]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_truncated_recording(tmp_path):
+    """Catches a traceback, or a recording taken for whole, where the disk was full."""
+    folder = tmp_path / "job"
+    record(folder, tmp_path / "out", [[layer(0)]], count=2)
+    with pytest.raises(StgaError, match="cannot be read as the images of a video"):
+        perform_in_folder(folder)
+    assert inspect_worker(folder).state == "failed"
+    assert not (folder / IMAGES).exists()
+    recorder = Recorder(tmp_path / IMAGES)
+    recorder._stream.close()
+    recorder._stream = Path("/dev/full").open("wb")  # noqa: SIM115
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.add([layer(0, count=10_000)], CAMERA)
+    with pytest.raises(StgaError, match=f"{IMAGES}: cannot be written .No space left"):
+        recorder.close()
+    recorder.close()

@@ -11,7 +11,6 @@ from command_line import stga
 from PIL import Image
 
 from stga_addon import report
-from stga_addon.capture.model import Capture
 from stga_addon.development.benchmark.benchmark import benchmark_chart
 from stga_addon.development.benchmark.statistics import MeanCurve
 from stga_addon.format import describe_figures
@@ -33,8 +32,9 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def test_summary_of_a_run() -> None:
-    """Catches the last evaluation given for the best one, and figures that were not measured."""
+def test_summary_of_a_run():
+    """Catches the last evaluation given for the best, a fitted PSNR that is not called so, and a
+    target that is reached and said to be missed, or the other way round."""
     lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
     assert lines == [
         "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
@@ -42,23 +42,6 @@ def test_summary_of_a_run() -> None:
         "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB",
     ]
     assert summarize_run([], None) == []
-
-
-def test_summary_of_a_continuation() -> None:
-    """Catches before and after exchanged, and a fitted PSNR that is not called so."""
-    before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
-    lines = report.summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
-    assert lines == [
-        "splats: 9 before, 12 after",
-        "held-out views (exposure fitted): 30.00 dB before, 32.00 dB after (+2.00)",
-        "held-out views (exposure not fitted): 15.00 dB before, 15.00 dB after (+0.00)",
-        "take 2 (exposure fitted): 20.00 dB before, 19.50 dB after (-0.50)",
-    ]
-
-
-def test_fitted_exposure_is_said() -> None:
-    """Catches a PSNR that six numbers a view were fitted for, shown like one without: in the
-    summary, beside the target, in the forecast and in the panel."""
     values = metrics([20.0, 31.0, 30.0], psnr_unmatched=25.0)
     summary = summarize_run(values, 30.5)
     assert summary[0].startswith(
@@ -73,10 +56,6 @@ def test_fitted_exposure_is_said() -> None:
         {"psnr": 31.0, "psnr_unmatched": 25.0}
     )
     assert "PSNR 31.00 dB" in " ".join(describe_figures({"psnr": 31.0}))
-
-
-def test_targets_and_plateaus() -> None:
-    """Catches a target that is reached and said to be missed, or the other way round."""
     assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
     missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
     assert missed.startswith(
@@ -90,11 +69,20 @@ def test_targets_and_plateaus() -> None:
     assert summarize_run(late, 30.0)[0].startswith("held-out views: 31.00 dB")
 
 
-def test_report_of_a_finished_run(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches metrics that a run writes and the summary cannot read, a missing picture, and a
-    missing library blamed where there was nothing to draw, and the other way round."""
+def test_summary_of_a_continuation() -> None:
+    """Catches before and after exchanged, and a fitted PSNR that is not called so."""
+    before, after = metrics([30.0, 32.0], psnr_take_2=20.0, psnr_unmatched=15.0, splats=9)
+    lines = report.summarize_continuation([before, {**after, "psnr_take_2": 19.5, "splats": 12}])
+    assert lines == [
+        "splats: 9 before, 12 after",
+        "held-out views (exposure fitted): 30.00 dB before, 32.00 dB after (+2.00)",
+        "held-out views (exposure not fitted): 15.00 dB before, 15.00 dB after (+0.00)",
+        "take 2 (exposure fitted): 20.00 dB before, 19.50 dB after (-0.50)",
+    ]
+
+
+def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
+    """Catches metrics that the summary cannot read, and a missing picture or reason for it."""
     settings = make_settings(iterations=12, hull_points=False, lattice=0)
     run, why = Run(toy.root, None, "vhap", settings), f"{CURVE} was not drawn: "
     train(toy, tmp_path / "run", run)
@@ -135,8 +123,9 @@ def evaluations(count: int) -> list[dict[str, Any]]:
     ]
 
 
-def test_run_chart_shows_regions_and_the_forecast() -> None:
-    """Catches swapped axes, a missing region, a forecast that starts elsewhere than the latest."""
+def test_chart_of_a_run():
+    """Catches swapped axes, a missing region or forecast, a chart of few evaluations that fails,
+    and an axis on which a steep start flattens the rest."""
     lines = evaluations(4)
     lines[-1]["forecast"] = {"seconds": 8.0, "psnr": 24.0, "error": 0.5}
     (axes,) = run_chart(lines).axes
@@ -146,10 +135,6 @@ def test_run_chart_shows_regions_and_the_forecast() -> None:
     np.testing.assert_array_equal(drawn["forecast"], [[5, 23], [8, 24]])
     band = axes.collections[0].get_paths()[0].vertices
     assert {(8.0, 23.5), (8.0, 24.5)} <= set(map(tuple, band))
-
-
-def test_a_run_of_any_length_is_rendered() -> None:
-    """Catches a chart that fails before two evaluations or without masks, and an empty one."""
     bare = [{"seconds": 2.0, "psnr": 20.0}, {"seconds": 3.0, "psnr": 21.0}]
     for lines in ([], evaluations(1), bare):
         stream = BytesIO()
@@ -157,25 +142,13 @@ def test_a_run_of_any_length_is_rendered() -> None:
         picture = Image.open(stream)
         assert picture.size == (900, 540)
         assert np.ptp(np.asarray(picture.convert("L"))) > 200
-
-
-def test_the_steep_start_is_cut_off() -> None:
-    """Catches an axis on which the first evaluation of a long run flattens all others."""
     lines = [{"seconds": float(s), "psnr": 36 - 30 / s**0.5} for s in (1, 10, 20, 50, 100)]
     (axes,) = run_chart(lines).axes
     assert 25 < axes.get_ylim()[0] < lines[1]["psnr"]
 
 
-def test_a_curve_that_ends_before_a_tenth_of_the_time() -> None:
-    """Catches a benchmark without a chart because one of its variants was stopped soon."""
-    long, short = np.linspace(1, 100, 50), np.linspace(1, 5, 5)
-    curves = {n: MeanCurve(x, x, x, x) for n, x in (("long", long), ("short", short))}
-    (axes,) = benchmark_chart(curves, "title").axes
-    assert axes.get_ylim()[0] <= 5
-
-
-def test_the_pareto_front_is_bold_and_bands_belong_to_their_curves() -> None:
-    """Catches a front on the wrong curve, and a band of another variant or color."""
+def test_chart_of_a_benchmark():
+    """Catches a front or band of another curve, and no chart where a variant was stopped soon."""
     x = np.linspace(1, 10, 50)
     high = MeanCurve(x, np.linspace(29, 30, 50), np.full(50, 28.0), np.full(50, 31.0))
     low = MeanCurve(x, np.full(50, 26.0), np.full(50, 25.9), np.full(50, 26.1))
@@ -189,6 +162,10 @@ def test_the_pareto_front_is_bold_and_bands_belong_to_their_curves() -> None:
         assert band.get_facecolor()[0, :3].tolist() == [
             int(str(line.get_color())[n : n + 2], 16) / 255 for n in (1, 3, 5)
         ]
+    long, short = np.linspace(1, 100, 50), np.linspace(1, 5, 5)
+    curves = {n: MeanCurve(x, x, x, x) for n, x in (("long", long), ("short", short))}
+    (axes,) = benchmark_chart(curves, "title").axes
+    assert axes.get_ylim()[0] <= 5
 
 
 @pytest.fixture(autouse=True)
@@ -197,18 +174,14 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", lambda *_: 0.001)
 
 
-def test_presets(toy_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Catches presets that are not told, or without their time, or without what was timed."""
+def test_presets(toy_root, capsys, monkeypatch):
+    """Catches presets without their time, or with the minutes of another device."""
     assert stga("presets", toy_root, "--device cpu") == 0
     device, *lines = capsys.readouterr().out.splitlines()
     assert device == "Training on the CPU (--device cpu)"
     assert [line.split()[0] for line in lines] == ["draft", "standard", "final"]
     assert lines[1].split()[1:6] == ["1900", "iterations", "about", "2", "s"]
-
-
-def test_what_is_timed_is_what_will_train(toy_root, tmp_path, capsys, monkeypatch):
-    """Catches a GPU that is given the minutes of the CPU."""
-    timed: list[str] = []
+    timed = []
 
     def time(*call):
         timed.append(call[3])

@@ -40,8 +40,7 @@ def takes_long(seconds, step):
 
 
 def is_own(value, function, step):
-    """A value and a function of the package as it is called here, and an error of it where they are
-    another's."""
+    """A value and a function of the package as it is called here, or an error."""
     if (type(value).__module__, function.__module__) != (
         "stga_addon.progress",
         "stga_addon.format",
@@ -56,8 +55,7 @@ PARTS = [(first, first + 3) for first in range(0, 21, 3)]
 
 
 def test_results_are_those_of_one_process_in_order():
-    """Catches parts that are lost, exchanged or done twice, what libraries print in the stream of
-    answers, and helpers that are started anew for every task."""
+    """Catches parts lost, exchanged or doubled, prints among answers, and new helpers per task."""
     pids = set()
     with Helpers(3) as helpers:
         for _ in range(2):
@@ -87,8 +85,7 @@ def halves(numbers, folder, step):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_was_found_is_not_worked_on_again(tmp_path, count):
-    """Catches an interrupted tracking that begins anew, one that takes results of other arguments,
-    and a progress that lacks what was kept."""
+    """Catches a call that begins anew, takes results of other arguments, or lacks kept progress."""
     called = tmp_path / "called"
     called.mkdir()
     parts = [(np.arange(3.0) + number, called) for number in range(4)]
@@ -121,15 +118,13 @@ def test_what_was_found_is_not_worked_on_again(tmp_path, count):
     ],
 )
 def test_failures_reach_who_asked(work, parts, error, says):
-    """Catches a caller that waits forever for a helper that failed or was killed, as for want of
-    memory."""
+    """Catches a caller that waits for ever for a helper that failed or was killed."""
     with pytest.raises(error, match=says), Helpers(2) as helpers:
         helpers.map(work, parts, lambda steps: None)
 
 
 def test_a_package_of_another_name_is_the_helpers_own(monkeypatch):
-    """Catches work that no helper can import: inside of Blender, this package is
-    `bl_ext.….stga.stga_addon`."""
+    """Catches work that no helper can import where the package is `bl_ext.….stga.stga_addon`."""
     package = ModuleType("installed")
     package.__path__ = [str(Path(__file__).parents[2])]
     monkeypatch.setitem(sys.modules, "installed", package)
@@ -202,8 +197,7 @@ messages.flush()
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_only_messages_reach_standard_output(closed: bool) -> None:
-    """Catches output of libraries between the messages, and a closed standard error that ends the
-    process."""
+    """Catches output of libraries between messages, and a closed standard error that ends it."""
     done = subprocess.run([sys.executable, "-c", CLAIM.format(closed=closed)], capture_output=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == b"message"

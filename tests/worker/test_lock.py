@@ -32,8 +32,7 @@ def hold(path: Path) -> AbstractContextManager[object]:
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    """Catches a worker that is reported alive forever after kill -9, a probe that leaves a lock
-    file behind, and a held lock that it misses."""
+    """Catches a worker alive for ever after kill -9, and a probe that leaves a file."""
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
     assert not path.exists()
@@ -55,9 +54,10 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     assert not is_locked(path)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
-def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
-    """Catches a file overwritten through a link at the lock's path."""
+@pytest.mark.skipif(os.name == "nt", reason="links need privileges, and pipes are no files")
+def test_what_is_no_lock_file(tmp_path):
+    """Catches a file overwritten through a link at the lock's path, and a read that never
+    returns."""
     path, target = tmp_path / "run.lock", tmp_path / "target"
     target.write_text("mine")
     path.symlink_to(target)
@@ -65,6 +65,9 @@ def test_symbolic_link_is_not_followed(tmp_path: Path) -> None:
         pass
     assert not is_locked(path)
     assert target.read_text() == "mine"
+    os.mkfifo(tmp_path / "pipe.lock")
+    assert lock_owner(tmp_path / "pipe.lock") == 0
+    assert not is_locked(tmp_path / "pipe.lock")
 
 
 @contextmanager
@@ -87,8 +90,7 @@ def probed(path: Path) -> Iterator[None]:
 
 
 def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a free lock that is reported as held because another probe has it for a moment, and a
-    worker that fails to start while its folder is watched."""
+    """Catches a probe that another one takes for a lock, or that keeps a worker from starting."""
     monkeypatch.setattr(lock, "PROBE_TIMEOUT_S", 10.0)
     monkeypatch.setattr(lock, "ACQUIRE_TIMEOUT_S", 10.0)
     with probed(tmp_path / "worker.lock"):
@@ -97,17 +99,9 @@ def test_probes_disturb_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         pass
 
 
-@pytest.mark.skipif(os.name == "nt", reason="named pipes are files on POSIX systems only")
-def test_owner_of_a_pipe_is_unknown(tmp_path: Path) -> None:
-    """Catches a read that never returns."""
-    os.mkfifo(tmp_path / "worker.lock")
-    assert lock_owner(tmp_path / "worker.lock") == 0
-    assert not is_locked(tmp_path / "worker.lock")
-
-
-@pytest.fixture
-def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Storage that answers as an NFS without its lock service does."""
+def test_storage_without_locks(tmp_path, monkeypatch):
+    """Catches workers that cannot run there, count as lost, or are two in one folder: storage that
+    answers as an NFS without its lock service does."""
     fcntl = pytest.importorskip("fcntl")
 
     def flock(descriptor: int, operation: int) -> None:
@@ -116,11 +110,6 @@ def without_locks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", flock)
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     monkeypatch.setattr(lock, "EXPIRY_S", 1.0)
-
-
-def test_storage_without_locks(tmp_path: Path, without_locks: None) -> None:
-    """Catches workers that cannot run, or count as lost while they go on, on such storage, two in
-    one folder, and a lock that outlives its worker."""
     folder, path = tmp_path / "job", tmp_path / "job/worker.lock"
     lease = path.with_name("worker.lock.lease")
     with status_writer(folder) as writer:

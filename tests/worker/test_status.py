@@ -57,13 +57,10 @@ main()
 @pytest.fixture
 def start(tmp_path, monkeypatch):
     """Start the worker above as a module, in a status folder that is returned with the process."""
-    packages = tmp_path / "packages"
-    packages.mkdir()
-    (packages / "counting.py").write_text(WORKER)
-    path = os.pathsep.join([str(ROOT), str(packages)])
-    monkeypatch.setattr(
-        launch, "worker_environment", lambda variables, python: {**variables, "PYTHONPATH": path}
-    )
+    (tmp_path / "counting.py").write_text(WORKER)
+    path = os.pathsep.join([str(ROOT), str(tmp_path)])
+    environment = lambda variables, python: {**variables, "PYTHONPATH": path}  # noqa: E731
+    monkeypatch.setattr(launch, "worker_environment", environment)
     running: list[subprocess.Popen[bytes]] = []
 
     def run(action: str = "work") -> tuple[Path, "subprocess.Popen[bytes]"]:
@@ -86,8 +83,7 @@ def wait(condition: Callable[[], bool], seconds: float = 20.0) -> None:
 
 
 def test_worker_is_cancelled(start):
-    """Catches figures that do not arrive, a cancel request that is ignored, and a second worker in
-    the folder."""
+    """Catches lost figures, a cancel that is ignored, and a second worker in the folder."""
     folder, process = start()
     assert inspect_worker(folder, process).state.is_alive
     wait(lambda: inspect_worker(folder, process).state == WorkerState.WORKING)
@@ -98,12 +94,10 @@ def test_worker_is_cancelled(start):
     assert (snapshot.status.message, snapshot.status.detail) == ("counting", "on time")
     assert list(snapshot.status.figures) == ["n"]
     if os.name != "nt":
-        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(
-            os.getpriority(os.PRIO_PROCESS, 0) + 5, 19
-        )
-    with pytest.raises(
-        StgaError, match=f"another worker is running here \\(process {process.pid}\\)"
-    ):
+        nicer = min(os.getpriority(os.PRIO_PROCESS, 0) + 5, 19)
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == nicer
+    message = rf"another worker is running here \(process {process.pid}\)"
+    with pytest.raises(StgaError, match=message):
         prepare_status_folder(folder)
     with pytest.raises(StgaError, match="another worker"):
         status.remove_status_folder(folder)
@@ -119,18 +113,18 @@ def test_worker_is_cancelled(start):
     assert inspect_worker(folder) == status.WorkerSnapshot()
 
 
-@pytest.mark.parametrize(
-    ("action", "code", "error"),
-    [
-        ("sentence", 1, "capture: is not a folder"),
-        ("bug", 1, "ValueError: a bug"),
-        ("exit", 7, "Worker exited with status 7: a line of the log"),
-    ],
-)
-def test_failures_are_reported(start, action, code, error):
-    """Catches a user's mistake reported with a traceback, a crash whose report lacks traceback or
-    log, and a worker that ends before its first status and leaves an exit status alone."""
+FAILURES = {
+    "sentence": (1, "capture: is not a folder"),
+    "bug": (1, "ValueError: a bug"),
+    "exit": (7, "Worker exited with status 7: a line of the log"),
+}
+
+
+@pytest.mark.parametrize("action", FAILURES)
+def test_failures_are_reported(start, action):
+    """Catches a user's mistake with a traceback, and a crash whose report lacks it, or the log."""
     folder, process = start(action)
+    code, error = FAILURES[action]
     assert process.wait(20) == code
     snapshot = inspect_worker(folder, process)
     assert snapshot.state == (WorkerState.LOST if action == "exit" else WorkerState.FAILED)
@@ -157,11 +151,9 @@ def test_killed_worker_is_lost(start):
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell closes the descriptors")
 @pytest.mark.parametrize("action", ["done", "sentence"])
-@pytest.mark.parametrize(
-    "streams", [">&- 2>&-", "<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"]
-)
+@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", ">/dev/full 2>/dev/full", "| true"])
 def test_final_status_without_output_streams(tmp_path, streams, action):
-    """Catches a worker without a final status where its output is closed, full or a broken pipe."""
+    """Catches a worker without a final status where its output is closed, full or broken."""
     script = WORKER.replace('print("a line of the log", flush=True)', "time.sleep(0.2)")
     (tmp_path / "counting.py").write_text(script)
     folder = tmp_path / "status"
@@ -173,28 +165,9 @@ def test_final_status_without_output_streams(tmp_path, streams, action):
     wait(lambda: (status.read_status(folder) or WorkerStatus()).state == expected)
 
 
-def test_interpreter_that_does_not_exist(tmp_path):
-    """Catches a traceback for a mistyped path, and files of a person removed with the status
-    folder."""
-    folder = tmp_path / "job"
-    for own in (True, False):
-        prepare_status_folder(folder)
-        if own:
-            (folder / "notes.txt").write_text("mine")
-        for python in (str(tmp_path / "nowhere/python"), "null\0character"):
-            prepare_status_folder(folder)
-            with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
-                start_worker(folder, python, [])
-        assert inspect_worker(folder).state == WorkerState.NONE
-        if own:
-            assert [path.name for path in folder.iterdir()] == ["notes.txt"]
-            (folder / "notes.txt").unlink()
-    assert not folder.exists()
-
-
 def test_only_own_files_are_removed(tmp_path):
-    """Catches a folder removed with a person's files, and one that is not a folder taken for an
-    error."""
+    """Catches a person's files removed or written over, and a traceback where a file is in the
+    way."""
     with status.status_writer(tmp_path / "job") as writer:
         writer.report(Progress(0.5, "working"))
     (tmp_path / "job" / "notes.txt").write_text("mine")
@@ -204,6 +177,19 @@ def test_only_own_files_are_removed(tmp_path):
     (tmp_path / "file").write_text("")
     status.remove_status_folder(tmp_path / "file")
     assert (tmp_path / "file").exists()
+    for folder, left in ((tmp_path / "new", []), (tmp_path / "job", ["notes.txt"])):
+        for python in (str(tmp_path / "nowhere/python"), "null\0character"):
+            prepare_status_folder(folder)
+            with pytest.raises(StgaError, match=r"cannot be started as a Python interpreter"):
+                start_worker(folder, python, [])
+            assert folder.exists() == bool(left)
+            assert [path.name for path in folder.glob("*")] == left
+    for use in (prepare_status_folder, status.request_cancel):
+        with pytest.raises(StgaError, match=r"file.*cannot be written"):
+            use(tmp_path / "file" / "status")
+    writing = status.status_writer(tmp_path / "file" / "status")
+    with pytest.raises(StgaError, match="cannot be written"), writing:
+        pass
 
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
@@ -244,8 +230,7 @@ def test_damaged_status_is_ignored(tmp_path, text):
 
 
 def test_status_round_trip(tmp_path, monkeypatch):
-    """Catches a field that is lost between worker and panel, and two workers that overwrite each
-    other's status."""
+    """Catches a field lost between worker and panel, NaN in it, and a status at every step."""
     figures, machine, now = {"psnr": 30.5}, platform.node(), 100.0
     expected = WorkerStatus("working", 0.25, "training", "enough", "", "", figures, machine, 0.25)
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
@@ -259,11 +244,6 @@ def test_status_round_trip(tmp_path, monkeypatch):
     assert status.read_status(tmp_path) == replace(
         expected, state=WorkerState.FINISHED, seconds=1.25
     )
-
-
-def test_status_is_written_rarely(tmp_path, monkeypatch):
-    """Catches a status written in every iteration, a new message that is delayed, and a NaN in
-    status.json, which other programs cannot read."""
     written = []
     monkeypatch.setattr(status, "write_json", lambda path, value, **_: written.append(value))
     writer = status.StatusWriter(tmp_path)
@@ -275,8 +255,7 @@ def test_status_is_written_rarely(tmp_path, monkeypatch):
 
 
 def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
-    """Catches a worker that fails because its status cannot be written, and a cause that is not
-    reported."""
+    """Catches a worker that fails with its status, and a cause that is not reported."""
 
     def full(path: Path, value: object, **options: object) -> None:
         raise StgaError(f"{path}: cannot be written ({os.strerror(errno.ENOSPC)})")
@@ -291,20 +270,9 @@ def test_full_disk_does_not_stop_the_work(tmp_path, monkeypatch):
     assert f"the disk that holds {tmp_path} is full" in inspect_worker(tmp_path).status.error
 
 
-def test_folder_that_cannot_be_written(tmp_path):
-    """Catches a traceback where the folder's place is taken by a file."""
-    (tmp_path / "file").write_text("")
-    for use in (prepare_status_folder, status.request_cancel):
-        with pytest.raises(StgaError, match=r"file.*cannot be written"):
-            use(tmp_path / "file" / "status")
-    writing = status.status_writer(tmp_path / "file" / "status")
-    with pytest.raises(StgaError, match="cannot be written"), writing:
-        pass
-
-
-def test_worker_environment(monkeypatch):
-    """Catches a worker with Blender's own standard library, one that writes into the extension's
-    folder, and one of Blender's Python without the packages of Blender's extensions."""
+def test_worker_environment(monkeypatch, tmp_path):
+    """Catches a worker with another Python's library, or with bytecode in the extension's
+    folder."""
     variables = {"PATH": "/bin", "PYTHONHOME": "/blender/python", "PYTHONPATH": "/other"}
     made = worker_environment(variables, "/usr/bin/python3")
     assert made["PATH"] == "/bin"
@@ -314,43 +282,6 @@ def test_worker_environment(monkeypatch):
     monkeypatch.setattr(sys, "path", ["", "/extensions/site-packages"])
     expected = os.pathsep.join([str(ROOT), "/extensions/site-packages"])
     assert worker_environment({}, sys.executable)["PYTHONPATH"] == expected
-
-
-def test_bytecode_of_the_own_interpreter(monkeypatch, tmp_path):
-    """Catches a worker that compiles the packages of an extension at every start, or writes among
-    their files.
-
-    Another interpreter has bytecode of its own packages, which it would not find with a prefix.
-    """
-    (tmp_path / "packages").mkdir()
-    (tmp_path / "packages/some_package.py").touch()
-    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "packages")])
-    variables = {**os.environ, "STGA_CACHE": str(tmp_path / "cache")}
-    command = [sys.executable, "-c", "import some_package"]
-    subprocess.run(command, env=worker_environment(variables, sys.executable), check=True)
-    assert [path.name for path in (tmp_path / "packages").iterdir()] == ["some_package.py"]
-    assert list((tmp_path / "cache").rglob("some_package.*.pyc"))
-    assert "PYTHONPYCACHEPREFIX" not in worker_environment(variables, "/usr/bin/python3")
-
-
-def test_own_interpreter_is_isolated(monkeypatch, tmp_path):
-    """Catches a worker of Blender's Python that imports from the user's site-packages or runs the
-    user's settings."""
-    theirs = tmp_path / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
-    theirs.mkdir(parents=True)
-    (theirs / "strange_package.py").touch()
-    variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
-    looking = "import importlib.util as u; exit(3 if u.find_spec('strange_package') else 0)"
-    variables["PYTHONPATH"] = str(theirs)
-    for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
-        command = [sys.executable, "-c", looking]
-        done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False)
-        assert done.returncode == code
-    assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
-
-
-def test_own_python(monkeypatch, tmp_path):
-    """Catches a program of PATH taken for the Python that Blender has as the system's library."""
     program = tmp_path / f"bin/python{sys.version_info[0]}.{sys.version_info[1]}"
     program.parent.mkdir()
     program.touch()
@@ -362,6 +293,31 @@ def test_own_python(monkeypatch, tmp_path):
         assert worker_environment({"PYTHONPATH": "/other"}, str(program))["PYTHONNOUSERSITE"] == "1"
     finally:
         own_python.cache_clear()
+
+
+def test_a_worker_of_the_own_interpreter(monkeypatch, tmp_path):
+    """Catches bytecode among an extension's files, the user's site-packages and the user's
+    settings."""
+    (tmp_path / "packages").mkdir()
+    (tmp_path / "packages/some_package.py").touch()
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path / "packages")])
+    variables = {**os.environ, "STGA_CACHE": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", "import some_package"]
+    subprocess.run(command, env=worker_environment(variables, sys.executable), check=True)
+    assert [path.name for path in (tmp_path / "packages").iterdir()] == ["some_package.py"]
+    assert list((tmp_path / "cache").rglob("some_package.*.pyc"))
+    assert "PYTHONPYCACHEPREFIX" not in worker_environment(variables, "/usr/bin/python3")
+    theirs = tmp_path / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+    theirs.mkdir(parents=True)
+    (theirs / "strange_package.py").touch()
+    variables = {**os.environ, "PYTHONUSERBASE": str(tmp_path), "PYTHONWARNINGS": "ignore"}
+    looking = "import importlib.util as u; exit(3 if u.find_spec('strange_package') else 0)"
+    variables["PYTHONPATH"] = str(theirs)
+    for environment, code in ((variables, 3), (worker_environment(variables, sys.executable), 0)):
+        command = [sys.executable, "-c", looking]
+        done = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL, check=False)
+        assert done.returncode == code
+    assert "PYTHONWARNINGS" in worker_environment(variables, "/usr/bin/python3")
 
 
 def test_log_lines(tmp_path):

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,9 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from batch.simulated import InProcessEngine
+from capture import factory
+from command_line import stga
 
 import stga_addon.development.commands  # noqa: F401 (adds its requests)
 from stga_addon.capture.model import Capture
+from stga_addon.cli.main import main
 from stga_addon.development.benchmark import scheduler, variants
 from stga_addon.development.benchmark.benchmark import write_report
 from stga_addon.development.benchmark.scheduler import BenchmarkRun, train_in_turns
@@ -48,8 +53,7 @@ def progress(share: float, iteration: int = 1) -> Progress:
 
 
 def test_turns() -> None:
-    """Catches a run that trains out of its turn, one that waits after its end, and one that
-    outlives its parent."""
+    """Catches a run that trains out of its turn, waits after its end, or outlives its parent."""
     replies = io.StringIO()
     turns = Turns(io.StringIO("0.5\n0.7\n"), replies)
     assert not turns.report(progress(0.0, iteration=0))  # still compiling
@@ -63,8 +67,7 @@ def test_turns() -> None:
 
 
 def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a worker that writes no figures of the finished avatar, and mistakes that end in a
-    traceback."""
+    """Catches a worker without figures of the finished avatar, and mistakes as tracebacks."""
     monkeypatch.setattr("stga_addon.development.benchmark.worker.WARM_UP_S", 0.01)
     run = run_in(toy, tmp_path / "run", iterations=20)
     write_request(request_folder(run.out), run.request)
@@ -86,16 +89,11 @@ def test_one_run(toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert "nowhere" in json.loads(replies.getvalue())["error"]
 
 
-@pytest.fixture
-def two_variants(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
+    """Catches training lost to Ctrl-C or done twice, and files that are missing at the end."""
     monkeypatch.setattr(variants, "MAIN_VARIANTS", VARIANTS)
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
-
-
-@pytest.mark.slow
-def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_variants: None) -> None:
-    """Catches training lost to Ctrl-C, runs trained twice or not in turns, and files that are
-    missing at the end."""
     request = Benchmark(tmp_path, toy.root, 2.0, seed=4)
     said: list[str] = []
 
@@ -133,8 +131,7 @@ def test_a_slice_is_stopped_and_goes_on(toy: Capture, tmp_path: Path, two_varian
 
 
 def test_exposure_is_fitted_for_all_or_none(toy, tmp_path, monkeypatch):
-    """Catches variants with the effect that are measured with fitted exposure beside others without
-    it."""
+    """Catches variants measured with fitted exposure beside others without it."""
     request = Benchmark(tmp_path, toy.root, 2.0)
     rows = ((0.0, 1.1, 1.0, 1.0, 0.0, 0.0, 0.0),)
     off = {"effects": {"exposure": "off"}}
@@ -150,11 +147,9 @@ def test_exposure_is_fitted_for_all_or_none(toy, tmp_path, monkeypatch):
     assert fitted == [False, False, True, True]
 
 
-@pytest.fixture
-def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program in place of workers: it trains in one turn, or cannot where the run's folder is
-    called `lost`."""
-    interpreter = tmp_path / "python"
+def test_workers_that_end_or_fail(toy, tmp_path, monkeypatch):
+    """Catches ended processes left unreaped, and hours of runs lost to one failure."""
+    interpreter = tmp_path / "python"  # trains in one turn, or cannot in the folder `lost`
     interpreter.write_text(
         '#!/bin/sh\ncase "$*" in */lost*) echo \'{"error": "nowhere"}\'; exit;; esac\n'
         'echo \'{"share": 0.1}\'\nread share\ntouch "$0.trained"\necho \'{"done": true}\'\n'
@@ -162,10 +157,6 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     interpreter.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(interpreter))
     monkeypatch.setattr(scheduler, "TURN_S", 0.5)
-
-
-def test_ended_workers_are_reaped(toy, tmp_path, monkeypatch, stand_in):
-    """Catches processes that have ended but are left unreaped until all other runs are trained."""
     started: list[subprocess.Popen[str]] = []
 
     class Recorded(subprocess.Popen[str]):
@@ -182,22 +173,52 @@ def test_ended_workers_are_reaped(toy, tmp_path, monkeypatch, stand_in):
 
     train_in_turns(runs, look)
     assert ended == [[], [False], [False, False], [True, True]]  # two starts, two turns
-
-
-def test_one_failure_does_not_end_the_others(toy: Capture, tmp_path: Path, stand_in: None) -> None:
-    """Catches an hour of runs lost to one that cannot be trained."""
     runs = [run_in(toy, tmp_path / name, seconds=1.0) for name in ("lost", "good")]
     assert train_in_turns(runs, lambda text: None) == {"lost": "nowhere"}
     assert (tmp_path / "python.trained").exists()
 
 
 def test_variants() -> None:
-    """Catches a variant whose settings cannot be made, or that the table cannot compare with the
-    standard."""
+    """Catches a variant without settings of its own, and a table without the standard."""
     for table in (MAIN_VARIANTS, SETTING_VARIANTS):
         made = [make_settings(**{"seconds": 1.0, **changes}) for changes in table.values()]
         assert len({str(replace(settings, preset=None)) for settings in made}) == len(table)
         assert "standard" in table
     assert list(select_variants(MAIN_VARIANTS, ["final", "draft"])) == ["draft", "final"]
-    with pytest.raises(StgaError, match="--only: 'fast' is not one of draft, standard"):
-        select_variants(MAIN_VARIANTS, ["fast"])
+
+
+def test_impossible_benchmarks(toy_root, tmp_path, capsys):
+    """Catches a mistake found only after the first hour of training."""
+    blind = factory.write_mesh_capture(tmp_path / "one", (0,), range(2))
+    (blind / "transforms_val.json").unlink()
+    for capture, arguments, message in (
+        (toy_root, "--only fast", "--only: 'fast' is not one of draft, standard"),
+        (toy_root, "--only draft --knobs", "--only: 'draft' is not one of standard, scale-0.5"),
+        (blind, "", "has no views to"),
+    ):
+        assert stga("benchmark", capture, "--out", tmp_path / "out", arguments) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
+    """Catches seeds that are no jobs, a finished one trained again, and no word of one."""
+    out, options = str(tmp_path / "out"), ["--budget", "1s", "--only", "draft", "--threads", "1"]
+    command = ["benchmark", str(toy_root), "--out", out, "--seeds", "2", *options]
+    assert main([*command, "--dry-run"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"benchmark-seed0 +Benchmark +1 thread, 1 GB +1 s\n", printed)
+    assert "2 jobs, 2 to do; 2 s of work" in printed
+    monkeypatch.setattr("stga_addon.jobs.batch.engines.make_engine", lambda *_: InProcessEngine())
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "2 of 2 jobs finished" in printed
+    assert "toy0, 1 s of training each, 2 seeds; mean ± spread" in printed
+    assert "| draft" in printed
+    runs = [read_run(tmp_path / f"out/benchmark-seed{seed}/draft") for seed in (0, 1)]
+    assert [run.settings.seed for run in runs] == [0, 1]
+    assert "benchmark-seed1" in (tmp_path / "out/report.html").read_text()
+    monkeypatch.setattr(InProcessEngine, "submit", lambda *_: pytest.fail("it trains again"))
+    assert main(command) == 0
+    assert capsys.readouterr().out.endswith(printed.partition("report.html\n")[2])

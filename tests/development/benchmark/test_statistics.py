@@ -18,14 +18,8 @@ from stga_addon.development.benchmark.statistics import (
 
 
 def line(seconds: float, psnr: float, iteration: int = 0, **more: Any) -> dict[str, Any]:
-    return {
-        "seconds": seconds,
-        "psnr": psnr,
-        "iteration": iteration,
-        "splats": 7,
-        "evaluation_s": 0.5,
-        **more,
-    }
+    values = {"seconds": seconds, "psnr": psnr, "iteration": iteration}
+    return values | {"splats": 7, "evaluation_s": 0.5, **more}
 
 
 def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outcome:
@@ -35,8 +29,7 @@ def outcome(variant: str, seed: int, psnr: float, finished: bool = True) -> Outc
 
 
 def test_summary_over_seeds() -> None:
-    """Catches the population's deviation for the sample's, seeds of other variants, and unfinished
-    runs that count."""
+    """Catches the population's deviation, seeds of other variants, and unfinished runs."""
     runs = [outcome("a", seed, psnr) for seed, psnr in enumerate((30.0, 31.0, 32.0))]
     table = summarize([*runs, outcome("a", 3, 99.0, finished=False), outcome("b", 0, 20.0)])
     assert table["a"]["val_psnr"] == Spread(31.0, 1.0, 3)
@@ -45,8 +38,8 @@ def test_summary_over_seeds() -> None:
     assert np.isnan(table["b"]["val_psnr"].spread)
 
 
-def test_mean_curves() -> None:
-    """Catches seeds averaged by position instead of by time."""
+def test_mean_curves():
+    """Catches seeds averaged by position, and a lead by exposure fitted for one alone."""
     slow = Outcome("a", 0, [line(2.0, 10.0), line(10.0, 18.0)], {})
     fast = Outcome("a", 1, [line(1.0, 11.0), line(5.0, 15.0), line(9.0, 19.0)], {})
     curve = mean_curves([slow, fast, Outcome("b", 0, [line(1.0, 5.0)], {})])["a"]
@@ -54,32 +47,10 @@ def test_mean_curves() -> None:
     np.testing.assert_allclose(curve.low, curve.seconds + 8)
     np.testing.assert_allclose(curve.high, curve.seconds + 10)
     np.testing.assert_allclose(curve.mean, curve.seconds + 9)
-
-
-def test_curves_compare_psnr_without_fit() -> None:
-    """Catches a variant that leads because exposure is fitted for it alone, in the chart and on the
-    front."""
     fitted = Outcome("a", 0, [line(s, 35.0, psnr_unmatched=28.0) for s in (1.0, 5.0)], {})
     curves = mean_curves([fitted, Outcome("b", 0, [line(s, 30.0) for s in (1.0, 5.0)], {})])
     np.testing.assert_allclose(curves["a"].mean, 28.0)
     assert [name for name, *_ in pareto_front(curves)] == ["b"]
-
-
-def test_both_psnrs_are_in_the_table() -> None:
-    """Catches a table of fitted figures that does not say so, or hides the others."""
-    runs = [
-        Outcome(
-            "a",
-            0,
-            [line(1.0, 35.0, 1)],
-            {"val": {"psnr": 35.0, "psnr_unmatched": 28.0, "ssim": 0.9}},
-        )
-    ]
-    heading = table_lines(summarize(runs))[0]
-    assert [cell.strip() for cell in heading.strip("|").split("|")][4:6] == ["val", "val unfitted"]
-    assert "The exposure of held-out cameras is fitted for all variants" in report_text(
-        runs, {}, 1.0, Path("head")
-    )
 
 
 def curve(seconds: list[float], psnr: list[float]) -> MeanCurve:
@@ -103,9 +74,9 @@ def test_the_front() -> None:
     assert pareto_front({}) == []
 
 
-def test_the_table() -> None:
-    """Catches columns out of line, figures under the wrong heading, and a comparison with the wrong
-    variant."""
+def test_the_report():
+    """Catches figures under a wrong heading, unnamed fits, and a ranking that seeds do not bear
+    out."""
     runs = [
         outcome(name, seed, psnr + seed)
         for name, psnr in (("standard", 30.0), ("draft", 27.0))
@@ -117,10 +88,13 @@ def test_the_table() -> None:
     assert cells[0] == ["variant", "iterations", "ms/it", "splats", "val", "SSIM", "Δ val"]
     assert cells[2] == ["standard", "100", "100.0", "7", "30.50±0.71", "0.9000±0.0000", "+0.00"]
     assert cells[3][-1] == "-3.00"
-
-
-def test_the_report_says_what_is_not_shown() -> None:
-    """Catches a ranking that the seeds do not bear out, and one seed taken for certainty."""
+    val = {"psnr": 35.0, "psnr_unmatched": 28.0, "ssim": 0.9}
+    runs = [Outcome("a", 0, [line(1.0, 35.0, 1)], {"val": val})]
+    heading = table_lines(summarize(runs))[0]
+    assert [cell.strip() for cell in heading.strip("|").split("|")][4:6] == ["val", "val unfitted"]
+    assert "The exposure of held-out cameras is fitted for all variants" in report_text(
+        runs, {}, 1.0, Path("head")
+    )
     two = [
         outcome(name, seed, psnr + seed)
         for name, psnr in (("a", 30.0), ("b", 30.5), ("c", 20.0))

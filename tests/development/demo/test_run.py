@@ -1,5 +1,4 @@
-"""Demo with few of its capture's images: Blender scene, selection, training, splats that follow the
-mesh."""
+"""Demo with few of its capture's images: scene, selection, training, splats."""
 
 import json
 
@@ -22,11 +21,8 @@ def unpack_few(folder):
     unpack_capture(folder)
     for path in folder.glob("transforms*.json"):
         document = read_json(path)
-        few = [
-            f
-            for f in document["frames"]
-            if f["timestep_index"] in TIMESTEPS and f["camera_index"] in CAMERAS
-        ]
+        few = [f for f in document["frames"] if f["timestep_index"] in TIMESTEPS]
+        few = [f for f in few if f["camera_index"] in CAMERAS]
         for frame in few:
             factor = WIDTH / frame["w"]
             frame |= {name: factor * frame[name] for name in ("fl_x", "fl_y", "cx", "cy")}
@@ -37,19 +33,12 @@ def unpack_few(folder):
         write_json(path, {**document, "frames": few})
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    """Folder of a demo."""
-    folder = tmp_path_factory.mktemp("demo")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "unpack_capture", unpack_few)
-        run.run_demo(folder, {"iterations": 60})
-    return folder
-
-
 @pytest.mark.slow
-def test_demo_writes_its_files(demo):
-    """Catches a break anywhere in the chain of the README's first command."""
+def test_demo(tmp_path, monkeypatch):
+    """Catches a break in the README's first command, and a demo.blend that is empty."""
+    monkeypatch.setattr(run, "unpack_capture", unpack_few)
+    demo = tmp_path / "demo"
+    run.run_demo(demo, {"iterations": 60})
     metrics = json.loads((demo / "metrics.json").read_text())
     assert metrics["blender_position_error_m"] < 1e-5
     # Far above what the untrained gray lattice reaches on these images (about 15 dB).
@@ -61,11 +50,6 @@ def test_demo_writes_its_files(demo):
     gray = (np.ptp(selection, axis=2) <= 3) & (selection.max(axis=2) < 250)
     assert colored.sum() > 50, "no selected splat is shown in color"
     assert gray.sum() > 50, "no frozen splat is shown gray"
-
-
-@pytest.mark.slow
-def test_the_blend_file_opens_with_head_groups_and_splats(demo):
-    """Catches a demo.blend that an artist opens to find empty or unanimated."""
     bpy.ops.wm.open_mainfile(filepath=str(demo / "demo.blend"))
     heads = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "head"]
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
@@ -74,12 +58,8 @@ def test_the_blend_file_opens_with_head_groups_and_splats(demo):
     assert heads[0].hide_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
     assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == len(CAMERAS)
-    views = [
-        area.spaces.active
-        for screen in bpy.data.screens
-        for area in screen.areas
-        if area.type == "VIEW_3D"
-    ]
+    areas = [area for screen in bpy.data.screens for area in screen.areas]
+    views = [area.spaces.active for area in areas if area.type == "VIEW_3D"]
     assert views
     pose = np.array(heads[0].matrix_world)
     center = pose[:3, :3] @ np.mean(heads[0].bound_box, axis=0) + pose[:3, 3]

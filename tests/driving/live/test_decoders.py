@@ -1,5 +1,4 @@
-"""Decoders of live sources, against bytes written from the layouts and against independent
-encoders."""
+"""Decoders of live sources, against bytes from the layouts and independent encoders."""
 
 import math
 import struct
@@ -21,8 +20,8 @@ def as_dict(weights) -> dict[str, float]:
 
 
 def test_live_link_face():
-    """Catches values at the place of the CSV's columns, where jaw and mouth have the right first, a
-    time in frames, and head angles taken from the eyes."""
+    """Catches values by the CSV's columns, times or angles of another kind, other counts
+    refused, and no face taken for a resting one."""
     weights = wire.mixed(0)
     packet = decode_live_link_face(wire.live_link_face(weights, 120, (0.1, -0.2, 0.3), "Änne"))
     assert packet is not None
@@ -30,11 +29,6 @@ def test_live_link_face():
     assert packet.head == pytest.approx((0.1, -0.2, 0.3))
     assert packet.subject == "Änne"
     assert packet.time == pytest.approx(120.25 / 60)
-
-
-def test_live_link_face_with_other_counts():
-    """Catches senders of 51 or 52 shapes that are refused, and a packet without a face that is
-    taken as one at rest."""
     weights = wire.mixed(1)
     packet = decode_live_link_face(wire.live_link_face(weights, count=51))
     assert as_dict(packet.weights) == pytest.approx({**weights, "tongueOut": 0.0})
@@ -50,9 +44,7 @@ def test_live_link_face_with_other_counts():
 
 
 def test_packets_of_pylivelinkface():
-    """Catches a header that is read little-endian, as that library writes it: version as four
-    bytes, then '$', which is the first byte of a length of 36. Its layout, written here from its
-    source of version 0.1."""
+    """Catches that library's little-endian header misread: version, '$', then the first length."""
     device = "$" + "12345678-1234-1234-1234-123456789abc"
     name = b"Python_LiveLinkFace"
     values = np.linspace(0, 1, 61)
@@ -65,8 +57,7 @@ def test_packets_of_pylivelinkface():
 
 
 def test_facial_mocap():
-    """Catches percent taken as weights, degrees as radians, pitch as yaw, and the second version's
-    separator."""
+    """Catches percent, degrees or pitch misread, and the second version's separator."""
     weights = {name: round(value, 2) for name, value in wire.mixed(2).items()}
     for separator in "-&":
         packet = read_performance.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
@@ -93,8 +84,7 @@ def bundle(*messages: bytes) -> bytes:
 
 
 def test_vmc_by_hand():
-    """Catches values that count before they are applied, are forgotten between two datagrams, or of
-    VRM's own expressions, whose A is no shape of ARKit."""
+    """Catches values used before they are applied, forgotten between datagrams, or VRM's own."""
     packet, known = decode_vmc(bundle(blend("JawOpen", 0.5), blend("A", 1.0)), Received())
     assert packet is None
     inner = bundle(blend("cheekPuff", 0.75), APPLY)
@@ -109,8 +99,7 @@ def test_vmc_by_hand():
 
 
 def test_vmc_with_python_osc():
-    """Catches what bytes by hand and decoder get wrong together: python-osc writes the
-    datagrams."""
+    """Catches what bytes by hand and decoder get wrong together."""
     message = pytest.importorskip("pythonosc.osc_message_builder")
     bundles = pytest.importorskip("pythonosc.osc_bundle_builder")
     weights, known = wire.mixed(3), Received()
@@ -136,8 +125,7 @@ def test_vmc_with_python_osc():
 
 @pytest.mark.parametrize("axis", range(3))
 def test_vmc_head(axis):
-    """Catches Unity's left-handed axes: a quaternion about x nods alike, about y and z turns the
-    other way."""
+    """Catches Unity's left-handed axes: about x a turn is alike, about y and z the other way."""
     angle = 0.3
     quaternion = np.array([0.0, 0.0, 0.0, math.cos(angle / 2)])
     quaternion[axis] = math.sin(angle / 2)

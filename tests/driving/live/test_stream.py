@@ -43,8 +43,7 @@ class Watched(Stream):
 
 
 def test_late_doubled_and_lost_packets_and_a_clock_that_starts_anew():
-    """Catches a head that jumps back in time, or stands still after midnight, packets that count
-    twice, and losses that are not counted: rows of half the rate of the clock are no losses."""
+    """Catches a head that jumps back or stands still after midnight, and wrong counts of losses."""
     stream = Watched(LINK)
     order = [0, 2, 4, 8, 6, 8, 10, 16]
     for number, frame in enumerate(order):
@@ -78,8 +77,7 @@ def test_a_face_that_leaves_the_picture():
 
 
 def test_two_phones_on_one_port():
-    """Catches a head that trembles between two faces, one that cannot be handed over, and one that
-    waits for a phone that is gone."""
+    """Catches a head that trembles between two faces, cannot be handed over, or waits for ever."""
     stream = Watched(LINK)
     for frame in range(60):
         stream.receive("10.0.0.5", jaw(frame, 0.1, subject="A"), frame / 60)
@@ -96,8 +94,7 @@ def test_two_phones_on_one_port():
 
 
 def test_rate_and_delay():
-    """Catches a rate that is not that of the last seconds, and a delay that grows with the clocks'
-    difference."""
+    """Catches a rate not of the last seconds, and a delay of the clocks' difference."""
     stream = Watched(LINK)
     for frame in range(300):
         late = 0.05 if frame == 299 else 0.0
@@ -107,8 +104,7 @@ def test_rate_and_delay():
 
 
 def test_on_loopback(monkeypatch):
-    """Catches a socket that waits, listens where it was not told to, or holds Blender up while it
-    is flooded."""
+    """Catches a socket that waits, listens elsewhere, or holds Blender up while it is flooded."""
     monkeypatch.setattr("stga_addon.driving.live.sources.MAX_DATAGRAMS", 50)
     receiver = Receiver(LINK, port=wire.free_port())
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -161,8 +157,7 @@ def test_addresses():
 
 
 def test_recording():
-    """Catches a take that has arrival times, a resting face that is not taken off, and sides
-    exchanged twice."""
+    """Catches arrival times, a resting face that is not taken off, and sides exchanged twice."""
     stream = Watched(LINK)
     data = wire.live_link_face({"jawOpen": 0.2, "mouthLeft": 0.3}, 0, (0.1, 0, 0))
     first = stream.receive("a", data, 0.0)
@@ -217,8 +212,7 @@ def test_vmc_whose_clock_stands_still(sent):
 
 
 def test_smoothing():
-    """Catches a filter that depends on the rate of the packets: a step is 63 % done after its time
-    constant."""
+    """Catches a filter that depends on the packets' rate: after its time constant 63 % are done."""
     stream = Watched(LINK)
     low, high = (row_of(stream.receive("a", jaw(frame, frame), 0.0)) for frame in (0, 1))
     for rate in (30, 120):

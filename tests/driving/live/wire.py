@@ -18,8 +18,7 @@ def live_link_face(
     weights: dict[str, float], frame: int = 0, head: tuple[float, float, float] = (0.0, 0.0, 0.0),
     subject: str = "phone", device: str = "DEVICE-1", count: int = 61, rate: int = 60,
 ) -> bytes:  # fmt: skip
-    """Big-endian: version 6; device and subject with their lengths; frame, subframe, rate,
-    denominator; the values."""
+    """Version, device and subject, frame and rate, the values; big-endian."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
     texts = device.encode(), subject.encode()
     names = b"".join(struct.pack(">i", len(text)) + text for text in texts)
