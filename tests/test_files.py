@@ -31,7 +31,7 @@ def write_half(path: Path) -> None:
         raise RuntimeError("mine")
 
 
-def test_replacing_is_all_or_nothing(tmp_path: Path) -> None:
+def test_replacing_is_all_or_nothing(tmp_path):
     """Catches a half-written file under the final name, and temporary files left behind."""
     path = tmp_path / "new" / "file.txt"
     with replacing(path) as partial:
@@ -56,7 +56,7 @@ UNWRITABLE = (
 
 
 @pytest.mark.parametrize("name", UNWRITABLE)
-def test_unwritable_paths(tmp_path: Path, name: str) -> None:
+def test_unwritable_paths(tmp_path, name):
     """Catches a traceback where a folder is a file, the file is a folder or no file can have such a
     name, a device, such as /dev/null, that is replaced by a file, a path that is refused only after
     minutes of work, and temporary files left beside it."""
@@ -75,7 +75,7 @@ def test_unwritable_paths(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\xff\xfe{}", b"[" * 200_000, b'{"a": 1'])
-def test_json(tmp_path: Path, content: bytes) -> None:
+def test_json(tmp_path, content):
     """Catches a traceback, a crash by deep nesting, a message that does not name the file, and an
     encoding that depends on the system."""
     value = {"name": "Grüße", "list": [1, 2.5, None, True], "nested": {"a": "b"}}
@@ -92,7 +92,7 @@ def test_json(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
+def test_npz_round_trip(tmp_path, compressed):
     """Catches a suffix that numpy adds, and arrays that change their type or shape."""
     arrays = {"a": np.arange(6, dtype=np.int32).reshape(2, 3), "b/c": np.array([True, False])}
     arrays["d"] = np.float64(3)
@@ -105,7 +105,7 @@ def test_npz_round_trip(tmp_path: Path, compressed: bool) -> None:
         assert again[name].dtype == np.asarray(array).dtype
 
 
-def test_flipped_bits(tmp_path: Path) -> None:
+def test_flipped_bits(tmp_path):
     """Catches damaged content that is read as if it were valid."""
     path = tmp_path / "a.npz"
     expected = np.random.default_rng(0).random(50)
@@ -123,7 +123,7 @@ def test_flipped_bits(tmp_path: Path) -> None:
     assert refused > 30
 
 
-def test_hostile_npz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_npz(tmp_path, monkeypatch):
     """Catches a small archive of oversized arrays."""
     path = tmp_path / "a.npz"
     np.savez_compressed(path, a=np.zeros(100_000))
@@ -152,7 +152,7 @@ def run(code: str, path: Path) -> int:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
-def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
     """Catches temporary files that stay after kill -9, and others, or those of living processes,
     that are removed."""
     other_host = ".a.json.00000000-4194304-00000000.partial"
@@ -170,7 +170,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
-def test_temporary_name_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_temporary_name_is_new(tmp_path, monkeypatch):
     """Catches a predictable temporary name, a link under that name that is followed and
     overwritten, and results that a group cannot read although its umask allows that."""
     names = set()

@@ -28,9 +28,7 @@ def heron(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> float:
     return float(np.sqrt(s * (s - a) * (s - b) * (s - c)))
 
 
-def frame_by_hand(
-    posed: np.ndarray, neutral: np.ndarray, convention: str
-) -> tuple[np.ndarray, np.ndarray, float]:
+def frame_by_hand(posed, neutral, convention):
     """Origin (3,), axes as columns (3, 3) and scale of one triangle (3, 3), as the two publications
     define them."""
     p, q, r = posed
@@ -76,7 +74,7 @@ def test_world_covariance_is_the_transformed_local_one(convention):
     splats = random_splats(3, 40, len(faces))
     world = to_world(splats, frames)
 
-    def covariance(s) -> np.ndarray:
+    def covariance(s):
         axes = scipy_rotation(s.rotation).as_matrix() * np.exp(s.log_scale)[:, None, :]
         return axes @ axes.transpose(0, 2, 1)
 
@@ -113,7 +111,7 @@ def test_unknown_convention_is_refused():
         face_frames(*random_mesh(0), random_mesh(0)[0], "gaussian-avatars")
 
 
-def test_backward_agrees_with_differences() -> None:
+def test_backward_agrees_with_differences():
     """Catches a gradient that leaves out what turns or grows a triangle, takes an edge for another,
     or has a wrong sign: against central differences of the frames in random directions."""
     vertices, faces = random_mesh(4)

@@ -23,7 +23,7 @@ def turned(camera: Camera) -> Camera:
     return replace(camera, world_to_camera=upside_down @ camera.world_to_camera)
 
 
-def test_timesteps_follow_each_other(toy: Capture) -> None:
+def test_timesteps_follow_each_other(toy):
     """Catches a mesh or an image of one take shown at a timestep of another."""
     other = moved(toy, 0.1)
     joined = join_takes([toy, other])
@@ -43,7 +43,7 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
         assert timesteps == [view.timestep for view in views]
 
 
-def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
+def test_cameras_keep_their_index_only_where_they_are_the_same(toy):
     """Catches exposure of one camera corrected in the images of another that merely has its number,
     and two that count as one because their takes begin as far apart as their numbers."""
     views, train = [], toy.views["train"]
@@ -66,7 +66,7 @@ def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> 
     assert indices[0] == 4 + 2 * start  # as in the identities of runs that have been extended
 
 
-def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
+def test_takes_of_other_heads_are_refused(toy):
     """Catches one person's expressions trained into another's avatar."""
     with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
         join_takes([toy, replace(toy, root=Path("other"), neutral=toy.neutral + 0.001)])
@@ -75,7 +75,7 @@ def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
     join_takes([toy, replace(toy, neutral=toy.neutral + 1e-6)])
 
 
-def test_frame_rate_of_takes(toy: Capture) -> None:
+def test_frame_rate_of_takes(toy):
     """Catches a rate of one take given to another that was recorded at a different one."""
     for first, second, expected in (
         (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None),

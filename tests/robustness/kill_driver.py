@@ -54,7 +54,7 @@ class Driver:
 
     def train(self, out: Path, resume: bool) -> None:
         ticks = iter(range(1 << 60))
-        run_module.perf_counter = lambda: float(next(ticks))  # type: ignore[attr-defined]
+        run_module.perf_counter = lambda: float(next(ticks))
         run_module.CHECKPOINT_S = INTERVAL
 
         def report(progress: run_module.Progress) -> bool:
@@ -94,7 +94,7 @@ class Driver:
 def opened(out: Path, faces: int) -> dict[str, Any]:
     """Read everything that a run folder may hold; "error" where something that exists cannot be
     read."""
-    found: dict[str, Any] = {"iteration": 0, "error": None}
+    found = {"iteration": 0, "error": None}
     try:
         if (out / "run.json").exists():
             run_folder.read_run(out)
@@ -121,8 +121,8 @@ def main(root: Path, kills: int) -> dict[str, Any]:
     whole = root / "whole"
     os.waitpid(driver.spawn(whole, False), 0)
     delays = random.Random(5)
-    records: list[dict[str, Any]] = []
-    finished: list[bool] = []
+    records = []
+    finished = []
     folder = 0
     while sum(record["killed"] for record in records) < kills:
         out = root / f"run{folder}"
