@@ -57,9 +57,7 @@ UNWRITABLE = (
 
 @pytest.mark.parametrize("name", UNWRITABLE)
 def test_unwritable_paths(tmp_path, name):
-    """Catches a traceback where a folder is a file, the file is a folder or no file can have such a
-    name, a device, such as /dev/null, that is replaced by a file, a path that is refused only after
-    minutes of work, and temporary files left beside it."""
+    """Catches a traceback, a device replaced by a file, and a path refused after the work."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder" / "inner").mkdir(parents=True)
     os.mkfifo(tmp_path / "pipe")
@@ -153,8 +151,7 @@ def run(code: str, path: Path) -> int:
 
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_leftovers_of_killed_processes_are_removed(tmp_path):
-    """Catches temporary files that stay after kill -9, and others, or those of living processes,
-    that are removed."""
+    """Catches temporary files that stay after kill -9, and living processes' removed."""
     other_host = ".a.json.00000000-4194304-00000000.partial"
     kept = {".notes.partial", ".a.json.123.partial", other_host, "a.json.partial"}
     for name in kept:
@@ -171,8 +168,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
 def test_temporary_name_is_new(tmp_path, monkeypatch):
-    """Catches a predictable temporary name, a link under that name that is followed and
-    overwritten, and results that a group cannot read although its umask allows that."""
+    """Catches a predictable temporary name, a link under it that is followed, and lost rights."""
     names = set()
     for _ in range(2):
         with replacing(tmp_path / "a.json") as partial:
@@ -214,8 +210,7 @@ def refused(times: int, winerror: int | None):
 
 @pytest.mark.parametrize("winerror", [5, 32])
 def test_a_file_that_another_program_has_open(winerror, tmp_path, monkeypatch):
-    """Catches hours of training that end because a virus scanner, or Blender, reads the last avatar
-    for a moment."""
+    """Catches hours of training that end as a virus scanner reads the last avatar."""
     write_json(tmp_path / "a.json", 1)
     fake, calls = refused(3, winerror)
     monkeypatch.setattr(files.os, "replace", fake)

@@ -50,9 +50,7 @@ RULES: list[tuple[dict[int, float], dict[str, np.ndarray], list[int]]] = [
 
 @pytest.mark.parametrize(("offsets", "regions", "expected"), RULES)
 def test_rules(offsets, regions, expected):
-    """Catches a mean taken over everything, a threshold that is not strict, a maximum or a
-    per-triangle rule inside a region, and a later region that unselects what an earlier one
-    selected."""
+    """Catches another mean, threshold or rule in a region, and a later one that unselects."""
     with np.errstate(all="raise"):
         chosen = select_faces(moved(offsets), NEUTRAL, FACES, regions, THRESHOLD)
     assert np.flatnonzero(chosen).tolist() == expected

@@ -95,8 +95,7 @@ def test_world_covariance_is_the_transformed_local_one(convention):
 
 
 def test_world_frame_changes_nothing():
-    """Catches world-space sets that drift when they pass through the same code as embedded ones,
-    and 0/0 when an optimizer, or a foreign file, delivers a zero quaternion."""
+    """Catches world-space sets that drift, and 0/0 of a zero quaternion."""
     splats = random_splats(5, 20, 1)
     splats.rotation[0] = 0
     world = to_world(splats, WORLD)

@@ -306,8 +306,7 @@ def test_positions_stay_near_where_the_mesh_is_torn():
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 @pytest.mark.parametrize("name", OFFSETS)
 def test_only_what_shows_is_kept(name, convention):
-    """Catches coefficients that are taken for invisible by another range, signal or unit than poses
-    have, and visible ones that are looked for in too small a unit."""
+    """Catches coefficients taken for invisible by another range, signal or unit than poses have."""
     neutral, rng = sheet(), np.random.default_rng(4)
     limits = rng.random((len(FACES), 2, 6)).astype(np.float32) * [[-2], [0.5]]
     unit = face_frames(neutral, FACES, neutral, convention).scale

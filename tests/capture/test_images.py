@@ -45,8 +45,7 @@ def saved(path: Path, pixels: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("background", [(255, 255, 255), (0, 0, 0), (10, 200, 90)])
 def test_transparency_is_laid_over_the_background(tmp_path, background):
-    """Catches premultiplied mixing and integer overflow, against the same in floating point; alpha
-    is the mask."""
+    """Catches premultiplied mixing and overflow; alpha is the mask."""
     view = view_of(saved(tmp_path / "x.png", np.dstack([COLOUR, ALPHA])))
     share = ALPHA[..., None] / 255
     expected = np.round(COLOUR * share + np.array(background) * (1 - share))
@@ -55,8 +54,7 @@ def test_transparency_is_laid_over_the_background(tmp_path, background):
 
 
 def test_gray_and_palette(tmp_path):
-    """Catches gray, black-and-white, gray with alpha and palette images read with a missing channel
-    axis, and 16-bit gray cut off at 255, which turns nearly everything white."""
+    """Catches a missing channel axis of gray or palettes, and 16-bit gray cut off at 255."""
     bits, few = GREY > 127, (COLOUR // 128) * 255
     la = np.dstack([GREY, np.where(bits, 255, 0).astype(np.uint8)])
     wide = RANDOM.integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)

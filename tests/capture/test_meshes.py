@@ -49,10 +49,7 @@ def test_obj_as_trimesh_reads_it(shared_data):
 
 
 def test_obj_dialects(tmp_path):
-    """Catches what exporters really write: colors, texture corners, several materials and objects,
-    quads, negative indices, Windows line ends, continued lines. trimesh would regroup the triangles
-    by material. And kept triangles that ignore how many vertices stand before a line that counts
-    backwards."""
+    """Catches colors, quads, negative indices, line ends and materials that are misread."""
     points = [f"v {i} {i * i} 0 1 0 0" for i in range(5)]
     lines = ["mtllib x.mtl", "o a", *points, "vt 0 0", "vn 0 0 1", "usemtl b", "f 4/1 2/1 1/1"]
     lines += ["usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]
@@ -154,8 +151,7 @@ def test_procrustes_as_scipy_has_it():
 
 
 def test_moving_jaw_does_not_drag_the_head():
-    """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the
-    skull by mm; and a fit that stops early, or divides by a residual of zero."""
+    """Catches least squares, which tilt the skull by the jaw, and 0/0 of no residual."""
     neutral = np.random.default_rng(2).normal(size=(2000, 3)) * 0.08
     jaw = neutral[:, 1] < np.quantile(neutral[:, 1], 0.4)
     opened = neutral - np.where(jaw[:, None], [[0.0, 0.02, 0.005]], 0.0)
@@ -230,8 +226,7 @@ def test_every_pixel_shows_the_nearest_triangle():
 
 
 def test_a_closed_mesh_has_no_holes():
-    """Catches pixels between two triangles whose centers lie on the common edge to within
-    rounding."""
+    """Catches pixels between two triangles whose centers lie on the common edge."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     for turn in np.linspace(0, 1, 7):
         camera = look_at((3 * np.sin(turn), 0, 3 * np.cos(turn)), (0, 0, 0), 64, 64, 64.0)

@@ -39,8 +39,7 @@ def each_split(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
 def test_mesh_capture(tmp_path, suffix):
-    """Catches a timestep paired with another's mesh or image, a lost gap, split or region, in each
-    mesh format."""
+    """Catches a timestep paired with another's mesh or image, a lost gap, split or region."""
     capture = open_capture(factory.write_mesh_capture(tmp_path / "capture", suffix=suffix))
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps, capture.flame) == ("mesh", (0, 1, 3), None)
@@ -100,8 +99,7 @@ def test_flame_capture(tmp_path):
 
 
 def test_flame_capture_without_paths_or_masks(tmp_path):
-    """Catches a canonical_flame_param.npz capture refused whose frames name no parameters, whose
-    model has no masks, or that has no cameras: it can be imported and animated."""
+    """Catches a capture refused whose frames name no parameters, or without cameras."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
 
     def strip(document):
@@ -391,8 +389,7 @@ def every_mesh(root: Path, model_file: Path | None) -> None:
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 0.02, 0.1, -1.0])
 @pytest.mark.filterwarnings("error")
 def test_camera_inside_the_head(tmp_path, distance):
-    """Catches divisions by a depth or distance of zero for a camera in the head, or with the head
-    behind it."""
+    """Catches divisions by zero for a camera in the head, or with the head behind it."""
     root = factory.write_mesh_capture(tmp_path / "capture")
 
     def change(document):

@@ -44,8 +44,7 @@ def test_timesteps_follow_each_other(toy):
 
 
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy):
-    """Catches exposure of one camera corrected in the images of another that merely has its number,
-    and two that count as one because their takes begin as far apart as their numbers."""
+    """Catches exposure of one camera corrected in another's images, and two that count as one."""
     views, train = [], toy.views["train"]
     for view in train:
         camera = turned(view.camera) if view.camera_index == 1 else view.camera

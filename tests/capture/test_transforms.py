@@ -54,8 +54,7 @@ def test_own_intrinsics_win(tmp_path):
 
 
 def test_cameras_are_numbered_alike_in_all_splits(tmp_path):
-    """Catches the held-out camera of `val` taking the number of a training camera when camera_index
-    is missing."""
+    """Catches the camera of `val` taking a training camera's number where none is given."""
     write = factory.write_mesh_capture(tmp_path / "capture")
     for keep_id in (True, False):
         for split in factory.SPLITS:
@@ -73,8 +72,7 @@ def test_cameras_are_numbered_alike_in_all_splits(tmp_path):
 
 
 def test_camera_is_known_by_where_it_stands(tmp_path):
-    """Catches one camera taken for two because of the sign of a zero or the last digits of its
-    pose."""
+    """Catches one camera taken for two by the sign of a zero or its pose's last digits."""
     frames = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(1, 1)]
     matrix = np.array(frames[1]["transform_matrix"])
     matrix[:3] -= 1e-9
@@ -113,8 +111,7 @@ def test_single_file_is_all_training(tmp_path):
 
 
 def test_static_capture_without_timesteps(tmp_path):
-    """Catches a plain NeRF transforms file (no timestep, no size but the image's, no suffix) being
-    refused."""
+    """Catches a plain NeRF transforms file being refused."""
     factory.write_images(tmp_path, [0], [0])
     entry = {"file_path": "images/00000_00", "transform_matrix": factory.pose(0).tolist()}
     frame = read_one(tmp_path, entry, camera_angle_x=0.5)
@@ -125,8 +122,7 @@ def test_static_capture_without_timesteps(tmp_path):
 
 
 def test_union_paths_stay_beside_the_capture(tmp_path):
-    """Catches union sets of VHAP, whose frames all lie in sibling folders (`../<sequence>/images`),
-    being refused, or resolved from the working directory."""
+    """Catches VHAP's union sets, whose frames lie in sibling folders, being refused."""
     root = tmp_path / "union"
     assert inside(root, "../seq_01/images/1.png", "x") == tmp_path / "seq_01/images/1.png"
     assert inside(root, "images/../../seq_01\\1.png", "x") == tmp_path / "seq_01/1.png"

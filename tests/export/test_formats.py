@@ -44,9 +44,7 @@ def test_ply_is_the_first_mesh(avatar, tmp_path):
 
 
 def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
-    """Catches frames left out, overwritten, or named after their place, frames of an earlier,
-    longer export that stay between or behind the new ones, other files removed, such as somebody's
-    scans with such names, and the first frames of a cancelled export among those of the last."""
+    """Catches frames left out, of an earlier or a cancelled export, and others' files removed."""
     export_avatar(tmp_path, avatar, "ply-sequence", posed(avatar, -7, 0, 1, 2, 100000))
     others = {"notes.txt", "point_cloud.ply", "12.ply", ".stga_sequence"}
     for name in others:

@@ -38,8 +38,7 @@ def test_the_dialect_of_the_published_files():
 
 @pytest.mark.parametrize("protocol", range(6))
 def test_every_pickle_protocol(tmp_path, protocol):
-    """Catches a protocol whose way of storing arrays (text, codecs, buffers) is not understood, and
-    a reader that knows only one numpy's private module names."""
+    """Catches a protocol, sparse layout or numpy module name that is not understood."""
     arrays, path = random_arrays(), tmp_path / "model.pkl"
     layout = ("csc_matrix", "csr_matrix", "coo_matrix")[protocol % 3]
     sparse = getattr(scipy.sparse, layout)(arrays["J_regressor"])

@@ -121,8 +121,7 @@ def test_a_triangle_that_flips_between_frames():
 
 
 def test_quaternions_near_half_turns_from_float32_matrices():
-    """Catches a square root of a negative number, or 0/0, where rounding leaves the trace a little
-    below −1."""
+    """Catches a negative square root, or 0/0, where rounding leaves the trace below −1."""
     rng = np.random.default_rng(2)
     axes = rng.normal(size=(500, 3))
     axes[:30] = np.repeat(np.eye(3), 10, axis=0)

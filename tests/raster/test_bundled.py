@@ -80,8 +80,7 @@ def test_kernels_of_another_machine_are_used_where_they_fit(tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_the_first_run_on_a_machine_has_the_bits_of_all_later_ones(kernel_bundle):
-    """Catches a helper that is called where it was compiled alone, in one process, and as a copy in
-    the next."""
+    """Catches a helper that is called in one process and compiled as a copy in the next."""
     folder, compiled = kernel_bundle
     environment = {
         **os.environ,

@@ -22,8 +22,7 @@ def logarithms(x, out):
 
 
 def test_exponential_and_logarithm_are_numpys():
-    """Catches a wrong coefficient, and a reduction that loses digits far from zero or at a power of
-    two."""
+    """Catches a wrong coefficient, and digits lost far from zero or at a power of two."""
     x = np.concatenate([np.linspace(-86, 88, 20_001), np.arange(-120, 120) * np.log(2) / 2]).astype(
         np.float32
     )

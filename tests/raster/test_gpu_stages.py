@@ -108,8 +108,7 @@ def pictures(width: int, height: int, seed: int = 1) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("kind", ["noise", "bright and flat", "equal"])
 def test_loss_and_gradient_are_the_cpus(device, size, kind):
-    """Catches a window, a padding, a byte of the target or a sign that differs, and a tile left out
-    of the sum."""
+    """Catches a window, padding, byte or sign that differs, and a tile left out of the sum."""
     image, target = pictures(*size)
     if kind == "bright and flat":
         image, target = np.full_like(image, 0.999), np.full_like(target, 255)

@@ -180,8 +180,7 @@ def test_image_and_gradients_are_the_references(back_end, name):
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
-    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on
-    triangles."""
+    """Catches a kernel that turns, scales or differentiates in the wrong frame."""
     scene, rng = cloud(1), np.random.default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]

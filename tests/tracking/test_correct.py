@@ -64,8 +64,7 @@ def test_a_key_moves_its_neighbors_and_nothing_else():
     [{}, {0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, dict.fromkeys(range(30), 0.1)],
 )
 def test_keys_anywhere(keys):
-    """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left
-    to solve, and a solution that drifts with every call."""
+    """Catches keys at the ends, side by side or everywhere, and a drift with every call."""
     given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
     found = correct(given)
     for timestep, values in given.items():
@@ -179,8 +178,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
-    """Catches a traceback, a warning of NumPy's, or heads that are overwritten from damaged
-    files."""
+    """Catches a traceback, or heads that are overwritten from damaged files."""
     out, model, before = tracked
     damage, file, message = DAMAGES[name]
     shutil.copytree(out, tmp_path / "out")

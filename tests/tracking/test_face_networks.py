@@ -32,8 +32,7 @@ def pictures() -> list[np.ndarray]:
 
 
 def test_landmarks_and_scores_are_mediapipes(pictures):
-    """Catches anchors, crop, rotation, resampling or an order of inputs that are not those that the
-    networks were trained with."""
+    """Catches other anchors, crops, rotation, resampling or inputs than networks had."""
     reference = np.load(REFERENCE)
     for image, points, scores in zip(
         pictures, reference["points"], reference["scores"], strict=True

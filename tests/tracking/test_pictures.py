@@ -91,8 +91,7 @@ def test_worst_views_first(tmp_path):
 
 
 def test_what_images_do_not_explain_counts_beside_landmarks(tmp_path):
-    """Catches a sheet that hides the timesteps at which landmarks and head agree on what the images
-    do not show."""
+    """Catches a sheet that hides where landmarks and head agree on what images do not show."""
     take = footage(tmp_path, 1, 4)
     errors = {"cam0": {0: 1.0, 1: 1.3, 2: 1.0, 3: 1.0}}
     misfit = {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}}

@@ -106,9 +106,7 @@ def test_a_broken_gradient_leaves_its_row(bad):
 
 @pytest.mark.parametrize("ahead", [0.0, 0.1])
 def test_many_rows(ahead):
-    """Catches rows that take their neighbours' step counts where the work is cut into blocks for
-    the threads, steps of harmonics above the degree in use, and Nesterov's momentum that gets into
-    the moments."""
+    """Catches others' step counts in blocks for threads, unused harmonics, and momentum."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
     state.steps[:] = rng.integers(0, 50, 1500)

@@ -106,8 +106,7 @@ def batch_of(capture, settings, timestep=1, **changes):
 
 @pytest.mark.parametrize("part", ["whole", "mouth", "another background"])
 def test_one_step_is_the_cpus(toy, part):
-    """Catches a term of the loss, a limit, a rate, a bias correction or a background that is left
-    out or differs."""
+    """Catches a term of the loss, a limit, rate, correction or background that differs."""
     settings = settings_of()
     changes = {}
     if part == "mouth":
@@ -166,8 +165,7 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy):
 
 
 def test_an_iteration_without_room_is_repeated(toy, monkeypatch):
-    """Catches an iteration lost, counted twice or half done where the buffers were too small for
-    it."""
+    """Catches an iteration lost, counted twice or half done where buffers were too small."""
     settings = settings_of()
     batches = [
         batch_of(toy, settings, timestep, selected=s)
@@ -289,8 +287,7 @@ def assert_near(got: TrainState, want: TrainState) -> None:
 @pytest.mark.parametrize("offsets", [tuple(OFFSETS), ("strain_position",), ("normal_color",)])
 @pytest.mark.parametrize("part", [None, "mouth"])
 def test_iterations_are_the_cpus(toy, part, offsets):
-    """Catches splats that are not moved or colored, a gradient of other splats or with that of the
-    limits, and another timestep's signal: over a few iterations, whole and local."""
+    """Catches splats not moved or colored, others' gradients, and another timestep's signal."""
     capture, settings = squeezed(toy), settings_of(driven_offsets=offsets)
     cpu, gpu = pair(capture, settings)
     before = every_bit(cpu.state)

@@ -110,8 +110,7 @@ def test_distance_matches_the_package_lpips(size):
 
 
 def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, monkeypatch):
-    """Catches images taken for −1…1, channels that are mixed up, a region that sees the rest of the
-    image, and images too small for the network."""
+    """Catches another range or channels, a region that sees the rest, and small images."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     image, target = pair(47, 68)
     evaluation_view = evaluation_view_of(tmp_path, target)

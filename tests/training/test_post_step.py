@@ -125,8 +125,7 @@ def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
 
 @pytest.mark.parametrize("region", [None, np.array([True, False, True, True])])
 def test_what_is_pruned(region):
-    """Catches positions in another unit or frame, images that do not show a point but count, splats
-    of other triangles, and bald triangles."""
+    """Catches positions in another frame, images that do not show a point, and bald triangles."""
     rng = np.random.default_rng(2)
     outlines, frames = pictures(rng)
     state = random_state(300, 4)

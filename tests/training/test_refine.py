@@ -89,8 +89,7 @@ def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def test_nothing_outside_the_region_changes_by_one_bit(parent, toy, tmp_path):
-    """Catches momentum, averaging, density control or stray resets that reach splats beyond the
-    region, and a refinement that does nothing."""
+    """Catches momentum, averages, density or resets beyond the region, and doing nothing."""
     before, region = read_avatar(parent / "avatar.npz"), toy.regions["mouth"]
     after = read_avatar(refine(parent, tmp_path / "refined") / "avatar.npz")
     outside = [~region[avatar.splats.face] for avatar in (before, after)]

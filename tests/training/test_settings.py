@@ -16,8 +16,7 @@ from stga_addon.training.settings import STRATEGIES, Rates, TrainingSettings, ma
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("schedule", ["default", "paper"])
 def test_json_round_trip(strategy, schedule):
-    """Catches a field, also of nested settings, that changes its value or kind (a tuple into a
-    list) in run.json, so a resumed run differs."""
+    """Catches a field, also of nested settings, that changes its value or kind in run.json."""
     chosen = SelectionOptions(threshold=0.5, zero_pose="all", regions=("nose",))
     changes = {"background": (0.0, 0.5, 1.0), "selection": chosen, "rates": Rates(xyz=1.0)}
     settings = make_settings(strategy, schedule, seconds=90.5, seed=7, **changes)

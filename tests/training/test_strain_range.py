@@ -81,9 +81,7 @@ def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
 
 
 def test_colors_follow_compression_and_shear_but_no_stretch(toy):
-    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched,
-    or that begin with the least compression, in the frames that training renders or in the avatar's
-    range."""
+    """Catches wrinkles of opposite sign in stretched skin, or of the least compression."""
     basis = FrameStore(toy, "stga", strain=True).strain
     assert basis is not None
     larger, little, smaller = (
@@ -102,8 +100,7 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy):
 
 @pytest.mark.parametrize("limited", [True, False])
 def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
-    """Catches a run of an earlier version that is resumed, which changes all its colors at once,
-    and one that is finished but cannot be opened."""
+    """Catches an earlier version's run resumed in other colors, or that cannot be opened."""
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     path = train(toy, out, run, report=stop_at(2))

@@ -158,8 +158,7 @@ def test_keyboard(browser, head, tmp_path):
 
 
 def test_sliders_are_flames(browser, head, tmp_path):
-    """Catches a slider that moves another blend shape, joint or axis than FLAME's of its name, one
-    that does not follow the motion until it is moved, and another first camera than the file's."""
+    """Catches a slider that moves another shape, joint or axis, or another first camera."""
     show(browser, tmp_path, head.data(exact=True))
     assert np.allclose(browser.evaluate(CAMERA), head.camera.world_to_camera.ravel())
     shown, component = browser.evaluate("""(() => {
@@ -226,8 +225,7 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
 
 @pytest.mark.nightly
 def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
-    """Catches textures, buffers and objects that pile up with the frames (ten minutes on an
-    accelerated clock)."""
+    """Catches textures, buffers and objects that pile up, on an accelerated clock."""
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=INSTRUMENTS)
     try:
         show(browser, tmp_path, head.data())
