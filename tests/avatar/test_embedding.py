@@ -95,17 +95,13 @@ def test_world_covariance_is_the_transformed_local_one(convention):
 
 
 def test_world_frame_changes_nothing():
-    """Catches world-space sets that drift, and 0/0 of a zero quaternion."""
+    """Catches world-space sets that drift, 0/0 of a zero quaternion, and a misspelt convention."""
     splats = random_splats(5, 20, 1)
     splats.rotation[0] = 0
     world = to_world(splats, WORLD)
     np.testing.assert_array_equal(world.xyz, splats.xyz)
     np.testing.assert_array_equal(world.log_scale, splats.log_scale)
     np.testing.assert_array_equal(world.rotation[0], [1, 0, 0, 0])
-
-
-def test_unknown_convention_is_refused():
-    """Catches a misspelt convention that would silently train in another frame."""
     with pytest.raises(ValueError, match="gaussian-avatars"):
         face_frames(*random_mesh(0), random_mesh(0)[0], "gaussian-avatars")
 

@@ -221,20 +221,6 @@ def test_a_head_that_is_not_in_meters(tmp_path, factor, says):
     assert says is None or says in warnings[0]
 
 
-def test_studio_head(shared_data):
-    """Catches a mesh that misses its image: every vertex of a real tracked mesh must project into
-    the mask."""
-    capture = open_capture(shared_data / "studio_head")
-    assert [len(views) for views in capture.views.values()] == [180, 12, 64]
-    assert (capture.timesteps, capture.warnings) == (tuple(range(16)), ())
-    assert set(capture.regions) == {"left_eye", "right_eye", "mouth", "nose"}
-    for view in (capture.views["train"][0], capture.views["val"][-1], capture.views["test"][-1]):
-        mask = read_mask(view)
-        assert mask is not None
-        column, row = view.camera.project(capture.mesh(view.timestep))[0].astype(int).T
-        assert (mask[row, column] > 0).mean() > 0.99
-
-
 def test_summary(tmp_path):
     """Catches counts, gaps, offsets or warnings that `info` would show wrong, by one at either end
     of a gap, too."""

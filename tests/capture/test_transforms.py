@@ -71,8 +71,8 @@ def test_cameras_are_numbered_alike_in_all_splits(tmp_path):
         assert where == {"train": {0, 1}, "val": {2}, "test": {0, 1, 2}}
 
 
-def test_camera_is_known_by_where_it_stands(tmp_path):
-    """Catches one camera taken for two by the sign of a zero or its pose's last digits."""
+def test_cameras_of_a_single_file(tmp_path):
+    """Catches one camera taken for two by a zero's sign, or two for one, and frames lost."""
     frames = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(1, 1)]
     matrix = np.array(frames[1]["transform_matrix"])
     matrix[:3] -= 1e-9
@@ -81,11 +81,6 @@ def test_camera_is_known_by_where_it_stands(tmp_path):
         del entry["camera_index"], entry["camera_id"]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
-
-
-def test_frames_share_cameras_that_are_alike_in_everything(tmp_path):
-    """Catches a camera of its own for each of 18,000 views, and one lens or pose taken for
-    another's."""
     entries = [
         factory.frame(0, 0), factory.frame(1, 0), factory.frame(2, 0), factory.frame(3, 0),
         factory.frame(4, 1),
@@ -98,10 +93,6 @@ def test_frames_share_cameras_that_are_alike_in_everything(tmp_path):
     assert len({id(camera) for camera in cameras}) == 4
     assert cameras[2].fl_x == cameras[0].fl_x + 1
     assert cameras[3].cy != cameras[0].cy
-
-
-def test_single_file_is_all_training(tmp_path):
-    """Catches frames lost, or split by guesswork, where a capture has transforms.json alone."""
     frames = [factory.frame(0, camera) for camera in range(3)]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     splits = read_splits(tmp_path).splits

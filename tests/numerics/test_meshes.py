@@ -106,20 +106,6 @@ def test_collapsed_triangles_render_and_train_in_float32():
             np.testing.assert_allclose(gradients[name], want, atol=2e-5 * largest, err_msg=name)
 
 
-def test_a_triangle_that_flips_between_frames():
-    """Catches a frame that is mirrored instead of turned: a flip is half a turn about the first
-    axis."""
-    for convention in CONVENTIONS:
-        before = face_frames(WHOLE, FACES, WHOLE, convention)
-        axis = before.rotation[0][:, 0]
-        flipped = WHOLE.mean(0) + Rotation.from_rotvec(np.pi * axis).apply(WHOLE - WHOLE.mean(0))
-        after = face_frames(flipped, FACES, WHOLE, convention)
-        turn = Rotation.from_matrix(after.rotation[0] @ before.rotation[0].T)
-        assert turn.magnitude() == pytest.approx(np.pi, abs=1e-9)
-        assert after.scale == pytest.approx(before.scale)
-        assert_proper(after.rotation)
-
-
 def test_quaternions_near_half_turns_from_float32_matrices():
     """Catches a negative square root, or 0/0, where rounding leaves the trace below −1."""
     rng = np.random.default_rng(2)
