@@ -29,9 +29,17 @@ def assert_same_pose(one: Camera, other: Camera) -> None:
 
 
 def test_orbit():
-    """Catches a turn in the other direction, about another point, or one that loses the framing."""
+    """Catches another direction or center, a turn that repeats a view, and limits left."""
     for degrees in (0, 30, -100, 180):
         assert_same_pose(orbited(camera(20), CENTER, UP, np.radians(degrees)), camera(20 + degrees))
+    full = turntable(camera(10), CENTER, 8, (-np.pi, np.pi))
+    for index, each in enumerate(full):
+        assert_same_pose(each, camera(10 + 45 * index))
+    partial = turntable(camera(10), CENTER, 200, (np.radians(-30), np.radians(60)))
+    x, _, z = (np.array([each.position for each in partial]) - CENTER).T
+    degrees = np.degrees(np.arctan2(x, z)) - 10
+    assert (degrees.min(), degrees.max()) == pytest.approx((-30, 60), abs=0.1)
+    assert np.abs(np.diff(np.append(degrees, degrees[0]))).max() < 2
 
 
 @pytest.mark.parametrize(("angles", "start", "expected"), [
@@ -44,19 +52,6 @@ def test_covered_angles(angles, start, expected):
     did."""
     covered = covered_angles([camera(angle) for angle in angles], camera(start), CENTER)
     np.testing.assert_allclose(np.degrees(covered), expected, atol=1e-9)
-
-
-def test_turntable():
-    """Catches a full turn that ends in its first view, and a partial one that leaves its limits or
-    jumps."""
-    full = turntable(camera(10), CENTER, 8, (-np.pi, np.pi))
-    for index, each in enumerate(full):
-        assert_same_pose(each, camera(10 + 45 * index))
-    partial = turntable(camera(10), CENTER, 200, (np.radians(-30), np.radians(60)))
-    x, _, z = (np.array([each.position for each in partial]) - CENTER).T
-    degrees = np.degrees(np.arctan2(x, z)) - 10
-    assert (degrees.min(), degrees.max()) == pytest.approx((-30, 60), abs=0.1)
-    assert np.abs(np.diff(np.append(degrees, degrees[0]))).max() < 2
 
 
 def test_central_camera():

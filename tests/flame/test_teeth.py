@@ -121,8 +121,7 @@ def test_identity_carries_the_teeth(flame_open):
 
 
 def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
-    """Catches lists of vertices of one published mesh, and lengths in meters: another numbering and
-    size of the same mesh has the same teeth."""
+    """Catches lists of one mesh's vertices, lengths in meters, and lips paired wrongly."""
     order = np.random.default_rng(1).permutation(5023)
     number = np.argsort(order)
     faces, shapes = number[flame_open.faces].astype(np.int32), flame_open.shapedirs[order]
@@ -131,11 +130,6 @@ def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
     np.testing.assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)
     np.testing.assert_allclose(other.shapedirs[5023:], toothed.shapedirs[5023:], atol=1e-9)
     np.testing.assert_array_equal(order[np.array(lip_pairs(other))], lip_pairs(toothed))
-
-
-def test_lips_face_each_other(flame_open, toothed):
-    """Catches vertices that are not on the lips, in another order, or paired with the wrong
-    ones."""
     upper, lower = (flame_open.v_template[ids] for ids in lip_pairs(toothed))
     np.testing.assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
     assert (np.diff(upper[:, 0]) < 0).all()

@@ -86,9 +86,8 @@ def parameters_in(out, model):
     return np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
 
 
-def test_a_corrected_capture_shows_the_key(tracked):
-    """Catches a key in other units or order than the files, and a report that is still that of
-    before."""
+def test_a_corrected_capture_shows_the_key(tracked, tmp_path):
+    """Catches a key in other units, a report of before, and another tracker's capture lost."""
     out, model, before = tracked
     report = read_json(out / "tracking.json")["reprojection_px"]["cam0"]
     key = before[1].copy()
@@ -104,11 +103,6 @@ def test_a_corrected_capture_shows_the_key(tracked):
     assert abs(after["4"] - report["4"]) < 0.02
     correct_capture(out, model, {})
     np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
-
-
-def test_what_cannot_be_corrected_is_named(tracked, tmp_path):
-    """Catches a capture of another tracker that is overwritten."""
-    out, model, before = tracked
     with pytest.raises(StgaError, match="has no timestep 99"):
         correct_capture(out, model, {99: before[0]})
     other = tmp_path / "other"

@@ -168,7 +168,7 @@ def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_what_is_hidden_and_what_it_looks_like(from_one_side):
-    """Catches a side, a normal or a mirror plane taken for another: against the ball."""
+    """Catches another side, normal or mirror plane, and a far side that takes any color."""
     capture, sides = from_one_side, unseen_sides(from_one_side)
     neutral, posed = (
         mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))
@@ -184,12 +184,6 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     copied = sides.triangles & (cosine[partner] > 0.7)
     assert copied.sum() > 20
     np.testing.assert_array_equal(sides.color[copied], sides.color[partner[copied]])
-
-
-def test_training_leaves_them_their_color(from_one_side):
-    """Catches splats of the far side that take any color, where they shine through the near side,
-    and a near side that is reset."""
-    capture = from_one_side
     trainer = Trainer(
         capture, quick_settings("global", iterations=200, lattice=1, sh_degree=1, sh_steps=()), {}
     )

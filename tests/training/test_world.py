@@ -114,8 +114,8 @@ def test_plates_without_the_person(walled):
         assert (hidden <= stripes.max((0, 1)) + 1e-6).all()
 
 
-def test_measured_with_the_world(walled, run, capsys):
-    """Catches figures of matted images called whole ones: against `stga render --world`."""
+def test_measured_with_the_world(walled, run, capsys, tmp_path):
+    """Catches matted images' figures called whole ones, and a traceback without a world."""
     assert stga("eval", run, "--split train") == 0
     assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
@@ -128,10 +128,6 @@ def test_measured_with_the_world(walled, run, capsys):
         errors.append(-10 * np.log10(((rendered - recorded) ** 2).mean()))
     assert found == pytest.approx(np.mean(errors), abs=0.05)
     assert found > 18
-
-
-def test_no_world(walled, run, tmp_path, capsys):
-    """Catches a traceback without a world, and one where nothing tells it apart."""
     avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
     avatar.write_bytes((run / "avatar.npz").read_bytes())
     asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")

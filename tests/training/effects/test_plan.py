@@ -29,8 +29,8 @@ def trained(root, tmp_path_factory):
     return out
 
 
-def test_the_run_keeps_its_plan(trained):
-    """Catches decisions or reasons lost in run.json, and settings that do not follow them."""
+def test_the_run_keeps_its_plan(trained, root, monkeypatch, capsys):
+    """Catches decisions lost in run.json, settings that do not follow, and decisions anew."""
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.effect_plan}
     assert (plan["strain-color"].choice, plan["strain-color"].on) == ("on", True)
@@ -39,6 +39,15 @@ def test_the_run_keeps_its_plan(trained):
     assert not run.settings.hull_points
     assert plan["exposure"].choice == "auto"
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
+    monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
+    before = read_run(trained)
+    train = "train", root, "--out", trained, "--resume --effect"
+    assert stga(*train, "strain-color=on") == 0
+    assert read_run(trained) == before
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert any(line.startswith("strain-color on, as asked:") for line in lines)
+    assert stga(*train, "strain-color=off") == 2
+    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("effect", ["strain-color", "normal-color"])
@@ -58,19 +67,6 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
         (effect, True, "two takes say so")
     ]
     assert add_effects(capture, extended, later) == (extended, later)
-
-
-def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
-    """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
-    before = read_run(trained)
-    train = "train", root, "--out", trained, "--resume --effect"
-    assert stga(*train, "strain-color=on") == 0
-    assert read_run(trained) == before
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert any(line.startswith("strain-color on, as asked:") for line in lines)
-    assert stga(*train, "strain-color=off") == 2
-    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 def test_info_shows_the_plan(tmp_path, capsys):
