@@ -35,8 +35,8 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_links_lead_somewhere(page):
-    """Catches links to pages, pictures and headings that were renamed or removed."""
+def test_what_a_page_names_is_there(page):
+    """Catches links, files, tests and commands that are gone, and addresses that go stale."""
     for target in re.findall(r"\]\(([^)\s]+)\)", TEXTS[page]):
         if "://" in target:
             continue
@@ -47,20 +47,10 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(linked.read_text(encoding="utf-8")), (
                 f"{name_of(page)}: {target}"
             )
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_named_files_exist(page):
-    """Catches docs that name a module or test file by an old path."""
     for path in re.findall(r"`([\w./]+/[\w.]+\.py)", TEXTS[page]):
         assert any((ROOT / folder / path).is_file() for folder in PATH_FOLDERS), (
             f"{name_of(page)}: {path}"
         )
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_named_tests_exist(page):
-    """Catches docs that cite a test which was renamed or removed."""
     sources = {
         path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")
     }
@@ -70,19 +60,9 @@ def test_named_tests_exist(page):
     every = "\n".join(sources.values())
     for test in re.findall(r"`(test_\w+)`", TEXTS[page]):
         assert f"def {test}(" in every, f"{name_of(page)}: {test}"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_commands_parse(page):
-    """Catches commands and flags that the docs show and the command line no longer knows."""
     for line in re.findall(r"^stga .*$", TEXTS[page], re.MULTILINE):
         words = shlex.split(line.partition("#")[0])[1:]
         make_parser().parse_args(words)  # exits where a word is unknown
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_no_package_index_is_named(page):
-    """Catches addresses of package files, which go stale: the docs name packages and versions."""
     assert not re.search(r"pythonhosted|pypi\.org", TEXTS[page])
 
 

@@ -57,7 +57,7 @@ def parsed(*words: str) -> dict[str, Any]:
     return given_options(parser.parse_args(["a.png", "--out", "b", *words]), Drawing)
 
 
-def test_what_is_given_reaches_its_field() -> None:
+def test_what_is_given_reaches_its_field():
     """Catches an option that is lost, of another type or in another field, and a default that hides
     the dataclass's."""
     assert Drawing(**parsed()) == Drawing(Path("a.png"), Path("b"))
@@ -100,7 +100,7 @@ NO_DURATIONS = "", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s
 NO_COLORS = "", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "nan,0,0", "0,0,inf", "a,b,c"
 
 
-def test_times_and_colors() -> None:
+def test_times_and_colors():
     """Catches minutes taken for seconds, 0…255 taken for 0…1, channels in another order, and a
     value that means something else than what was typed."""
     assert {text: duration(text) for text in DURATIONS} == DURATIONS
@@ -119,7 +119,7 @@ def test_times_and_colors() -> None:
     ("--tones dark", "--tones: has no effect without --shaded"),
     ("--width 3", "--width: has no effect without --shaded"),
 ])  # fmt: skip
-def test_options_that_need_others(words: str, message: str) -> None:
+def test_options_that_need_others(words, message):
     """Catches an option that is ignored without a message, and one that is refused where it has an
     effect."""
     refuse_useless(Drawing(**parsed("--shaded", "--strokes", "3", "--tones=dark", "--width=3")))

@@ -37,7 +37,7 @@ def render(parts: dict[str, Path], out: Path, *more: object) -> int:
     return main([str(a) for a in [*arguments, *more]])
 
 
-def test_the_other_person_moves_the_avatar(parts: dict[str, Path], tmp_path: Path) -> None:
+def test_the_other_person_moves_the_avatar(parts, tmp_path):
     """Catches the other's identity, a wrong timestep, and cameras that come more than once."""
     out = tmp_path / "out"
     assert render(parts, out, "--flame", parts["model"]) == 0

@@ -69,10 +69,10 @@ SIDE = "expected a whole number from 1 up to 9"
 KINDS = "expected one of Circle, Square"
 
 
-def test_round_trip() -> None:
+def test_round_trip():
     """Catches a field that is lost, takes another type, or is confused with an alternative of the
     same form."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays = {}
     plain = to_json(EVERYTHING, arrays)
     again = from_json(Drawing, json.loads(json.dumps(plain)), arrays=arrays)
     for name, value in vars(EVERYTHING).items():
@@ -112,12 +112,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"main": 3}, "setting main: expected an object of Circle or an object of Square, got 3"),
     ({"main": Circle(0.0)}, "setting main.radius: expected a finite number above 0.0 up to 9.0"),
     ({"others": (Circle(), Square(10))}, f"setting others.1.side: {SIDE}, got 10"),
-    ({"last": Square(1, [1])}, "setting last.points: expected an array, got "),  # type: ignore[arg-type]
+    ({"last": Square(1, [1])}, "setting last.points: expected an array, got "),
 ]
 
 
 @pytest.mark.parametrize(("changes", "message"), REFUSED)
-def test_what_is_not_allowed(changes: dict[str, Any], message: str) -> None:
+def test_what_is_not_allowed(changes, message):
     """Catches a limit that does not hold, or holds for the value at its end, and a message about
     another field."""
     with pytest.raises(StgaError) as caught:
@@ -125,7 +125,7 @@ def test_what_is_not_allowed(changes: dict[str, Any], message: str) -> None:
     assert str(caught.value).startswith(message)
 
 
-def test_limits() -> None:
+def test_limits():
     """Catches an inclusive limit that excludes its value, whole numbers that are refused as finite
     ones, and one given so that overflows where it is counted with, at either sign."""
     largest = (1 << 31) - 1
@@ -155,7 +155,7 @@ OTHER_FORMS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "message"), OTHER_FORMS)
-def test_json_of_another_form(changes: dict[str, Any], message: str) -> None:
+def test_json_of_another_form(changes, message):
     """Catches a traceback for a file edited by hand, and a message that does not say where the
     mistake is."""
     plain = to_json(Drawing())
@@ -165,7 +165,7 @@ def test_json_of_another_form(changes: dict[str, Any], message: str) -> None:
 
 
 @pytest.mark.parametrize("named", ["nowhere", 3, None, []])
-def test_an_array_that_is_not_there(named: object) -> None:
+def test_an_array_that_is_not_there(named):
     """Catches an array that is required and missing, taken for one that may be left out."""
     plain = {"points": {"array": named}}
     with pytest.raises(StgaError, match="setting points: expected an array, got None"):

@@ -50,9 +50,7 @@ RULES: list[tuple[dict[int, float], dict[str, np.ndarray], list[int]]] = [
 
 @pytest.mark.parametrize(("offsets", "regions", "expected"), RULES)
 def test_rules(offsets, regions, expected):
-    """Catches a mean taken over everything, a threshold that is not strict, a maximum or a
-    per-triangle rule inside a region, and a later region that unselects what an earlier one
-    selected."""
+    """Catches another mean, threshold or rule in a region, and a later one that unselects."""
     with np.errstate(all="raise"):
         chosen = select_faces(moved(offsets), NEUTRAL, FACES, regions, THRESHOLD)
     assert np.flatnonzero(chosen).tolist() == expected
@@ -87,31 +85,26 @@ def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:
 
 
 def test_every_timestep_is_selected_from_its_expression_mesh():
-    """Catches regions that the options do not name, and the wrong zero pose: "ears" is no key
-    region here."""
-    asked: list[tuple[int, str]] = []
+    """Catches regions not named, the wrong zero pose, and the authors' own faces overruled."""
+    asked = []
     options = SelectionOptions(threshold=THRESHOLD, zero_pose="all")
     chosen = select_capture(capture({}, asked), options)
     assert numbers(chosen) == {1: [1, 2], 4: [4], 6: [6]}
     assert asked == [(1, "all"), (4, "all"), (6, "all")]
-
-
-def test_selection_that_came_with_the_capture_wins():
-    """Catches the rule overriding the authors' own training faces, an empty choice included."""
-    asked: list[tuple[int, str]] = []
+    asked = []
     given = {4: region(0, 7), 6: region()}
     chosen = select_capture(capture(given, asked), SelectionOptions(threshold=THRESHOLD))
     assert numbers(chosen) == {1: [1, 2], 4: [0, 7], 6: []}
     assert asked == [(1, "head")]
 
 
-def test_options() -> None:
+def test_options():
     """Catches a threshold that selects nothing, or everything, without saying so, one of zero that
     is refused, a misspelled zero pose that is found only where the first FLAME mesh is posed, and a
     key region under another name than captures give it."""
     for threshold in (float("nan"), -1.0, float("inf"), "5", None):
         with pytest.raises(StgaError, match="threshold: expected a finite number from 0, got"):
-            validate(SelectionOptions(threshold=threshold))  # type: ignore[arg-type]
+            validate(SelectionOptions(threshold=threshold))
     validate(SelectionOptions(threshold=0.0))
     with pytest.raises(StgaError, match="zero_pose: expected one of head, all, got 'face'"):
         validate(SelectionOptions(zero_pose="face"))

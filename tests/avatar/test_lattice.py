@@ -49,8 +49,7 @@ def test_order_4_is_the_corners_and_midpoints_of_the_four_subtriangles(conventio
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_world_scale_is_flat_along_the_normal(convention):
-    """Catches scale in the wrong unit (triangle units against meters) or flattened along the wrong
-    axis."""
+    """Catches triangle units taken for meters, and flattening along another axis."""
     neutral, faces = random_mesh(2)
     splats = lattice_splats(neutral, faces, 2, convention=convention)
     frames = face_frames(neutral, faces, neutral, convention)

@@ -74,7 +74,7 @@ def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> Non
     """The last camera is `val`, the last timestep `test`, all else `train`."""
     last_camera = max(f["camera_index"] for f in frames)
     last_timestep = max(f["timestep_index"] for f in frames)
-    splits: dict[str, list[dict[str, Any]]] = {name: [] for name in SPLITS}
+    splits = {name: [] for name in SPLITS}
     for entry in frames:
         name = "val" if entry["camera_index"] == last_camera else "train"
         splits["test" if entry["timestep_index"] == last_timestep else name].append(entry)
@@ -82,10 +82,7 @@ def write_splits(root: Path, frames: list[dict[str, Any]], **shared: Any) -> Non
         (root / f"transforms_{name}.json").write_text(json.dumps({**shared, "frames": entries}))
 
 
-def write_mesh_capture(
-    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2),
-    suffix: str = ".obj",
-) -> Path:  # fmt: skip
+def write_mesh_capture(root, timesteps=(0, 1, 3), cameras=(0, 1, 2), suffix=".obj"):
     """Layout "mesh" with a canonical mesh and one region, `mouth`."""
     write_images(root, timesteps, cameras)
     (root / "meshes").mkdir()
@@ -149,9 +146,7 @@ def flame_parameters(timestep: int) -> dict[str, np.ndarray]:
     }
 
 
-def write_flame_capture(
-    root: Path, timesteps: Sequence[int] = (0, 1, 3), cameras: Sequence[int] = (0, 1, 2)
-) -> tuple[Path, Path]:
+def write_flame_capture(root, timesteps=(0, 1, 3), cameras=(0, 1, 2)):
     """Layout "flame": the capture's folder and the model's file."""
     write_images(root, timesteps, cameras)
     (root / "flame_param").mkdir()
@@ -164,9 +159,7 @@ def write_flame_capture(
     return root, write_flame_model(root / "model.npz")
 
 
-def write_release(
-    root: Path, timesteps: Sequence[int] = (0, 1), cameras: Sequence[int] = (0, 1)
-) -> Path:
+def write_release(root, timesteps=(0, 1), cameras=(0, 1)):
     """The layout of the STGA authors' release; the first timestep trains triangles 0, 2 and 5,
     others name none."""
     write_images(root, timesteps, cameras)

@@ -3,7 +3,7 @@
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +30,11 @@ def views(tmp_path: Path) -> list[View]:
 @pytest.fixture
 def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the views in the order in which they are decoded."""
-    names: list[str] = []
+    names = []
 
     def counted(view: View, *rest: object) -> object:
         names.append(view.name)
-        return read_view(view, *rest)  # type: ignore[arg-type]
+        return read_view(view, *rest)
 
     monkeypatch.setattr(module, "read_view", counted)
     return names
@@ -50,7 +50,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def test_order_and_content(views: list[View]) -> None:
+def test_order_and_content(views):
     """Catches views out of order, doubled, lost at the end, or paired with another's image, a
     deadlock where a single view exceeds the queue, and a consumer that changes the cached image
     under the next visit's feet."""
@@ -67,7 +67,7 @@ def test_order_and_content(views: list[View]) -> None:
                 array[0] = 0
 
 
-def test_cache_is_bounded(views: list[View], decoded: list[str]) -> None:
+def test_cache_is_bounded(views, decoded):
     """Catches a cache that outgrows its limit, or throws out what the next epoch asks for."""
     sequence = [views[i] for i in (0, 1, 0, 2, 2, 1)]
     with ViewLoader(sequence, cache_bytes=2 * VIEW_BYTES) as loader:
@@ -76,7 +76,7 @@ def test_cache_is_bounded(views: list[View], decoded: list[str]) -> None:
     assert decoded == [views[i].name for i in (0, 1, 2, 2)]
 
 
-def test_scales_by_position(views: list[View], decoded: list[str]) -> None:
+def test_scales_by_position(views, decoded):
     """Catches a full-size image from the cache where a small one is due, a camera that does not
     match it, and a coarse-to-fine run whose small images fill the cache for good."""
     sizes = [0.5, 0.5, 1.0, 1.0, 0.25]
@@ -88,7 +88,7 @@ def test_scales_by_position(views: list[View], decoded: list[str]) -> None:
     assert len(decoded) == 3
 
 
-def test_errors_come_where_their_view_would(views: list[View]) -> None:
+def test_errors_come_where_their_view_would(views):
     """Catches an error lost in the thread, or raised before the good views ahead of it; a hang
     afterwards; and an exception of the given iterator taken for its end."""
     views[2].image.write_bytes(b"broken")
@@ -100,7 +100,7 @@ def test_errors_come_where_their_view_would(views: list[View]) -> None:
                 next(loader)
     assert loader_threads() == 0
 
-    def order() -> Iterator[View]:
+    def order():
         yield views[0]
         raise ValueError("bad schedule")
 
@@ -110,7 +110,7 @@ def test_errors_come_where_their_view_would(views: list[View]) -> None:
             next(loader)
 
 
-def test_closes_from_any_state(views: list[View]) -> None:
+def test_closes_from_any_state(views):
     """Catches a thread left behind: full queue, finished, unused, or closed twice."""
     loader = ViewLoader(itertools.cycle(views), queue_bytes=VIEW_BYTES)
     next(loader)
@@ -124,30 +124,12 @@ def test_closes_from_any_state(views: list[View]) -> None:
     assert loader_threads() == 0
 
 
-def test_waiting_is_counted(views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a wait that is not measured: slow decoding shows, and views that are ready cost
-    nothing."""
-
-    def slow(view: View, *rest: object) -> object:
-        time.sleep(0.05)
-        return read_view(view, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(module, "read_view", slow)
-    with ViewLoader(views[:3]) as loader:
-        list(loader)
-        assert loader.waited_s > 0.1
-    with ViewLoader(views[:3]) as loader:
-        wait_until(lambda: loader_threads() == 0)
-        list(loader)
-        assert loader.waited_s < 0.05
-
-
-def test_meshes_are_read_in_the_thread_and_bounded(views: list[View]) -> None:
+def test_meshes_are_read_in_the_thread_and_bounded(views):
     """Catches meshes of another timestep, or read by the consumer, and a thread that runs ahead
     without limit on an endless order of views."""
-    read: list[tuple[int, str]] = []
+    read = []
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         read.append((timestep, threading.current_thread().name))
         return np.full((1000, 3), float(timestep))
 

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from stga_addon.capture.meshes import (
     read_regions,
     tracked_meshes,
 )
-from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
 
@@ -27,7 +25,7 @@ from . import factory
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
-def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
+def test_order_is_kept(tmp_path, suffix):
     """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused vertex;
     and STL triangles welded by position, which would join lips and eyelids that merely touch."""
     vertices, faces = factory.ball()
@@ -41,7 +39,7 @@ def test_order_is_kept(tmp_path: Path, suffix: str) -> None:
     assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
 
 
-def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
+def test_obj_as_trimesh_reads_it(shared_data):
     """Catches an error of the OBJ parser, against trimesh on a real tracked mesh."""
     path = shared_data / "studio_head/meshes/00003.obj"
     reference = trimesh.load(path, process=False, maintain_order=True)
@@ -50,11 +48,8 @@ def test_obj_as_trimesh_reads_it(shared_data: Path) -> None:
     np.testing.assert_array_equal(faces, reference.faces)
 
 
-def test_obj_dialects(tmp_path: Path) -> None:
-    """Catches what exporters really write: colors, texture corners, several materials and objects,
-    quads, negative indices, Windows line ends, continued lines. trimesh would regroup the triangles
-    by material. And kept triangles that ignore how many vertices stand before a line that counts
-    backwards."""
+def test_obj_dialects(tmp_path):
+    """Catches colors, quads, negative indices, line ends and materials that are misread."""
     points = [f"v {i} {i * i} 0 1 0 0" for i in range(5)]
     lines = ["mtllib x.mtl", "o a", *points, "vt 0 0", "vn 0 0 1", "usemtl b", "f 4/1 2/1 1/1"]
     lines += ["usemtl a", "f 1//1 2//1 3//1 4//1", "o b", "f -1 -2\\", " -3", "f 1/1/1 3/1/1 5/1/1"]
@@ -71,7 +66,7 @@ def test_obj_dialects(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
 @pytest.mark.parametrize("kept", [0.0, 0.5, 0.99])
-def test_truncated_mesh(tmp_path: Path, suffix: str, kept: float) -> None:
+def test_truncated_mesh(tmp_path, suffix, kept):
     """Catches a download that broke off: trimesh itself reads half an STL as an empty mesh."""
     path = tmp_path / f"x{suffix}"
     factory.write_mesh(path, *factory.ball())
@@ -83,7 +78,7 @@ def test_truncated_mesh(tmp_path: Path, suffix: str, kept: float) -> None:
         read_mesh(path)
 
 
-def test_missing_and_unknown_meshes(tmp_path: Path) -> None:
+def test_missing_and_unknown_meshes(tmp_path):
     """Catches a missing file or a foreign format ending in a traceback."""
     with pytest.raises(StgaError, match=r"none\.ply: cannot be read"):
         read_mesh(tmp_path / "none.ply")
@@ -91,7 +86,7 @@ def test_missing_and_unknown_meshes(tmp_path: Path) -> None:
         read_mesh(tmp_path / "x.fbx")
 
 
-def test_topology_must_not_change(tmp_path: Path) -> None:
+def test_topology_must_not_change(tmp_path):
     """Catches splats bound to triangles that are other ones in a later frame; the error names the
     file."""
     vertices, faces = factory.ball()
@@ -114,12 +109,12 @@ def test_topology_must_not_change(tmp_path: Path) -> None:
             mesh(timestep)
 
 
-def test_meshes_are_kept_within_bounds() -> None:
+def test_meshes_are_kept_within_bounds():
     """Catches a mesh parsed again at each visit, a cache that grows with the sequence, or a shared
     array changed."""
-    calls: list[int] = []
+    calls = []
 
-    def read(timestep: int) -> np.ndarray:
+    def read(timestep):
         calls.append(timestep)
         return np.full((4, 3), float(timestep))
 
@@ -134,7 +129,7 @@ def test_meshes_are_kept_within_bounds() -> None:
         mesh(0)[0] = 1
 
 
-def test_region_holds_triangles_with_all_corners_in_it(tmp_path: Path) -> None:
+def test_region_holds_triangles_with_all_corners_in_it(tmp_path):
     """Catches a region that takes triangles with one or two corners in it."""
     path = tmp_path / "regions.json"
     path.write_text(json.dumps({"nose": [2, 1, 0], "none": []}))
@@ -143,7 +138,7 @@ def test_region_holds_triangles_with_all_corners_in_it(tmp_path: Path) -> None:
     assert regions["none"].tolist() == [False, False]
 
 
-def test_procrustes_as_scipy_has_it() -> None:
+def test_procrustes_as_scipy_has_it():
     """Catches a reflection, a transposed rotation or ignored weights, against scipy's
     align_vectors."""
     random = np.random.default_rng(1)
@@ -155,9 +150,8 @@ def test_procrustes_as_scipy_has_it() -> None:
     np.testing.assert_allclose(rotation @ a + translation, b, atol=1e-12)
 
 
-def test_moving_jaw_does_not_drag_the_head() -> None:
-    """Catches a plain least-squares fit: with 40 % of the vertices turned down by 2 cm it tilts the
-    skull by mm; and a fit that stops early, or divides by a residual of zero."""
+def test_moving_jaw_does_not_drag_the_head():
+    """Catches least squares, which tilt the skull by the jaw, and 0/0 of no residual."""
     neutral = np.random.default_rng(2).normal(size=(2000, 3)) * 0.08
     jaw = neutral[:, 1] < np.quantile(neutral[:, 1], 0.4)
     opened = neutral - np.where(jaw[:, None], [[0.0, 0.02, 0.005]], 0.0)
@@ -170,7 +164,7 @@ def test_moving_jaw_does_not_drag_the_head() -> None:
     assert np.abs(opened @ plain[0].T + plain[1] - opened).max() > 1e-3
 
 
-def test_names_and_files(toy: Capture, tmp_path: Path) -> None:
+def test_names_and_files(toy, tmp_path):
     """Catches a region of other triangles than those painted, weights of another mesh taken for
     this one's, and a refinement that would train nothing and say so nowhere."""
     np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
@@ -232,8 +226,7 @@ def test_every_pixel_shows_the_nearest_triangle():
 
 
 def test_a_closed_mesh_has_no_holes():
-    """Catches pixels between two triangles whose centers lie on the common edge to within
-    rounding."""
+    """Catches pixels between two triangles whose centers lie on the common edge."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     for turn in np.linspace(0, 1, 7):
         camera = look_at((3 * np.sin(turn), 0, 3 * np.cos(turn)), (0, 0, 0), 64, 64, 64.0)

@@ -38,9 +38,8 @@ def each_split(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])
-def test_mesh_capture(tmp_path: Path, suffix: str) -> None:
-    """Catches a timestep paired with another's mesh or image, a lost gap, split or region, in each
-    mesh format."""
+def test_mesh_capture(tmp_path, suffix):
+    """Catches a timestep paired with another's mesh or image, a lost gap, split or region."""
     capture = open_capture(factory.write_mesh_capture(tmp_path / "capture", suffix=suffix))
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps, capture.flame) == ("mesh", (0, 1, 3), None)
@@ -75,7 +74,7 @@ def test_one_timestep_or_camera(tmp_path, timesteps, cameras):
     assert summarize_capture(capture)
 
 
-def test_flame_capture(tmp_path: Path) -> None:
+def test_flame_capture(tmp_path):
     """Catches parameters of another timestep, a lost offset or shape, and head motion left in the
     expression."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
@@ -99,12 +98,11 @@ def test_flame_capture(tmp_path: Path) -> None:
     assert len(capture.faces) == len(model.faces)
 
 
-def test_flame_capture_without_paths_or_masks(tmp_path: Path) -> None:
-    """Catches a canonical_flame_param.npz capture refused whose frames name no parameters, whose
-    model has no masks, or that has no cameras: it can be imported and animated."""
+def test_flame_capture_without_paths_or_masks(tmp_path):
+    """Catches a capture refused whose frames name no parameters, or without cameras."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
 
-    def strip(document: dict[str, Any]) -> None:
+    def strip(document):
         for entry in document["frames"]:
             del entry["flame_param_path"]
 
@@ -123,7 +121,7 @@ def test_flame_capture_without_paths_or_masks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rows", [5023, 5143])
-def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: int) -> None:
+def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
     """Catches a mesh of 9976 triangles where VHAP tracked 10144, whichever size its offsets have.
     The real template and triangles; skinning and expressions are filled in, for they are not
     published openly."""
@@ -147,7 +145,7 @@ def test_published_topology_gets_teeth(tmp_path: Path, shared_data: Path, rows: 
     np.testing.assert_allclose(capture.neutral[:5023], template + np.float32(0.001), atol=1e-7)
 
 
-def test_release_layout(tmp_path: Path) -> None:
+def test_release_layout(tmp_path):
     """Catches keyframes read as something else, and a selection that came with the capture being
     recomputed."""
     capture = open_capture(factory.write_release(tmp_path / "capture"))
@@ -162,7 +160,7 @@ def test_release_layout(tmp_path: Path) -> None:
     assert not (selected[1] & ~moving).any()
 
 
-def test_bare_folder(tmp_path: Path) -> None:
+def test_bare_folder(tmp_path):
     """Catches frame 10 sorted before frame 9, and the neutral mesh taken for a timestep."""
     vertices, faces = factory.ball()
     for timestep in (9, 10, 12):
@@ -182,7 +180,7 @@ def test_bare_folder(tmp_path: Path) -> None:
     assert open_capture(tmp_path).timesteps == (0, 1, 2, 3)
 
 
-def test_principal_point_is_checked_against_the_masks(tmp_path: Path, shared_data: Path) -> None:
+def test_principal_point_is_checked_against_the_masks(tmp_path, shared_data):
     """Catches a capture of the other convention opened silently, a warning where all is well, and a
     check too dull for a real head: the principal point 10 pixels off the center, of 401."""
     root = factory.write_mesh_capture(tmp_path / "capture")
@@ -201,7 +199,7 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path, shared_dat
         elif entry.suffix == ".json":
             shutil.copy(entry, root)
 
-    def shift(document: dict[str, Any]) -> None:
+    def shift(document):
         for entry in document["frames"]:
             entry["cy"] -= 10
 
@@ -211,7 +209,7 @@ def test_principal_point_is_checked_against_the_masks(tmp_path: Path, shared_dat
 
 
 @pytest.mark.parametrize(("factor", "says"), [(1000.0, "200 m"), (1e-3, "0.0002 m"), (1.0, None)])
-def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str | None) -> None:
+def test_a_head_that_is_not_in_meters(tmp_path, factor, says):
     """Catches a capture in millimeters that trains to nonsense, or renders nothing, silently."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     vertices, faces = factory.ball()
@@ -223,35 +221,15 @@ def test_a_head_that_is_not_in_meters(tmp_path: Path, factor: float, says: str |
     assert says is None or says in warnings[0]
 
 
-def test_studio_head(shared_data: Path) -> None:
-    """Catches a mesh that misses its image: every vertex of a real tracked mesh must project into
-    the mask."""
-    capture = open_capture(shared_data / "studio_head")
-    assert [len(views) for views in capture.views.values()] == [180, 12, 64]
-    assert (capture.timesteps, capture.warnings) == (tuple(range(16)), ())
-    assert set(capture.regions) == {"left_eye", "right_eye", "mouth", "nose"}
-    for view in (capture.views["train"][0], capture.views["val"][-1], capture.views["test"][-1]):
-        mask = read_mask(view)
-        assert mask is not None
-        column, row = view.camera.project(capture.mesh(view.timestep))[0].astype(int).T
-        assert (mask[row, column] > 0).mean() > 0.99
-
-
-def test_summary(tmp_path: Path) -> None:
+def test_summary(tmp_path):
     """Catches counts, gaps, offsets or warnings that `info` would show wrong, by one at either end
     of a gap, too."""
     root, model_file = factory.write_flame_capture(tmp_path / "capture")
     lines = dict(summarize_capture(open_capture(root, model_file, "opencv")))
-    assert lines["layout"] == "flame"
-    assert lines["cameras"] == "3: 0–2"
-    assert lines["image size"] == "40 x 60"
     assert lines["timesteps"] == "3: 0–1, 3 (gap 2)"
     expected = "train 4 views (2 timesteps, 2 cameras); val 2 views (2 timesteps, 1 cameras); "
     assert lines["splits"] == expected + "test 3 views (1 timesteps, 3 cameras)"
-    assert lines["mesh"] == "162 vertices, 320 triangles"
     assert lines["static offset"] == "up to 0.9 mm"
-    assert lines["dynamic offset"] == "none"
-    assert "principal point" in lines["warning"]
     release = dict(summarize_capture(open_capture(factory.write_release(tmp_path / "release"))))
     assert release["regions"] == "none"
     assert release["given selection"] == "1 timesteps, 0.9% of the triangles on average"
@@ -260,7 +238,7 @@ def test_summary(tmp_path: Path) -> None:
     assert format_ranges([0, 2, 3, 7]) == "4: 0, 2–3, 7 (gaps 1, 4–6)"
 
 
-def test_numpy_alone_is_enough(tmp_path: Path) -> None:
+def test_numpy_alone_is_enough(tmp_path):
     """Catches an import that needs more than numpy: Blender must open a capture without Pillow,
     trimesh or torch. What does need them says so."""
     root = factory.write_mesh_capture(tmp_path / "capture")
@@ -332,7 +310,7 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 
 def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
     def damage(root: Path) -> None:
-        arrays: dict[str, Any] = factory.flame_parameters(0) | change
+        arrays = factory.flame_parameters(0) | change
         given = {name: array for name, array in arrays.items() if array is not None}
         np.savez(root / "flame_param/00000.npz", **given)
 
@@ -397,8 +375,7 @@ def every_mesh(root: Path, model_file: Path | None) -> None:
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 0.02, 0.1, -1.0])
 @pytest.mark.filterwarnings("error")
 def test_camera_inside_the_head(tmp_path, distance):
-    """Catches divisions by a depth or distance of zero for a camera in the head, or with the head
-    behind it."""
+    """Catches divisions by zero for a camera in the head, or with the head behind it."""
     root = factory.write_mesh_capture(tmp_path / "capture")
 
     def change(document):
@@ -412,7 +389,7 @@ def test_camera_inside_the_head(tmp_path, distance):
     assert np.isnan(samples.pixel_width).all() or distance > 0
 
 
-def test_what_is_no_capture(tmp_path: Path) -> None:
+def test_what_is_no_capture(tmp_path):
     """Catches a wrong folder, file or option ending in a traceback or in an empty capture."""
     for folder in (tmp_path / "none", Path("a" * 5000), Path("a/" * 3000), Path("nul\0")):
         with pytest.raises(StgaError, match="is not a folder"):
@@ -439,9 +416,8 @@ def test_what_is_no_capture(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
-    """Catches a motion that needs a folder around it, or loses its identity, offsets or regions on
-    the way."""
+def test_a_motion_file_is_a_capture_without_views(tmp_path):
+    """Catches a motion that needs a folder or loses identity, and a model that is ignored."""
     root, model_file = factory.write_flame_capture(tmp_path / "flame")
     whole = open_capture(root, model_file)
     motion = open_capture(root / "flame_param/00003.npz", model_file)
@@ -449,11 +425,6 @@ def test_a_motion_file_is_a_capture_without_views(tmp_path: Path) -> None:
     np.testing.assert_array_equal(motion.mesh(0), whole.mesh(3))
     np.testing.assert_array_equal(motion.neutral, whole.neutral)
     assert motion.regions.keys() == whole.regions.keys()
-
-
-def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
-    """Catches a capture that brings its model and still asks for it; and a given one ignored."""
-    root, model_file = factory.write_flame_capture(tmp_path / "capture")
     own = root / "flame_model.npz"
     shutil.copy(model_file, own)
     capture = open_capture(root)
@@ -463,7 +434,7 @@ def test_a_flame_model_in_the_captures_folder(tmp_path: Path) -> None:
     assert open_capture(root, model_file).flame_file == model_file
 
 
-def test_frame_rate(tmp_path: Path) -> None:
+def test_frame_rate(tmp_path):
     """Catches a rate that is lost in one of the layouts, made up where none is written, or one at
     which nothing plays, which fails as late as in an export."""
     mesh = factory.write_mesh_capture(tmp_path / "mesh")

@@ -23,8 +23,8 @@ def turned(camera: Camera) -> Camera:
     return replace(camera, world_to_camera=upside_down @ camera.world_to_camera)
 
 
-def test_timesteps_follow_each_other(toy: Capture) -> None:
-    """Catches a mesh or an image of one take shown at a timestep of another."""
+def test_timesteps_follow_each_other(toy):
+    """Catches one take's mesh, image or rate in another's place, and another person's head."""
     other = moved(toy, 0.1)
     joined = join_takes([toy, other])
     (start,) = first_timesteps([toy, other])[1:]
@@ -41,11 +41,21 @@ def test_timesteps_follow_each_other(toy: Capture) -> None:
         assert [view.image for view in both[len(views) :]] == [view.image for view in views]
         timesteps = [view.timestep - start for view in both[len(views) :]]
         assert timesteps == [view.timestep for view in views]
+    for first, second, expected in (
+        (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None),
+        (60.0, 25.0, None),
+    ):  # fmt: skip
+        joined = join_takes([replace(toy, fps=first), replace(moved(toy, 0.1), fps=second)])
+        assert joined.fps == expected, (first, second)
+    with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
+        join_takes([toy, replace(toy, root=Path("other"), neutral=toy.neutral + 0.001)])
+    with pytest.raises(StgaError, match=r"^other: its mesh has other triangles than"):
+        join_takes([toy, replace(toy, root=Path("other"), faces=toy.faces[::-1])])
+    join_takes([toy, replace(toy, neutral=toy.neutral + 1e-6)])
 
 
-def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> None:
-    """Catches exposure of one camera corrected in the images of another that merely has its number,
-    and two that count as one because their takes begin as far apart as their numbers."""
+def test_cameras_keep_their_index_only_where_they_are_the_same(toy):
+    """Catches exposure of one camera corrected in another's images, and two that count as one."""
     views, train = [], toy.views["train"]
     for view in train:
         camera = turned(view.camera) if view.camera_index == 1 else view.camera
@@ -64,22 +74,3 @@ def test_cameras_keep_their_index_only_where_they_are_the_same(toy: Capture) -> 
     indices = [found.camera_index for found in joined.views["train"][-2:]]
     assert len({*indices, *(found.camera_index for found in toy.views["train"])}) == 2 + 3
     assert indices[0] == 4 + 2 * start  # as in the identities of runs that have been extended
-
-
-def test_takes_of_other_heads_are_refused(toy: Capture) -> None:
-    """Catches one person's expressions trained into another's avatar."""
-    with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
-        join_takes([toy, replace(toy, root=Path("other"), neutral=toy.neutral + 0.001)])
-    with pytest.raises(StgaError, match=r"^other: its mesh has other triangles than"):
-        join_takes([toy, replace(toy, root=Path("other"), faces=toy.faces[::-1])])
-    join_takes([toy, replace(toy, neutral=toy.neutral + 1e-6)])
-
-
-def test_frame_rate_of_takes(toy: Capture) -> None:
-    """Catches a rate of one take given to another that was recorded at a different one."""
-    for first, second, expected in (
-        (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None),
-        (60.0, 25.0, None),
-    ):  # fmt: skip
-        joined = join_takes([replace(toy, fps=first), replace(moved(toy, 0.1), fps=second)])
-        assert joined.fps == expected, (first, second)

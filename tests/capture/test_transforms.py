@@ -2,21 +2,18 @@
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from stga_addon.capture.transforms import Frame, inside, read_splits, read_transforms
+from stga_addon.capture.transforms import inside, read_splits, read_transforms
 from stga_addon.errors import StgaError
 
 from . import factory
 
 
-def read_one(
-    folder: Path, entry: dict[str, Any], principal_point: str = "vhap", **shared: Any
-) -> Frame:
+def read_one(folder, entry, principal_point="vhap", **shared):
     path = folder / "transforms.json"
     path.write_text(json.dumps({**shared, "frames": [entry]}))
     return read_transforms(path, principal_point)[0]
@@ -38,7 +35,7 @@ def test_projection_is_that_of_an_opengl_camera(tmp_path, convention, cx, cy):
     np.testing.assert_allclose(camera.camera_to_world_gl, factory.pose(2), atol=1e-12)
 
 
-def test_own_intrinsics_win(tmp_path: Path) -> None:
+def test_own_intrinsics_win(tmp_path):
     """Catches a reader that trusts the top level, which real exports get wrong, or loses it as a
     fallback; a frame's own angle wins over a focal length at the top."""
     own, half = factory.frame(0, 0), {"w": 8, "h": 8, "cx": 1.0, "cy": 1.0}
@@ -56,14 +53,13 @@ def test_own_intrinsics_win(tmp_path: Path) -> None:
         assert found == pytest.approx(expected)
 
 
-def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
-    """Catches the held-out camera of `val` taking the number of a training camera when camera_index
-    is missing."""
+def test_cameras_are_numbered_alike_in_all_splits(tmp_path):
+    """Catches the camera of `val` taking a training camera's number where none is given."""
     write = factory.write_mesh_capture(tmp_path / "capture")
     for keep_id in (True, False):
         for split in factory.SPLITS:
 
-            def strip(document: dict[str, Any], keep_id: bool = keep_id) -> None:
+            def strip(document, keep_id=keep_id):
                 for entry in document["frames"]:
                     entry.pop("camera_index", None)
                     if not keep_id:
@@ -75,9 +71,8 @@ def test_cameras_are_numbered_alike_in_all_splits(tmp_path: Path) -> None:
         assert where == {"train": {0, 1}, "val": {2}, "test": {0, 1, 2}}
 
 
-def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
-    """Catches one camera taken for two because of the sign of a zero or the last digits of its
-    pose."""
+def test_cameras_of_a_single_file(tmp_path):
+    """Catches one camera taken for two by a zero's sign, or two for one, and frames lost."""
     frames = [factory.frame(0, 0), factory.frame(1, 0), factory.frame(1, 1)]
     matrix = np.array(frames[1]["transform_matrix"])
     matrix[:3] -= 1e-9
@@ -86,11 +81,6 @@ def test_camera_is_known_by_where_it_stands(tmp_path: Path) -> None:
         del entry["camera_index"], entry["camera_id"]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
-
-
-def test_frames_share_cameras_that_are_alike_in_everything(tmp_path: Path) -> None:
-    """Catches a camera of its own for each of 18,000 views, and one lens or pose taken for
-    another's."""
     entries = [
         factory.frame(0, 0), factory.frame(1, 0), factory.frame(2, 0), factory.frame(3, 0),
         factory.frame(4, 1),
@@ -103,10 +93,6 @@ def test_frames_share_cameras_that_are_alike_in_everything(tmp_path: Path) -> No
     assert len({id(camera) for camera in cameras}) == 4
     assert cameras[2].fl_x == cameras[0].fl_x + 1
     assert cameras[3].cy != cameras[0].cy
-
-
-def test_single_file_is_all_training(tmp_path: Path) -> None:
-    """Catches frames lost, or split by guesswork, where a capture has transforms.json alone."""
     frames = [factory.frame(0, camera) for camera in range(3)]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     splits = read_splits(tmp_path).splits
@@ -115,9 +101,8 @@ def test_single_file_is_all_training(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_static_capture_without_timesteps(tmp_path: Path) -> None:
-    """Catches a plain NeRF transforms file (no timestep, no size but the image's, no suffix) being
-    refused."""
+def test_static_capture_without_timesteps(tmp_path):
+    """Catches a plain NeRF transforms file being refused."""
     factory.write_images(tmp_path, [0], [0])
     entry = {"file_path": "images/00000_00", "transform_matrix": factory.pose(0).tolist()}
     frame = read_one(tmp_path, entry, camera_angle_x=0.5)
@@ -127,9 +112,8 @@ def test_static_capture_without_timesteps(tmp_path: Path) -> None:
     assert frame.view.image == tmp_path / "images/00000_00.png"
 
 
-def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
-    """Catches union sets of VHAP, whose frames all lie in sibling folders (`../<sequence>/images`),
-    being refused, or resolved from the working directory."""
+def test_union_paths_stay_beside_the_capture(tmp_path):
+    """Catches VHAP's union sets, whose frames lie in sibling folders, being refused."""
     root = tmp_path / "union"
     assert inside(root, "../seq_01/images/1.png", "x") == tmp_path / "seq_01/images/1.png"
     assert inside(root, "images/../../seq_01\\1.png", "x") == tmp_path / "seq_01/1.png"
@@ -143,7 +127,7 @@ def test_union_paths_stay_beside_the_capture(tmp_path: Path) -> None:
     "images/C:/x.png", "..", "", "a\0b",
 ])  # fmt: skip
 @pytest.mark.parametrize("field", ["file_path", "fg_mask_path", "mesh_path", "flame_param_path"])
-def test_paths_that_leave_are_refused(tmp_path: Path, path: str, field: str) -> None:
+def test_paths_that_leave_are_refused(tmp_path, path, field):
     """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating
     system."""
     with pytest.raises(StgaError, match=rf"transforms\.json: frames\[0\]\.{field}: "):
@@ -167,7 +151,7 @@ MALFORMED: list[tuple[str, Any]] = [
 
 
 @pytest.mark.parametrize(("field", "value"), MALFORMED)
-def test_malformed_fields(tmp_path: Path, field: str, value: Any) -> None:
+def test_malformed_fields(tmp_path, field, value):
     """Catches a wrong value that passes, or ends in a traceback, instead of an error that names
     file and field."""
     named = "w" if field == "h" and value is True else field
@@ -176,7 +160,7 @@ def test_malformed_fields(tmp_path: Path, field: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize("field", ["fl_x", "w", "timestep_index"])
-def test_missing_fields_are_named(tmp_path: Path, field: str) -> None:
+def test_missing_fields_are_named(tmp_path, field):
     """Catches a frame without focal length, or without size and image, read as zeros, and one that
     silently becomes timestep 0 among others."""
     frames = [factory.frame(4, 0), factory.frame(4, 1)]

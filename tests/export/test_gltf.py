@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from avatar.conftest import random_splats, rendered
+from avatar.conftest import random_splats, rendered, world_splats
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import to_world
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.export.formats import export_avatar
 
 PREFIX = "KHR_gaussian_splatting:"
@@ -95,15 +95,12 @@ def test_renders_equal(avatar, tmp_path):
     reader of glTF refuses, and fallback colors that are not linear."""
     export_avatar(tmp_path / "a.glb", avatar, "gltf", [(0, avatar.neutral)])
     _, found = parsed(tmp_path / "a.glb")
-    opacity = found[PREFIX + "OPACITY"][:, 0].astype(np.float64)
-    again = Splats(
-        xyz=found["POSITION"],
-        rotation=found[PREFIX + "ROTATION"][:, [3, 0, 1, 2]],
-        log_scale=np.log(found[PREFIX + "SCALE"]),
-        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh=np.stack([found[PREFIX + name] for name in harmonic_names(3)], axis=1),
-        face=np.zeros(50, np.int32),
-        unbound=np.zeros(50, bool),
+    again = world_splats(
+        found["POSITION"],
+        found[PREFIX + "ROTATION"][:, [3, 0, 1, 2]],
+        np.log(found[PREFIX + "SCALE"]),
+        found[PREFIX + "OPACITY"][:, 0].astype(np.float64),
+        np.stack([found[PREFIX + name] for name in harmonic_names(3)], axis=1),
     )
     expected = to_world(avatar.splats, avatar.frames(avatar.neutral))
     assert np.abs(rendered(again) - rendered(expected)).max() < 1e-4

@@ -23,9 +23,7 @@ def world_splats(count: int = 20, sh_degree: int = 3) -> Splats:
     return replace(splats, unbound=np.zeros(count, bool))
 
 
-def by_hand(
-    kind: str, properties: dict[str, str], rows: list[dict[str, float]], *before: str
-) -> bytes:
+def by_hand(kind, properties, rows, *before):
     """A PLY file made without the code under test; `before`: lines of an earlier element."""
     lines = ["ply", f"format {kind} 1.0", "comment made by hand, Zoë", *before]
     lines.append(f"element vertex {len(rows)}")

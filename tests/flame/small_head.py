@@ -35,9 +35,7 @@ def small_head_colors() -> np.ndarray:
     return read_npz(FILE)["colors"].astype(np.float64)
 
 
-def subdivided(
-    model: FlameModel, *values: np.ndarray
-) -> tuple[FlameModel, *tuple[np.ndarray, ...]]:
+def subdivided(model, *values):
     """The same surface with a vertex in the middle of each edge; and values (V, …) of its
     vertices."""
     edges = np.sort(model.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)

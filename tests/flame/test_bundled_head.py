@@ -9,7 +9,6 @@ from scipy.spatial import cKDTree
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.development.arkit_shapes import ict_names
-from stga_addon.development.bundled_head import collapsed
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import arkit_weights
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
@@ -162,30 +161,6 @@ def test_arkits_weights_are_its_coefficients(head):
     assert frames[0].eyes_pose[1] > 0.5  # the left eye looks to the person's left
     assert not np.any([frame.jaw_pose for frame in frames])
     np.testing.assert_allclose(arkit_weights(frames, found, sequence), weights, atol=1e-12)
-
-
-def test_thinning_keeps_shape_and_topology():
-    """Catches collapses that move vertices, tear or fold the surface, eat its border, or ignore
-    detail."""
-    side = np.arange(25)
-    x, y = (grid.ravel() / 24.0 for grid in np.meshgrid(side, side))
-    vertices = np.stack([x, y, 0.05 * np.sin(6 * x) * np.sin(6 * y)], axis=1)
-    first = (side[:-1, None] + 25 * side[:-1]).ravel()
-    corners = [[0, 1, 25], [1, 26, 25]]
-    triangles = np.concatenate([first[:, None] + offsets for offsets in corners])
-    left = collapsed(vertices, triangles, np.where(x < 0.5, 100.0, 1.0), 300)
-    assert 290 <= len(left) <= 301
-    corners = vertices[left]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (normals[:, 2] > 0).all()
-    edges = np.sort(np.concatenate([left[:, [0, 1]], left[:, [1, 2]], left[:, [2, 0]]]), axis=1)
-    _, count = np.unique(edges, axis=0, return_counts=True)
-    assert count.max() == 2
-    assert normals[:, 2].sum() / 2 == pytest.approx(1.0, abs=0.01)  # the whole square is covered
-    centers = corners.mean(1)
-    wanted = 0.05 * np.sin(6 * centers[:, 0]) * np.sin(6 * centers[:, 1])
-    assert np.abs(centers[:, 2] - wanted).max() < 0.01
-    assert (centers[:, 0] < 0.5).mean() > 0.55
 
 
 def test_a_changed_model_file_is_read_again(tmp_path):

@@ -35,7 +35,7 @@ def _arrays(seed: int, model: FlameModel) -> dict[str, np.ndarray]:
     """A timestep as VHAP writes it: float32 with a leading 1."""
     frame = random_frame(seed, model.n_expression)
     rng = np.random.default_rng(seed)
-    fields: dict[str, Any] = {name: getattr(frame, name)[None] for name in FRAME_FIELDS}
+    fields = {name: getattr(frame, name)[None] for name in FRAME_FIELDS}
     fields["shape"] = rng.normal(size=model.n_identity)
     fields["static_offset"] = rng.normal(0, 0.01, (1, len(model.v_template), 3))
     return {name: value.astype(np.float32) for name, value in fields.items()}
@@ -46,7 +46,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
     return path
 
 
-def test_a_frame_as_written(tmp_path: Path, tiny_flame: FlameModel) -> None:
+def test_a_frame_as_written(tmp_path, tiny_flame):
     # Catches a field read into another's place, a lost leading axis, and a loader that insists on
     # what real exports leave out.
     arrays = _arrays(1, tiny_flame)
@@ -73,7 +73,7 @@ def test_a_frame_as_written(tmp_path: Path, tiny_flame: FlameModel) -> None:
 
 
 @pytest.mark.parametrize("rows", [160, 280])
-def test_offsets_without_and_with_teeth(tmp_path: Path, tiny_flame: FlameModel, rows: int) -> None:
+def test_offsets_without_and_with_teeth(tmp_path, tiny_flame, rows):
     # Catches offsets of a mesh with 120 teeth vertices more or fewer being refused or shifted.
     model = replace(tiny_flame, v_template=np.zeros((280 if rows == 160 else 160, 3)))
     given = np.random.default_rng(3).normal(size=(1, rows, 3))
@@ -84,14 +84,14 @@ def test_offsets_without_and_with_teeth(tmp_path: Path, tiny_flame: FlameModel, 
     assert not offset[160:].any()
 
 
-def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
+def test_meshes_of_a_sequence(tiny_flame):
     # Catches which parameters count as head motion and which as expression.
     rng = np.random.default_rng(6)
     shape, offset = rng.normal(size=8), rng.normal(0, 0.01, (40, 3))
     sequence = replace(_motion(tiny_flame), shape=shape, static_offset=offset)
     frame, zero = sequence.frame(7), np.zeros(3)
 
-    def mesh(**changed: Any) -> np.ndarray:
+    def mesh(**changed):
         new = replace(frame, **changed)
         return flame_forward(tiny_flame, sequence.shape, new, sequence.static_offset)
 
@@ -107,7 +107,7 @@ def test_meshes_of_a_sequence(tiny_flame: FlameModel) -> None:
         expression_mesh(sequence, 7, "neck")
 
 
-def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
+def test_a_motion_is_its_frames(tmp_path, tiny_flame):
     # Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and
     # GaussianAvatars' files alike.
     frames = [_arrays(seed, tiny_flame) for seed in (10, 11, 12)]
@@ -128,7 +128,7 @@ def test_a_motion_is_its_frames(tmp_path: Path, tiny_flame: FlameModel) -> None:
     np.testing.assert_array_equal(sequence_mesh(named, 7), sequence_mesh(motion, 2))
 
 
-def test_plain_expression_and_pose_files(tmp_path: Path, tiny_flame: FlameModel) -> None:
+def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
     # Catches another tracker's names or packing read into the wrong joint, and an identity that is
     # insisted on.
     rng = np.random.default_rng(20)
@@ -172,8 +172,8 @@ def _assert_same(frame: FlameFrame, other: FlameFrame) -> None:
         np.testing.assert_allclose(*both, atol=1e-12)
 
 
-def test_quaternions_against_scipy() -> None:
-    # Catches a wrong order, sign or half angle, and division by zero at small angles.
+def test_quaternions_against_scipy():
+    """Catches another order, sign or half angle, 0/0, and interpolation the long way round."""
     rng = np.random.default_rng(0)
     vectors = [rng.normal(0, 1.2, (50, 3)), rng.normal(0, 1e-9, (5, 3)), np.zeros((1, 3))]
     vectors = np.concatenate(vectors)
@@ -182,21 +182,12 @@ def test_quaternions_against_scipy() -> None:
     np.testing.assert_allclose(np.abs((made * expected).sum(1)), 1, atol=1e-14)
     np.testing.assert_allclose(_matrices(to_axis_angle(made)), _matrices(vectors), atol=1e-14)
     np.testing.assert_allclose(_matrices(to_axis_angle(-made)), _matrices(vectors), atol=1e-14)
-
-
-def test_slerp_against_scipy() -> None:
-    # Catches interpolation the long way round, at uneven speed, or that is undefined between equal
-    # rotations.
     pairs = np.random.default_rng(1).normal(0, 1.5, (30, 2, 3))
     for a, b in [*pairs, np.zeros((2, 3)), np.full((2, 3), 0.4)]:
         for share in (0.0, 0.3, 1.0):
             made = slerp(from_axis_angle(a), -from_axis_angle(b), np.array(share))
             found = _matrices(to_axis_angle(made))[0]
             np.testing.assert_allclose(found, _between(a, b, share), atol=1e-12)
-
-
-def test_continuous_changes_signs_only() -> None:
-    # Catches a step that runs through zero when its ends are interpolated one number at a time.
     angles = (0.6 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi
     turning = from_axis_angle(np.outer(angles, [0, 1, 0]))
     made = continuous(turning)
@@ -204,7 +195,7 @@ def test_continuous_changes_signs_only() -> None:
     assert ((made[1:] * made[:-1]).sum(1) > 0).all()
 
 
-def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame: FlameModel) -> None:
+def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
     # Catches frames shifted by gaps in the timesteps, keyframes that are resampled although nothing
     # asked for it, and a last frame lost to rounding (0.1 is not a tenth).
     motion = _motion(tiny_flame)
@@ -226,7 +217,7 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame: Flame
             _assert_same(retimed(motion, step)[-1], motion.frame(7))
 
 
-def test_strength(tiny_flame: FlameModel) -> None:
+def test_strength(tiny_flame):
     # Catches a head that drifts to the origin, or faces elsewhere, when only its movement should
     # shrink, and a field of a frame that no part of a motion switches.
     assert {name for fields in PARTS.values() for name in fields} == set(FRAME_FIELDS)
@@ -245,7 +236,7 @@ def test_strength(tiny_flame: FlameModel) -> None:
     np.testing.assert_allclose(_matrices(half.rotation)[0], middle, atol=1e-12)
 
 
-def test_driven_by_the_neutral_mesh_alone(tiny_flame: FlameModel) -> None:
+def test_driven_by_the_neutral_mesh_alone(tiny_flame):
     # Catches joints of the mean face, and the other person's identity or offsets on this one.
     rng, ones = np.random.default_rng(3), np.ones((40, 3))
     shape, offset = rng.normal(size=8), rng.normal(0, 0.01, (40, 3))

@@ -32,9 +32,8 @@ def toothed(flame_open: FlameModel) -> FlameModel:
     return with_teeth(flame_open)
 
 
-def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches vertices that are inserted rather than appended: tracked offsets would land
-    elsewhere; and selection that leaves the teeth out of the mouth region."""
+def test_counts_and_untouched_head(flame_open, toothed):
+    """Catches vertices inserted, teeth out of the mouth or on other bones, and slivers."""
     assert (len(toothed.v_template), len(toothed.faces)) == (5143, 10144)
     model = with_teeth(replace(flame_open, masks={"lips": np.concatenate(lip_pairs(flame_open))}))
     assert key_regions(model)["mouth"][9976:].all()
@@ -43,9 +42,22 @@ def test_counts_and_untouched_head(flame_open: FlameModel, toothed: FlameModel) 
     np.testing.assert_array_equal(toothed.faces[:9976], flame_open.faces)
     assert toothed.faces[9976:].min() == 5023
     assert set(toothed.faces[9976:].ravel()) == set(range(5023, 5143))
+    jaw = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
+    np.testing.assert_array_equal(toothed.weights[5023:][jaw], np.tile([0, 0, 1, 0, 0], (60, 1)))
+    np.testing.assert_array_equal(toothed.weights[5023:][~jaw], np.tile([0, 1, 0, 0, 0], (60, 1)))
+    assert not toothed.shapedirs[5023:, :, 60:].any()
+    assert not toothed.posedirs[5023:].any()
+    assert not toothed.j_regressor[:, 5023:].any()
+    np.testing.assert_array_equal(toothed.j_regressor[:, :5023], flame_open.j_regressor)
+    corners = toothed.v_template[toothed.faces[9976:]]
+    edges = corners[:, 1:] - corners[:, :1]
+    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+    assert double_area.min() / 2 > 1.5e-6
+    assert (double_area / longest**2).min() > 0.15
 
 
-def test_index_layout() -> None:
+def test_index_layout():
     """Catches triangles in another order, doubled, flipped, or that start at another corner: splats
     bound to them by index would turn or move to another tooth. Left mirrors right."""
     strips = teeth_faces(0).reshape(6, 14, 2, 3)
@@ -60,17 +72,7 @@ def test_index_layout() -> None:
     assert zlib.crc32(strips.astype("<i4").tobytes()) == LAYOUT_CRC32
 
 
-def test_sound_triangles(toothed: FlameModel) -> None:
-    """Catches slivers, whose frames and strain are noise."""
-    corners = toothed.v_template[toothed.faces[9976:]]
-    edges = corners[:, 1:] - corners[:, :1]
-    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    assert double_area.min() / 2 > 1.5e-6
-    assert (double_area / longest**2).min() > 0.15
-
-
-def test_rows_bite(toothed: FlameModel) -> None:
+def test_rows_bite(toothed):
     """Catches rows that are upside down, far apart or larger than teeth, and an arch that is
     shifted, or turned towards one cheek."""
     rows = toothed.v_template[5023:].reshape(8, 15, 3)
@@ -87,7 +89,7 @@ def test_rows_bite(toothed: FlameModel) -> None:
 
 
 @pytest.mark.parametrize("jaw_deg", [0, 10, 20])
-def test_teeth_stay_behind_the_lips(toothed: FlameModel, jaw_deg: float) -> None:
+def test_teeth_stay_behind_the_lips(toothed, jaw_deg):
     """Catches teeth in the flesh, or through the lips, of the mean face and of others."""
     skin, teeth = toothed.faces[:9976], toothed.faces[9976:]
     for seed in range(5):
@@ -101,19 +103,7 @@ def test_teeth_stay_behind_the_lips(toothed: FlameModel, jaw_deg: float) -> None
     assert crossings(mesh, skin, teeth) > 10  # what is counted above can be found
 
 
-def test_what_moves_the_teeth(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches teeth that follow expressions or correctives, the wrong bone, or shift the joints,
-    and an upper row that follows the jaw."""
-    jaw = np.isin(np.repeat(np.arange(8), 15), (LR, LE, LRB, LEB))
-    np.testing.assert_array_equal(toothed.weights[5023:][jaw], np.tile([0, 0, 1, 0, 0], (60, 1)))
-    np.testing.assert_array_equal(toothed.weights[5023:][~jaw], np.tile([0, 1, 0, 0, 0], (60, 1)))
-    assert not toothed.shapedirs[5023:, :, 60:].any()
-    assert not toothed.posedirs[5023:].any()
-    assert not toothed.j_regressor[:, 5023:].any()
-    np.testing.assert_array_equal(toothed.j_regressor[:, :5023], flame_open.j_regressor)
-
-
-def test_identity_carries_the_teeth(flame_open: FlameModel) -> None:
+def test_identity_carries_the_teeth(flame_open):
     """Catches teeth that stay, or grow otherwise, where the head is moved, wider, longer or has a
     bent mouth."""
     template = flame_open.v_template
@@ -130,9 +120,8 @@ def test_identity_carries_the_teeth(flame_open: FlameModel) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_teeth_and_lips_come_from_the_mesh(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches lists of vertices of one published mesh, and lengths in meters: another numbering and
-    size of the same mesh has the same teeth."""
+def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
+    """Catches lists of one mesh's vertices, lengths in meters, and lips paired wrongly."""
     order = np.random.default_rng(1).permutation(5023)
     number = np.argsort(order)
     faces, shapes = number[flame_open.faces].astype(np.int32), flame_open.shapedirs[order]
@@ -141,11 +130,6 @@ def test_teeth_and_lips_come_from_the_mesh(flame_open: FlameModel, toothed: Flam
     np.testing.assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)
     np.testing.assert_allclose(other.shapedirs[5023:], toothed.shapedirs[5023:], atol=1e-9)
     np.testing.assert_array_equal(order[np.array(lip_pairs(other))], lip_pairs(toothed))
-
-
-def test_lips_face_each_other(flame_open: FlameModel, toothed: FlameModel) -> None:
-    """Catches vertices that are not on the lips, in another order, or paired with the wrong
-    ones."""
     upper, lower = (flame_open.v_template[ids] for ids in lip_pairs(toothed))
     np.testing.assert_array_equal(lip_pairs(toothed), lip_pairs(flame_open))
     assert (np.diff(upper[:, 0]) < 0).all()
@@ -160,7 +144,7 @@ def test_lips_face_each_other(flame_open: FlameModel, toothed: FlameModel) -> No
     assert after - before > 0.008
 
 
-def test_a_closed_mouth_is_refused(flame_open: FlameModel) -> None:
+def test_a_closed_mouth_is_refused(flame_open):
     """Catches teeth at the neck, which is open too."""
     in_front = np.flatnonzero(flame_open.v_template[:, 2] > 0.03)
     edges = [(a, b) for a, b in open_edges(flame_open.faces) if a in in_front and b in in_front]

@@ -55,7 +55,7 @@ def filled(rng: random.Random, case: Path, rows: list[Any]) -> list[str]:
     def of(value: str) -> str:
         return some_path(rng, case, *value[1:].split()) if value.startswith("@") else value
 
-    found: list[str] = []
+    found = []
     for row in rows:
         if isinstance(row, str):
             found.append(of(row))

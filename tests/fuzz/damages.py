@@ -79,10 +79,10 @@ def mutate_json(rng: random.Random, path: Path) -> str:
         document = [json.loads(line) for line in lines]
     except (ValueError, RecursionError):  # an earlier damage
         return mutate_bytes(rng, path)
-    node: Any = document
-    trail: list[Any] = []
+    node = document
+    trail = []
     while True:
-        keys: list[Any] = list(node) if isinstance(node, dict) else list(range(len(node)))
+        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
         if not keys:
             return "nothing"
         key = rng.choice(keys)
@@ -129,7 +129,7 @@ def mutate_npz(rng: random.Random, path: Path) -> str:
         arrays[rng.choice(["x", "../x", "0", f"{name}/"])] = arrays.pop(name)
     elif chance < 0.4 and arrays[name].size and arrays[name].dtype.kind in "if":
         flat = arrays[name] = arrays[name].copy()
-        worst: list[float] = [np.nan, np.inf, -1e30, 1e6]
+        worst = [np.nan, np.inf, -1e30, 1e6]
         if flat.dtype.kind == "i":
             worst = [-1, np.iinfo(flat.dtype).max]
         flat.reshape(-1)[rng.randrange(flat.size)] = rng.choice(worst)

@@ -85,7 +85,7 @@ def flame_motion(path: Path) -> None:
 
 
 def flame_pickle(protocol: int) -> Callable[[Path], Any]:
-    arrays: dict[str, Any] = random_arrays(vertices=6)
+    arrays = random_arrays(vertices=6)
     arrays["J_regressor"] = scipy.sparse.csc_matrix(arrays["J_regressor"])
     return lambda path: path.write_bytes(pickle.dumps(arrays, protocol))
 
@@ -116,7 +116,7 @@ def metrics(path: Path) -> None:
 
 
 RIG, NAMES = scenes.rig(2), ["cam0.png", "cam1.png"]
-LANDMARK_CAMERA = FootageCamera("cam0", RIG[0], ImageFrames(dict.fromkeys(range(4))))  # type: ignore[arg-type]
+LANDMARK_CAMERA = FootageCamera("cam0", RIG[0], ImageFrames(dict.fromkeys(range(4))))
 ROW = "{},1,2,3,10,20,30,24.3,0.01,-0.01,0.1,0.02,0,0,0.001,0\n"
 
 

@@ -93,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
     capture, run, footage = case / "mesh", case / "splats", case / "footage"
-    once: dict[str, Any] = {"iterations": 1, "device": "cpu"}
+    once = {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(small_head(0).n_expression + 18)
     avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
@@ -101,7 +101,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
         footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"
     )
     capture_of_avatar = case / "made/capture"
-    requests: tuple[ask.Request, ...] = (
+    requests = (
         ask.Train(case / "asked", capture, settings, selection={0: np.ones(320, bool)}),
         ask.Resume(run, capture, device="cpu"),
         ask.Refine(case / "refined", run, weights=np.linspace(0, 1, 320, dtype=np.float32), **once),
@@ -145,7 +145,7 @@ def call(arguments: list[Any]) -> tuple[Any, str, str]:
     out, error = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(error):
         try:
-            code: Any = main([str(argument) for argument in arguments])
+            code = main([str(argument) for argument in arguments])
         except SystemExit as stopped:  # argparse's way
             code = stopped.code
     return code, out.getvalue(), error.getvalue()
@@ -153,13 +153,13 @@ def call(arguments: list[Any]) -> tuple[Any, str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
-def test_command_line(folder: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
+def test_command_line(folder, monkeypatch, part):
     """Catches tracebacks, other exit codes, long messages, numeric warnings, hangs and files left
     half-written."""
     case, scratch = folder / "case", folder / "scratch"
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
-    failures: dict[str, list[str]] = {}
+    failures = {}
     for number in range(FIRST_CASE + part, FIRST_CASE + CASES, PARTS):
         shutil.rmtree(case, ignore_errors=True)
         shutil.rmtree(scratch, ignore_errors=True)

@@ -35,16 +35,14 @@ from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import summarize_capture
 from stga_addon.capture.open import open_capture, read_face_ids
 from stga_addon.errors import StgaError
-from stga_addon.export.ply import read_ply
 from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.unpickle import read_pickled_arrays
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.training.run import checkpoint as checkpoints
-from stga_addon.training.run import metrics_log
 
 from .damages import damage_content
-from .readers import LINE, TARGETS
+from .readers import TARGETS
 
 MAX_READ_S, MAX_READ_BYTES = 2.0, 200e6
 GIGA = 10**9
@@ -103,9 +101,8 @@ OF_A_FOLDER = ("run", "checkpoint", "selection", "metrics", "colmap")
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_reader(tmp_path: Path, name: str) -> None:
-    """Catches a reader that neither loads a damaged file nor raises StgaError, or that trusts a
-    file because of its name."""
+def test_reader(tmp_path, name):
+    """Catches a reader that neither loads a damaged file nor raises StgaError."""
     target = TARGETS[name]
     path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
     path.parent.mkdir()
@@ -133,9 +130,8 @@ def test_reader(tmp_path: Path, name: str) -> None:
     sys.platform == "win32", reason="needs links, pipes and devices of a POSIX system"
 )
 @pytest.mark.parametrize("reader", [name for name in TARGETS if not name.startswith("colmap")])
-def test_what_is_no_file(tmp_path: Path, reader: str) -> None:
-    """Catches readers that wait for ever on a pipe, fill the memory from a device, or trip over a
-    link to itself or a name that no file can have."""
+def test_what_is_no_file(tmp_path, reader):
+    """Catches readers that wait on a pipe, read a device, or trip over a link to itself."""
     target = TARGETS[reader]
     for kind, make in IN_PLACE.items():
         (tmp_path / kind).mkdir()
@@ -181,7 +177,7 @@ LYING_ARRAYS = {
 
 
 @pytest.mark.parametrize("lie", LYING_ARRAYS)
-def test_arrays_that_lie(tmp_path: Path, lie: str) -> None:
+def test_arrays_that_lie(tmp_path, lie):
     """Catches memory allocated on the word of a header, and header parsers that fail with errors of
     their own."""
     path = archive(tmp_path / "a.npz", {"a.npy": LYING_ARRAYS[lie]})
@@ -192,7 +188,7 @@ def test_arrays_that_lie(tmp_path: Path, lie: str) -> None:
 
 
 @pytest.mark.parametrize("packing", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED])
-def test_damaged_packing(tmp_path: Path, packing: int) -> None:
+def test_damaged_packing(tmp_path, packing):
     """Catches each decompressor's own exceptions, and an archive unpacked by its entries' names."""
     array = npy(shape=(9,), data=bytes(range(36)))
     path = archive(tmp_path / "a.npz", {"../a.npy": array, "/tmp/x.npy": array}, packing)
@@ -273,7 +269,7 @@ BROKEN_MESHES = {
 
 
 @pytest.mark.parametrize("name", [*MESHES, *BROKEN_MESHES])
-def test_meshes(tmp_path: Path, name: str) -> None:
+def test_meshes(tmp_path, name):
     """Catches memory allocated on a header's word, files read or servers asked because a mesh names
     them, and parsers that do not end."""
     path = tmp_path / name
@@ -320,20 +316,11 @@ HEADS = [
 
 
 @pytest.mark.parametrize(("data", "expected"), HEADS)
-def test_head_models(tmp_path: Path, data: bytes, expected: str) -> None:
+def test_head_models(tmp_path, data, expected):
     """Catches a traceback, a hang or gigabytes of memory for a GLB that is damaged or hostile."""
     path = tmp_path / "a.glb"
     path.write_bytes(data)
     assert re.search(f"a.glb: .*{expected}", behaves(lambda: read_head_model(path), tmp_path))
-
-
-@pytest.mark.parametrize("count", ["1000000000", "9" * 30, "1e9", "-1", "1_0", "0"])
-@pytest.mark.parametrize("layout", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_splats_of_absurd_number(tmp_path: Path, count: str, layout: str) -> None:
-    """Catches memory allocated for a billion splats that the file does not have."""
-    path, head = tmp_path / "a.ply", f"ply\nformat {layout} 1.0\nelement vertex {count}\n"
-    path.write_text(f"{head}property float x\nend_header\n0 0 0\n")
-    assert behaves(lambda: read_ply(path), tmp_path)
 
 
 # Pickles
@@ -364,7 +351,7 @@ PICKLES = {
 
 
 @pytest.mark.parametrize("name", PICKLES)
-def test_pickles(tmp_path: Path, name: str) -> None:
+def test_pickles(tmp_path, name):
     """Catches pickles whose size is a lie, that run what they name, that change how later files are
     read, or that never end."""
     path, good = tmp_path / "a.pkl", tmp_path / "good.pkl"
@@ -387,9 +374,7 @@ class Sparse:
 
 
 @pytest.mark.parametrize("shape", [(10**5, 10**5), (20_000, 10_000), (5, 10**18), (10**4, -1)])
-def test_sparse_matrices_that_would_be_large(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
-) -> None:
+def test_sparse_matrices_that_would_be_large(tmp_path, monkeypatch, shape):
     """Catches a matrix of a few entries filled in to gigabytes."""
     import scipy.sparse
 
@@ -401,7 +386,7 @@ def test_sparse_matrices_that_would_be_large(
 
 
 @pytest.mark.parametrize("shape", [(-1, -6), ("a",), (10**400,), (2, 3, None), (1,) * 70])
-def test_shapes_that_are_none(tmp_path: Path, shape: tuple[Any, ...]) -> None:
+def test_shapes_that_are_none(tmp_path, shape):
     """Catches arithmetic on shapes that are not numbers, not positive or of too many axes."""
     path, code = tmp_path / "a.pkl", pickle.dumps({"v_template": np.arange(6.0)}, 2)
     path.write_bytes(code.replace(pickle.dumps((6,), 2)[2:-1], pickle.dumps(shape, 2)[2:-1]))
@@ -421,9 +406,7 @@ def capture_with(root: Path, change: Callable[[dict[str, Any]], object]) -> Path
 FRAME_VALUES: dict[str, dict[str, Any]] = {
     "path of nul": {"file_path": "a\0b.png"}, "half a character": {"mesh_path": "\ud800.obj"},
     "long path": {"file_path": "x" * 5000 + ".png"}, "deep path": {"mesh_path": "a/" * 5000},
-    "path out": {"mesh_path": "../../../etc/passwd"}, "home": {"fg_mask_path": "~/x.png"},
-    "path out by backslashes": {"file_path": "a\\..\\..\\..\\x.png"},
-    "absolute path": {"fg_mask_path": "/etc/passwd"}, "drive": {"file_path": "C:\\x.png"},
+    "home": {"fg_mask_path": "~/x.png"},
     "path of a folder": {"file_path": "."}, "path of paths": {"file_path": ["x" * 700_000]},
     "huge focal length": {"fl_x": 10**400}, "far focal length": {"fl_x": 1e30},
     "no focal length": {"fl_x": 1e-30}, "no angle": {"fl_x": None, "camera_angle_x": 5e-324},
@@ -433,16 +416,14 @@ FRAME_VALUES: dict[str, dict[str, Any]] = {
     "huge camera": {"camera_index": 10**400},
     "huge matrix": {"transform_matrix": [[10**400] * 4] * 4},
     "matrix of lists": {"transform_matrix": [[[]] * 4] * 4}, "number as list": {"w": [40]},
-    "matrix of text": {"transform_matrix": [["1"] * 4] * 4}, "number as text": {"fl_x": "200"},
-    "true": {"timestep_index": True},
+    "matrix of text": {"transform_matrix": [["1"] * 4] * 4},
     "camera of lists": {"camera_id": [[["x"]]], "camera_index": None},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FRAME_VALUES)
-def test_frames(tmp_path: Path, name: str) -> None:
-    """Catches values that are valid JSON and nonsense: numbers beyond floats, paths beyond names,
-    jumps in time."""
+def test_frames(tmp_path, name):
+    """Catches valid JSON that is nonsense: numbers beyond floats, paths beyond names."""
     change = FRAME_VALUES[name]
     root = capture_with(tmp_path / "capture", lambda document: document["frames"][0].update(change))
     message = behaves(lambda: summarize_capture(open_capture(root)), tmp_path)
@@ -453,24 +434,13 @@ def test_frames(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     "value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ".", 3, ["a"]]
 )
-def test_files_of_the_top_level(tmp_path: Path, key: str, value: Any) -> None:
+def test_files_of_the_top_level(tmp_path, key, value):
     """Catches the same in the paths that are not a frame's."""
     root = capture_with(tmp_path / "capture", lambda document: document.update({key: value}))
     assert behaves(lambda: open_capture(root), tmp_path)
 
 
-@pytest.mark.parametrize(
-    "name", ["images/00000_00.png", "meshes/00000.obj", "meshes/neutral.obj", "regions.json"]
-)
-def test_pipes_in_a_capture(tmp_path: Path, name: str) -> None:
-    """Catches a capture that is never opened because it waits for a pipe."""
-    root = factory.write_mesh_capture(tmp_path / "capture", (0, 1), (0, 1))
-    (root / name).unlink()
-    os.mkfifo(root / name)
-    assert name in behaves(lambda: open_capture(root), tmp_path)
-
-
-def test_view_names_hold_no_backslashes(tmp_path: Path) -> None:
+def test_view_names_hold_no_backslashes(tmp_path):
     """Catches a rendering, named after its view, written outside its folder on Windows, where these
     are paths."""
     change = {"file_path": "a\\..\\images\\00000_00.png"}
@@ -504,7 +474,6 @@ def full(value: Any, *shape: int) -> np.ndarray:
 DIGITS = "9" * 5000
 XMP = test_calibrations.XMP_COEFFICIENTS
 CSV = "cam0.png,1,2,3,10,20,30,24.3"
-ZEROS = ",0,0,0,0,0,0,0,0"
 LANDMARK_ROWS = [
     ({"points": full(0.0, 4, 3)}, r"points has shape \(4, 3\), expected \(4, any, 2\)"),
     ({"points": full("x", 4, 6, 2)}, "points holds <U1, expected floating-point numbers"),
@@ -649,7 +618,7 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
     ("reader", "change", "message"),
     [(reader, *row) for reader, rows in WRONG.items() for row in rows],
 )
-def test_wrong_fields_are_named(tmp_path: Path, reader: str, change: Any, message: str) -> None:
+def test_wrong_fields_are_named(tmp_path, reader, change, message):
     """Catches a file that is read as something else, and a message without file and field."""
     target = TARGETS[reader]
     path = tmp_path / target.name
@@ -670,7 +639,7 @@ META_VALUES: dict[str, Any] = {
 }  # fmt: skip
 
 
-def test_checkpoints_of_wrong_kinds(tmp_path: Path) -> None:
+def test_checkpoints_of_wrong_kinds(tmp_path):
     """Catches a checkpoint that loads and then fails, or trains for ever, in the middle of the
     resumed run."""
     checkpoints.write_checkpoint(tmp_path, make_checkpoint())
@@ -685,7 +654,7 @@ def test_checkpoints_of_wrong_kinds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("part", ["parameters", "first", "second"])
-def test_checkpoints_whose_values_train_nothing(tmp_path: Path, part: str) -> None:
+def test_checkpoints_whose_values_train_nothing(tmp_path, part):
     """Catches a broken number that a resumed run would keep for ever, and spherical harmonics of no
     degree, which the kernels would read past their end."""
     for value in (float("nan"), float("inf")):
@@ -703,24 +672,8 @@ def test_checkpoints_whose_values_train_nothing(tmp_path: Path, part: str) -> No
 
 
 @pytest.mark.parametrize("name", ["²", "९", "-1", "9" * 5000, "", "1.5"])
-def test_selections_of_odd_timesteps(tmp_path: Path, name: str) -> None:
+def test_selections_of_odd_timesteps(tmp_path, name):
     """Catches names that Python calls digits and cannot turn into a number."""
     np.savez(tmp_path / "selection.npz", **{name: np.ones(5, bool)})
     message = behaves(lambda: checkpoints.read_selection(tmp_path, 5), tmp_path)
     assert "९" in message if name == "९" else message
-
-
-@pytest.mark.parametrize(
-    "damage", [b"\xff\xff\n", b"\0" * 100, b"[" * 100_000, b'{"iteration": 20, "sec']
-)
-def test_metrics_after_a_power_cut(tmp_path: Path, damage: bytes) -> None:
-    """Catches a run that cannot be resumed because of a line of its log: what was whole before it
-    stays."""
-    metrics_log.append_metrics(tmp_path, {"iteration": 10, **LINE})
-    with (tmp_path / "metrics.jsonl").open("ab") as out:
-        out.write(damage)
-    assert not behaves(lambda: metrics_log.read_metrics(tmp_path), tmp_path)
-    assert metrics_log.read_metrics(tmp_path) == [{"iteration": 10, **LINE}]
-    metrics_log.cut_metrics(tmp_path, 20)
-    metrics_log.append_metrics(tmp_path, {"iteration": 20, **LINE})
-    assert [line["iteration"] for line in metrics_log.read_metrics(tmp_path)] == [10, 20]

@@ -18,14 +18,7 @@ from stga_addon.capture.camera import Camera
 IMAGES = "rgb", "alpha", "depth"
 
 
-def facing(
-    count: int,
-    seed: int = 0,
-    size: tuple[int, int] = (37, 29),
-    focal: float = 40.0,
-    degree: int = 1,
-    **changes: object,
-) -> Scene:
+def facing(count, seed=0, size=(37, 29), focal=40.0, degree=1, **changes):
     """`count` splats two meters before a camera at the origin that looks along +z; `changes`
     replaces parameters."""
     rng = np.random.default_rng(seed)
@@ -81,9 +74,7 @@ def steady_pixels(scene: Scene, margin: float = 1e-3) -> np.ndarray:
     return steady.numpy()
 
 
-def compare(
-    scene: Scene, near: float = 0.01, roundings: int = 0
-) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+def compare(scene, near=0.01, roundings=0):
     """Largest differences between kernels and reference on steady pixels, and the kernels'
     gradients.
 
@@ -120,9 +111,7 @@ def compare(
     return errors, gradients
 
 
-def _named(
-    images: list[np.ndarray], gradients: dict[str, np.ndarray], steady: np.ndarray
-) -> dict[str, np.ndarray]:
+def _named(images, gradients, steady):
     """The images, black where they are not steady, and the gradients."""
     shown = (np.where(steady, image, image * 0) for image in images)
     return dict(zip(IMAGES, shown, strict=True)) | gradients

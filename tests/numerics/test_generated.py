@@ -75,7 +75,7 @@ def steady_order(scene: Scene) -> bool:
 
 @settings(max_examples=6000 if FUZZING else 100, **(BOUNDED | {"derandomize": not FUZZING}))
 @given(scenes())
-def test_any_scene_is_the_references(back_end: str, scene: Scene) -> None:
+def test_any_scene_is_the_references(back_end, scene):
     """Catches NaN, infinity and disagreement that no listed scene provokes; in `make fuzz` with
     others every time."""
     if not (steady_colors(scene) and steady_order(scene)):
@@ -97,9 +97,7 @@ WILD = st.sampled_from([sign * size for size in SIZES for sign in (1, -1)])
         max_size=12,
     )
 )
-def test_any_number_in_any_place_harms_only_its_splat(
-    places: list[tuple[int, str, int, float]],
-) -> None:
+def test_any_number_in_any_place_harms_only_its_splat(places):
     """Catches overflow, 0/0 and NaN from any combination of extreme entries in up to a dozen
     places.
 
@@ -120,7 +118,7 @@ def test_any_number_in_any_place_harms_only_its_splat(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gradient_is_the_central_difference(name: str) -> None:
+def test_gradient_is_the_central_difference(name):
     """Catches an error that reference and kernels share, which comparing the two would not show.
 
     Differences of the float64 image in random directions, weighted by cotangents that vanish on

@@ -44,7 +44,7 @@ def shown_and_expected(posed: list[np.ndarray], neutral: list[np.ndarray], conve
 
 @pytest.mark.parametrize("when", ["now", "in the neutral mesh", "always"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_degenerate_triangles_are_numpys(convention: str, when: str) -> None:
+def test_degenerate_triangles_are_numpys(convention, when):
     """Catches Blender's own substitutes for missing axes, and a rounding error taken for a normal
     or for growth.
 
@@ -71,7 +71,7 @@ def test_degenerate_triangles_are_numpys(convention: str, when: str) -> None:
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_half_turns_and_flips(convention: str) -> None:
+def test_half_turns_and_flips(convention):
     """Catches a matrix-to-quaternion conversion that divides by zero at trace −1, and a mirrored
     frame."""
     turns = [np.eye(3), *HALF_TURNS]

@@ -103,7 +103,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_hard_scene_is_the_references(back_end: str, name: str) -> None:
+def test_hard_scene_is_the_references(back_end, name):
     """Catches what the comment beside the scene says; anything not finite; any error beyond the
     table's tolerances."""
     # The kernel's near plane is the float32 next to 0.01.
@@ -113,7 +113,7 @@ def test_hard_scene_is_the_references(back_end: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("norm", [0.0, 1e-38, 1e-20, 1e-13, 1e13, 1e20, 1e37])
-def test_quaternions_of_any_length(back_end: str, norm: float) -> None:
+def test_quaternions_of_any_length(back_end, norm):
     """Catches squares that leave float32's range: such splats, and those of length zero, used to
     vanish.
 
@@ -149,7 +149,7 @@ BROKEN = {name: (name, np.nan) for name in NAMES} | {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_splat_is_dropped(back_end: str, name: str) -> None:
+def test_a_broken_splat_is_dropped(back_end, name):
     """Catches NaN that spreads, or that a clamp turns into a plausible number.
 
     NaN in `sh` was cut to zero: a black splat with NaN gradients. The image and the other rows'
@@ -171,7 +171,7 @@ def test_a_broken_splat_is_dropped(back_end: str, name: str) -> None:
         assert not gradients[parameter][3].any(), parameter
 
 
-def test_ten_thousand_opaque_layers(back_end: str) -> None:
+def test_ten_thousand_opaque_layers(back_end):
     """Catches a backward pass that divides by 1 − alpha beyond the pixel's end: gradients of 1e30
     and NaN.
 
@@ -227,7 +227,7 @@ def head_camera(distance: float = 0.8, focal: float = 90.0) -> Camera:
 
 
 @pytest.mark.parametrize("shift", [[100.0, 0, 0], [-60.0, 70, 40], [1e4, 1e4, 1e4]])
-def test_a_head_far_from_the_origin_is_the_same_head(back_end: str, shift: list[float]) -> None:
+def test_a_head_far_from_the_origin_is_the_same_head(back_end, shift):
     """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a
     millimeter."""
     posed, neutral, faces = triangles()
@@ -256,9 +256,7 @@ def test_a_head_far_from_the_origin_is_the_same_head(back_end: str, shift: list[
 @pytest.mark.parametrize(
     ("size", "distance", "focal"), [(1000.0, 800.0, 90.0), (1e-3, 0.08, 9e3), (1e-3, 0.02, 2e3)]
 )
-def test_a_mesh_a_thousand_times_too_large_or_small(
-    back_end: str, size: float, distance: float, focal: float
-) -> None:
+def test_a_mesh_a_thousand_times_too_large_or_small(back_end, size, distance, focal):
     """Catches absolute thresholds (areas, lengths) on the way from a mesh to an image and back to
     the splats.
 

@@ -7,19 +7,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from stga_addon.avatar.embedding import WORLD, FaceFrames
-from stga_addon.capture.camera import Camera
-from stga_addon.raster.cpu.layout import CameraFrames, Parameters
+from stga_addon.avatar.embedding import WORLD
+from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.rasterize import Rasterizer, ViewOptions, upload_frames, upload_splats
 
 
-def render_differentiable(
-    splats: Parameters, camera: Camera, frames: FaceFrames = WORLD, face: np.ndarray | None = None,
-    degree: int = 3, antialiased: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+def render_differentiable(splats, camera, frames=WORLD, face=None, degree=3, antialiased=False):
     """Differentiable rendering on the first adapter; everything as in
     `cpu.autograd.render_differentiable`."""
     face = np.zeros(len(splats.xyz), np.int32) if face is None else face
@@ -42,10 +38,7 @@ def shared_rasterizer() -> Rasterizer:
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray,
-        *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+    def forward(ctx, options, camera_frames, face, *tensors):
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         ctx.saved = options, camera_frames, face, splats
         image, transmittance, _ = render(options, camera_frames, face, splats)
@@ -60,10 +53,7 @@ class _Blend(torch.autograd.Function):
         return None, None, None, *given[: len(ctx.needs_input_grad) - 3]
 
 
-def render(
-    options: ViewOptions, camera_frames: CameraFrames, face: np.ndarray, splats: Parameters,
-    cotangents: tuple[np.ndarray, np.ndarray] | None = None, rasterizer: Rasterizer | None = None,
-) -> tuple[np.ndarray, np.ndarray, Parameters]:  # fmt: skip
+def render(options, camera_frames, face, splats, cotangents=None, rasterizer=None):
     """Image and transmittance, and the gradients where there are cotangents of these two."""
     rasterizer = rasterizer or shared_rasterizer()
     device, (height, width) = rasterizer.device, (options.camera.height, options.camera.width)

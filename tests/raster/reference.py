@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, normalize
 
-from stga_addon.avatar.embedding import FaceFrames
 from stga_addon.capture.camera import Camera
 
 MAX_ALPHA = 0.999
@@ -25,16 +24,8 @@ FRUSTUM_MARGIN = 0.3
 
 
 def render(
-    xyz: Tensor,
-    rotation: Tensor,
-    log_scale: Tensor,
-    opacity: Tensor,
-    sh: Tensor,
-    camera: Camera,
-    sh_degree: int = 3,
-    near: float = NEAR_M,
-    antialiased: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
+    xyz, rotation, log_scale, opacity, sh, camera, sh_degree=3, near=NEAR_M, antialiased=False
+):
     """Image of world-space splats: color (3, H, W) on black, alpha (H, W), depth (H, W) = Σ weight
     · z.
 
@@ -58,9 +49,7 @@ def render(
     return blend(alpha, sh_color(sh[order], xyz[order] - position, sh_degree), depth)
 
 
-def embed(
-    xyz: Tensor, rotation: Tensor, log_scale: Tensor, frames: FaceFrames, face: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def embed(xyz, rotation, log_scale, frames, face):
     """World-space xyz (N, 3), rotation (N, 4) wxyz and log_scale (N, 3) of splats in the frames of
     triangles face (N,)."""
     n = len(xyz)
@@ -85,9 +74,7 @@ def camera_space(xyz: Tensor, camera: Camera) -> Tensor:
     return xyz @ view[:3, :3].T + view[:3, 3]
 
 
-def project(
-    xyz: Tensor, rotation: Tensor, log_scale: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def project(xyz, rotation, log_scale, camera):
     """Project N world-space Gaussians; all must be in front of the camera.
 
     Returns center (N, 2) in pixels, covariance (N, 2, 2) in square pixels with the low-pass, depth

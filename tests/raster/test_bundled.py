@@ -49,9 +49,7 @@ def loads(output: str) -> bool:
 
 
 @pytest.mark.slow
-def test_kernels_of_another_machine_are_used_where_they_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_of_another_machine_are_used_where_they_fit(tmp_path, monkeypatch):
     """Catches a first training that compiles what the zip holds, because of the folder, the time of
     the files or the processor's name; and kernels of an older version that are used for newer
     sources."""
@@ -81,11 +79,8 @@ def test_kernels_of_another_machine_are_used_where_they_fit(
 
 
 @pytest.mark.slow
-def test_the_first_run_on_a_machine_has_the_bits_of_all_later_ones(
-    kernel_bundle: tuple[Path, str],
-) -> None:
-    """Catches a helper that is called where it was compiled alone, in one process, and as a copy in
-    the next."""
+def test_the_first_run_on_a_machine_has_the_bits_of_all_later_ones(kernel_bundle):
+    """Catches a helper that is called in one process and compiled as a copy in the next."""
     folder, compiled = kernel_bundle
     environment = {
         **os.environ,

@@ -22,8 +22,7 @@ def logarithms(x, out):
 
 
 def test_exponential_and_logarithm_are_numpys():
-    """Catches a wrong coefficient, and a reduction that loses digits far from zero or at a power of
-    two."""
+    """Catches a wrong coefficient, digits lost far from zero, and NaN that becomes a number."""
     x = np.concatenate([np.linspace(-86, 88, 20_001), np.arange(-120, 120) * np.log(2) / 2]).astype(
         np.float32
     )
@@ -39,10 +38,6 @@ def test_exponential_and_logarithm_are_numpys():
     logarithms(positive, found)
     exact = np.log(positive.astype(np.float64))
     assert (np.abs(found - exact) / np.maximum(1, np.abs(exact))).max() < 3e-7
-
-
-def test_what_is_not_a_number_stays_so():
-    """Catches bounds that turn NaN into a number: a broken splat would become a visible one."""
     x, found = np.array([np.nan, np.inf, 1e30, -np.inf, -1e30], np.float32), np.empty(5, np.float32)
     exponentials(x, found)
     assert np.isnan(found[0])

@@ -28,16 +28,14 @@ def device() -> Device:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
 @pytest.mark.parametrize("count", [1, 3, 4, 1021])
-def test_arrays_arrive_whole(device: Device, dtype: type, count: int) -> None:
+def test_arrays_arrive_whole(device, dtype, count):
     """Catches the last bytes of an image that is no multiple of a word left behind."""
     values = (np.arange(count) * 7 % 251).astype(dtype)
     buffer = device.upload(f"values {np.dtype(dtype)}", values)
     np.testing.assert_array_equal(device.read(buffer, values.shape, dtype), values)
 
 
-def test_every_thread_of_a_long_dispatch_runs_once(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_thread_of_a_long_dispatch_runs_once(device, monkeypatch):
     """Catches threads beyond the longest row of workgroups that are lost or run twice, and a
     dispatch that would read what another one bound."""
     source = device_module._source
@@ -57,7 +55,7 @@ def test_every_thread_of_a_long_dispatch_runs_once(
         device.record().dispatch("numbers.main", (1, 1, 1), {"others": buffer})
 
 
-def test_a_buffer_grows_and_begins_with_zeros(device: Device) -> None:
+def test_a_buffer_grows_and_begins_with_zeros(device):
     """Catches a buffer that is too small, and a new one at every request."""
     small = device.buffer("growing", 100)
     assert device.buffer("growing", 50) is small
@@ -67,7 +65,7 @@ def test_a_buffer_grows_and_begins_with_zeros(device: Device) -> None:
     assert not device.read(large, (200,)).any()
 
 
-def test_what_the_user_is_told(device: Device) -> None:
+def test_what_the_user_is_told(device):
     """Catches a traceback of the driver's instead of a sentence."""
     with pytest.raises(StgaError, match=r"no such adapter; there are: .*\("):
         Device("Voodoo 2")
@@ -79,14 +77,12 @@ def test_what_the_user_is_told(device: Device) -> None:
         raise gpu_device.wgpu.GPUValidationError("Parent device is lost")
 
 
-def test_a_lost_device_is_told_to_who_waits(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lost_device_is_told_to_who_waits(device, monkeypatch):
     """Catches a run that waits for ever for a driver that was reset."""
     readback = Readback(device, 4)
     words = device.upload("words", np.zeros(4, np.uint32))
 
-    def lost(*_: object) -> None:
+    def lost(*_):
         raise gpu_device.wgpu.GPUError("Parent device is lost")
 
     with monkeypatch.context() as broken:
@@ -101,7 +97,7 @@ def test_a_lost_device_is_told_to_who_waits(
     device.failures.clear()
 
 
-def test_adapters_have_names_of_their_own() -> None:
+def test_adapters_have_names_of_their_own():
     """Catches two equal cards of which only one can be chosen."""
     assert len(adapters()) == len(set(adapters()))
     assert all(name.strip() for name in adapters())

@@ -7,7 +7,6 @@ import pytest
 
 from raster import gpu_device
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.optimizer import AdamOptions
 from stga_addon.raster.gpu.device import Device
 from stga_addon.raster.gpu.layout import split_rows
 from stga_addon.raster.gpu.optimizer import OptimizerTables, optimize, upload_step
@@ -41,10 +40,7 @@ def random_state(count: int = 700, seed: int = 1) -> SimpleNamespace:
     )  # fmt: skip
 
 
-def on_device(
-    device: Device, state: SimpleNamespace, weights: tuple[float, float, float] = (0, 0, 0),
-    options: AdamOptions = OPTIONS,
-) -> SimpleNamespace:  # fmt: skip
+def on_device(device, state, weights=(0, 0, 0), options=OPTIONS):
     """The tables after a step; weights: of scale, distance, opacity."""
     n, upload = len(state.steps), device.upload
     buffers = {name: upload(f"test {name}", getattr(state, name)) for name in TABLES}
@@ -66,7 +62,7 @@ def on_device(
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e18, -1e20])
-def test_a_broken_gradient_leaves_its_field(device: Device, value: float) -> None:
+def test_a_broken_gradient_leaves_its_field(device, value):
     """Catches NaN, or a square beyond float32, that gets into a row; and other fields that stop
     with it."""
     state = random_state(40)
@@ -86,7 +82,7 @@ def test_a_broken_gradient_leaves_its_field(device: Device, value: float) -> Non
 
 @pytest.mark.parametrize("ahead", [0.0, 0.1])
 @pytest.mark.parametrize("steps", [0, 1, 2, 10, 100, 499, 500, 10_000, 2**31 - 2])
-def test_a_step_at_any_age(device: Device, steps: int, ahead: float) -> None:
+def test_a_step_at_any_age(device, steps, ahead):
     """Catches 1 − βⁿ computed as a difference of nearly equal numbers, and Nesterov's momentum that
     gets into the moments; compared with float64."""
     state = random_state(64)
@@ -109,7 +105,7 @@ def test_a_step_at_any_age(device: Device, steps: int, ahead: float) -> None:
 
 
 @pytest.mark.parametrize("log_scale", [10.0, 40.0, 43.0])
-def test_limit_of_one_enormous_splat(device: Device, log_scale: float) -> None:
+def test_limit_of_one_enormous_splat(device, log_scale):
     """Catches a square that overflows, and with it everybody's gradient; compared with float64."""
     state = random_state()
     state.splats[5, 7:10], state.wanted[5] = log_scale, True
@@ -126,7 +122,7 @@ def test_limit_of_one_enormous_splat(device: Device, log_scale: float) -> None:
 
 
 @pytest.mark.parametrize("wanted", ["none", "within the limits"])
-def test_norms_of_zero(device: Device, wanted: str) -> None:
+def test_norms_of_zero(device, wanted):
     """Catches 0/0 where no row exceeds its limit."""
     state = random_state()
     state.gradients[:] = 0

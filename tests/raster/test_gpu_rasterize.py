@@ -17,7 +17,7 @@ from stga_addon.raster.gpu.rasterize import Rasterizer, ViewOptions
 pytestmark = pytest.mark.needs("adapter")
 
 
-def test_the_same_bits_twice_and_from_used_buffers() -> None:
+def test_the_same_bits_twice_and_from_used_buffers():
     """Catches sums in the order of chance, and results that depend on what an earlier image left in
     the buffers."""
     used = Rasterizer(Device())
@@ -37,7 +37,7 @@ def test_the_same_bits_twice_and_from_used_buffers() -> None:
             np.testing.assert_array_equal(got, want, err_msg=f"{name}: {field}")
 
 
-def test_a_trial_finds_wrong_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_finds_wrong_numbers(monkeypatch):
     """Catches a trial that passes whatever a device computes."""
     device = gpu_device.device()
     monkeypatch.setattr(trial, "SECONDS", 0.0)

@@ -43,7 +43,7 @@ def view_of(device: Device, splats: int) -> Any:
 
 @pytest.mark.parametrize("count", [1, 255, 257, 2048, 2049, 10_000])
 @pytest.mark.parametrize("kind", ["random", "few", "equal", "reversed", "two digits"])
-def test_sorted_keys_are_numpys(device: Device, count: int, kind: str) -> None:
+def test_sorted_keys_are_numpys(device, count, kind):
     """Catches a key lost at a block's edge, a digit's carry, equal keys that change places, and the
     tiles of a large image, which need a second pass."""
     random = np.random.default_rng(count)
@@ -62,7 +62,7 @@ def test_sorted_keys_are_numpys(device: Device, count: int, kind: str) -> None:
     np.testing.assert_array_equal(device.read(found[0], (count,), np.uint32), keys[order])
 
 
-def test_a_count_beyond_32_bits_is_too_many(device: Device) -> None:
+def test_a_count_beyond_32_bits_is_too_many(device):
     """Catches a sum that wraps around to a small number: of three workgroups with 2³¹ − 1 pairs
     each."""
     until = np.full(3 * WORKGROUP + 3, 0x7FFFFFFF, np.uint32)
@@ -80,9 +80,7 @@ SIZES = [(100, 70), (1, 1), (1, 40), (40, 1), (17, 33), (32, 16), (9, 11)]
 SSIM_WEIGHT = 0.2
 
 
-def on_device(
-    device: Device, image: np.ndarray, target: np.ndarray, touched: np.ndarray, **options
-) -> tuple[np.ndarray, float]:
+def on_device(device, image, target, touched, **options):
     """Gradient (3, H, W), filled with 77 before, and loss; touched (rows, columns) of tiles."""
     _, height, width = image.shape
     columns, rows = tile_grid(width, height)
@@ -109,9 +107,8 @@ def pictures(width: int, height: int, seed: int = 1) -> tuple[np.ndarray, np.nda
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("kind", ["noise", "bright and flat", "equal"])
-def test_loss_and_gradient_are_the_cpus(device: Device, size: tuple[int, int], kind: str) -> None:
-    """Catches a window, a padding, a byte of the target or a sign that differs, and a tile left out
-    of the sum."""
+def test_loss_and_gradient_are_the_cpus(device, size, kind):
+    """Catches a window, padding, byte or sign that differs, and a tile left out of the sum."""
     image, target = pictures(*size)
     if kind == "bright and flat":
         image, target = np.full_like(image, 0.999), np.full_like(target, 255)
@@ -134,7 +131,7 @@ def test_loss_and_gradient_are_the_cpus(device: Device, size: tuple[int, int], k
 
 
 @pytest.mark.parametrize("scale", [1e4, 1e8, 1e15, 1e18])
-def test_extreme_images_stay_bounded(device: Device, scale: float) -> None:
+def test_extreme_images_stay_bounded(device, scale):
     """Catches variances that become negative or overflow, whose gradient is NaN or enormous."""
     image, target = pictures(40, 30)
     gradient, _ = on_device(device, np.float32(scale) * image, target, np.ones((2, 3), bool))
@@ -148,7 +145,7 @@ FRAME_TOLERANCE = 2e-6
 
 @pytest.mark.parametrize("mesh", ["ball", "collapsed", "lines in the neutral mesh", "far away"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
-def test_frames_and_signals_are_numpys(device: Device, convention: str, mesh: str) -> None:
+def test_frames_and_signals_are_numpys(device, convention, mesh):
     """Catches another rule for a triangle without area, an axis that differs, and edges that lose
     digits in float32."""
     posed, neutral, faces = bent_ball() if mesh in ("ball", "far away") else collapsed()

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from raster import reference
-from stga_addon.avatar.embedding import WORLD, FaceFrames, face_frames
+from stga_addon.avatar.embedding import WORLD, face_frames
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
@@ -49,16 +49,16 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
 
 
 def cloud(
-    seed: int,
-    count: int = 60,
-    size: tuple[int, int] = (50, 37),
-    degree: int = 3,
-    spread: float = 0.8,
-    log_scale: float = -2.0,
-    logit: float = 0.0,
-    zoom: float = 1.0,
-    shift: tuple[float, float] = (0.0, 0.0),
-) -> Scene:
+    seed,
+    count=60,
+    size=(50, 37),
+    degree=3,
+    spread=0.8,
+    log_scale=-2.0,
+    logit=0.0,
+    zoom=1.0,
+    shift=(0.0, 0.0),
+):
     """`count` random splats around the origin; the image is wide enough to hold most of them at
     zoom 1."""
     rng = np.random.default_rng(seed)
@@ -109,9 +109,8 @@ Gradients = dict[str, np.ndarray]
 
 
 def reference_gradients(
-    scene: Scene, cotangents: list[torch.Tensor], frames: FaceFrames | None = None,
-    face: np.ndarray | None = None, antialiased: bool = False, near: float = reference.NEAR_M,
-) -> tuple[Images, Gradients]:  # fmt: skip
+    scene, cotangents, frames=None, face=None, antialiased=False, near=reference.NEAR_M
+):
     """Images and gradients of the float64 reference for the very numbers that the kernels get; of
     world-space splats, or in the frames of the triangles face (N,)."""
     tensors = {n: torch.from_numpy(a).double().requires_grad_() for n, a in scene.splats.items()}
@@ -126,10 +125,7 @@ def reference_gradients(
     return finish(images, cotangents, tensors)
 
 
-def kernel_gradients(
-    scene: Scene, cotangents: list[torch.Tensor], frames: FaceFrames = WORLD,
-    face: np.ndarray | None = None, antialiased: bool = False,
-) -> tuple[Images, Gradients]:  # fmt: skip
+def kernel_gradients(scene, cotangents, frames=WORLD, face=None, antialiased=False):
     """The same of the kernels."""
     tensors = {n: torch.from_numpy(a).clone().requires_grad_() for n, a in scene.splats.items()}
     images = render_differentiable(
@@ -184,8 +180,7 @@ def test_image_and_gradients_are_the_references(back_end, name):
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
-    """Catches a kernel that turns, scales or differentiates in the wrong frame when splats ride on
-    triangles."""
+    """Catches a kernel that turns, scales or differentiates in the wrong frame."""
     scene, rng = cloud(1), np.random.default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]

@@ -33,7 +33,7 @@ def count_up(work, done):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 20])
 @pytest.mark.parametrize("piece", [1, 6])
-def test_every_unit_is_done_once(count: int, piece: int) -> None:
+def test_every_unit_is_done_once(count, piece):
     """Catches pieces that overlap, are left out at the end, or are taken by two threads that read
     the counter before either has advanced it: pieces this short collide at once."""
     set_threads(count)
@@ -53,7 +53,7 @@ def fail(work, numbers, at):
 
 
 @pytest.mark.parametrize("at", [0, 9])
-def test_an_error_reaches_the_caller(at: int) -> None:
+def test_an_error_reaches_the_caller(at):
     """Catches an error that dies with its thread, a caller that then waits for ever, and threads
     lost to it."""
     set_threads(3)
@@ -73,7 +73,7 @@ def meet(work, met, patience):
         met[1 + begin] = fetch_add(met, 0, 0)
 
 
-def test_the_threads_work_at_once() -> None:
+def test_the_threads_work_at_once():
     """Catches helpers that never come: all is done, but by the caller alone."""
     set_threads(7)
     for _ in range(5):
@@ -83,7 +83,7 @@ def test_the_threads_work_at_once() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
-def test_a_forked_process_has_threads_of_its_own() -> None:
+def test_a_forked_process_has_threads_of_its_own():
     """Catches a child that gives its kernels to its parent's threads, or waits for the lock that
     one of them held."""
     set_threads(3)
@@ -96,15 +96,15 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_several_callers_at_a_time() -> None:
+def test_several_callers_at_a_time():
     """Catches shared state between calls: Blender draws a viewport in a thread of its own while
     another one renders."""
     scene = SCENES["plain"]
     cotangents = random_cotangents(scene.camera)
     _, expected = kernel_gradients(scene, cotangents)
-    found: list[dict[str, np.ndarray]] = []
+    found = []
 
-    def render() -> None:
+    def render():
         for _ in range(5):
             found.append(kernel_gradients(scene, cotangents)[1])
 
@@ -128,14 +128,14 @@ def spin(times):
     return x
 
 
-def test_python_goes_on_meanwhile() -> None:
+def test_python_goes_on_meanwhile():
     """Catches kernels that hold Python's lock: Blender's window would stand still while a picture
     is rendered."""
     spin(1)
-    ticks: list[float] = []
+    ticks = []
     ended = threading.Event()
 
-    def tick() -> None:
+    def tick():
         while not ended.wait(0.001):
             ticks.append(time.monotonic())
 

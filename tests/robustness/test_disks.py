@@ -14,7 +14,6 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.files import read_json, write_json
-from stga_addon.progress import Progress
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, locked
@@ -30,9 +29,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return factory.write_mesh_capture(tmp_path_factory.mktemp("disk"), (0, 1, 3), range(3))
 
 
-def test_no_room_for_a_checkpoint(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_room_for_a_checkpoint(root, tmp_path, monkeypatch):
     """Catches a checkpoint destroyed by the one that did not fit, a traceback, and a run that
     cannot go on when there is room again: from one moment on, the system refuses every file above a
     size."""
@@ -42,7 +39,7 @@ def test_no_room_for_a_checkpoint(
     run = Run(capture.root, None, "vhap", quick_settings(iterations=ITERATIONS, lattice=1))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def no_more(progress: Progress) -> bool:
+    def no_more(progress):
         if progress.figures().get("iteration", 0) == FULL_AT:
             resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
         return False
@@ -62,14 +59,12 @@ def test_no_room_for_a_checkpoint(
     assert read_checkpoint(tmp_path).iteration == ITERATIONS
 
 
-def test_an_error_when_the_data_reaches_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_when_the_data_reaches_the_disk(tmp_path, monkeypatch):
     """Catches a rename before the data is known to be on the disk: network drives report a full one
     only then."""
     write_json(tmp_path / "a.json", [1])
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", full)
@@ -79,7 +74,7 @@ def test_an_error_when_the_data_reaches_the_disk(
     assert os.listdir(tmp_path) == ["a.json"]
 
 
-def test_metrics_that_cannot_be_written(tmp_path: Path) -> None:
+def test_metrics_that_cannot_be_written(tmp_path):
     """Catches a traceback from the one file that is not replaced but grows."""
     (tmp_path / "metrics.jsonl").mkdir()
     with pytest.raises(StgaError, match=r"metrics\.jsonl: cannot be written"):
@@ -119,7 +114,7 @@ print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
 @pytest.mark.skipif(
     not hasattr(os, "fork"), reason="needs processes that start within a microsecond"
 )
-def test_never_two_in_one_folder(tmp_path: Path) -> None:
+def test_never_two_in_one_folder(tmp_path):
     """Catches two runs that both take over the lock of a third at the same moment."""
     with locked(tmp_path):
         pass

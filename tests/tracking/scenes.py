@@ -21,23 +21,32 @@ def write_image(path, value=128, size=(WIDTH, HEIGHT)):
     Image.new("RGB", size, (value, 10, 20)).save(path)
 
 
-def write_video(path, values, size=(WIDTH, HEIGHT), rate=25, gop=5):
-    """A video whose frames are gray of the given values; every fifth is a key frame, and some refer
-    to later ones."""
+def encode(path, frames, codec="libx264", options=None, rate=25, times=None, set_up=None):
+    """A video of images (H, W, 3) uint8, or of PyAV's frames; times: of each, in frames; set_up: of
+    the encoder."""
     import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(
-            "libx264", rate=rate, options={"g": str(gop), "bf": "2", "crf": "10"}
-        )
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for value in values:
-            frame = av.VideoFrame.from_ndarray(
-                np.full((size[1], size[0], 3), value, np.uint8), format="rgb24"
-            )
+        stream = container.add_stream(codec, rate=rate, options=dict(options or {}))
+        stream.pix_fmt = "yuv420p"
+        for number, frame in enumerate(frames):
+            if isinstance(frame, np.ndarray):
+                frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
+            if number == 0:
+                stream.width, stream.height = frame.width, frame.height
+                if set_up is not None:
+                    set_up(stream)
+            frame.pts = number if times is None else times[number]
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def write_video(path, values, size=(WIDTH, HEIGHT), rate=25, gop=5):
+    """A video whose frames are gray of the given values; every fifth is a key frame, and some refer
+    to later ones."""
+    frames = (np.full((size[1], size[0], 3), value, np.uint8) for value in values)
+    encode(path, frames, options={"g": str(gop), "bf": "2", "crf": "10"}, rate=rate)
 
 
 def quaternion(rotation):

@@ -208,8 +208,7 @@ def test_labels_are_image_names_or_paths(tmp_path):
 
 
 def test_mirrored_axes(tmp_path):
-    """Catches an export whose world was mirrored, in which left and right of the face would be
-    swapped."""
+    """Catches an export whose world was mirrored: left and right would be swapped."""
     write_export(tmp_path / "cameras.xml", rig(1), ["a"], intrinsics={"f": 50.0})
     text = (tmp_path / "cameras.xml").read_text(encoding="utf-8")
     matrix = np.linalg.inv(rig(1)[0].world_to_camera) * [[-1], [1], [1], [1]]
@@ -255,8 +254,7 @@ def intrinsics(camera):
 
 @pytest.mark.parametrize("as_attributes", [False, True])
 def test_xmp(tmp_path, as_attributes):
-    """Catches either form of the pose, a focal length not of the longer side, and swapped
-    tangential coefficients."""
+    """Catches either form of the pose, another side's focal length, and swapped coefficients."""
     camera = rig()[1]
     write_xmp(tmp_path / "b.xmp", camera, as_attributes=as_attributes)
     (shot,), left_out = read_realitycapture_xmp(tmp_path.glob("*.xmp"), lambda label: (30, 40))

@@ -36,8 +36,7 @@ def reconstruction():
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
 def test_projections_are_colmaps(tmp_path, kind):
-    """Catches any model, text or binary, whose coefficients, pose or principal point are read as
-    another's."""
+    """Catches any model whose coefficients, pose or principal point are read as another's."""
     model = reconstruction()
     getattr(model, f"write_{kind}")(str(tmp_path))
     shots = read_colmap(tmp_path)

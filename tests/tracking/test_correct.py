@@ -64,8 +64,7 @@ def test_a_key_moves_its_neighbors_and_nothing_else():
     [{}, {0: 0.2}, {29: 0.2}, {10: 0.2, 11: -0.1}, dict.fromkeys(range(30), 0.1)],
 )
 def test_keys_anywhere(keys):
-    """Catches ends of the take, neighboring keys and keys everywhere, where there is nothing left
-    to solve, and a solution that drifts with every call."""
+    """Catches keys at the ends, side by side or everywhere, and a drift with every call."""
     given = {timestep: opened(timestep, angle) for timestep, angle in keys.items()}
     found = correct(given)
     for timestep, values in given.items():
@@ -87,9 +86,8 @@ def parameters_in(out, model):
     return np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
 
 
-def test_a_corrected_capture_shows_the_key(tracked):
-    """Catches a key in other units or order than the files, and a report that is still that of
-    before."""
+def test_a_corrected_capture_shows_the_key(tracked, tmp_path):
+    """Catches a key in other units, a report of before, and another tracker's capture lost."""
     out, model, before = tracked
     report = read_json(out / "tracking.json")["reprojection_px"]["cam0"]
     key = before[1].copy()
@@ -105,11 +103,6 @@ def test_a_corrected_capture_shows_the_key(tracked):
     assert abs(after["4"] - report["4"]) < 0.02
     correct_capture(out, model, {})
     np.testing.assert_allclose(parameters_in(out, model), before, atol=1e-7)
-
-
-def test_what_cannot_be_corrected_is_named(tracked, tmp_path):
-    """Catches a capture of another tracker that is overwritten."""
-    out, model, before = tracked
     with pytest.raises(StgaError, match="has no timestep 99"):
         correct_capture(out, model, {99: before[0]})
     other = tmp_path / "other"
@@ -179,8 +172,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_damaged_capture_is_named(tracked, tmp_path, capsys, name):
-    """Catches a traceback, a warning of NumPy's, or heads that are overwritten from damaged
-    files."""
+    """Catches a traceback, or heads that are overwritten from damaged files."""
     out, model, before = tracked
     damage, file, message = DAMAGES[name]
     shutil.copytree(out, tmp_path / "out")

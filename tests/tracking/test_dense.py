@@ -193,8 +193,7 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
 
 @pytest.mark.slow
 def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeypatch):
-    """Catches parts that are put together in another order, what one part leaves behind for the
-    next, and an interrupted take that begins anew or ends otherwise."""
+    """Catches parts in another order, what one leaves behind, and a take that begins anew."""
     monkeypatch.setattr(dense, "PART_TIMESTEPS", 3)
     monkeypatch.setattr(dense, "TEXTURE_PART_TIMESTEPS", 3)
     take = scene(np.radians([-40, 40]), openings=OPENINGS[:6], size=(115, 150))
@@ -221,8 +220,7 @@ def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeyp
 
 @pytest.mark.slow
 def test_raised_brows_are_not_lowered_by_images_that_prove_little():
-    """Catches images that are believed against the landmarks of a region because they look a little
-    more like another pose: here, more of a picture shows lowered brows than raised ones."""
+    """Catches images that overrule landmarks though they look hardly more like another pose."""
     eyes, still = np.radians([-50, 0, 50]), [0.0] * 8
     take, lowered = (scene(eyes, still, brows=brows) for brows in (1.5, -1.5))
 

@@ -86,8 +86,7 @@ def recorded(head, rig, meshes, places, noise=0.0, wrong=0.0, **more):
 
 
 def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differences():
-    """Catches a joint, corrective or shape that moves landmarks otherwise than FLAME's own forward
-    pass."""
+    """Catches a joint, corrective or shape that moves landmarks otherwise than FLAME."""
     arrays = random_arrays()
     skeleton = arrays["J_regressor"], np.array([-1, 0, 1, 1, 1]), arrays["weights"]
     shapes = arrays["v_template"], arrays["shapedirs"], 9, arrays["posedirs"]

@@ -133,14 +133,6 @@ def test_seams_are_merged_and_kept_where_a_target_parts_them(tmp_path):
     assert found.faces.tolist() == [[0, 1, 2], [0, 3, 4]]
 
 
-def test_a_small_glb_is_read(tmp_path):
-    """Catches the errors above that come from the file they start with."""
-    (tmp_path / "a.glb").write_bytes(simple())
-    found = read_head_model(tmp_path / "a.glb").model
-    np.testing.assert_array_equal(found.v_template, np.eye(3))
-    np.testing.assert_allclose(found.shapedirs, 0.1, atol=1e-8)
-
-
 def test_shape_keys_become_a_linear_model(tmp_path):
     """Catches shape keys in Blender's axes or object space, and those relative to others, in the
     model's file."""

@@ -60,8 +60,7 @@ def test_an_outline_that_is_off_is_drawn_to_the_person(has_plate):
 
 
 def test_hair_is_soft():
-    """Catches a hard edge where hair lets the wall through: within the edge, nearer to the truth
-    than a hard mask."""
+    """Catches a hard edge where hair lets the wall through."""
     coverage, head, colors = person(softness=4.0)
     matte = find_matte(filmed(coverage, colors, room()), coverage.astype(np.float32), head) / 255
     edge = (coverage > 0.1) & (coverage < 0.9)

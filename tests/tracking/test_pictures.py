@@ -71,31 +71,12 @@ def tiles(sheet, count):
 
 
 def test_worst_views_first(tmp_path):
-    """Catches views in the order of cameras, or the best ones, and a picture of another
-    timestep."""
+    """Catches views in another order or of another timestep, and a mesh shifted by the crop."""
     take = footage(tmp_path, 2, 3)
     errors = {"cam0": {0: 1.0, 2: 5.0}, "cam1": {0: 2.0, 1: 9.0, 2: 0.5}}
     sheet = write(tmp_path, take, errors)
     corners = [plain[3, 3, :2].tolist() for plain, _ in tiles(sheet, 5)]
     assert corners == [[20, 20], [0, 40], [20, 0], [0, 0], [20, 40]]
-
-
-def test_what_images_do_not_explain_counts_beside_landmarks(tmp_path):
-    """Catches a sheet that hides the timesteps at which landmarks and head agree on what the images
-    do not show."""
-    take = footage(tmp_path, 1, 4)
-    errors = {"cam0": {0: 1.0, 1: 1.3, 2: 1.0, 3: 1.0}}
-    misfit = {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}}
-    sheet = write(tmp_path, take, errors, misfit)
-    corners = [plain[3, 3, 1] for plain, _ in tiles(sheet, 4)]
-    assert corners == [40, 60, 20, 0]
-    # a row of the chart for each region
-    assert len(sheet) == len(write(tmp_path, take, errors)) + 2 * 12
-
-
-def test_mesh_lies_on_the_head(tmp_path):
-    """Catches a mesh that is shifted, scaled or flipped against its image by the crop."""
-    take = footage(tmp_path, 2, 2)
     sheet = write(tmp_path, take, {"cam0": {1: 1.0}, "cam1": {0: 2.0}})
     for plain, drawn in tiles(sheet, 2):
         head = plain.min(axis=2) > 128
@@ -107,6 +88,18 @@ def test_mesh_lies_on_the_head(tmp_path):
         assert drawn[y, x, 2] > drawn[y, x, 0]
         top = head.any(axis=1).argmax()
         assert drawn[top + 12, x, 1] > drawn[2 * y - top - 12, x, 1]
+
+
+def test_what_images_do_not_explain_counts_beside_landmarks(tmp_path):
+    """Catches a sheet that hides where landmarks and head agree on what images do not show."""
+    take = footage(tmp_path, 1, 4)
+    errors = {"cam0": {0: 1.0, 1: 1.3, 2: 1.0, 3: 1.0}}
+    misfit = {"mouth": {0: 0.1, 1: 0.1, 2: 0.4, 3: 0.1}, "eyes": {0: 0.05, 3: 0.15}}
+    sheet = write(tmp_path, take, errors, misfit)
+    corners = [plain[3, 3, 1] for plain, _ in tiles(sheet, 4)]
+    assert corners == [40, 60, 20, 0]
+    # a row of the chart for each region
+    assert len(sheet) == len(write(tmp_path, take, errors)) + 2 * 12
 
 
 def test_what_a_matte_leaves_out_is_green(tmp_path):

@@ -152,8 +152,7 @@ def test_offsets_are_smooth_robust_and_local(head):
 
 
 def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
-    """Catches a Laplacian that counts neighbors: on triangles of many sizes, as the bundled head's,
-    it takes a slope for a bend, and smooths the person away."""
+    """Catches a Laplacian that counts neighbors and takes a slope for a bend."""
     y, x = (0.004 * values.ravel() for values in np.indices((12, 12)))
     flat = np.column_stack([x, y]) + np.random.default_rng(0).uniform(-0.0013, 0.0013, (144, 2))
     vertices = np.column_stack([flat, np.zeros(144)])

@@ -75,8 +75,7 @@ def change(path, **values):
 
 
 def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
-    """Catches a default that needs a file, a capture that opens only with one, or with another one
-    that is given, and weights of another scale."""
+    """Catches a default that needs a file, and weights of another scale."""
     monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
     head = HeadModel(flame_model(None), "flame")
     meshes = record(tmp_path, head)
@@ -90,9 +89,7 @@ def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
 
 
 def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head):
-    """Catches wrong axes, units or a principal point counted from the wrong side in what is
-    written; a bar that jumps back, a step that it does not know, and a fit of which nobody hears
-    how good it is."""
+    """Catches wrong axes, units or a principal point in what is written, and a bar's jumps."""
     folder, meshes = recorded
     paths, told = (folder / "footage", folder / "head.npz", folder / "out"), []
     request = Track(*paths, landmarks=folder / "points", meshes=True)
@@ -203,9 +200,7 @@ OTHERS = {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}
 ])  # fmt: skip
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_what_does_not_fit_is_named(recorded, capsys, file, changes, more, message):
-    """Catches a camera that is mirrored, misplaced or was started later and quietly ruins the
-    capture, landmarks of one camera taken for those of another number, a division by the extent of
-    landmarks that all lie on one triangle, and offsets ignored where frames are listed."""
+    """Catches a camera mirrored, misplaced or started later, and others' landmarks."""
     folder, _ = recorded
     points = np.load(folder / "points/cam3.npz")["points"]
     change(folder / f"points/{file}.npz", **changes(points))
@@ -247,8 +242,7 @@ def test_a_wrong_focal_length_is_named(recorded, capsys, factor):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_timesteps_that_determine_no_pose_are_interpolated(tmp_path, head, capsys):
-    """Catches NaN, or a head at the camera, from landmarks of one timestep that are too few to tell
-    where it is, and training on images whose head is a guess."""
+    """Catches NaN, or a head at the camera, of too few landmarks, and training on a guess."""
     record(tmp_path, head, timesteps=8)
     face = np.load(tmp_path / "points/head_model.npz")["face"]
     face[:7] = -1
@@ -397,8 +391,7 @@ def test_the_capture_is_not_written_into_the_footage(tmp_path):
 
 
 def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monkeypatch):
-    """Catches landmarks of a run that was out of step taken for those of the corrected offset, and
-    those of a recording or a head model that was replaced under its name."""
+    """Catches landmarks of another offset, recording or head model under its name."""
     write_folders(tmp_path / "footage", (6, 8))
     write_flame(head.model, tmp_path / "head.npz")
     use_detector(monkeypatch, Counting([]), places_on(head, LANDMARKS))

@@ -10,7 +10,7 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
 
-from .scenes import rig, write_colmap_text
+from .scenes import encode, rig, write_colmap_text
 
 av = pytest.importorskip("av")
 
@@ -74,18 +74,15 @@ def write_numbered(path, codec, options, frames=FRAMES, rate=25, durations=None)
     """A video of numbered pictures; durations: of each frame, in frames of `rate`."""
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV lacks {codec}")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=rate, options=dict(options))
-        stream.width, stream.height = COLUMNS * BLOCK, ROWS * BLOCK
-        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-        if codec == "mpeg4" or codec == "mpeg2video":
+
+    def set_up(stream):
+        if codec == "mjpeg":
+            stream.pix_fmt = "yuvj420p"
+        if codec in ("mpeg4", "mpeg2video"):
             stream.codec_context.max_b_frames = int(options["bf"])
-        for number in range(frames):
-            frame = av.VideoFrame.from_ndarray(picture(number), format="rgb24")
-            if durations is not None:
-                frame.pts = sum(durations[:number])
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+
+    times = durations and [sum(durations[:number]) for number in range(frames)]
+    encode(path, map(picture, range(frames)), codec, options, rate, times, set_up)
 
 
 def copy_packets(source, path, shift=0, first=0, last=None, options=None):
@@ -230,12 +227,7 @@ def test_display_matrices(tmp_path, turn):
     path, levels = tmp_path / "phone.mp4", {"a": 30, "b": 90, "c": 150, "d": 210}
     stored = np.reshape(list(levels.values()), (2, 2))
     image = np.kron(stored, np.ones((32, 48))).astype(np.uint8)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"crf": "8"})
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
-        frame = av.VideoFrame.from_ndarray(np.repeat(image[..., None], 3, axis=2), format="rgb24")
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+    encode(path, [np.repeat(image[..., None], 3, axis=2)], options={"crf": "8"})
     data = bytearray(path.read_bytes())
     at = data.index(b"tkhd") + 44  # of the track header, version 0: 16.16 and 2.30 fixed point
     a, b, c, d = (value << 16 for value in matrix)
@@ -271,20 +263,17 @@ def test_colors_of_phones(tmp_path, name):
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV lacks {codec}")
     options = {"crf": "4"} | ({"x265-params": "log-level=0"} if deep else {})
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25, options=options)
-        stream.width, stream.height, stream.pix_fmt = 64, 64, pixels
-        context = stream.codec_context
+
+    def set_up(stream):
+        stream.pix_fmt, context = pixels, stream.codec_context
         context.color_primaries, context.color_trc = primaries, transfer
         context.colorspace, context.color_range = matrix, 1
-        image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
-        frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(
-            format=pixels, dst_colorspace=matrix
-        )
-        for number in range(4):
-            frame.pts = number
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+
+    image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
+    frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(
+        format=pixels, dst_colorspace=matrix
+    )
+    encode(path, [frame] * 4, codec, options, set_up=set_up)
     found = open_footage(path).cameras[0].image(0)[32, 32] / 255
     np.testing.assert_allclose(found, expected, atol=0.025)
 

@@ -38,7 +38,7 @@ def separate_rows(state: TrainState) -> list[dict[str, torch.Tensor]]:
 
 
 @pytest.mark.parametrize(("seed", "degree"), [(0, 1), (1, 1), (2, 3), (3, 0)])
-def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) -> None:
+def test_each_row_is_torchs_adam_with_its_own_history(seed, degree):
     """Catches a shared step count, momentum that moves unlisted rows, a swapped rate or beta, a
     misplaced ε, and a running average that begins with the initial value, or goes on while its row
     is frozen.
@@ -50,7 +50,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
     rows = separate_rows(state)
     groups = [{"params": [row[name] for row in rows], "lr": rate} for name, rate in RATES.items()]
     theirs = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-5)
-    history: list[list[torch.Tensor]] = [[] for _ in rows]
+    history = [[] for _ in rows]
     for _ in range(25):
         listed = np.flatnonzero(rng.random(6) < [1, 0.7, 0.5, 0.3, 0.1, 0.0]).astype(np.int32)
         # Sizes over many orders of magnitude: those of real gradients are 1e-8 to 1e-3.
@@ -86,7 +86,7 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed: int, degree: int) ->
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
+def test_a_broken_gradient_leaves_its_row(bad):
     """Catches one NaN spreading into parameters or moments, where it would stay for ever."""
     state = random_state(4, 3)
     before = bits(state)
@@ -105,10 +105,8 @@ def test_a_broken_gradient_leaves_its_row(bad: float) -> None:
 
 
 @pytest.mark.parametrize("ahead", [0.0, 0.1])
-def test_many_rows(ahead: float) -> None:
-    """Catches rows that take their neighbours' step counts where the work is cut into blocks for
-    the threads, steps of harmonics above the degree in use, and Nesterov's momentum that gets into
-    the moments."""
+def test_many_rows(ahead):
+    """Catches others' step counts in blocks for threads, unused harmonics, and momentum."""
     state = random_state(1500, 7)
     rng = np.random.default_rng(0)
     state.steps[:] = rng.integers(0, 50, 1500)
@@ -142,7 +140,7 @@ def test_many_rows(ahead: float) -> None:
         assert (error <= 1e-6 + 1e-5 * np.abs(step) + 1e-6 * np.abs(value)).all(), name
 
 
-def test_epsilon_is_the_same_share_at_every_image_size() -> None:
+def test_epsilon_is_the_same_share_at_every_image_size():
     """Catches splats that hardly show learning at another speed on images of another size."""
     camera = Camera(200, 100, 300.0, 300.0, 100.0, 50.0, np.eye(4))
     epsilon = adam.adam_options(TrainingSettings(adam_epsilon=0.003), camera).epsilon

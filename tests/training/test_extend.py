@@ -3,9 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +13,17 @@ from PIL import Image
 from stga_addon.avatar.file import read_avatar
 from stga_addon.avatar.strain import TRAINED_RANGE
 from stga_addon.capture.meshes import read_mesh
-from stga_addon.capture.model import Capture, require_same_scale
+from stga_addon.capture.model import require_same_scale
 from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
-from stga_addon.jobs.train import Extend, Prepared, prepare
+from stga_addon.jobs.train import Extend, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.optimize.trainer import EXTEND_LOCAL_SHARE, Strategy
 from stga_addon.training.run import continuation
 from stga_addon.training.run.checkpoint import read_checkpoint
-from stga_addon.training.run.continuation import EXTEND_REPLAY_SHARE, START_SHARE, continued_order
+from stga_addon.training.run.continuation import START_SHARE
 from stga_addon.training.run.folder import Run, open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
 from stga_addon.training.run.session import train
@@ -64,32 +62,30 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out
 
 
-def prepare_extension(
-    parent: Path, takes: tuple[Path, ...], growth: float = 0.0, iterations: int = 1
-) -> Prepared:
+def prepare_extension(parent, takes, growth=0.0, iterations=1):
     request = Extend(
         parent / "unused", parent, takes, growth=growth, iterations=iterations, device="cpu"
     )
     return prepare(request, ignore, lambda line: None)
 
 
-def extend(
-    parent: Path, take: Path, out: Path, stop: int | None = None, growth: float = 0.0
-) -> Path:
+def extend(parent, take, out, stop=None, growth=0.0):
     prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
     train(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 
-def test_the_run_remembers_its_takes(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
-) -> None:
-    """Catches a run that opens without its new take, or with one of exchanged images."""
+def test_the_run_remembers_its_takes(takes, parent, tmp_path):
+    """Catches a new take that is lost, exchanged, not learned or hidden in a mean."""
     before = {path.name: path.read_bytes() for path in parent.iterdir()}
     moved = Path(shutil.copytree(takes[1], tmp_path / "new"))
     out = extend(parent, moved, tmp_path / "extended")
     assert {path.name: path.read_bytes() for path in parent.iterdir()} == before
+    first, *_, last = read_metrics(out)
+    assert first["iteration"] == 0
+    assert last["psnr_take_2"] > first["psnr_take_2"] + 0.1
+    assert last["psnr_take_1"] != last["psnr_take_2"]
     opened = open_run(out)
     assert opened.capture.timesteps == (0, 1, 3, 4, 5, 7)
     assert [take.start for take in opened.run.takes] == [4]
@@ -107,8 +103,8 @@ def test_the_run_remembers_its_takes(
         open_run(out)
 
 
-def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches a selection by motion alone, which learns no changed skin, or of the whole head."""
+def test_what_looks_different_is_selected(takes, parent, tmp_path):
+    """Catches a selection by motion alone or of other timesteps, and rates that jump."""
     prepared = prepare_extension(parent, (takes[1],), iterations=1)
     capture = prepared.capture
     height = capture.mesh(4)[capture.faces].mean(1)[:, 1]
@@ -116,18 +112,17 @@ def test_what_looks_different_is_selected(takes: tuple[Path, Path], parent: Path
     selected = prepared.selection[4]
     assert selected[front & (height > 0.055)].mean() > 0.8
     assert selected[front & (height < 0)].mean() < 0.1
-
-
-def test_selection_is_written_without_training(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
-) -> None:
-    """Catches a selection at other timesteps than the new take's own, and a run begun."""
+    original = read_run(parent).settings.rates
+    extended = prepared.run.settings.rates
+    middle = learning_rates(original, START_SHARE)
+    assert learning_rates(extended, 0.0) == pytest.approx(
+        {**middle, "strain_color": original.strain_color}
+    )
     path = tmp_path / "selection.npz"
     assert main(["extend", str(parent), str(takes[1]), "--select-only", str(path)]) == 0
-    expected = prepare_extension(parent, (takes[1],), iterations=1).selection
     written = read_npz(path)
     assert list(written) == ["00000", "00001", "00003"]
-    for timestep, faces in expected.items():
+    for timestep, faces in prepared.selection.items():
         np.testing.assert_array_equal(written[f"{timestep - 4:05d}"], faces)
     assert not parent.with_name("run_2").exists()
     assert (
@@ -135,28 +130,16 @@ def test_selection_is_written_without_training(
     )
 
 
-def test_each_take_is_evaluated_apart(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
-) -> None:
-    """Catches what was forgotten hidden in a mean, and a new take that is not learned."""
-    first, *_, last = read_metrics(extend(parent, takes[1], tmp_path / "extended"))
-    assert first["iteration"] == 0
-    assert last["psnr_take_2"] > first["psnr_take_2"] + 0.1
-    assert last["psnr_take_1"] != last["psnr_take_2"]
-
-
 @pytest.mark.parametrize("growth", [0.0, 0.5])
 def test_a_stopped_extension_is_continued_to_the_same_bits(
-    takes: tuple[Path, Path],
-    parent: Path,
-    tmp_path: Path,
-    growth: float,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Catches an order, selection, take or count of splats that resuming does not find again."""
+    takes, parent, tmp_path, growth, monkeypatch
+):
+    """Catches an order, selection or count of splats not found again, or only by the parent."""
     monkeypatch.setattr(continuation, "DENSITY_INTERVAL", 3)
     whole = extend(parent, takes[1], tmp_path / "whole", growth=growth)
-    stopped = extend(parent, takes[1], tmp_path / "stopped", stop=7, growth=growth)
+    beside = Path(shutil.copytree(parent, tmp_path / "parent"))
+    stopped = extend(beside, takes[1], tmp_path / "stopped", stop=7, growth=growth)
+    shutil.rmtree(beside)  # resuming does not need it
     before, after = (len(read_avatar(run / "avatar.npz").splats) for run in (parent, whole))
     assert (after > before) == bool(growth)
     opened = open_run(stopped)
@@ -165,23 +148,7 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_a_resumed_extension_needs_no_parent(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
-) -> None:
-    """Catches a run that fails at its next evaluation because the run that it began with was moved,
-    or that takes over another avatar that lies there now."""
-    beside = Path(shutil.copytree(parent, tmp_path / "parent"))
-    out = extend(beside, takes[1], tmp_path / "extended", stop=7)
-    before = read_avatar(out / "avatar.npz").strain_range
-    shutil.rmtree(beside)
-    opened = open_run(out)
-    train(opened.capture, out, opened.run, resume=True)
-    np.testing.assert_array_equal(read_avatar(out / "avatar.npz").strain_range, before)
-
-
-def test_what_follows_strain_can_begin_with_a_further_take(
-    takes: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_what_follows_strain_can_begin_with_a_further_take(takes, tmp_path):
     """Catches splats that cannot gain coefficients or train them, and an avatar that jumps."""
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
@@ -202,27 +169,7 @@ def test_what_follows_strain_can_begin_with_a_further_take(
     ).all()  # what the takes show, not any strain
 
 
-def test_old_views_are_replayed(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches an extension that sees the new take only, or old views at one end only."""
-    prepared = prepare_extension(parent, (takes[1],), iterations=1)
-    assert prepared.run.continuation is not None
-    views = list(islice(continued_order(prepared.run.continuation, prepared.capture, None, 0), 40))
-    is_old = [view.timestep < 4 for view in views]
-    assert sum(is_old) == round(40 * EXTEND_REPLAY_SHARE)
-    assert not any(first and second for first, second in pairwise(is_old))
-
-
-def test_strain_color_begins_with_its_first_rate(takes: tuple[Path, Path], parent: Path) -> None:
-    """Catches strain coefficients as slow as trained colors, and other rates that jump."""
-    original = read_run(parent).settings.rates
-    extended = prepare_extension(parent, (takes[1],), iterations=1).run.settings.rates
-    middle = learning_rates(original, START_SHARE)
-    assert learning_rates(extended, 0.0) == pytest.approx(
-        {**middle, "strain_color": original.strain_color}
-    )
-
-
-def test_what_new_takes_need_is_trained_first() -> None:
+def test_what_new_takes_need_is_trained_first():
     """Catches an extension that trains all splats from the start, or never."""
     region = np.array([True, False])
     settings = TrainingSettings(strategy="extend")
@@ -234,16 +181,10 @@ def test_what_new_takes_need_is_trained_first() -> None:
 
 
 @pytest.mark.parametrize("change", ["shape", "images", "folder"])
-def test_takes_that_do_not_fit(
-    takes: tuple[Path, Path],
-    parent: Path,
-    tmp_path: Path,
-    change: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_takes_that_do_not_fit(takes, parent, tmp_path, change, monkeypatch):
     """Catches another head, or a take without images, found after minutes of training."""
 
-    def changed(path: Path, *rest: Any) -> Capture:
+    def changed(path, *rest):
         capture = open_capture(path, *rest)
         if change == "shape":
             return replace(capture, neutral=capture.neutral * 1.1)
@@ -287,35 +228,14 @@ def in_millimeters(root: Path, cameras: bool, meshes: bool = False) -> Path:
         (False, True, r"new: its tracked meshes are 1e\+03 times as large as the neutral mesh"),
     ],
 )
-def test_a_take_in_millimeters(
-    takes: tuple[Path, Path],
-    parent: Path,
-    tmp_path: Path,
-    cameras: bool,
-    meshes: bool,
-    expected: str,
-) -> None:
+def test_a_take_in_millimeters(takes, parent, tmp_path, cameras, meshes, expected):
     """Catches a take in another unit, on which training is wasted without an error."""
     take = in_millimeters(Path(shutil.copytree(takes[0], tmp_path / "new")), cameras, meshes)
     with pytest.raises(StgaError, match=expected):
         prepare_extension(parent, (take,))
 
 
-def test_a_flame_take_in_millimeters(tmp_path: Path) -> None:
-    """Catches a FLAME take in millimeters; its meshes' size is the model's."""
-    root, model = factory.write_flame_capture(tmp_path / "old")
-    run = tmp_path / "run"
-    settings = quick_settings("global", iterations=1, lattice=0, density_interval=0)
-    train(open_capture(root, model), run, Run(root, model, "vhap", settings))
-    moved = in_millimeters(Path(shutil.copytree(root, tmp_path / "new")), cameras=True)
-    for path in (moved / "flame_param").glob("*.npz"):
-        parameters = dict(np.load(path))
-        np.savez(path, **{**parameters, "translation": 1000 * parameters["translation"]})
-    with pytest.raises(StgaError, match=r"new: its head appears (9|1e\+03)\d* times smaller"):
-        prepare_extension(run, (moved,))
-
-
-def test_takes_from_another_distance_fit(takes: tuple[Path, Path]) -> None:
+def test_takes_from_another_distance_fit(takes):
     """Catches a refusal of cameras that stand three times as far away, or zoom."""
     first = open_capture(takes[0])
     cameras = [view.camera for view in first.views["train"]]
@@ -326,11 +246,9 @@ def test_takes_from_another_distance_fit(takes: tuple[Path, Path]) -> None:
     require_same_scale(zoomed, first)
 
 
-def test_views_that_show_something_else_are_named(
-    takes: tuple[Path, Path], parent: Path, tmp_path: Path
-) -> None:
+def test_views_that_show_something_else_are_named(takes, parent, tmp_path):
     """Catches exchanged images without a warning, and a warning about a changed look."""
-    said: list[str] = []
+    said = []
     request = Extend(parent / "unused", parent, (takes[1],), iterations=1, device="cpu")
     prepare(request, ignore, said.append)
     assert not [line for line in said if "swapped" in line]

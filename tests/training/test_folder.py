@@ -39,7 +39,7 @@ def edit_json(path: Path, **changes: Any) -> None:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
+def test_run_round_trip(tmp_path, strategy):
     """Catches a setting that a resumed run would not have."""
     bare = Run(Path("/x"), None, "vhap", make_settings(seconds=60.0))
     for run in (make_run(strategy=strategy), bare):
@@ -58,13 +58,14 @@ def test_run_round_trip(tmp_path: Path, strategy: str) -> None:
         ("settings", {}, r"settings: fields are missing or unknown \(adam_beta2, adam_epsilon, "),
         ("device", "toaster", "device: expected auto, cpu, gpu or gpu:NAME, got 'toaster'"),
         ("principal_point", "corner", "expected one of vhap, .*, got 'corner'"),
+        ("effect_plan", [{"effect": "jaw"}], r"effect_plan\.0: fields are missing or unknown"),
         ("identity", {"faces": 5}, r"identity: fields are missing or unknown \(cameras, "),
         ("takes", [{"capture": "a"}], r"takes\.0: fields are missing or .* \(identity, start\)"),
         ("continuation", {"parent": "a", "avatar": "b", "first": 5, "last": 3},
          "continuation: its last timestep 3 is before its first, 5"),
     ],
 )  # fmt: skip
-def test_damaged_runs(tmp_path: Path, field: str, value: Any, message: str) -> None:
+def test_damaged_runs(tmp_path, field, value, message):
     """Catches a run of another version taken for one's own, and a traceback of one edited."""
     folder.write_run(tmp_path, make_run())
     edit_json(tmp_path / "run.json", **{field: value})
@@ -72,7 +73,7 @@ def test_damaged_runs(tmp_path: Path, field: str, value: Any, message: str) -> N
         folder.read_run(tmp_path)
 
 
-def test_selection_round_trip(tmp_path: Path) -> None:
+def test_selection_round_trip(tmp_path):
     """Catches timesteps mixed up, masks that lose their kind, and those of another mesh."""
     rng = np.random.default_rng(0)
     selection = {t: rng.random(FACES) < 0.5 for t in (0, 3, 123456)}
@@ -93,9 +94,8 @@ def test_selection_round_trip(tmp_path: Path) -> None:
         checkpoint_files.read_selection(tmp_path, FACES)
 
 
-def test_checkpoint_round_trip(tmp_path: Path) -> None:
-    """Catches a moment or a count that resumption would lose, and arrays of another order than
-    rows, of which Adam would step a copy."""
+def test_checkpoint_round_trip(tmp_path):
+    """Catches a moment or count lost, arrays by columns, and a possible value refused."""
     checkpoint = make_checkpoint()
     checkpoint_files.write_checkpoint(tmp_path, checkpoint)
     again = checkpoint_files.read_checkpoint(tmp_path)
@@ -115,6 +115,13 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     assert not by_columns["parameters/xyz"].flags.c_contiguous
     state = checkpoint_files.read_checkpoint(tmp_path).state
     assert all(array.flags.c_contiguous for array in arrays_of(state).values())
+    largest = (1 << 53) - 1
+    for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
+        extreme = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, np.inf, 0, [])
+        checkpoint_files.write_checkpoint(tmp_path, extreme)
+        limited = checkpoint_files.read_checkpoint(tmp_path)
+        assert (limited.iteration, limited.visit, limited.last_timestep) == counts
+        assert limited.best_difference == np.inf  # before any evaluation
 
 
 def meta(**changes: Any) -> np.ndarray:
@@ -138,13 +145,8 @@ METAS: dict[str, dict[str, Any]] = {
     "malformed .*color": {"color": 3},
     "iteration is -1, expected a whole number from 0 up": {"iteration": -1},
     "iteration is 9007199254740992": {"iteration": 1 << 53},  # beyond what is exact
-    "visit is -2, expected a whole number from -1 up": {"visit": -2},
-    "initial_count is -1": {"initial_count": -1},
-    "evaluations is -1": {"evaluations": -1},
     "elapsed_s is inf": {"elapsed_s": math.inf},
     "elapsed_s is -1.0": {"elapsed_s": -1.0},
-    "last_timestep is -1": {"last_timestep": -1},
-    "identity is None, expected a text": {"identity": None},
 }
 """What is said of counts and other values -> them."""
 SHAPES = r"first is float32 \(4, 3, 3\), expected float32 \(5, 3, 3\)"
@@ -162,21 +164,19 @@ DAMAGES: dict[str, dict[str, np.ndarray | None]] = {
 
 
 @pytest.mark.parametrize("says", DAMAGES)
-def test_damaged_checkpoints(tmp_path: Path, says: str) -> None:
-    """Catches a checkpoint of the wrong shape getting as far as the kernels, which do not check,
-    and one that is refused for another reason than what is wrong with it."""
+def test_damaged_checkpoints(tmp_path, says):
+    """Catches a checkpoint that only the kernels would trip over, or refused for what is right."""
     checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
-        arrays: dict[str, np.ndarray | None] = dict(data)
+        arrays = dict(data)
     np.savez(path, **{k: v for k, v in {**arrays, **DAMAGES[says]}.items() if v is not None})
     with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{says}"):
         checkpoint_files.read_checkpoint(tmp_path)
 
 
-def test_checkpoints_of_version_3(tmp_path: Path) -> None:
-    """Catches an older run that can neither be resumed nor says why, and strain colors of its
-    splats that are dropped in silence."""
+def test_checkpoints_of_version_3(tmp_path):
+    """Catches an older run that says not why, and strain colors that are dropped."""
     checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
     path = tmp_path / "checkpoint.npz"
     with np.load(path) as data:
@@ -192,24 +192,13 @@ def test_checkpoints_of_version_3(tmp_path: Path) -> None:
                 checkpoint_files.read_checkpoint(tmp_path)
 
 
-def test_checkpoint_at_its_limits(tmp_path: Path) -> None:
-    """Catches a first or last possible value that counts as damaged."""
-    largest = (1 << 53) - 1
-    for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
-        checkpoint = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, np.inf, 0, [])
-        checkpoint_files.write_checkpoint(tmp_path, checkpoint)
-        again = checkpoint_files.read_checkpoint(tmp_path)
-        assert (again.iteration, again.visit, again.last_timestep) == counts
-        assert again.best_difference == np.inf  # before any evaluation
-
-
 def line(iteration: int, **changes: Any) -> dict[str, Any]:
     """A line of metrics with the fields that every line has."""
     times = {"seconds": 0.5 * iteration, "evaluation_s": 0.1, "wall_s": float(iteration)}
     return {"iteration": iteration, "splats": 80, **times, **changes}
 
 
-def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
+def test_metrics_with_a_cut_last_line(tmp_path):
     """Catches a last line that a kill cut in the way of resuming, and lines lost before it."""
     assert metrics_log.read_metrics(tmp_path) == []
     lines = [line(n, psnr=20.0 + n, ssim=0.9) for n in (10, 20, 30)]
@@ -217,7 +206,11 @@ def test_metrics_with_a_cut_last_line(tmp_path: Path) -> None:
         metrics_log.append_metrics(tmp_path, written)
     assert metrics_log.read_metrics(tmp_path) == lines
     path = tmp_path / "metrics.jsonl"
-    path.write_text(path.read_text()[:-5])
+    whole = path.read_bytes()
+    for cut in (b"\xff\xff\n", bytes(100), b"[" * 100_000, b'{"iteration": 40, "sec'):
+        path.write_bytes(whole + cut)
+        assert metrics_log.read_metrics(tmp_path) == lines
+    path.write_bytes(whole[:-5])
     assert metrics_log.read_metrics(tmp_path) == lines[:2]
     metrics_log.cut_metrics(tmp_path, 20)
     metrics_log.append_metrics(tmp_path, line(25))
@@ -247,7 +240,7 @@ FORECAST = {"seconds": 1.0, "psnr": 30.0, "error": 0.1, "ahead": 5.0, "gain": 0.
         (line(10, forecast=FORECAST), "forecast has no psnr"),
     ],
 )
-def test_damaged_metrics(tmp_path: Path, damaged: Any, message: str) -> None:
+def test_damaged_metrics(tmp_path, damaged, message):
     """Catches a traceback in resume, curve or summary for a missing or wrong field."""
     for written in (line(5), damaged, line(20)):
         metrics_log.append_metrics(tmp_path, written)
@@ -256,8 +249,8 @@ def test_damaged_metrics(tmp_path: Path, damaged: Any, message: str) -> None:
     assert len(str(caught.value)) < 400
 
 
-def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
-    """Catches two processes writing one checkpoint, within one process and across two."""
+def test_second_run_is_refused_while_the_first_lives(tmp_path):
+    """Catches two processes writing one checkpoint, and a folder that is locked for ever."""
     target = tmp_path / "new" / "run"
     with folder.locked(target):
         mine = rf"another run is working in this folder \(process {os.getpid()}\)"
@@ -281,12 +274,6 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path: Path) -> None:
     assert lock_owner(target / "run.lock") == other.pid
     with folder.locked(target):  # its process is gone
         assert lock_owner(target / "run.lock") == os.getpid()
-
-
-def test_a_lock_that_nobody_holds_is_taken_over(tmp_path: Path) -> None:
-    """Catches a folder locked for ever by a process killed while it wrote its lock, or whose number
-    lives on in another process (1 always does); and a traceback, or talk of another run, where the
-    name is that of a file."""
     for content in ("", "hello", "0", "1", str(os.getpid())):
         (tmp_path / "run.lock").write_text(content)
         with folder.locked(tmp_path):

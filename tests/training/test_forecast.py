@@ -27,8 +27,8 @@ def curve(times: np.ndarray, psnr: np.ndarray) -> list[tuple[float, float]]:
     return list(zip(times.tolist(), psnr.tolist(), strict=True))
 
 
-def test_a_curve_of_the_models_own_kind_is_continued_exactly() -> None:
-    """Catches a gain over the wrong span, and a slope that is not the curve's."""
+def test_a_curve_of_the_models_own_kind_is_continued_exactly():
+    """Catches another span or slope than the curve's, an outlier that tilts it, and its error."""
     for count in (MIN_EVALUATIONS, 9, 20):
         seen = curve(TIMES[:count], rising(TIMES[:count]))
         for ahead in (5.0, 30.0):
@@ -38,10 +38,11 @@ def test_a_curve_of_the_models_own_kind_is_continued_exactly() -> None:
             assert told.seconds == end
             assert told.psnr == pytest.approx(float(rising(np.array([end]))[0]), abs=1e-6)
             assert told.gain == pytest.approx(told.psnr - seen[-1][1], abs=1e-6)
-
-
-def test_the_error_is_earned() -> None:
-    """Catches an error that does not follow how wrong the earlier forecasts were."""
+    psnr = rising(TIMES)
+    psnr[-3] -= 2
+    told = forecast(curve(TIMES, psnr), 20.0)
+    assert told is not None
+    assert told.psnr == pytest.approx(float(rising(TIMES[-1:] + 20)[0]), abs=0.1)
     calm, wild = (forecast(curve(TIMES, rising(TIMES, noise)), 20.0) for noise in (0.0, 0.5))
     assert calm is not None
     assert wild is not None
@@ -49,7 +50,7 @@ def test_the_error_is_earned() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.03, 0.1])
-def test_four_of_five_forecasts_come_true(noise: float) -> None:
+def test_four_of_five_forecasts_come_true(noise):
     """Catches an error that is too small to be honest or too large to say anything."""
     misses, errors = [], []
     for seed in range(30):
@@ -63,17 +64,9 @@ def test_four_of_five_forecasts_come_true(noise: float) -> None:
     assert np.median(errors) < 3 * np.median(misses)
 
 
-def test_one_bad_evaluation_does_not_tilt_the_forecast() -> None:
-    """Catches least squares: after splats were put back, one may be a decibel too low."""
-    psnr = rising(TIMES)
-    psnr[-3] -= 2
-    told = forecast(curve(TIMES, psnr), 20.0)
-    assert told is not None
-    assert told.psnr == pytest.approx(float(rising(TIMES[-1:] + 20)[0]), abs=0.1)
-
-
-def test_nothing_is_said_too_early_or_of_nonsense() -> None:
-    """Catches a division by nothing, and forecasts from two points."""
+@pytest.mark.filterwarnings("error")
+def test_nothing_is_said_too_early_or_of_nonsense():
+    """Catches a division by nothing, even its warning, and forecasts from two points."""
     assert forecast([], 10.0) is None
     assert forecast(curve(TIMES[:3], rising(TIMES[:3])), 10.0) is None
     assert forecast([(1.0, 20.0), (2.0, 21.0), (2.0, 22.0), (3.0, 23.0)], 10.0) is None
@@ -82,10 +75,24 @@ def test_nothing_is_said_too_early_or_of_nonsense() -> None:
     same = forecast([(float(t), 30.0) for t in range(1, 9)], 4.0)
     assert same is not None
     assert (same.gain, same.psnr) == (0.0, 30.0)
+    seconds = np.arange(5.0)
+    assert forecast(curve(seconds, seconds + 20), 5.0) is None
+    assert "too few evaluations" in explain_missed_target(curve(seconds, seconds + 20), 40)
 
 
-def test_plateau_start() -> None:
-    """Catches a run called finished while it rises, and one that falls and is not."""
+def evaluations(psnr: np.ndarray, detail: np.ndarray) -> list[dict[str, float]]:
+    rows = zip(TIMES.tolist(), psnr.tolist(), detail.tolist(), strict=True)
+    return [{"seconds": s, "psnr": p, "detail_difference": d} for s, p, d in rows]
+
+
+def test_a_run_is_flat_when_neither_measure_rises():
+    """Catches a run called finished while PSNR or detail rises, and one that falls and is not."""
+    fell = np.where(TIMES < 50, rising(TIMES), 30.0)
+    sharper = 0.1 / np.sqrt(TIMES)
+    assert flat_since(evaluations(fell, sharper)) is None
+    assert flat_since(evaluations(fell, np.where(TIMES < 30, sharper, 0.05))) == 48.0
+    assert flat_since([{"seconds": s, "psnr": p} for s, p in curve(TIMES, fell)]) == 48.0
+    assert flat_since([]) is None
     assert plateau_start(curve(TIMES, rising(TIMES))) is None
     fell = np.where(TIMES < 50, rising(TIMES), rising(np.array([48.0])) - (TIMES - 50) / 100)
     assert plateau_start(curve(TIMES, fell)) == 48.0
@@ -94,22 +101,7 @@ def test_plateau_start() -> None:
     assert plateau_start(curve(TIMES[:3], np.full(3, 30.0))) is None
 
 
-def evaluations(psnr: np.ndarray, detail: np.ndarray) -> list[dict[str, float]]:
-    rows = zip(TIMES.tolist(), psnr.tolist(), detail.tolist(), strict=True)
-    return [{"seconds": s, "psnr": p, "detail_difference": d} for s, p, d in rows]
-
-
-def test_a_run_is_flat_when_neither_measure_rises() -> None:
-    """Catches a run stopped by PSNR while detail, by which the avatar is kept, still improves."""
-    fell = np.where(TIMES < 50, rising(TIMES), 30.0)
-    sharper = 0.1 / np.sqrt(TIMES)
-    assert flat_since(evaluations(fell, sharper)) is None
-    assert flat_since(evaluations(fell, np.where(TIMES < 30, sharper, 0.05))) == 48.0
-    assert flat_since([{"seconds": s, "psnr": p} for s, p in curve(TIMES, fell)]) == 48.0
-    assert flat_since([]) is None
-
-
-def test_forecast_of_both_measures() -> None:
+def test_forecast_of_both_measures():
     """Catches a detail difference forecast in dB, upwards, or where it is not measured."""
     lines = evaluations(rising(TIMES), 10 ** (-(30 - 20 / np.sqrt(TIMES)) / 20))
     assert detail_curve(lines)[-1][1] == pytest.approx(30 - 20 / np.sqrt(120))
@@ -123,10 +115,10 @@ def test_forecast_of_both_measures() -> None:
     assert forecast_text([], 120.0) == ""
 
 
-def test_hits() -> None:
+def test_hits():
     """Catches forecasts counted too early, or compared with the wrong moment."""
 
-    def told(seconds: float, psnr: float) -> dict[str, float]:
+    def told(seconds, psnr):
         return Forecast(seconds, psnr, 0.2, 10.0, 0.0).as_json()
 
     lines = [
@@ -139,7 +131,7 @@ def test_hits() -> None:
     assert checked_forecasts([{"seconds": 1.0}]) == (0, 0)
 
 
-def test_why_a_target_was_missed() -> None:
+def test_why_a_target_was_missed():
     """Catches "train longer" where that is no help, and another time than it will take."""
     risen = curve(TIMES, rising(TIMES))  # in 120 s; 36 − 20/√400 = 35
     assert explain_missed_target(risen, 35).endswith(
@@ -149,24 +141,7 @@ def test_why_a_target_was_missed() -> None:
     assert explain_missed_target(risen, 40).endswith(
         "levels off at about 36.0 dB; more time alone would not reach it"
     )
-    for near in (35.99, 37):  # 1.8 dB are still to come, which may be off by as much as a forecast
-        assert explain_missed_target(risen, near).endswith(
-            "levels off at about 36.0 dB; only a much longer budget might reach it"
-        )
-    fell = np.where(TIMES < 50, rising(TIMES), 30.0)
-    assert "nothing was gained after 48 s" in explain_missed_target(curve(TIMES, fell), 40)
-    assert "does not rise steadily" in explain_missed_target(
-        curve(TIMES[:6], -rising(TIMES[:6])), 40
-    )
     assert explain_missed_target([(1.0, 20.0)], 40) == (
         "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it "
         "would take"
     )
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_curve_that_starts_at_zero_has_no_forecast() -> None:
-    """Catches a warning about a division by zero in the summary of a run of a few milliseconds."""
-    seconds = np.arange(5.0)
-    assert forecast(curve(seconds, seconds + 20), 5.0) is None
-    assert "too few evaluations" in explain_missed_target(curve(seconds, seconds + 20), 40)

@@ -53,9 +53,7 @@ def batch_of(capture: Capture, width: int, height: int) -> Batch:
     )
 
 
-def cpu_bytes(
-    capture: Capture, count: int, size: tuple[int, int], log_scale: float
-) -> tuple[Counts, int]:
+def cpu_bytes(capture, count, size, log_scale):
     """Of the state and of the buffers that iterations share; without what a kernel allocates for
     itself."""
     state = new_state(splats_on(capture, count, log_scale))
@@ -68,9 +66,7 @@ def cpu_bytes(
     return (count, size[0] * size[1], pairs), sum(array.nbytes for array in arrays)
 
 
-def gpu_bytes(
-    capture: Capture, count: int, size: tuple[int, int], capacity: int
-) -> tuple[Counts, int]:
+def gpu_bytes(capture, count, size, capacity):
     rasterize.INITIAL_PAIR_CAPACITY = capacity
     device, frames = Device(), FrameStore(capture, SETTINGS.convention)
     state = new_state(splats_on(capture, count, -9.0))
@@ -87,9 +83,7 @@ def per_item(measured: list[tuple[Counts, int]]) -> np.ndarray:
     return np.linalg.solve(counts, [size for _, size in measured])[:3]
 
 
-def test_memory_is_the_cpus_and_as_documented(
-    toy: Capture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_is_the_cpus_and_as_documented(toy, monkeypatch):
     """Catches a table added to the GPU's iterations, and figures in the documentation that no
     longer hold."""
     monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end

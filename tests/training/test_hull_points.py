@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import face_frames, to_world
 from stga_addon.avatar.splats import SH_C0
-from stga_addon.capture.camera import Camera
+from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.forward import FlameFrame, neutral_frame
 from stga_addon.flame.model import FlameModel, torso_faces
@@ -36,15 +36,9 @@ def cameras(count: int = 20) -> list[Camera]:
     found = []
     for n in range(count):
         height, angle = 1 - 2 * (n + 0.5) / count, n * np.pi * (3 - np.sqrt(5))
-        forward = -np.array(
-            [np.sqrt(1 - height**2) * np.cos(angle), height, np.sqrt(1 - height**2) * np.sin(angle)]
-        )
-        right = np.cross(forward, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = [right, np.cross(forward, right), forward]
-        pose[2, 3] = FAR
-        found.append(Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2 + 2, SIZE / 2 - 3, pose))
+        x, z = np.sqrt(1 - height**2) * np.array([np.cos(angle), np.sin(angle)])
+        camera = look_at(FAR * np.array([x, height, z]), (0, 0, 0), SIZE, SIZE, FOCAL)
+        found.append(replace(camera, cx=SIZE / 2 + 2, cy=SIZE / 2 - 3))
     return found
 
 
@@ -91,7 +85,7 @@ def in_world(capture: Capture, points, convention: str = "stga"):
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_points_stand_on_the_balls_surface(beside: Capture, convention: str) -> None:
+def test_points_stand_on_the_balls_surface(beside, convention):
     """Catches swapped image axes, an ignored principal point, points in the wrong frame, and a
     shell with holes."""
     points = hull_points(beside, beside.views["train"], convention, 1)
@@ -115,9 +109,8 @@ def test_points_stand_on_the_balls_surface(beside: Capture, convention: str) -> 
     assert gaps.max() < 2.5 * VOXEL_SIZE_M
 
 
-def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside: Capture) -> None:
-    """Catches limits that would pull hair onto the skin, and hair that follows a far part of the
-    face."""
+def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside):
+    """Catches limits that pull hair onto the skin or a far face, and captures without masks."""
     points = hull_points(beside, beside.views["train"], "stga", 2)
     assert points.unbound.all()
     assert points.sh.shape == (len(points), 9, 3)
@@ -131,20 +124,13 @@ def test_points_are_unbound_gray_and_embedded_in_the_nearest_triangle(beside: Ca
     bound = distances[np.arange(len(some)), points.face[some]]
     # The nearest triangle need not have the nearest centroid, but on this even mesh it nearly does.
     np.testing.assert_allclose(bound, distances.min(axis=1), atol=3e-4)
-
-
-def test_masks_that_are_missing_are_read_from_white(beside: Capture) -> None:
-    """Catches captures without masks left without points; the light color stands 5 under white in
-    one channel only."""
     views = [replace(view, mask=None) for view in beside.views["train"]]
     bare, masked = (hull_points(beside, v, "stga", 0) for v in (views, beside.views["train"]))
     np.testing.assert_array_equal(bare.xyz, masked.xyz)
 
 
 @pytest.mark.parametrize(("whole", "shift"), [(10, 1), (6, 1), (4, 9)])
-def test_blocks_leave_nothing_out(
-    beside: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: int, shift: int
-) -> None:
+def test_blocks_leave_nothing_out(beside, tmp_path, monkeypatch, whole, shift):
     """Catches blocks of voxels that are skipped although some of their voxels are in the hull; all
     but a few images end `shift` pixels behind the ball's first column."""
     views = list(beside.views["train"])
@@ -162,7 +148,7 @@ def test_blocks_leave_nothing_out(
     assert np.array_equal(*found)
 
 
-def test_nothing_near_the_mesh(tmp_path: Path) -> None:
+def test_nothing_near_the_mesh(tmp_path):
     """Catches points on the skin itself, where the mesh's own splats are; here the ball is half
     inside the head."""
     capture = scene(tmp_path, np.array([0.04, 0.04, 0.02]), 0.04)
@@ -175,7 +161,7 @@ def test_nothing_near_the_mesh(tmp_path: Path) -> None:
     assert np.abs(head).min() < MIN_MESH_DISTANCE_M + VOXEL_SIZE_M
 
 
-def test_one_mask_that_says_no_is_enough(beside: Capture, tmp_path: Path) -> None:
+def test_one_mask_that_says_no_is_enough(beside, tmp_path):
     """Catches carving by vote: what one view sees as background is not there."""
     views = list(beside.views["train"])
     black = tmp_path / "black.png"
@@ -195,7 +181,7 @@ def posed_head(model: FlameModel, frame: FlameFrame) -> FlameSequence:
 
 
 @pytest.mark.parametrize("one", [False, True])
-def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -> None:
+def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
     """Catches a collar that turns with the chin it lies under, and hair beside the neck that does
     not."""
     model = small_head(0)
@@ -219,7 +205,7 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path: Path, one: bool) -
         np.testing.assert_allclose(world[0], world[1], atol=1e-6)
 
 
-def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> None:
+def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     """Catches a chest that bulges as the hull of few cameras does, one that loses its place when it
     turns, and a hull of many cameras that is thrown away."""
     model = small_head(0)
@@ -245,14 +231,8 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path: Path) -> No
     np.testing.assert_array_equal(hull_points(capture, views, "stga", 0, torso=True).xyz, many.xyz)
 
 
-def test_a_mesh_in_millimeters_does_not_fill_the_memory(beside: Capture) -> None:
-    """Catches a grid of 4 mm laid through a mesh of 100 m: 10^13 points."""
-    huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
-    assert len(hull_points(huge, beside.views["train"][:2], "stga", 0)) < 100_000
-
-
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside: Capture, convention: str) -> None:
+def test_a_single_camera_gets_a_layer_as_deep_as_the_mesh(beside, convention):
     """Catches points off their rays, holes in the layer, and one before or behind the head."""
     view = next(view for view in beside.views["train"] if _gap(view.camera) > 0.02)
     world = in_world(beside, flat_points(beside, view, convention, 1), convention)
@@ -283,9 +263,7 @@ def _gap(camera: Camera) -> float:
 
 
 @pytest.mark.parametrize(("right", "up", "continued"), [(0.0, -0.24, True), (0.22, 0.05, False)])
-def test_a_single_camera_continues_the_torso_that_it_cuts_off(
-    tmp_path: Path, right: float, up: float, continued: bool
-) -> None:
+def test_a_single_camera_continues_the_torso_that_it_cuts_off(tmp_path, right, up, continued):
     """Catches a chest that ends in the air, and hair that is continued like one."""
     model = small_head(0)
     head = posed_head(model, neutral_frame(model))
@@ -312,11 +290,13 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(
         assert (whole.opacity[beyond] > 2).all()
 
 
-def test_no_layer_where_nothing_lies_beside_the_mesh(tmp_path: Path) -> None:
-    """Catches a crash where nothing lies outside the mesh, which is the best of captures."""
+def test_no_layer_where_nothing_lies_beside_the_mesh(tmp_path, beside):
+    """Catches a crash where nothing lies outside the mesh, and 10^13 points of one of 100 m."""
     capture = scene(tmp_path, CENTRE, 0.0)
     for points in (
         flat_points(capture, capture.views["train"][0], "stga", 1),
         hull_points(capture, capture.views["train"], "stga", 1),
     ):
         assert points.sh.shape == (0, 4, 3)
+    huge = replace(beside, mesh=lambda timestep: 1000 * beside.mesh(timestep))
+    assert len(hull_points(huge, beside.views["train"][:2], "stga", 0)) < 100_000

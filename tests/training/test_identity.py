@@ -21,15 +21,13 @@ from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import request_folder, write_request
 from stga_addon.jobs.train import Resume
-from stga_addon.progress import Progress
 from stga_addon.render import device as device_choice
 from stga_addon.schema import to_json
 from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, device_of, open_run, read_run, write_run
-from stga_addon.training.run.identity import RunIdentity, difference, identity_of
+from stga_addon.training.run.identity import difference, identity_of
 from stga_addon.training.run.session import train
-from stga_addon.training.settings import TrainingSettings
 
 from .toys import assert_same_state, quick_settings, stop_at
 
@@ -110,9 +108,7 @@ def other_lens(root: Path) -> None:
         (larger_neutral, "another neutral mesh"),
     ],
 )
-def test_changed_captures_are_refused(
-    copy: Path, toy: Capture, tmp_path: Path, change: Callable[[Path], None], message: str
-) -> None:
+def test_changed_captures_are_refused(copy, toy, tmp_path, change, message):
     """Catches a run resumed or measured on another capture, named or replaced in place."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     change(other)
@@ -127,9 +123,7 @@ def test_changed_captures_are_refused(
         open_run(copy)
 
 
-def test_moved_captures_and_refined_meshes_are_accepted(
-    copy: Path, toy: Capture, tmp_path: Path
-) -> None:
+def test_moved_captures_and_refined_meshes_are_accepted(copy, toy, tmp_path):
     """Catches a run lost with its capture's old path, or with a better tracking."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     vertices, faces = factory.ball()
@@ -150,14 +144,12 @@ FOLLOWS = "strain_position", "older_strain_color"
 @pytest.mark.parametrize(
     ("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD)), (6, {"adam_nesterov"})]
 )
-def test_runs_of_earlier_format_versions_are_resumed(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int, lacks: set[str]
-) -> None:
+def test_runs_of_earlier_format_versions_are_resumed(toy, tmp_path, monkeypatch, version, lacks):
     """Catches a run of an earlier version that is refused for settings that it lacks, goes on with
     other ones, or with another value of one."""
     out = tmp_path / "run"
 
-    def recorded(capture: Capture, principal_point: str, settings: TrainingSettings) -> RunIdentity:
+    def recorded(capture, principal_point, settings):
         known = {name: value for name, value in to_json(settings).items() if name not in lacks}
         known |= AS_THEN
         digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
@@ -168,7 +160,7 @@ def test_runs_of_earlier_format_versions_are_resumed(
         begun = make_run(toy, driven_offsets=FOLLOWS, **OLD)
         train(toy, out, begun, report=stop_at(ITERATIONS // 2))
 
-    def as_then(document: dict[str, Any]) -> None:
+    def as_then(document):
         document["version"] = version
         for name in lacks:
             del document["settings"][name]
@@ -184,11 +176,11 @@ def test_runs_of_earlier_format_versions_are_resumed(
         train(toy, out, make_run(toy, torso=True, driven_offsets=FOLLOWS, **OLD), resume=True)
 
 
-def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
+def test_last_bits_of_another_machine_are_accepted(toy):
     """Catches a run lost where another linear algebra library rounds differently."""
     rng = np.random.default_rng(0)
 
-    def shifted(view: Any) -> Any:
+    def shifted(view):
         noise = 1e-15 * rng.normal(size=(4, 4))
         return replace(
             view, camera=replace(view.camera, world_to_camera=view.camera.world_to_camera + noise)
@@ -202,7 +194,7 @@ def test_last_bits_of_another_machine_are_accepted(toy: Capture) -> None:
     assert difference(one, two) is None
 
 
-def test_another_flame_model_is_refused(toy: Capture, tmp_path: Path) -> None:
+def test_another_flame_model_is_refused(toy, tmp_path):
     """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a
     moved one, and one that blames the FLAME file where it is resumed on tracked meshes."""
     root, model = factory.write_flame_capture(tmp_path / "capture")
@@ -220,9 +212,7 @@ def test_another_flame_model_is_refused(toy: Capture, tmp_path: Path) -> None:
     assert stga("train", root, "--out", out, "--resume --flame", moved) == 0
 
 
-def test_every_command_checks_the_identity(
-    copy: Path, toy: Capture, tmp_path: Path, capsys: Any
-) -> None:
+def test_every_command_checks_the_identity(copy, toy, tmp_path, capsys):
     """Catches a command without the check: each ends with one sentence and exit code 2."""
     other = shutil.copytree(toy.root, tmp_path / "other")
     move_cameras(other)
@@ -244,12 +234,12 @@ def test_every_command_checks_the_identity(
     assert stga("export", copy, "--capture", other, "--format ply --timestep 0 --out", ply) == 0
 
 
-def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Capture) -> None:
+def test_a_checkpoint_left_from_another_run_is_not_taken(copy, toy):
     """Catches a new run that continues a removed one, as it died before a checkpoint."""
     (copy / "run.json").unlink()
     run = make_run(toy, seed=5)
 
-    def die(progress: Progress) -> bool:
+    def die(progress):
         if progress.figures().get("iteration", 0):
             raise OSError("died")
         return False
@@ -257,9 +247,9 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Captur
     with pytest.raises(OSError, match="died"):
         train(toy, copy, run, report=die)
     assert not (copy / "checkpoint.npz").exists()
-    reached: list[float] = []
+    reached = []
 
-    def report(progress: Progress) -> bool:
+    def report(progress):
         return bool(reached.append(progress.figures().get("iteration", 0)))
 
     train(toy, copy, run, resume=True, report=report)
@@ -267,9 +257,7 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy: Path, toy: Captur
 
 
 @pytest.mark.parametrize("name", ["checkpoint.npz", "selection.npz"])
-def test_files_of_another_run_are_refused(
-    copy: Path, toy: Capture, tmp_path: Path, name: str
-) -> None:
+def test_files_of_another_run_are_refused(copy, toy, tmp_path, name):
     """Catches a checkpoint or a selection that was copied beside the run.json of another run."""
     train(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
     shutil.copy(tmp_path / "other" / name, copy / name)
@@ -277,7 +265,7 @@ def test_files_of_another_run_are_refused(
         train(toy, copy, make_run(toy), resume=True)
 
 
-def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path) -> None:
+def test_principal_point_comes_with_run_and_avatar(toy, tmp_path):
     """Catches `render` that reads cameras by another convention than the avatar's."""
     root = shutil.copytree(toy.root, tmp_path / "capture")
     edit_frames(root, lambda frame: frame.update(cy=frame["cy"] + 7))
@@ -287,7 +275,7 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
     assert read_avatar(out / "avatar.npz").principal_point == "opencv"
     cameras = root / "transforms_test.json"
 
-    def pictures(source: Path, *options: str) -> list[bytes]:
+    def pictures(source, *options):
         folder = tmp_path / f"{source.name}{len(options)}"
         driver = ("--capture", root) if source.is_file() else ()
         assert stga("render", source, "--cameras", cameras, "--out", folder, *driver, *options) == 0
@@ -298,7 +286,7 @@ def test_principal_point_comes_with_run_and_avatar(toy: Capture, tmp_path: Path)
     assert pictures(out) == pictures(out / "avatar.npz") == expected
 
 
-def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_belongs_to_the_run(copy, monkeypatch):
     """Catches a run that moves from the CPU to a GPU, or to another GPU."""
     run = read_run(copy)
     assert run.device == "cpu"
@@ -320,10 +308,10 @@ def test_device_belongs_to_the_run(copy: Path, monkeypatch: pytest.MonkeyPatch) 
     assert device_of(replace(run, device="cuda:0"), "cpu")[0] == "cpu"
 
 
-def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Path) -> None:
-    """Catches Ctrl-C that loses what was trained, or saves half an iteration."""
+def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
+    """Catches Ctrl-C that loses what was trained or half an iteration, or cannot quit at once."""
 
-    def interrupt(progress: Progress) -> bool:
+    def interrupt(progress):
         if progress.figures().get("iteration", 0) == 5 and progress.stage == "Training":
             signal.raise_signal(signal.SIGINT)
         return False
@@ -338,23 +326,19 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy: Capture, tmp_path: Pa
     train(toy, unbroken, make_run(toy))
     assert_same_state(out, unbroken)
 
-
-def test_second_interrupt_quits_at_once(toy: Capture, tmp_path: Path) -> None:
-    """Catches a training that cannot be ended while it saves."""
-
-    def interrupt_twice(progress: Progress) -> bool:
+    def interrupt_twice(progress):
         if progress.figures().get("iteration", 0) == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        train(toy, tmp_path, make_run(toy), report=interrupt_twice)
-    assert not (tmp_path / "checkpoint.npz").exists()
+        train(toy, tmp_path / "twice", make_run(toy), report=interrupt_twice)
+    assert not (tmp_path / "twice/checkpoint.npz").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_prepared_run_begins_with_its_identity(toy: Capture, tmp_path: Path) -> None:
+def test_a_prepared_run_begins_with_its_identity(toy, tmp_path):
     """Catches a run.json written ahead of the training that stays without identity."""
     write_run(tmp_path, make_run(toy))
     assert json.loads((tmp_path / "run.json").read_text())["identity"] is None

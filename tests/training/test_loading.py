@@ -2,7 +2,6 @@
 
 import threading
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,15 +35,13 @@ def no_residuals(*arguments: Any) -> Residuals:
     return Residuals(np.zeros(1), np.ones(1))
 
 
-def test_no_mesh_is_read_on_the_training_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     """Catches training that waits for mesh files, and numbers that depend on it."""
     timesteps = range(2 * KEPT)
     opened = open_capture(factory.write_mesh_capture(tmp_path / "capture", timesteps, range(2)))
-    read: list[tuple[int, bool]] = []
+    read = []
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         read.append((timestep, threading.current_thread() is threading.main_thread()))
         return opened.mesh(timestep)
 
@@ -59,7 +56,7 @@ def test_no_mesh_is_read_on_the_training_thread(
     before = [timesteps[0], *evenly_spread(timesteps[1:-1], MAX_LATER_TIMESTEPS)]
     assert [timestep for timestep, on_training_thread in read if on_training_thread] == before
 
-    def without_meshes(*arguments: Any, **options: Any) -> ViewLoader:
+    def without_meshes(*arguments, **options):
         return ViewLoader(*arguments, **{**options, "mesh": None})
 
     read.clear()
@@ -71,7 +68,7 @@ def test_no_mesh_is_read_on_the_training_thread(
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
-def test_frames_are_those_of_the_timesteps_mesh(toy: Capture, convention: str) -> None:
+def test_frames_are_those_of_the_timesteps_mesh(toy, convention):
     """Catches frames of another timestep or convention, or scaled by the posed mesh."""
     store = FrameStore(toy, convention)
     for timestep in (3, 0, 3):
@@ -81,11 +78,11 @@ def test_frames_are_those_of_the_timesteps_mesh(toy: Capture, convention: str) -
     assert np.abs(store.of(3).origin - store.of(0).origin).max() > 1e-3
 
 
-def test_meshes_are_read_once_and_few_are_kept(toy: Capture) -> None:
+def test_meshes_are_read_once_and_few_are_kept(toy):
     """Catches a mesh file read in every iteration, and a long sequence that fills the memory."""
-    read: list[int] = []
+    read = []
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         read.append(timestep)
         return toy.mesh(3)
 

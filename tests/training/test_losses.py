@@ -29,9 +29,7 @@ def random_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.
     return image, np.ascontiguousarray(target.transpose(1, 2, 0))
 
 
-def reference(
-    image: np.ndarray, target: np.ndarray, weight: float
-) -> tuple[np.ndarray, torch.Tensor, torch.Tensor]:
+def reference(image, target, weight):
     """Gradient (3, H, W), |difference| and SSIM maps, in float64 by autograd."""
     x = torch.tensor(image, dtype=torch.float64, requires_grad=True)
     # The 8-bit value as the float32 it is compared as, so that equal pixels are equal here too.
@@ -47,7 +45,7 @@ def assert_same_gradient(gradient: np.ndarray, expected: np.ndarray) -> None:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_gradient_and_values(height: int, width: int, weight: float) -> None:
+def test_gradient_and_values(height, width, weight):
     """Catches a wrong window, padding, constant or derivative, lost rows, small images."""
     image, target = random_pair(height, width)
     out = np.full_like(image, np.nan)
@@ -60,7 +58,7 @@ def test_gradient_and_values(height: int, width: int, weight: float) -> None:
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])
-def test_constant_images(value: int) -> None:
+def test_constant_images(value):
     """Catches 0/0 and a negative variance, and a sign for pixels that already agree."""
     target = np.full((20, 25, 3), value, np.uint8)
     same = np.full((3, 20, 25), np.float32(value) * np.float32(1 / 255), np.float32)
@@ -84,7 +82,7 @@ RECTANGLES = {
 
 
 @pytest.mark.parametrize("name", RECTANGLES)
-def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
+def test_rectangles_have_the_whole_images_gradient(name):
     """Catches pixels read beyond LOSS_REACH_PX (they are NaN), and written outside."""
     image, target = random_pair(59, 71, seed=1)
     rectangles = np.array(RECTANGLES[name], np.int64)
@@ -108,7 +106,7 @@ def test_rectangles_have_the_whole_images_gradient(name: str) -> None:
 
 @pytest.mark.parametrize(("height", "width"), [*SIZES, (401, 275)])
 @pytest.mark.parametrize("bands", [1, 2, 3, 64])
-def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
+def test_rectangles_tile_the_image(height, width, bands):
     """Catches a pixel that two rectangles or none cover, and an empty one."""
     covered = np.zeros((height, width), int)
     for x0, y0, x1, y1 in whole_image(height, width, bands):
@@ -118,7 +116,7 @@ def test_rectangles_tile_the_image(height: int, width: int, bands: int) -> None:
     np.testing.assert_array_equal(covered, 1)
 
 
-def test_bands_do_not_change_a_bit() -> None:
+def test_bands_do_not_change_a_bit():
     """Catches a run that goes another way on another number of threads, and so bands."""
     image, target = random_pair(75, 110, seed=2)
     whole, cut = np.empty_like(image), np.empty_like(image)
@@ -128,7 +126,7 @@ def test_bands_do_not_change_a_bit() -> None:
         np.testing.assert_array_equal(cut, whole)
 
 
-def test_sums_are_added_up_in_one_order() -> None:
+def test_sums_are_added_up_in_one_order():
     """Catches a sum whose order LLVM chooses: it was another after another compilation, and where
     LLVM feared that arrays overlap, with other addresses."""
     image, target = random_pair(37, 802, seed=3)
@@ -143,7 +141,7 @@ def test_sums_are_added_up_in_one_order() -> None:
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.6, 1.0])
 @pytest.mark.parametrize("seed", range(5))
-def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None:
+def test_tile_rectangles_cover_the_marked_tiles(share, seed):
     """Catches tiles left out, swapped axes, and rectangles that reach over the image's edge."""
     rng = np.random.default_rng(seed)
     height, width = rng.integers(1, 120, 2) if seed < 3 else rng.integers(300, 600, 2)
@@ -160,7 +158,7 @@ def test_tile_rectangles_cover_the_marked_tiles(share: float, seed: int) -> None
     assert covered[pixels].all()
 
 
-def test_separate_tiles_get_separate_rectangles() -> None:
+def test_separate_tiles_get_separate_rectangles():
     """Catches one box around everything, which costs the whole image; touching tiles split."""
     tiles = np.zeros((6, 8), bool)
     tiles[0, 0] = tiles[1, 1] = tiles[5, 7] = True

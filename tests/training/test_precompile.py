@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from capture import factory
@@ -55,7 +54,7 @@ print(json.dumps([sum(before.values()), {name: [before[name], after[name]] for n
 """
 
 
-def test_training_compiles_nothing_new(tmp_path: Path) -> None:
+def test_training_compiles_nothing_new(tmp_path):
     """Catches a kernel first met in the middle of a run (other types, read-only or strided arrays):
     seconds lost.
 
@@ -92,7 +91,7 @@ print(json.dumps([sum(kernel.stats.cache_hits.values()), len(kernel.signatures)]
 
 @pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two processors")
-def test_a_second_process_compiles_what_is_missing(tmp_path: Path) -> None:
+def test_a_second_process_compiles_what_is_missing(tmp_path):
     """Catches a first start that waits for a second process and then compiles everything again, or
     never starts one.
 

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from stga_addon.tracking.folder import (
     write_torso_points,
 )
 from stga_addon.training.optimize.avatar_tracking import (
-    AvatarTracking,
     normal_images,
     track_by_avatar,
 )
@@ -60,10 +58,8 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
     return run, root
 
 
-def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
-    """Catches colors of another exposure or light that are taken for those of another pose, a head
-    that keeps the size that landmarks gave it, files that keep the old parameters, and identities
-    that change."""
+def test_another_recording_is_tracked(recording, lost):  # noqa: F811
+    """Catches another exposure or light taken for a pose, a lost size, identity or offset."""
     run, root = recording
     before = json.loads((root / "transforms_train.json").read_text())["frames"]
     found = track_recording(run, root, Helpers(1), ignore)
@@ -81,18 +77,6 @@ def test_another_recording_is_tracked(recording, lost) -> None:  # noqa: F811
     misfit = read_json(root / "tracking.json")["image_misfit"][AVATAR_MISFIT]
     assert sorted(misfit) == sorted(map(str, TIMESTEPS))
     assert found.misfit.max() < 0.2
-
-
-def test_another_person_is_missed(recording) -> None:
-    """Catches a misfit that is small whatever the images show."""
-    run, root = recording
-    for path in (root / "images").iterdir():
-        Image.fromarray(np.asarray(Image.open(path))[..., [1, 2, 0]]).save(path)
-    assert np.median(track_recording(run, root, Helpers(1), ignore).misfit) > 0.4
-
-
-def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
-    """Catches an identity or an offset that gets lost on its way into the tracker."""
     fit, model = avatar_person(recording[0])
     assert model == recording[1] / "model.npz"
     np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
@@ -100,13 +84,21 @@ def test_the_head_is_the_avatars(recording, lost) -> None:  # noqa: F811
     assert len(fit.shape) == 4
 
 
-def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch) -> None:
+def test_another_person_is_missed(recording):
+    """Catches a misfit that is small whatever the images show."""
+    run, root = recording
+    for path in (root / "images").iterdir():
+        Image.fromarray(np.asarray(Image.open(path))[..., [1, 2, 0]]).save(path)
+    assert np.median(track_recording(run, root, Helpers(1), ignore).misfit) > 0.4
+
+
+def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch):
     """Catches a cancelled tracking that begins anew, or goes on with another avatar's."""
     (run, root), calls = recording, list[int]()
     every, twice = [1] * len(TIMESTEPS), [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")
 
-    def counted(*arguments: Any) -> AvatarTracking:
+    def counted(*arguments):
         calls.append(len(arguments[3]))
         return track_by_avatar(*arguments)
 

@@ -14,7 +14,7 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
-from stga_addon.jobs.train import Prepared, Refine, prepare
+from stga_addon.jobs.train import Refine, prepare
 from stga_addon.progress import ignore
 from stga_addon.training.optimize.state import TrainState, arrays_of
 from stga_addon.training.run import continuation as module
@@ -68,9 +68,7 @@ def opening(toy: Capture) -> Callable[..., Any]:
     return lambda folder, flame=None: OpenedRun(read_run(folder), capture, (capture,))
 
 
-def prepare_refinement(
-    parent: Path, region: str, frames: tuple[int, int] | None = None, **changes: Any
-) -> Prepared:
+def prepare_refinement(parent, region, frames=None, **changes):
     changes = {"frames": frames, "iterations": ITERATIONS, "device": "cpu", **changes}
     request = Refine(parent / "unused", parent, region, **changes)
     return prepare(request, ignore, lambda line: None)
@@ -90,11 +88,8 @@ def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
     return {name: array[keep].view(np.uint8) for name, array in kept.items()}
 
 
-def test_nothing_outside_the_region_changes_by_one_bit(
-    parent: Path, toy: Capture, tmp_path: Path
-) -> None:
-    """Catches momentum, averaging, density control or stray resets that reach splats beyond the
-    region, and a refinement that does nothing."""
+def test_nothing_outside_the_region_changes_by_one_bit(parent, toy, tmp_path):
+    """Catches momentum, averages, density or resets beyond the region, and doing nothing."""
     before, region = read_avatar(parent / "avatar.npz"), toy.regions["mouth"]
     after = read_avatar(refine(parent, tmp_path / "refined") / "avatar.npz")
     outside = [~region[avatar.splats.face] for avatar in (before, after)]
@@ -118,9 +113,7 @@ def test_nothing_outside_the_region_changes_by_one_bit(
             np.testing.assert_array_equal(kept[1][name], old, err_msg=name)
 
 
-def test_a_stopped_refinement_is_continued_to_the_same_bits(
-    parent: Path, toy: Capture, tmp_path: Path
-) -> None:
+def test_a_stopped_refinement_is_continued_to_the_same_bits(parent, toy, tmp_path):
     """Catches an order, a region or a rate that resuming does not find again."""
     whole = refine(parent, tmp_path / "whole", frames=(1, 3))
     stopped = refine(parent, tmp_path / "stopped", stop=7, frames=(1, 3))
@@ -130,9 +123,7 @@ def test_a_stopped_refinement_is_continued_to_the_same_bits(
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
 
-def test_the_avatar_before_is_the_first_evaluation(
-    parent: Path, toy: Capture, tmp_path: Path
-) -> None:
+def test_the_avatar_before_is_the_first_evaluation(parent, toy, tmp_path):
     """Catches a report without what came before, and a region that is not measured apart."""
     prepared = prepare_refinement(parent, "mouth", (1, 3))
     train(toy, tmp_path / "refined", prepared.run, prepared.selection)
@@ -142,9 +133,7 @@ def test_the_avatar_before_is_the_first_evaluation(
     assert last["psnr_region"] > first["psnr_region"]
 
 
-def test_a_region_that_no_camera_faces_is_refused(
-    parent: Path, toy: Capture, tmp_path: Path
-) -> None:
+def test_a_region_that_no_camera_faces_is_refused(parent, toy, tmp_path):
     """Catches a refinement without a view to train on, which ends in a traceback."""
     away = np.asarray(toy.neutral)[toy.faces].mean(1)[:, 2] < -0.09
     write_npz(tmp_path / "away.npz", {"weights": away})
@@ -154,24 +143,18 @@ def test_a_region_that_no_camera_faces_is_refused(
         prepare_refinement(parent, str(tmp_path / "away.npz"))
 
 
-def test_a_changed_avatar_is_not_refined(parent: Path, tmp_path: Path) -> None:
-    """Catches a refinement of another avatar than the one that its run.json names."""
-    prepared = prepare_refinement(parent, "mouth")
-    (parent / "avatar.npz").write_bytes(b"")
-    with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
-        train(prepared.capture, tmp_path / "refined", prepared.run, prepared.selection)
-
-
-def test_without_its_checkpoint_an_avatar_is_refined_as_well(
-    parent: Path, toy: Capture, tmp_path: Path
-) -> None:
-    """Catches a refinement that needs moments, or takes those of another state."""
+def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent, toy, tmp_path):
+    """Catches a refinement that needs moments, and one of another avatar than its run.json's."""
     (parent / "checkpoint.npz").unlink()
     after = read_avatar(refine(parent, tmp_path / "refined", growth=0.0) / "avatar.npz").splats
     before = read_avatar(parent / "avatar.npz").splats
     outside = ~toy.regions["mouth"][before.face]
     assert np.array_equal(after.xyz[outside], before.xyz[outside])
     assert not np.array_equal(after.xyz[~outside], before.xyz[~outside])
+    prepared = prepare_refinement(parent, "mouth")
+    (parent / "avatar.npz").write_bytes(b"")
+    with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
+        train(prepared.capture, tmp_path / "again", prepared.run, prepared.selection)
 
 
 @pytest.mark.parametrize(
@@ -185,13 +168,13 @@ def test_without_its_checkpoint_an_avatar_is_refined_as_well(
         ({"growth": 1000.0}, "setting growth"),
     ],
 )
-def test_what_is_refused(parent: Path, changes: dict[str, Any], sentence: str) -> None:
+def test_what_is_refused(parent, changes, sentence):
     """Catches a traceback, or a folder begun, for what cannot be refined."""
     with pytest.raises(StgaError, match=sentence):
         prepare_refinement(parent, **{"region": "mouth", **changes})
 
 
-def test_late_rates_are_the_rest_of_the_schedule() -> None:
+def test_late_rates_are_the_rest_of_the_schedule():
     """Catches rates that jump where a continuation begins, or end elsewhere than a training's."""
     rates = Rates()
     late = continued_settings(TrainingSettings(iterations=9), "refine", 0.0, None, 5, 0).rates
@@ -200,7 +183,7 @@ def test_late_rates_are_the_rest_of_the_schedule() -> None:
         assert learning_rates(late, progress) == pytest.approx(expected)
 
 
-def test_order_of_views_continues_and_replays(toy: Capture) -> None:
+def test_order_of_views_continues_and_replays(toy):
     """Catches a resumed order that starts anew, and frames forgotten or too often trained."""
     continuation = Continuation(Path(), "", 1, 1)
     for region, count in ((np.ones(len(toy.faces), bool), 27), (None, 24)):  # to refine, to extend
@@ -214,7 +197,7 @@ def test_order_of_views_continues_and_replays(toy: Capture) -> None:
     assert {view.timestep for view in alone} == {0, 1, 3}
 
 
-def test_replayed_timesteps_differ_most(toy: Capture) -> None:
+def test_replayed_timesteps_differ_most(toy):
     """Catches a replay of neighbors alike, and one that grows with the takes' length."""
     offsets = {0: 0.0, 1: 0.001, 2: 0.05, 3: 0.051, 4: -0.04}
     capture = replace(
@@ -229,7 +212,7 @@ def test_replayed_timesteps_differ_most(toy: Capture) -> None:
     assert len({view.camera_index for view in kept}) > 4
 
 
-def test_views_that_see_the_region(toy: Capture) -> None:
+def test_views_that_see_the_region(toy):
     """Catches a region that is refined in views from behind, which do not show it: a triangle's
     winding in pixels is the opposite of that seen from outside."""
     views = toy.views["train"]

@@ -7,7 +7,7 @@ from stga_addon.training.optimize.state import arrays_of, join, keep_rows, new_s
 from .toys import random_splats, random_state
 
 
-def test_keep_and_join() -> None:
+def test_keep_and_join():
     """Catches an array left at its old length or in another order after pruning."""
     state = random_state(9, 5)
     keep = np.array([True, False, True, True, False, False, True, False, True])
@@ -21,7 +21,7 @@ def test_keep_and_join() -> None:
         assert joined[name].flags.c_contiguous
 
 
-def test_memory_is_shared_where_promised_and_only_there() -> None:
+def test_memory_is_shared_where_promised_and_only_there():
     """Catches training that changes the splats it began with, and Adam on a copy."""
     splats = random_splats(6, 4)
     xyz, face = splats.xyz.copy(), splats.face.copy()

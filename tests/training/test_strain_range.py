@@ -1,7 +1,6 @@
 """The range of deformation that an avatar takes along from its training."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def strains(toy: Capture, timesteps: set[int]) -> np.ndarray:
     return np.stack([deformation(basis, deformed(toy, t)) for t in sorted(timesteps)])
 
 
-def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path) -> None:
+def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
@@ -56,7 +55,7 @@ def test_a_run_writes_the_range_of_what_it_trained(toy: Capture, tmp_path: Path)
     assert read_avatar(train(capture, tmp_path / "off", without)).strain_range is None
 
 
-def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) -> None:
+def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
     """Catches an avatar that forgets expressions because only one frame was refined."""
     count = len(toy.faces)
     limits = np.broadcast_to(np.array([[-0.5], [0.01]], np.float32), (count, 2, 6)).copy()
@@ -81,10 +80,8 @@ def test_a_continuation_keeps_what_its_parent_saw(toy: Capture, tmp_path: Path) 
     np.testing.assert_array_equal(unlimited, np.broadcast_to(TRAINED_RANGE, (count, 2, 6)))
 
 
-def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> None:
-    """Catches wrinkles of compressed skin that show with the opposite sign where it is stretched,
-    or that begin with the least compression, in the frames that training renders or in the avatar's
-    range."""
+def test_colors_follow_compression_and_shear_but_no_stretch(toy):
+    """Catches wrinkles of opposite sign in stretched skin, or of the least compression."""
     basis = FrameStore(toy, "stga", strain=True).strain
     assert basis is not None
     larger, little, smaller = (
@@ -102,9 +99,8 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy: Capture) -> Non
 
 
 @pytest.mark.parametrize("limited", [True, False])
-def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, limited: bool) -> None:
-    """Catches a run of an earlier version that is resumed, which changes all its colors at once,
-    and one that is finished but cannot be opened."""
+def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
+    """Catches an earlier version's run resumed in other colors, or that cannot be opened."""
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
     path = train(toy, out, run, report=stop_at(2))
@@ -122,12 +118,12 @@ def test_a_run_of_another_range_is_not_resumed(toy: Capture, tmp_path: Path, lim
     train(toy, out, run, resume=True)
 
 
-def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
+def test_the_range_covers_an_expression_of_few_timesteps(toy):
     """Catches a blink of six frames in 1,200 that is trained, but clipped."""
     view, blink = toy.views["train"][0], range(1003, 1009)
     views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         return np.asarray(toy.neutral) * (0.85 if timestep in blink else 1.0)
 
     basis = strain_basis(toy.neutral, toy.faces, trained_range(len(toy.faces)))
@@ -135,13 +131,11 @@ def test_the_range_covers_an_expression_of_few_timesteps(toy: Capture) -> None:
     assert (limits[:, 0] <= deformation(basis, mesh(blink[0]))).all()
 
 
-def test_evaluation_while_training_measures_the_avatar_that_is_written(
-    toy: Capture, tmp_path: Path
-) -> None:
+def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_path):
     """Catches metrics of an avatar that follows held-out expressions further than the file does."""
     strong = {view.timestep for view in toy.views["val"]} - {0}
 
-    def mesh(timestep: int) -> np.ndarray:
+    def mesh(timestep):
         return np.asarray(toy.neutral) * (0.8 if timestep in strong else 1.0)
 
     weak = tuple(view for view in toy.views["train"] if view.timestep not in strong)
@@ -155,7 +149,7 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(
     assert found == pytest.approx(best["psnr"], abs=1e-3)
 
 
-def test_another_runs_range_is_refused(toy: Capture, tmp_path: Path) -> None:
+def test_another_runs_range_is_refused(toy, tmp_path):
     """Catches a resumed run that clips its colors to what another run has seen."""
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"

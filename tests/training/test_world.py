@@ -50,7 +50,7 @@ def plates_of(texture: np.ndarray) -> list[CleanPlate]:
     return [CleanPlate(camera, wall(camera, texture), seen) for camera in cameras]
 
 
-def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
+def test_a_wall_from_a_camera_that_did_not_see_it():
     """Catches a wall at a wrong distance, or right from the plates' cameras alone."""
     noise = np.random.default_rng(0).random((512, 512, 3))
     texture = gaussian_filter(noise, (4, 4, 0), mode="wrap")
@@ -63,7 +63,7 @@ def test_a_wall_from_a_camera_that_did_not_see_it() -> None:
         assert -10 * np.log10((error**2).mean()) > least
 
 
-def test_a_wall_of_one_color() -> None:
+def test_a_wall_of_one_color():
     """Catches a distance that is read from noise, a wall that is darker between its splats or at
     its border, and a search for larger blocks that never ends."""
     plates = plates_of(np.full((512, 512, 3), 0.6))
@@ -102,7 +102,7 @@ def run(walled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_plates_without_the_person(walled: Path) -> None:
+def test_plates_without_the_person(walled):
     """Catches a person who remains, a blurred wall, and holes without a color."""
     for plate in clean_plates(open_capture(walled)):
         stripes = np.broadcast_to(STRIPES, plate.image.shape) / 255
@@ -114,10 +114,8 @@ def test_plates_without_the_person(walled: Path) -> None:
         assert (hidden <= stripes.max((0, 1)) + 1e-6).all()
 
 
-def test_measured_with_the_world(
-    walled: Path, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches figures of matted images called whole ones: against `stga render --world`."""
+def test_measured_with_the_world(walled, run, capsys, tmp_path):
+    """Catches matted images' figures called whole ones, and a traceback without a world."""
     assert stga("eval", run, "--split train") == 0
     assert "in front of its world, against whole images as recorded" in capsys.readouterr().out
     found = json.loads((run / "quality_train.json").read_text())["psnr_recorded"]
@@ -130,12 +128,6 @@ def test_measured_with_the_world(
         errors.append(-10 * np.log10(((rendered - recorded) ** 2).mean()))
     assert found == pytest.approx(np.mean(errors), abs=0.05)
     assert found > 18
-
-
-def test_no_world(
-    walled: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Catches a traceback without a world, and one where nothing tells it apart."""
     avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
     avatar.write_bytes((run / "avatar.npz").read_bytes())
     asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")

@@ -14,7 +14,7 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.export.playback import Playback, ShapeControls
+from stga_addon.export.playback import Playback
 from stga_addon.export.web.data_file import WebRig, data_file, flame_rig
 from stga_addon.export.web.page import page
 from stga_addon.flame.forward import FlameFrame
@@ -58,9 +58,7 @@ class Head:
     def rig(self) -> WebRig:
         return flame_rig(self.sequence)
 
-    def data(
-        self, rig: WebRig | None = None, exact: bool = False, controls: ShapeControls | None = None
-    ) -> bytes:
+    def data(self, rig=None, exact=False, controls=None):
         playback = Playback("Zoë", 2.0, {"front": self.camera}, selection=self.selection)
         playback = replace(playback, controls=controls)
         return data_file(self.avatar, rig or self.rig, playback, exact)
@@ -71,12 +69,7 @@ class Head:
         return [faces % (number + 2) == 0 for number in range(len(self.meshes))]
 
 
-def make_head(
-    convention: str = "stga",
-    sh_degree: int = 3,
-    antialiased: bool = True,
-    offsets: tuple[str, ...] = tuple(OFFSETS),
-) -> Head:
+def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OFFSETS)):
     """offsets: names of driven offsets, which the ranges of most triangles cut off; splats move as
     far as they spread."""
     model = small_head(0)

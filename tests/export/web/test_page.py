@@ -6,30 +6,21 @@ import io
 import re
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from export.web.browser import Browser
-from stga_addon.avatar.file import Avatar
-from stga_addon.capture.open import open_capture
-from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import baked_rig, data_file
+from stga_addon.export.web.data_file import baked_rig
 from stga_addon.export.web.page import page
 from stga_addon.render.render import render_avatar, to_uint8
-from stga_addon.training.optimize.initial_splats import initial_splats
-from stga_addon.training.settings import make_settings
 
 from .conftest import Head, make_head, show
 
 pytestmark = pytest.mark.needs("chromium")
 
 MIN_PSNR, MIN_EXCHANGED_PSNR = 55.0, 45.0
-MIN_QUANTIZED_PSNR = 58.0
-"""Quantized against unquantized, of opaque splats with random colors. Trained heads reach 60 dB and
-more."""
 MIN_EXACT_PSNR = 68.0
 """Unquantized. Splats placed on the driver's grid of 1/16 pixel, as interpolated offsets are, lower
 it to 58 dB; colors in half floats take some dB of the rest."""
@@ -97,35 +88,6 @@ def test_picture_is_the_renderers(options, exact, browser, tmp_path):
         assert found[1] >= MIN_PSNR
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
-
-
-@pytest.mark.slow
-def test_a_capture_plays_as_rendered(browser, shared_data, tmp_path):
-    """Catches a page that differs from the renderer on the size, cameras and meshes of a capture,
-    and steps of the data file that are coarse enough to be seen."""
-    capture = open_capture(shared_data / "studio_head")
-    splats = initial_splats(capture, make_settings(iterations=1))
-    rng = np.random.default_rng(0)
-    splats = replace(
-        splats,
-        opacity=splats.opacity + np.float32(3.0),
-        sh=splats.sh + rng.normal(0, 0.05, splats.sh.shape).astype(np.float32),
-    )
-    neutral, shape = capture.neutral.astype(np.float32), (len(capture.faces), 3, 3)
-    colors = "strain_color", "normal_color"
-    driven = {name: rng.normal(0, 0.03, shape).astype(np.float32) for name in colors}
-    avatar = Avatar(splats, "stga", neutral, capture.faces, antialiased=True, driven_offsets=driven)
-    views = [capture.views["val"][0], capture.views["test"][20]]
-    meshes = [capture.mesh(view.timestep) for view in views]
-    playback = Playback(title="Studio", fps=2.0, views={"a": views[0].camera, "b": views[1].camera})
-    rig = baked_rig(meshes)
-    show(browser, tmp_path, data_file(avatar, rig, playback))
-    quantized = [picture(browser, number, name) for number, name in enumerate("ab")]
-    for number, view in enumerate(views):
-        expected = to_uint8(render_avatar(avatar, meshes[number], view.camera))
-        assert difference(quantized[number], expected) >= MIN_PSNR
-    show(browser, tmp_path, data_file(avatar, rig, playback, exact=True))
-    assert difference(quantized[0], picture(browser, 0, "a")) >= MIN_QUANTIZED_PSNR
 
 
 def cut(text: str, start: str, characters: int = 0) -> str:

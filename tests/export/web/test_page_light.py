@@ -43,7 +43,7 @@ COLORS = """(() => {
 def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> Head:
     """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes.
     lashes: around a nose that is wet as well."""
-    head = make_head(**options)  # type: ignore[arg-type]
+    head = make_head(**options)
     neutral, faces = head.avatar.neutral.astype(np.float64), head.avatar.faces
     transfer, occlusion = transfer_of(neutral, faces, 48)
     radiance = uniform((0.5, 0.45, 0.4))
@@ -177,7 +177,7 @@ def test_light_controls(browser, tmp_path):
     show(browser, tmp_path, head.data())
     assert not browser.evaluate("document.getElementById('light').hidden")
 
-    def choose(kind: str) -> dict[str, object] | None:
+    def choose(kind):
         return browser.evaluate(f"""{{
           const list = document.querySelector('#light select');
           list.value = '{kind}';
@@ -190,7 +190,7 @@ def test_light_controls(browser, tmp_path):
     assert set(dragged) == {"even", "sun", "exposure"}
     assert browser.evaluate("document.querySelector('#light-dragged').hidden") is False
 
-    def side_of_light() -> float:
+    def side_of_light():
         """Brightness of the right half of the picture over the left."""
         levels = picture(browser, 0)
         covered = levels.min(2) < 250
@@ -198,7 +198,7 @@ def test_light_controls(browser, tmp_path):
         left, right = (shown[:, k][covered[:, k]].mean() for k in np.s_[:half, half:])
         return float(right / left)
 
-    def mouse(kind: str, x: float, y: float, **keys: int) -> None:
+    def mouse(kind, x, y, **keys):
         at = {"type": f"mouse{kind}", "x": x, "y": y, "button": "left", "clickCount": 1}
         browser.send("Input.dispatchMouseEvent", **at, **keys)
 

@@ -158,8 +158,7 @@ def test_keyboard(browser, head, tmp_path):
 
 
 def test_sliders_are_flames(browser, head, tmp_path):
-    """Catches a slider that moves another blend shape, joint or axis than FLAME's of its name, one
-    that does not follow the motion until it is moved, and another first camera than the file's."""
+    """Catches a slider that moves another shape, joint or axis, or another first camera."""
     show(browser, tmp_path, head.data(exact=True))
     assert np.allclose(browser.evaluate(CAMERA), head.camera.world_to_camera.ravel())
     shown, component = browser.evaluate("""(() => {
@@ -205,7 +204,7 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     context = "player.gl.getExtension('WEBGL_lose_context')"
     browser.evaluate(f"{{ window.extension = document.querySelector('stga-avatar').{context}; }}")
 
-    def send(kind: str, action: str) -> None:
+    def send(kind, action):
         """Lose or restore the context, and wait for its event."""
         browser.evaluate(f"""new Promise((done) => {{
           const canvas = document.querySelector('stga-avatar').shadowRoot.querySelector('canvas');
@@ -226,8 +225,7 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
 
 @pytest.mark.nightly
 def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
-    """Catches textures, buffers and objects that pile up with the frames (ten minutes on an
-    accelerated clock)."""
+    """Catches textures, buffers and objects that pile up, on an accelerated clock."""
     added = browser.send("Page.addScriptToEvaluateOnNewDocument", source=INSTRUMENTS)
     try:
         show(browser, tmp_path, head.data())
@@ -241,7 +239,7 @@ def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
       avatar.play();
     })()""")
 
-    def played(pictures: int) -> tuple[int, int, int]:
+    def played(pictures):
         """Rounds of the motion, WebGL objects alive and bytes of JavaScript afterwards."""
         play = f"window.playFor({BATCH}, {PLAY_RATE})"
         rounds = sum(browser.evaluate(play) for _ in range(pictures // BATCH))
@@ -274,7 +272,7 @@ def server(tmp_path: Path) -> Iterator[str]:
     made.server_close()
 
 
-def test_the_documented_embedding_works(browser, head: Head, tmp_path, server):
+def test_the_documented_embedding_works(browser, head, tmp_path, server):
     """Catches a snippet of docs/web.md that does not work as it stands, and an element that loads
     something else."""
     site = tmp_path / "site"

@@ -62,9 +62,7 @@ def test_pose_is_flames(head, baked, tmp_path):
 
 
 def test_a_head_at_rest_stays_where_it_is(tmp_path):
-    """Catches strain that is not taken off: within the range of colors, a mesh at rest has some;
-    and a single frame, or an avatar without selection, color harmonics and offsets, that the player
-    refuses."""
+    """Catches strain of rest that is not taken off, and a single frame that is refused."""
     for offsets in (tuple(OFFSETS), ()):
         head = make_head(sh_degree=0, offsets=offsets)
         neutral, faces = head.avatar.neutral, head.avatar.faces
@@ -80,9 +78,7 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
 @pytest.mark.parametrize("offsets", [tuple(OFFSETS), ("strain_position",), ("normal_color",)])
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_frames_and_signals_are_the_embedding(convention, offsets, tmp_path):
-    """Catches another axis, scale, sliver rule, strain or change of the normal than those that the
-    splats were trained with; origins and colors that do not follow them, or follow those of the
-    frame before; and color that is, or is not, the light of the capture."""
+    """Catches another axis, scale, sliver rule, strain or light than splats were trained with."""
     head = make_head(convention, offsets=offsets)
     results = evaluated(head.data(exact=True), tmp_path)["results"]
     for mesh, result in zip(head.meshes, results, strict=True):
@@ -112,10 +108,7 @@ def test_frames_and_signals_are_the_embedding(convention, offsets, tmp_path):
 
 
 def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
-    """Catches neighbors that are lost, or counted another number of times, where more than two
-    triangles share an edge, two share all edges, or one has an edge twice: against a search of all
-    pairs of edges, and numpy's frames; and the normal of a triangle without area on the neutral
-    mesh, or on the posed one."""
+    """Catches neighbors lost or counted twice, and normals of triangles without area."""
     rng = np.random.default_rng(0)
     neutral = rng.normal(0, 0.1, (9, 3)).astype(np.float32)
     neutral[8] = neutral[7]

@@ -6,6 +6,7 @@ import struct
 from typing import Any
 
 import numpy as np
+from avatar.conftest import world_splats
 from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.splats import Splats
@@ -50,24 +51,13 @@ def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
     opacity = np.clip(arrays["opacity"].astype(np.float64), 1e-6, 1 - 1e-6)
     rest = arrays.get("sh", np.zeros((count, 0))).reshape(count, -1, 3)
     per_face = arrays["splats_per_face"]
-    return Splats(
-        xyz=arrays["xyz"],
-        rotation=rotation.astype(np.float32),
-        log_scale=arrays["log_scale"],
-        opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
-        sh=np.concatenate([arrays["color"][:, None], rest], axis=1).astype(np.float32),
-        face=np.repeat(np.arange(len(per_face)), per_face).astype(np.int32),
-        unbound=np.zeros(count, bool),
-    )
+    sh = np.concatenate([arrays["color"][:, None], rest], axis=1)
+    splats = world_splats(arrays["xyz"], rotation, arrays["log_scale"], opacity, sh)
+    splats.face[:] = np.repeat(np.arange(len(per_face)), per_face)
+    return splats
 
 
-def posed_mesh(
-    header: dict[str, Any],
-    arrays: dict[str, np.ndarray],
-    coefficients: np.ndarray,
-    pose: np.ndarray,
-    frame: int,
-) -> np.ndarray:
+def posed_mesh(header, arrays, coefficients, pose, frame):
     """Vertices (V, 3) of coefficients (R,), pose (J, 3) axis-angle and the translation of a
     frame."""
     local = Rotation.from_rotvec(pose).as_matrix()
@@ -75,7 +65,7 @@ def posed_mesh(
     shaped = arrays["base"] + np.einsum("r,rvc->vc", coefficients, arrays["basis"])
     shaped = shaped + np.einsum("p,pvc->vc", features, arrays["correctives"])
     joints = arrays["joint_rest"] + np.einsum("r,rjc->jc", coefficients, arrays["joint_basis"])
-    world: list[np.ndarray] = []
+    world = []
     for joint, parent in enumerate(header["parents"]):
         own = np.eye(4)
         own[:3, :3] = local[joint]

@@ -12,12 +12,12 @@ from .scenes import Scene, photograph
 @pytest.fixture(scope="session")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Capture]:
     """Changes to `Scene` -> the capture that it is painted as."""
-    made: dict[str, Capture] = {}
+    made = {}
 
     def paint(**changes: object) -> Capture:
         key = repr(sorted(changes.items(), key=lambda item: item[0]))
         if key not in made:
-            made[key] = photograph(tmp_path_factory.mktemp("scene"), Scene(**changes))  # type: ignore[arg-type]
+            made[key] = photograph(tmp_path_factory.mktemp("scene"), Scene(**changes))
         return made[key]
 
     return paint

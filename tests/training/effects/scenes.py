@@ -9,7 +9,7 @@ import trimesh
 from PIL import Image, ImageDraw
 
 from stga_addon.avatar.strain import deformation, strain_basis
-from stga_addon.capture.camera import Camera
+from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.model import Capture, View
 
 SIZE, FOCAL, SUPERSAMPLED = 100, 420.0, 3
@@ -123,19 +123,11 @@ def _deform(vertices: np.ndarray, timestep: int, amount: float) -> np.ndarray:
 def _camera(number: int, count: int) -> Camera:
     angle = np.linspace(-0.9, 0.9, count)[number] if count > 1 else 0.0
     height = 0.3 * (-1) ** number
-    back = np.array(
-        [np.sin(angle) * np.cos(height), np.sin(height), np.cos(angle) * np.cos(height)]
-    )
-    right = np.cross([0, 1, 0], back) / np.linalg.norm(np.cross([0, 1, 0], back))
-    rotation = np.stack([right, -np.cross(back, right), -back])
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, -rotation @ back
-    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, view)
+    x, z = np.cos(height) * np.array([np.sin(angle), np.cos(angle)])
+    return look_at((x, np.sin(height), z), (0, 0, 0), SIZE, SIZE, FOCAL)
 
 
-def _draw(
-    mesh: np.ndarray, faces: np.ndarray, camera: Camera, colors: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _draw(mesh, faces, camera, colors):
     """Picture (SIZE, SIZE, 3) float and mask (SIZE, SIZE) uint8, drawn large and shrunk."""
     pixels, depth = camera.project(mesh)
     pixels = SUPERSAMPLED * pixels - 0.5
@@ -154,9 +146,7 @@ def _draw(
     return color / weight[..., None], np.where(coverage > 127, 255, 0).astype(np.uint8)
 
 
-def _keep(
-    folder: Path, t: int, c: int, camera: Camera, image: np.ndarray, mask: np.ndarray | None
-) -> View:
+def _keep(folder, t, c, camera, image, mask):
     name = f"{t:05d}_{c:02d}.png"
     Image.fromarray(np.clip(image, 0, 255).round().astype(np.uint8)).save(folder / name)
     mask_path = None if mask is None else folder / f"mask_{name}"

@@ -16,11 +16,10 @@ from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.optimize import cpu_backend, frames, initial_splats, post_step, trainer
 from stga_addon.training.optimize.image_preparation import exposure_correction
-from stga_addon.training.run import folder, session
+from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.settings import make_settings
-from training.heads import write_head
 
 from .scenes import unlike_cameras
 
@@ -42,7 +41,7 @@ def train(capture, out, monkeypatch, choice):
     settings, plan = plan_effects(capture, wanted)
     if settings.density_interval:
         settings = replace(settings, density_interval=2, density_span=(0.0, 1.0))
-    calls: Counter[str] = Counter()
+    calls = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
     session.train(capture, out, Run(capture.root, None, "vhap", settings, plan))
@@ -69,25 +68,6 @@ def test_off_calls_nothing_and_on_calls_all(painted, tmp_path, monkeypatch):
     assert calls["background"] == ITERATIONS
     assert state.parameters.sh.shape[1] == 16
     assert "strain_color" in state.driven_offsets
-
-
-@pytest.mark.parametrize("choice", ["on", "off"])
-def test_tracking_is_refined_or_not_touched(tmp_path, monkeypatch, choice):
-    """Catches parameters refined or written with the effect off, or not refined with it on."""
-    capture, _ = write_head(tmp_path / "head")
-    settings, _ = plan_effects(
-        capture, make_settings(iterations=ITERATIONS, effects={"tracking": choice})
-    )
-    calls: Counter[str] = Counter()
-    names = {"RefinedTracking": trainer, "frame_backward": cpu_backend, "write_tracking": folder}
-    for name, module in names.items():
-        monkeypatch.setattr(module, name, counting(calls, name, getattr(module, name)))
-    session.train(
-        capture, tmp_path / "run", Run(capture.root, capture.root / "model.npz", "vhap", settings)
-    )
-    assert set(calls) == (set() if choice == "off" else set(names))
-    assert (read_checkpoint(tmp_path / "run").tracking is None) == (choice == "off")
-    assert (tmp_path / "run/tracking.npz").exists() == (choice == "on")
 
 
 def test_exposure_is_taken_away(painted):
@@ -132,7 +112,7 @@ def test_no_splats_on_teeth(painted):
 
 
 def test_antialiasing_reaches_training_and_evaluation(painted):
-    """Catches an effect that is decided and then forgotten: against the reference in float64."""
+    """Catches an effect that is decided and then forgotten: against float64."""
     capture, losses, pictures = painted(), [], []
     view, image, _ = read_view(capture.views["train"][0], 0.4)
     target = torch.from_numpy(image.transpose(2, 0, 1) / 255)

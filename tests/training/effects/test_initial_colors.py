@@ -15,8 +15,8 @@ from stga_addon.training.settings import make_settings
 from .scenes import own_colors
 
 
-def test_splats_start_with_the_colors_of_the_images(painted):
-    """Catches colors of other triangles, mirrored images, mixed channels, and white mixed in."""
+def test_splats_start_with_the_colors_of_the_images(painted, monkeypatch):
+    """Catches other triangles' colors, mixed channels, and one side's colors on the other."""
     capture = painted()
     splats = initial_splats(capture, make_settings(iterations=1, lattice=1, hull_points=False))
     found = 255 * (0.5 + SH_C0 * splats.sh[:, 0])
@@ -26,10 +26,13 @@ def test_splats_start_with_the_colors_of_the_images(painted):
     assert np.median(error[front]) < 3
     assert np.percentile(error[front], 95) < 15
     assert not splats.sh[:, 1:].any()
+    colors = triangle_colors(capture, capture.views["train"])
+    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_SHARE", 2.0)
+    np.testing.assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
 
 
 def test_what_no_view_shows_has_the_nearest_color(painted):
-    """Catches a gray back of the head, which shows as soon as the avatar is turned."""
+    """Catches a gray back of the head, and a division by zero where nothing is seen."""
     capture = painted()
     colors = triangle_colors(capture, capture.views["train"][:1])
     center = capture.neutral[capture.faces].mean(1)
@@ -40,6 +43,11 @@ def test_what_no_view_shows_has_the_nearest_color(painted):
     gap = np.abs(colors[hidden][:, None] - shown[None]).max(axis=2).min(axis=1)
     assert gap.max() < 1e-6  # a color that some visible triangle has
     assert np.abs(255 * colors[hidden] - 127.5).max() > 20
+    views = [
+        replace(view, camera=replace(view.camera, cx=-1000.0))
+        for view in capture.views["train"][:2]
+    ]
+    np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
 
 
 def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted):
@@ -55,22 +63,6 @@ def test_the_side_that_no_camera_sees_has_the_colors_of_its_mirror_image(painted
     colors = triangle_colors(capture, views)
     error = np.abs(255 * colors - own_colors(capture)[mirrored]).max(axis=1)
     assert np.median(error[other]) < 3
-
-
-def test_cameras_on_both_sides_mirror_nothing(painted, monkeypatch):
-    """Catches colors of one side on the other where cameras see both."""
-    capture = painted()
-    colors = triangle_colors(capture, capture.views["train"])
-    monkeypatch.setattr("stga_addon.training.optimize.initial_splats.MIN_ONE_SIDED_SHARE", 2.0)
-    np.testing.assert_array_equal(colors, triangle_colors(capture, capture.views["train"]))
-
-
-def test_masks_that_show_nothing_give_gray(painted, tmp_path):
-    """Catches a division by zero where no triangle is seen."""
-    capture = painted()
-    two = capture.views["train"][:2]
-    views = [replace(view, camera=replace(view.camera, cx=-1000.0)) for view in two]
-    np.testing.assert_array_equal(triangle_colors(capture, views), 0.5)
 
 
 PLATES = {

@@ -1,19 +1,16 @@
 """Effect plan: decided once, printed, stored with the run and kept on resume."""
 
 import re
-from pathlib import Path
 
 import pytest
 from capture import factory
 from command_line import stga
 
 from stga_addon.capture.open import open_capture
-from stga_addon.errors import StgaError
-from stga_addon.files import read_json, write_json
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects import plan as planning
 from stga_addon.training.effects.plan import Verdict, add_effects, plan_effects
-from stga_addon.training.run.folder import Run, read_run, write_run
+from stga_addon.training.run.folder import read_run
 from stga_addon.training.settings import make_settings
 
 
@@ -32,8 +29,8 @@ def trained(root, tmp_path_factory):
     return out
 
 
-def test_the_run_keeps_its_plan(trained):
-    """Catches decisions or reasons lost in run.json, and settings that do not follow them."""
+def test_the_run_keeps_its_plan(trained, root, monkeypatch, capsys):
+    """Catches decisions lost in run.json, settings that do not follow, and decisions anew."""
     run = read_run(trained)
     plan = {decision.effect: decision for decision in run.effect_plan}
     assert (plan["strain-color"].choice, plan["strain-color"].on) == ("on", True)
@@ -42,6 +39,15 @@ def test_the_run_keeps_its_plan(trained):
     assert not run.settings.hull_points
     assert plan["exposure"].choice == "auto"
     assert run.settings.effects == {"strain-color": "on", "hull-points": "off"}
+    monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
+    before = read_run(trained)
+    train = "train", root, "--out", trained, "--resume --effect"
+    assert stga(*train, "strain-color=on") == 0
+    assert read_run(trained) == before
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert any(line.startswith("strain-color on, as asked:") for line in lines)
+    assert stga(*train, "strain-color=off") == 2
+    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("effect", ["strain-color", "normal-color"])
@@ -61,19 +67,6 @@ def test_takes_can_call_for_strain(root, monkeypatch, choice, expected, effect):
         (effect, True, "two takes say so")
     ]
     assert add_effects(capture, extended, later) == (extended, later)
-
-
-def test_a_resumed_run_decides_nothing(trained, root, monkeypatch, capsys):
-    """Catches a run that goes on with other effects than it began with."""
-    monkeypatch.setattr("stga_addon.training.effects.plan.plan_effects", None)
-    before = read_run(trained)
-    train = "train", root, "--out", trained, "--resume --effect"
-    assert stga(*train, "strain-color=on") == 0
-    assert read_run(trained) == before
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    assert any(line.startswith("strain-color on, as asked:") for line in lines)
-    assert stga(*train, "strain-color=off") == 2
-    assert "differs from what was decided for this run" in capsys.readouterr().err
 
 
 def test_info_shows_the_plan(tmp_path, capsys):
@@ -112,24 +105,3 @@ def test_baselines_decide_nothing(root, tmp_path, capsys):
         assert not run.settings.driven_offsets
         assert stga(*train, tmp_path / "no", "--effect strain-color=on") == 2
         assert "--effect cannot be combined with" in capsys.readouterr().err
-
-
-def test_settings_that_ask_for_nothing(root):
-    """Catches `make_settings` whose settings are not final: benchmarks and tests rely on them."""
-    settings = make_settings(iterations=5)
-    assert plan_effects(open_capture(root), settings) == (settings, ())
-
-
-def test_a_damaged_plan(tmp_path):
-    """Catches a run.json whose plan is taken for what it is not."""
-    write_run(tmp_path, Run(Path("/capture"), None, "vhap", make_settings(iterations=5)))
-    whole = read_json(tmp_path / "run.json")
-    good = {"effect": "jaw", "choice": "auto", "on": True, "reason": "", "cost": ""}
-    plans = (7, [7], [{**good, "on": "yes"}], [{**good, "choice": "maybe"}], [{"effect": "jaw"}])
-    rows = ([0.0] * 7, [0.0, 1, 1, 1, 0, 0], [0.0, 1, float("nan"), 1, 0, 0, 0])
-    damages = [{"effect_plan": plan} for plan in plans]
-    damages += [{"settings": {**whole["settings"], "exposure": [row]}} for row in rows]
-    for damage in damages:
-        write_json(tmp_path / "run.json", {**whole, **damage})
-        with pytest.raises(StgaError, match=r"run\.json: "):
-            read_run(tmp_path)

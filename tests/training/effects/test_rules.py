@@ -12,7 +12,7 @@ from stga_addon.files import write_json
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES, teeth_faces
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE
-from stga_addon.training.effect_catalog import EFFECTS, RELIGHT, parse_choice
+from stga_addon.training.effect_catalog import RELIGHT
 from stga_addon.training.effects import plan as rules
 from stga_addon.training.effects.evidence import Evidence
 from stga_addon.training.effects.facts import MAX_TIMESTEPS, CaptureFacts
@@ -75,9 +75,7 @@ def test_what_cannot_work_is_refused(painted, scene, choice, reason):
 
 
 def test_plain(painted):
-    """Catches noise, edges between triangles or pose that count as a cause: nothing but the mesh's
-    colors is there; and an effect of FLAME's that is planned for a capture without its
-    parameters."""
+    """Catches noise, edges or pose that count as a cause, and FLAME's effects without FLAME."""
     plan, settings = planned(painted())
     assert on(plan) == MOVING
     assert (settings.sh_degree, settings.exposure) == (0, ())
@@ -123,9 +121,7 @@ def test_what_moves_over_triangles_with_strain(painted):
     ],
 )
 def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on, on_tracked, tmp_path):
-    """Catches an effect left off for a small loss in one kind of view although it gains much in the
-    other, one that is on for what only one kind gains, a figure that does not show a loss, and
-    tracked takes whose samples are taken for as exact as a capture's own."""
+    """Catches a small loss that outweighs a large gain, or is not shown, and takes as exact."""
     errors = {"frames": Evidence(*frames), "cameras": Evidence(*cameras)}
     change = {"smoothed_strain": 0.1}.__getitem__
     capture = SimpleNamespace(root=tmp_path)
@@ -137,19 +133,13 @@ def test_what_is_gained_outweighs_what_is_lost(frames, cameras, gained, on, on_t
         path.parent.mkdir(exist_ok=True)
         path.touch()
     assert rules.strain(SimpleNamespace(capture=capture, **known)).on == on_tracked
-
-
-def test_few_frames_tell_nothing_of_unseen_ones():
-    """Catches a figure of 0 levels as the reason where nothing could be left out."""
-    change = {"smoothed_strain": 0.1}.__getitem__
     verdict = rules.strain(SimpleNamespace(signal_change=change, timesteps=3))
     assert (verdict.on, verdict.fixed) == (False, False)
     assert verdict.reason.startswith("3 frames are too few to tell what")
 
 
 def test_color_that_follows_the_normal(painted):
-    """Catches a head that turns in a light that stays, and keeps its shade; and one that hardly
-    turns, and is trained with coefficients that nothing determines."""
+    """Catches a head that turns and keeps its shade, and coefficients that nothing tells."""
     plan, _ = planned(painted())
     turn = float(re.search(r"turn by (.*)°", plan["normal-color"].reason)[1])
     assert plan["normal-color"].on == (turn > rules.MIN_TURN_DEG)
@@ -161,8 +151,7 @@ def test_color_that_follows_the_normal(painted):
 
 
 def test_color_that_follows_the_view(painted):
-    """Catches gloss that is not seen, or is taken for the cameras' exposure; and effects that one
-    camera cannot tell anything about."""
+    """Catches gloss taken for exposure, and effects that one camera cannot tell."""
     plan, settings = planned(painted(paint=gloss))
     assert on(plan) == {*MOVING, "view-color"}
     assert settings.sh_degree == TrainingSettings.sh_degree
@@ -186,12 +175,18 @@ def test_cameras_of_different_exposure(painted):
 
 
 def test_background(painted):
-    """Catches a background guessed without masks, and a wrong color that is trained against."""
+    """Catches a background guessed without masks, and splats of the wall behind the head."""
     plan, settings = planned(painted(background=(0, 0, 0), **FEW_VIEWS))
     assert plan["background"].on
     assert settings.background == (0.0, 0.0, 0.0)
     plan, settings = planned(painted(masks=False, **FEW_VIEWS))
     assert (plan["background"].on, settings.random_background) == (False, False)
+    capture = painted(masks=False, background=(90, 110, 70), **FEW_VIEWS)
+    plan, settings = planned(capture)
+    assert (settings.backdrop, settings.hull_points) == ("mesh", False)
+    assert settings.random_background
+    assert "sampled images have no mask" in plan["background"].reason
+    assert len(initial_splats(capture, settings)) == len(capture.faces) * 3
 
 
 def in_a_room(capture):
@@ -204,9 +199,7 @@ def in_a_room(capture):
 
 
 def test_a_room_behind_the_head(painted):
-    """Catches masks that are not used, and a background of many colors that is exchanged as if it
-    had one; splats of a wall that nobody asked for, and a world that is told from a camera that
-    moves."""
+    """Catches masks not used, a room exchanged as one color, and a world of a moving camera."""
     verdict = rules.background(in_a_room(painted()))
     assert (verdict.on, verdict.changes["backdrop"]) == (True, "masked")
     assert "varies by 40 of 255 levels, is replaced" in verdict.reason
@@ -222,16 +215,6 @@ def test_a_room_behind_the_head(painted):
     facts = in_a_room(painted())
     facts.views = (first, *rest, again)
     assert (rules.world(facts).fixed, rules.world(facts).reason[:9]) == (True, "1 of 8 ca")
-
-
-def test_a_room_without_masks(painted):
-    """Catches splats of the wall behind the head, and what is left out unsaid."""
-    capture = painted(masks=False, background=(90, 110, 70), **FEW_VIEWS)
-    plan, settings = planned(capture)
-    assert (settings.backdrop, settings.hull_points) == ("mesh", False)
-    assert settings.random_background
-    assert "sampled images have no mask" in plan["background"].reason
-    assert len(initial_splats(capture, settings)) == len(capture.faces) * 3
 
 
 def test_something_beside_the_mesh_of_one_camera(painted):
@@ -271,13 +254,19 @@ def test_many_splats_a_pixel(painted):
 
 
 def test_selection_follows_the_strategy(painted):
-    """Catches a strategy that was asked for and is dropped, or one that was not and is taken."""
+    """Catches a strategy dropped or taken unasked, and refused as sampled frames stand still."""
     selective = make_settings("selective", iterations=1, effects={})
     assert plan_effects(painted(**FEW_VIEWS), selective)[0].strategy == "selective"
     assert planned(painted(**FEW_VIEWS), selection="on")[1].strategy == "selective"
     settings, plan = plan_effects(painted(**STILL), selective)
     assert settings.strategy == "global"
     assert "2 mm" in next(decision.reason for decision in plan if decision.effect == "selection")
+    moving = painted()
+    still = replace(moving, expression_mesh=lambda timestep, zero_pose: moving.neutral)
+    still = replace(still, timesteps=tuple(range(500)))
+    verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
+    assert (verdict.on, verdict.fixed) == (False, False)
+    assert "any of 64 frames" in verdict.reason
 
 
 def frame(**pose):
@@ -327,8 +316,8 @@ def off_track(capture, meters, device="cpu"):
     return facts
 
 
-def test_mesh_and_mask_disagree(painted):
-    """Catches a tracking that is off and left so, and one refined for no reason."""
+def test_mesh_and_mask_disagree(painted, tmp_path):
+    """Catches a tracking that is off, or of landmarks, and left so, and one refined in vain."""
     assert not rules.tracking(off_track(painted(), 0.0)).on
     found = rules.tracking(off_track(painted(), 0.012))  # five pixels
     assert found.on
@@ -342,30 +331,13 @@ def test_mesh_and_mask_disagree(painted):
         verdict = rules.tracking(impossible)
         assert (verdict.on, verdict.fixed) == (False, True)
     assert "on the CPU only, not on cuda:0" in verdict.reason
-
-
-def test_a_capture_that_was_tracked_here(painted, tmp_path):
-    """Catches the effect left off where the tracking is known to be that of landmarks."""
     facts = off_track(painted(), 0.0)
     facts.capture = replace(facts.capture, root=tmp_path)
-    assert not rules.tracking(facts).on
     (tmp_path / LANDMARKS_FOLDER).mkdir()
     for name in (REPORT_FILE, f"{LANDMARKS_FOLDER}/{PLACES_FILE}"):
         (tmp_path / name).touch()
     assert rules.tracking(facts).on
     facts.device = "gpu:0"
-    assert not rules.tracking(facts).on
-
-
-def test_overrides(painted):
-    """Catches a choice that does not reach the settings, or whose reason is lost."""
-    choices = {"strain_color": "on", "view_color": "on", "background": "off", "density": "off"}
-    plan, settings = planned(painted(), **choices)
-    assert ("strain_color" in settings.driven_offsets, settings.sh_degree) == (True, 3)
-    assert (settings.random_background, settings.density_interval) == (False, 0)
-    assert plan["strain-color"].choice == "on"
-    assert "as asked" in str(plan["strain-color"])
-    assert max(gains(plan["strain-color"])) < 0
 
 
 def test_torso(tmp_path):
@@ -389,22 +361,13 @@ def test_torso(tmp_path):
     assert rules.torso(SimpleNamespace(frames=[])) is None
 
 
-def test_names():
-    """Catches an effect without a rule, and a rule without an effect."""
-    assert list(rules.RULES) == list(EFFECTS)
-    assert parse_choice("jaw=off") == ("jaw", "off")
-    for wrong in ("jaws=on", "jaw", "jaw=maybe"):
-        with pytest.raises(StgaError, match=f"'{wrong}' is not NAME=on"):
-            parse_choice(wrong)
-
-
 def seen(samples):
     """(S, K) bool: which triangles have a color in which views."""
     return ~np.isnan(samples.color[..., 0])
 
 
 def test_samples(painted):
-    """Catches colors that are taken beside their triangle or from one that another hides."""
+    """Catches colors beside the triangle, or of what hides it: itself, a hand or the nose."""
     capture = painted()
     samples = take_samples(capture)
     assert seen(samples).any(0).mean() > 0.5
@@ -416,11 +379,6 @@ def test_samples(painted):
     assert len(known) == len(capture.faces)
     middle = np.nanmedian(samples.color[:, known], 0) - np.nanmedian(other.color[:, known], 0)
     assert abs(middle).mean() < 2.0
-
-
-def test_hidden_triangles(painted):
-    """Catches colors of what stands in front, a hand or the nose, taken for the triangle's."""
-    capture = painted()
     # above the ball's equator
     plate = np.array([[-0.2, 0, 0.12], [0.2, 0, 0.12], [0.2, 0.4, 0.12], [-0.2, 0.4, 0.12]])
     corners = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(capture.neutral)
@@ -439,8 +397,7 @@ def test_hidden_triangles(painted):
 
 
 def test_every_camera_is_sampled(painted):
-    """Catches cameras without exposure: those beyond the sampled views, and one that films where no
-    timestep is; and cameras or timesteps of a long sequence that are left out."""
+    """Catches cameras without exposure, and parts of a long sequence that are left out."""
     views = [
         SimpleNamespace(timestep=t, camera_index=c) for t in range(20) for c in range(3 * MAX_VIEWS)
     ]
@@ -465,7 +422,7 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
         "stga_addon.training.effects.facts.lip_pairs", lambda model: np.arange(30).reshape(2, 15)
     )
     neutral = np.random.default_rng(0).normal(size=(TEMPLATE_VERTICES + TEETH_VERTICES, 3))
-    posed: list[int] = []
+    posed = []
 
     def expression_mesh(timestep, zero_pose):
         posed.append(timestep)
@@ -501,13 +458,3 @@ def test_lips_that_part(painted, shared_data):
     assert CaptureFacts(replace(capture, timesteps=(0, 2)), settings).lip_gap_mm == pytest.approx(
         10, abs=0.2
     )
-
-
-def test_a_sample_without_motion_does_not_forbid_selection(painted):
-    """Catches a choice refused because the few timesteps posed happen not to move."""
-    capture = painted()
-    still = replace(capture, expression_mesh=lambda timestep, zero_pose: capture.neutral)
-    still = replace(still, timesteps=tuple(range(500)))
-    verdict = rules.selection(CaptureFacts(still, make_settings(iterations=1)))
-    assert (verdict.on, verdict.fixed) == (False, False)
-    assert "any of 64 frames" in verdict.reason
