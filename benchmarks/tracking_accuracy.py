@@ -1,23 +1,28 @@
 """Accuracy of `stga track`: distances of the tracked head from a capture's own meshes.
 
     python benchmarks/tracking_accuracy.py CAPTURE [--model HEAD] [--flame FILE] [--timesteps 8]
+        [--cameras 4]
 
 CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the
 model that they were made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of
 FLAME's open template (`v_template`, `shapedirs`, `faces`); without it, the bundled head. Prints in
 millimeters, within 9 cm of the landmarks' center: how far what the cameras see of the capture's
 mesh, by its triangles' centers, is from the tracked surface and, where both have the same topology,
-vertices from each other. Landmarks are detected, or read from the folder of --landmarks.
+vertices from each other. Of several timesteps with the bundled head, also how the true motion about
+its mean shows in the tracked one, the head held still: the share that is followed, correlation and
+error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from the folder of
+--landmarks; --cameras: as many of those nearest to the middle, every second one.
 """
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
-from stga_addon.capture.mesh_geometry import vertex_normals
+from stga_addon.capture.mesh_geometry import similarity, vertex_normals
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.teeth import TEETH_VERTICES
@@ -30,6 +35,12 @@ from stga_addon.tracking.landmarks import read_places
 from stga_addon.tracking.seen_surface import facing, in_sight
 from stga_addon.tracking.track import track
 
+SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}
+"""Of ARKit's shapes, how the names of those begin that move a part of the face."""
+MIN_MOTION, STILL_SHARE, MAX_DISTANCE_M = 0.5, 0.35, 0.006
+"""Of the largest motion by such shapes, from which on a vertex belongs to the part; share of the
+face that moves least, by which heads are laid on each other; of a true vertex from the tracked
+surface, up to which it lies on it."""
 FACE_RADIUS_M = 0.09
 MIN_COSINE = 0.2
 """Of the angle between normal and camera, from which on a camera sees a triangle."""
@@ -59,6 +70,7 @@ def main() -> None:
     parser.add_argument("--flame", type=Path)
     parser.add_argument("--landmarks", type=Path)
     parser.add_argument("--timesteps", type=int)
+    parser.add_argument("--cameras", type=int)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         measure(options, Path(name))
@@ -67,6 +79,11 @@ def main() -> None:
 def measure(options: argparse.Namespace, folder: Path) -> None:
     """Track, and print a row in Markdown for each timestep."""
     footage = open_footage(options.capture, frames=FrameRange(stop=options.timesteps))
+    if options.cameras is not None:
+        at = np.array([own.camera.position for own in footage.cameras])
+        order = np.argsort(np.linalg.norm(at - at.mean(0), axis=1), kind="stable")
+        chosen = order[: 2 * options.cameras : 2].tolist()
+        footage = replace(footage, cameras=tuple(footage.cameras[row] for row in chosen))
     true, file = open_capture(options.capture, options.flame), head_file(options.model, folder)
     begin = perf_counter()
     result = track(footage, file, folder / "out", options.landmarks, mattes=False)
@@ -84,6 +101,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     }
     print("| timestep | surface: median | 90 % | vertices: mean |")
     print("| --- | --- | --- | --- |")
+    meshes = []
     for timestep in footage.timesteps:
         camera, known = first[0], footage.cameras[0].camera
         local = (
@@ -92,6 +110,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         local = (local / result.scale - known.world_to_camera[:3, 3]) @ known.world_to_camera[
             :3, :3
         ]
+        meshes.append((true.mesh(timestep), local))
         mesh, middle = true.mesh(timestep), places.on(local, found.faces)[used].mean(0)
         centers, normals = (
             mesh[true.faces].mean(1),
@@ -108,8 +127,43 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
         median, most = np.median(distance), np.percentile(distance, 90)
         print(f"| {timestep} | {median:.2f} | {most:.2f} | {shift:.2f} |")
+    if options.model is None and len(meshes) > 2:
+        heads, own = (np.stack(every) for every in zip(*meshes, strict=True))
+        report_motion(heads, own, found.faces, result.scale)
     print(f"\n{len(list(footage.views()))} images, {seconds:.1f} s")
     print(f"reprojection {result.median_px:.2f} px, scale {result.scale:.4f}")
+
+
+def report_motion(true: np.ndarray, tracked: np.ndarray, faces: np.ndarray, scale: float) -> None:
+    """Print a row in Markdown for each part of the face: true meshes (T, V, 3), tracked ones of the
+    bundled head (T, W, 3)."""
+    model = read_head_model(None).model
+    places, away = nearest_points(tracked[0], faces, true[0])
+    followed = np.stack([places.on(mesh, faces) for mesh in tracked])
+    shapes = np.square(model.shapedirs[:, :, model.n_identity :]).sum(1)
+    parts = {}
+    for part, start in SHAPES.items():
+        named = [name.startswith(start) for name in model.expression_names]
+        moved = places.on(np.sqrt(shapes[:, named].sum(1)), faces)
+        parts[part] = (away * scale < MAX_DISTANCE_M) & (moved > MIN_MOTION * moved.max())
+    middle = np.mean([true[0][part].mean(0) for part in parts.values()], axis=0)
+    face = away * scale < MAX_DISTANCE_M
+    face &= np.linalg.norm(true[0] - middle, axis=1) * scale < FACE_RADIUS_M
+    parts["face"] = face
+    moved = places.on(np.sqrt(shapes.sum(1)), faces)
+    still = face & (moved <= np.quantile(moved[face], STILL_SHARE))
+    motion = []
+    for heads in (true, followed):
+        first = heads[0][still]
+        laid = [similarity(head[still], first, metric=True).apply(head) for head in heads]
+        motion.append(np.stack(laid) - np.mean(laid, axis=0))
+    print("\n| part | followed | correlation | error, mm |\n| --- | --- | --- | --- |")
+    for part, where in parts.items():
+        one, other = (own[:, where] for own in motion)
+        both, size = (one * other).sum(), np.square(one).sum()
+        error = 1000 * scale * np.sqrt(np.square(one - other).sum(2).mean())
+        correlation = both / np.sqrt(size * np.square(other).sum())
+        print(f"| {part} | {both / size:.2f} | {correlation:.2f} | {error:.2f} |")
 
 
 if __name__ == "__main__":
