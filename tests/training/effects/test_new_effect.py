@@ -1,22 +1,25 @@
 """The recipe "an effect with a parameter" of docs/architecture.md, followed by a toy."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stga_addon.avatar.embedding import FaceFrames
+from stga_addon.avatar.embedding import FaceFrames, face_frames, to_world
 from stga_addon.avatar.file import Avatar, read_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.offsets import OFFSETS, POSITION, SIGNALS, DrivenOffset
 from stga_addon.avatar.strain import StrainBasis
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.export.formats import export_avatar
+from stga_addon.export.formats import FORMATS, export_avatar
+from stga_addon.export.ply import read_ply
 from stga_addon.training.effect_catalog import EFFECTS, Effect
 from stga_addon.training.effects.plan import (
     RULES,
     Verdict,
+    add_effects,
     describe_effects,
     plan_effects,
 )
@@ -66,8 +69,22 @@ def planned(capture: Capture) -> Run:
     return Run(capture.root, None, "vhap", *plan_effects(capture, settings))
 
 
-def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture, tmp_path):
-    """Catches plan, training, density, checkpoint, file or continuation that go by names."""
+def made(seed: int = 0) -> tuple[Avatar, np.ndarray]:
+    """An avatar with the toy's coefficients, and a posed mesh."""
+    rng = np.random.default_rng(seed)
+    neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3]]) / 10
+    faces = np.int32([[0, 1, 2], [1, 3, 2]])
+    values = {NAME: rng.normal(0, 0.05, (2, 3, 3)).astype(np.float32)}
+    return Avatar(
+        lattice_splats(neutral, faces, 1), "stga", neutral, faces, driven_offsets=values
+    ), neutral * 1.3
+
+
+def test_it_is_decided_trained_and_resumed_to_the_same_bits(
+    capture: Capture, tmp_path: Path
+) -> None:
+    """Catches a parameter that the plan, training, density control, the checkpoint, the avatar file
+    or a continuation loses, because one of them goes by names instead of the tables."""
     run = planned(capture)
     assert run.settings.driven_offsets == (NAME,)
     assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
@@ -93,7 +110,16 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(capture, tmp_path):
     )
 
 
-def test_a_device_without_its_kernels_says_so(capture):
+def test_a_continuation_adds_it(capture: Capture) -> None:
+    """Catches an effect that only runs which began with it can have."""
+    run = planned(capture)
+    (decision,) = (each for each in run.effect_plan if each.effect == "toy-growth")
+    without = replace(run.settings, driven_offsets=())
+    settings, _ = add_effects(capture, without, (replace(decision, on=False),))
+    assert settings.driven_offsets == (NAME,)
+
+
+def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
     """Catches an effect that trains without its parameter on a GPU."""
     with pytest.raises(
         StgaError, match=f"driven offset {NAME}: is trained on the CPU only, not on gpu"
@@ -103,11 +129,48 @@ def test_a_device_without_its_kernels_says_so(capture):
         )
 
 
-def test_the_web_player_says_that_it_lacks_it(tmp_path):
-    """Catches a page that shows the avatar without the effect."""
-    neutral = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) / 10
-    faces, values = np.int32([[0, 1, 2]]), {NAME: np.ones((1, 3, 3), np.float32)}
-    splats = lattice_splats(neutral, faces, 1)
-    avatar = Avatar(splats, "stga", neutral, faces, driven_offsets=values)
-    with pytest.raises(StgaError, match=f"the web player has no driven offset {NAME}"):
-        export_avatar(tmp_path / "a.html", avatar, "web", [(0, neutral)])
+@pytest.mark.parametrize(
+    "format", [name for name, row in FORMATS.items() if row.source != "motion"]
+)
+def test_exports_hold_it_or_say_that_they_cannot(format: str, tmp_path: Path) -> None:
+    """Catches an export that shows the avatar without the effect."""
+    if format == "usd":
+        pytest.importorskip("pxr")
+    avatar, posed = made()
+    path = tmp_path / f"avatar{(FORMATS[format].suffixes or ('',))[0]}"
+    if FORMATS[format].is_page:
+        with pytest.raises(StgaError, match=f"the web player has no driven offset {NAME}"):
+            export_avatar(path, avatar, format, [(0, posed)])
+        return
+    files = export_avatar(path, avatar, format, [(0, posed)])
+    moved = [file.read_bytes() for file in files]
+    export_avatar(path, replace(avatar, driven_offsets={}), format, [(0, posed)])
+    assert moved != [file.read_bytes() for file in files]
+
+
+def test_it_moves_splats_as_its_file_says(tmp_path: Path) -> None:
+    """Catches an offset in other axes or units than the triangle's: against float64."""
+    avatar, posed = made()
+    [file] = export_avatar(tmp_path / "a.ply", avatar, "ply", [(0, posed)])
+    frames = face_frames(posed, avatar.faces, avatar.neutral)
+    np.testing.assert_allclose(frames.scale, 1.3, rtol=1e-6)
+    first, second, third = avatar.driven_offsets[NAME].swapaxes(0, 1)
+    local = 0.3 * first + 0.09 * second + 0.027 * third
+    moves = 1.3 * np.einsum("fij,fj->fi", frames.rotation, local.astype(np.float64))
+    expected = to_world(avatar.splats, frames).xyz + moves[avatar.splats.face]
+    np.testing.assert_allclose(read_ply(file).xyz, expected, atol=1e-6)
+    assert np.abs(moves).max() > 0.01
+
+
+def test_blender_keeps_it() -> None:
+    """Catches a parameter lost in a .blend file, which viewport and renders pose."""
+    bpy = pytest.importorskip("bpy")
+    from stga_addon.scene.arrays import triangle_mesh
+    from stga_addon.scene.display.splat_object import show_avatar, stored_avatar
+
+    avatar, posed = made()
+    head = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
+    bpy.context.scene.collection.objects.link(head)
+    stored = stored_avatar(show_avatar(avatar, head))
+    np.testing.assert_array_equal(stored.driven_offsets[NAME], avatar.driven_offsets[NAME])
+    np.testing.assert_allclose(stored.frames(posed).origin, avatar.frames(posed).origin, atol=1e-7)
