@@ -10,8 +10,8 @@ millimeters, within 9 cm of the landmarks' center: how far what the cameras see 
 mesh, by its triangles' centers, is from the tracked surface and, where both have the same topology,
 vertices from each other. Of several timesteps with the bundled head, also how the true motion about
 its mean shows in the tracked one, the head held still: the share that is followed, correlation and
-error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from the folder of
---landmarks; --cameras: as many of those nearest to the middle, every second one.
+median error of what moves by brows, lids, lips and jaw. Landmarks are detected, or read from the
+folder of --landmarks; --cameras: as many of those nearest to the middle, every second one.
 """
 
 import argparse
@@ -157,11 +157,11 @@ def report_motion(true: np.ndarray, tracked: np.ndarray, faces: np.ndarray, scal
         first = heads[0][still]
         laid = [similarity(head[still], first, metric=True).apply(head) for head in heads]
         motion.append(np.stack(laid) - np.mean(laid, axis=0))
-    print("\n| part | followed | correlation | error, mm |\n| --- | --- | --- | --- |")
+    print("\n| part | followed | correlation | median error, mm |\n| --- | --- | --- | --- |")
     for part, where in parts.items():
         one, other = (own[:, where] for own in motion)
         both, size = (one * other).sum(), np.square(one).sum()
-        error = 1000 * scale * np.sqrt(np.square(one - other).sum(2).mean())
+        error = 1000 * scale * np.median(np.linalg.norm(one - other, axis=2))
         correlation = both / np.sqrt(size * np.square(other).sum())
         print(f"| {part} | {both / size:.2f} | {correlation:.2f} | {error:.2f} |")
 
