@@ -10,11 +10,9 @@ from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 
-LANDMARK_SIGMA_M, WEIGHT_SIGMA = 0.002, 0.35
-"""Standard deviations of a landmark over people and views, and of an expression that is a weight
-from 0 to 1, as ARKit's are; that of principal components is 1, and that of BLINK, which lasts too
-short to be drawn back."""
-BLINK = "eyeBlink"
+LANDMARK_SIGMA_M = 0.002
+"""Standard deviation of a landmark over people and views; coefficients have a standard deviation of
+1."""
 SCALE_SIGMA = 0.3  # Of the capture's scale, relative: the first guess comes from the average head
 JOINT_SIGMA_RAD = {
     "root": (3.0, 3.0, 3.0),
@@ -26,7 +24,7 @@ JOINT_SIGMA_RAD = {
 """Landmarks of the face cannot tell the neck's rotation from the head's: nearly all of it becomes
 the root's."""
 WEIGHT_EXCESS_SIGMA = 0.1  # By which a coefficient that is a weight from 0 to 1 leaves that range
-LID_SHAPES = {BLINK: 1.0, "eyeLookDown": 0.57}
+LID_SHAPES = {"eyeBlink": 1.0, "eyeLookDown": 0.57}
 """Shares by which shapes close an eye; it is closed where their weights, times these, add up to
 1."""
 TRANSLATION_SIGMA_M = 10.0
@@ -282,10 +280,7 @@ def parameter_precision(head: HeadModel) -> np.ndarray:
         for name, present in zip(JOINTS, head.joints, strict=True)
     ]
     rigid = np.concatenate([*joints, (TRANSLATION_SIGMA_M,) * TRANSLATION_SIZE])
-    sigma = np.ones(head.model.n_expression)
-    for column, name in enumerate(head.model.expression_names):
-        sigma[column] = 1.0 if name.startswith(BLINK) else WEIGHT_SIGMA
-    return np.concatenate([sigma, rigid]) ** -2.0
+    return np.concatenate([np.ones(head.model.n_expression), rigid**-2.0])
 
 
 def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
