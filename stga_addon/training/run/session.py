@@ -260,7 +260,7 @@ class _Session:
                 self.trainer.frames.clear()
 
     def _squared_error(self, views: Sequence[View]) -> float:
-        """Mean over the views, of images as high as the avatar tracks in."""
+        """Mean over the views, of images as high as the avatar tracks in; never quite 0."""
         settings, share = self.run.settings, self._spent().share
         prepare, errors = image_preparation(self.capture, settings), []
         red, green, blue = (round(255 * channel) for channel in settings.background)
@@ -271,7 +271,7 @@ class _Session:
                 image, _ = prepare(small, image, mask)
             drawn = self.trainer.render(small, share)
             errors.append(np.square(drawn - image.transpose(2, 0, 1) / 255).mean())
-        return float(np.mean(errors)) if errors else math.nan
+        return float(np.mean(errors)) + 1e-12 if errors else math.nan
 
     def _track(
         self,
