@@ -48,11 +48,11 @@ from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
 from .state import state_of_avatar
 
-RENDERINGS, RENDERINGS_AGAIN = 7, 5
+RENDERINGS, RENDERINGS_AGAIN = 5, 3
 """Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
-PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 20
+PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 10
 """Heights of the images in which the first timestep of another recording is tracked before, as a
 pattern on clothes leads astray by more than its width, and renderings in each."""
 ROOT = JOINTS.index("root")
@@ -73,9 +73,10 @@ MISS_LEVELS = 24
 @dataclass(frozen=True)
 class AvatarTracking:
     """Parameters (T, E + 18) of timesteps; (T,) the share of the head's pixels whose colors the
-    avatar misses by more than MISS_LEVELS; (T, 3) by how much the torso is shifted, of
-    `torso_shapes`; (T,) the head's scale, where it was sought; and (T, P, P) inverse covariances of
-    what was sought: expressions, the torso's shift, scale, pose."""
+    avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) by how
+    much the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and
+    (T, P, P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose.
+    """
 
     timesteps: tuple[int, ...]
     parameters: np.ndarray
@@ -261,7 +262,7 @@ class _Tracker:
         shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
         found, first = tracked, None
-        if self._change is not None:
+        if self._change is not None and not self._is_again:
             starts = tracked, tracked + self._change
             losses = [self._loss(start, timestep, shots) for start in starts]
             best = min((0, 1), key=lambda number: losses[number][0])
@@ -273,7 +274,8 @@ class _Tracker:
                 found, _ = self._minimize(timestep, small, tracked, found, renderings)
         found, known = self._minimize(timestep, shots, tracked, found, renderings, first)
         self._change = found - tracked
-        return found, known, self._misfit(found, shots)
+        misfit = self._misfit(found, shots) if self._is_again else np.nan
+        return found, known, misfit
 
     def _minimize(
         self,

@@ -73,13 +73,12 @@ def track_recording(
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
     stored = read_json(root / REPORT_FILE)
-    rounds = ROUNDS if stored["in_order"] else 1
-    total = rounds * len(timesteps)
+    total = ROUNDS * len(timesteps)
     report(0, total)
     factor = _fit_scale(run, root, helpers, lambda: report(0, total))
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
     light = _light(*_open(*source, 0))
-    for number in range(rounds):
+    for number in range(ROUNDS):
         sequence = _open(*source, number)[2].flame
         assert sequence is not None
         starts = range(0, len(timesteps), PART_TIMESTEPS)
