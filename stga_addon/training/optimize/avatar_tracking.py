@@ -48,7 +48,7 @@ from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
 from .state import state_of_avatar
 
-RENDERINGS, RENDERINGS_AGAIN = 5, 3
+RENDERINGS, RENDERINGS_AGAIN = 7, 3
 """Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
