@@ -3,7 +3,7 @@
     python benchmarks/avatar_tracking.py RUN [--timesteps 16]
 
 Tracks timesteps of the run's capture, from where landmarks and dense tracking left them: as
-training does, and in the two rounds of `stga track --avatar`, of which the first begins in small
+training does, and as the two rounds of `stga track --avatar` do, of which the first begins in small
 images. Prints a row in Markdown for each: processor seconds, and seconds of wall time, by timestep
 and camera, in one process, without reading the avatar and compiling kernels. On two processors that
 have nothing else to do, wall time is about half of the processor seconds.

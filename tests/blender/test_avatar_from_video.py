@@ -40,7 +40,7 @@ def begin(requests):
 
 
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
-    """Catches other settings than `stga avatar VIDEO`, and a drop without a word."""
+    """Catches other settings than `stga avatar VIDEO`, and a dropped video that starts nothing."""
     out, opened = tmp_path / "out", list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
     monkeypatch.setattr(extension.operators.monitor, "show_panel", show_panel)

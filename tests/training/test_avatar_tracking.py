@@ -25,6 +25,7 @@ from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
 from stga_addon.progress import Cancelled
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.report import report_run
+from stga_addon.tracking.folder import is_in_order
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.avatar_tracking import (
     AvatarTracking,
@@ -245,8 +246,8 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
         avatar: Avatar, settings: TrainingSettings, shown: Capture, timesteps: list[int], *_: Any
     ) -> AvatarTracking:
         assert shown.flame is not None
-        given.append((tuple(timesteps), {view.camera_index for view in shown.views["train"]}))
-        assert list(shown.views) == ["train"]
+        seen = (view for views in shown.views.values() for view in views)
+        given.append((tuple(timesteps), {view.camera_index for view in seen}))
         values = np.stack([shown.flame.frame(timestep).parameters for timestep in timesteps])
         values[:, -3:] += 0.004
         none = np.zeros((len(values), 3))
@@ -260,6 +261,14 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     np.testing.assert_array_equal(checkpoint.tracking, before)
     said = "\n".join(report_run(tmp_path))
     assert re.search(r"left out lose \d\.\d\d dB, so heads stay as they were tracked", said)
+    # timesteps in no order have no neighbors that could say anything
+    assert is_in_order(tmp_path) is None
+    (tmp_path / "tracking.json").write_text('{"in_order": false}')
+    assert is_in_order(tmp_path) is False
+    monkeypatch.setattr(session, "is_in_order", lambda root: False)
+    train(replace(capture, views={**capture.views, "val": ()}), tmp_path / "b", make_run(capture))
+    assert given[1][0] == TIMESTEPS[:-1]
+    assert read_checkpoint(tmp_path / "b").rounds == 2
 
 
 def test_stopped_and_resumed_is_the_unbroken_run(

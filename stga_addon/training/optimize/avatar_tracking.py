@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 from ...avatar.file import Avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
+from ...capture.loader import Preparation
 from ...capture.mesh_geometry import rasterize, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
@@ -204,6 +205,17 @@ def normal_images(
     return seen, found
 
 
+def read_small(
+    view: View, height_px: int, settings: TrainingSettings, prepare: Preparation | None
+) -> tuple[View, np.ndarray]:
+    """A view with a camera of at most that height, and its image (H, W, 3) uint8 as training with
+    the settings sees it; prepare: their `image_preparation`."""
+    red, green, blue = (round(255 * part) for part in settings.background)
+    scale = min(1.0, height_px / view.camera.height)
+    view, image, mask = read_view(view, scale, (red, green, blue))
+    return view, image if prepare is None else prepare(view, image, mask)[0]
+
+
 class _Tracker:
     def __init__(
         self,
@@ -325,11 +337,7 @@ class _Tracker:
         return missed / max(count, 1)
 
     def _read(self, view: View, height: int) -> tuple[View, np.ndarray]:
-        background = [round(255 * part) for part in self._settings.background]
-        scale = min(1.0, height / view.camera.height)
-        view, image, mask = read_view(view, scale, (background[0], background[1], background[2]))
-        if self._prepare is not None:
-            image, _ = self._prepare(view, image, mask)
+        view, image = read_small(view, height, self._settings, self._prepare)
         if self._shading is not None:
             mesh = self._capture.mesh(view.timestep)
             head, normals = normal_images(mesh, self._capture.faces, view.camera)

@@ -39,7 +39,7 @@ SHADING_PRIOR, SHADING_ITERATIONS = 0.01, 6
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
-"""Of tracking, each from the smooth motion that the one before has led to."""
+"""Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]

@@ -17,7 +17,6 @@ from time import perf_counter
 import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
-from ...capture.images import read_view
 from ...capture.loader import ViewLoader
 from ...capture.model import Capture, View, evenly_spread
 from ...errors import DeviceError, StgaError, shorten
@@ -31,7 +30,12 @@ from ..evaluate import lpips, metrics
 from ..evaluate.evaluator import Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
 from ..evaluate.metrics import RESIDUAL_SCALE, triangle_residuals
-from ..optimize.avatar_tracking import MAX_HEIGHT_PX, RefinedTracking, track_by_avatar
+from ..optimize.avatar_tracking import (
+    MAX_HEIGHT_PX,
+    RefinedTracking,
+    read_small,
+    track_by_avatar,
+)
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
@@ -171,7 +175,7 @@ class _Session:
                 every = {view.timestep for own in views.values() for view in own}
                 unseen = every - {view.timestep for view in views["train"]}
                 if tracking is not None and tracking.has_moved and tracking.rounds == 1 and unseen:
-                    self._track(tracking, self.capture, sorted(unseen))
+                    self._track(tracking, self.capture, sorted(unseen), sorted(unseen))
             # LPIPS takes long, so a run that is stopped goes without
             self._evaluate(perceptual=self._is_finished())
             self._write_checkpoint()
@@ -261,14 +265,10 @@ class _Session:
 
     def _squared_error(self, views: Sequence[View]) -> float:
         """Mean over the views, of images as high as the avatar tracks in; never quite 0."""
-        settings, share = self.run.settings, self._spent().share
-        prepare, errors = image_preparation(self.capture, settings), []
-        red, green, blue = (round(255 * channel) for channel in settings.background)
+        settings, share, errors = self.run.settings, self._spent().share, []
+        prepare = image_preparation(self.capture, settings)
         for view in views:
-            scale = min(1.0, MAX_HEIGHT_PX / view.camera.height)
-            small, image, mask = read_view(view, scale, (red, green, blue))
-            if prepare is not None:
-                image, _ = prepare(small, image, mask)
+            small, image = read_small(view, MAX_HEIGHT_PX, settings, prepare)
             drawn = self.trainer.render(small, share)
             errors.append(np.square(drawn - image.transpose(2, 0, 1) / 255).mean())
         return float(np.mean(errors)) + 1e-12 if errors else math.nan
@@ -278,10 +278,10 @@ class _Session:
         tracking: RefinedTracking,
         capture: Capture,
         tracked: list[int],
-        changed: list[int] | None = None,
+        changed: list[int],
     ) -> None:
         """Track timesteps of a capture by the avatar, one round more; none where the report says to
-        stop. changed: to which they give their change, those between them included."""
+        stop. changed: the same and those between them, which change as their neighbors do."""
 
         def stops(done: int, total: int) -> bool:
             told = self._tell(f"Tracking by the avatar: {done} of {total}")
@@ -293,7 +293,7 @@ class _Session:
             found = track_by_avatar(self._avatar(), settings, capture, tracked, seconds, stops)
         except Cancelled:
             return
-        tracking.take(found, changed or tracked)
+        tracking.take(found, changed)
         self.trainer.frames.clear()
         tracking.rounds += 1
 
