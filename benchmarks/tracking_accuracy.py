@@ -72,6 +72,8 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int)
     parser.add_argument("--cameras", type=int)
     options = parser.parse_args()
+    if options.cameras is not None and options.cameras < 1:
+        parser.error(f"--cameras: expected 1 or more, got {options.cameras}")
     with tempfile.TemporaryDirectory() as name:
         measure(options, Path(name))
 
