@@ -1,13 +1,19 @@
-"""`python -m stga_addon`: the command line; says which package this Python lacks."""
+"""`python -m stga_addon`, and `stga`: the command line; says which package this Python lacks."""
 
 import sys
+from importlib import import_module
+from importlib.util import find_spec
 
 try:
     from .cli.main import main
+
+    if find_spec(".development", __package__) is not None:  # not in the extension's zip
+        import_module(".development.commands", __package__)  # adds its commands and requests
 except ModuleNotFoundError as error:
     print(f"stga: {sys.executable} lacks the package '{error.name}'", file=sys.stderr)
     raise SystemExit(2) from None
 except KeyboardInterrupt:
     raise SystemExit(130) from None
 
-raise SystemExit(main())
+if __name__ == "__main__":
+    raise SystemExit(main())

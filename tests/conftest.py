@@ -21,6 +21,7 @@ from capture import factory
 from export.web.browser import find_browser
 from filelock import FileLock
 
+import stga_addon.development.commands  # noqa: F401  adds its commands, as `__main__` does
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 

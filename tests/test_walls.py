@@ -32,8 +32,6 @@ LAYERS = (
     {"tracking"}, {"driving"}, {"training"}, {"report"}, {"jobs"}, {"scene"}, {"cli"},
     {"development"}, {"__main__", "__init__"},
 )  # fmt: skip
-NAMED_WHERE_THERE = {"stga_addon/cli/main.py": "development"}
-"""The file that loads a room after its own, which the extension's zip leaves out."""
 LIGHT = (
     "errors", "files", "flame", "capture", "capture.open", "avatar", "avatar.file", "export.ply",
     "selection", "jobs.perform", "jobs.monitor_state", "jobs.python_check",
@@ -61,9 +59,8 @@ def imports(path: Path) -> tuple[tuple[str, int], ...]:
 @cache
 def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
     """The same for every string that is the name of a module, whatever reads it: `import_module`,
-    `find_spec`, a table of them, or another Python after `-m`; without NAMED_WHERE_THERE."""
+    `find_spec`, a table of them, or another Python after `-m`."""
     named: list[tuple[str, int]] = []
-    optional = NAMED_WHERE_THERE.get(name_of(path))
     depth = len(path.relative_to(ROOT).parts)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         text = node.value if isinstance(node, ast.Constant) else None
@@ -77,7 +74,7 @@ def imports_by_name(path: Path) -> tuple[tuple[str, int], ...]:
             named.append(
                 (module.removeprefix("stga_addon."), level - 1) if inside else (module, level)
             )
-    return tuple(each for each in named if each[0].split(".")[0] != optional)
+    return tuple(named)
 
 
 def module_file(path: Path) -> Path | None:

@@ -10,8 +10,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -81,8 +79,6 @@ def _fail(message: str) -> int:
 
 def make_parser(head: OpenHead | None = None) -> argparse.ArgumentParser:
     """The parser of all commands; what the head of the open file provides may be left out."""
-    if find_spec("..development", __package__) is not None:  # not in the extension's zip
-        import_module("..development.commands", __package__)  # adds its commands and requests
     top = _Parser(prog="stga", description="Selective-training Gaussian head avatars.")
     top.add_argument("--version", action="version", version=__version__)
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
