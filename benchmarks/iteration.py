@@ -8,9 +8,9 @@ are), or on an evenly covered ellipsoid, for which a selection costs most. Print
 instruction set, and medians over repeats in one process; beside each stage the bytes it must at
 least move and the time that takes at this machine's measured copy bandwidth, and for the image loss
 its arithmetic at the measured rate of multiply-adds. --opensplat: a checkout of OpenSplat,
-whose CPU rasterizer is compiled and run on the same splats. Run it on an idle machine, or with
---processor-time: instead of time that passes, that of the processor, of ours divided by its
-threads.
+whose CPU rasterizer is compiled and run on the same splats, by wall time. Run it on an idle
+machine, or with --processor-time: instead of time that passes, that of the processor, of ours
+divided by its threads.
 """
 
 import argparse
@@ -60,8 +60,8 @@ from stga_addon.training.optimize.trainer import make_backend
 from stga_addon.training.settings import make_settings
 
 RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
-
-
+SSIM_WEIGHT = 0.2
+"""Of the image loss."""
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
 """Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in
 each channel 14 blurs of 11, SSIM with its derivatives, and the rest.
@@ -217,7 +217,7 @@ def stages(
             count * 42 + pixels * 20,
         ),
         "L1 + SSIM, both ways": (
-            lambda: image_gradient(r.image, target, bands, 0.2, v_image),
+            lambda: image_gradient(r.image, target, bands, SSIM_WEIGHT, v_image),
             pixels * (12 + 3 + 12),
         ),
         "blend backward": (
@@ -286,7 +286,7 @@ def main() -> None:
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
     found = cpu_table(splats, frames, target, options.repeats, clock)
     if options.opensplat:
-        compare_opensplat(options.opensplat, splats, frames, target, found, options.repeats, clock)
+        compare_opensplat(options.opensplat, splats, frames, target, options.repeats)
 
     def measure(batch: Batch) -> float:
         return median_ms(lambda: backend.step(batch), options.repeats, clock)
@@ -334,40 +334,32 @@ def cpu_table(
 
 
 def compare_opensplat(
-    folder: Path, splats: Splats, frames, target: np.ndarray, found: dict[str, float], repeats: int,
-    clock: Callable[[], float],
-) -> None:  # fmt: skip
-    """Print both rasterizers' times for one image and its gradient; found: stage -> ms of ours."""
+    folder: Path, splats: Splats, frames, target: np.ndarray, repeats: int
+) -> None:
+    """Print the wall time of both rasterizers for an image, its loss and the splats' gradients."""
     import opensplat  # needs a C++ compiler
 
     state, buffers, background = new_state(splats), BufferPool(), np.ones(3, np.float32)
     face, gradients = state.face, state.gradients
+    rectangles, v_image = whole_image(*target.shape[:2]), np.empty((3, *target.shape[:2]), "f4")
 
     def forward():
         return render_forward(state.parameters, face, frames, 3, background, buffers=buffers)
 
     def both_ways():
-        render_backward(
-            forward(), state.parameters, face, frames, v_image, gradients, buffers=buffers
-        )
+        output = forward()
+        image_gradient(output.image, target, rectangles, SSIM_WEIGHT, v_image)
+        render_backward(output, state.parameters, face, frames, v_image, gradients, buffers=buffers)
 
     output = forward()
-    v_image = np.empty_like(output.image)
-    image_gradient(output.image, target, whole_image(*target.shape[:2]), 0.2, v_image)
-    peer = opensplat.both_ways_ms(
-        folder,
-        output.projection,
-        output.lists.visible,
-        output.image.copy(),
-        v_image,
-        min(repeats, 5),
-        perf_counter if clock is perf_counter else process_time,
+    visible, image = output.lists.visible, output.image.copy()
+    theirs = opensplat.both_ways_ms(
+        folder, output.projection, visible, image, target, SSIM_WEIGHT, min(repeats, 9)
     )
-    blending = found["blend"] + found["blend backward"]
-    print(f"{'OpenSplat, both ways':<22}{peer[1]:8.2f}   forward {peer[0]:.2f}, on one thread")
-    print(f"{'blending, both ways':<22}{blending:8.2f}   {peer[1] / blending:.1f} times as fast")
-    ours = median_ms(both_ways, repeats, clock)
-    print(f"{'with projection, sorting':<22}{ours:8.2f}   {peer[1] / ours:.1f} times as fast")
+    for name, run, peer in (("forward", forward, theirs[0]), ("both ways", both_ways, theirs[1])):
+        ours = median_ms(run, repeats, perf_counter)
+        print(f"OpenSplat {name:<12}{peer:8.2f}   ours, with projection, {ours:.2f}:", end=" ")
+        print(f"{peer / ours:.1f} times as fast")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""OpenSplat's CPU rasterizer beside ours: the same projected splats, image and gradient of the
-image.
+"""OpenSplat's CPU rasterizer and image loss beside ours: the same projected splats and target.
 
-Built from the user's own checkout of OpenSplat (AGPL), of which nothing is kept here.
+Built from the user's own checkout of OpenSplat (AGPL) of 2026 or later, of which nothing is kept
+here. It starts a thread for each of the machine's processors.
 """
 
 import statistics
-from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -22,17 +22,23 @@ BINDING = """
 
 std::vector<torch::Tensor> both_ways(
     int64_t width, int64_t height, std::vector<torch::Tensor> splats, torch::Tensor background,
-    torch::Tensor v_image
+    torch::Tensor target, double ssim_weight
 ) {
     auto &xy = splats[0], &conic = splats[1], &color = splats[2], &opacity = splats[3];
     auto &cov = splats[4];
     auto [image, left, lists] = rasterize_forward_tensor_cpu(
         width, height, xy, conic, color, opacity, background, cov, splats[5]);
     std::vector<torch::Tensor> out = {image};
-    if (v_image.numel()) {
+    if (target.numel()) {
+        auto none = torch::empty({0}), one = torch::ones({1});
+        float weight = ssim_weight;
+        auto [stats, partials] =
+            fused_loss_forward_tensor_cpu(image, target, none, weight, false, true);
+        auto v_image = fused_loss_backward_tensor_cpu(
+            image, target, none, partials, stats, one, weight, false);
         auto gradients = rasterize_backward_tensor_cpu(
             height, width, xy, conic, color, opacity, background, cov, splats[5], left, lists,
-            v_image, torch::zeros_like(left));
+            v_image, torch::zeros_like(left), none, none, none, none);
         out.push_back(std::get<0>(gradients));
     }
     delete[] lists;
@@ -50,28 +56,32 @@ def build(folder: Path) -> Any:
 
 def both_ways_ms(
     folder: Path, projection: layout.Projection, rows: np.ndarray, image: np.ndarray,
-    v_image: np.ndarray, repeats: int, clock: Callable[[], float],
+    target: np.ndarray, ssim_weight: float, repeats: int,
 ) -> tuple[float, float]:  # fmt: skip
-    """Median milliseconds of its forward pass, and of forward and backward pass together, over a
-    white background.
+    """Median milliseconds of wall time of its forward pass, and of forward pass, loss and backward
+    pass together, over a white background.
 
-    rows (M,): the visible splats; image, v_image (3, H, W): ours and its gradient; clock: returns
-    seconds. Raises ValueError where its image is another one.
+    rows (M,): the visible splats; image (3, H, W): ours; target (H, W, 3) uint8. Raises ValueError
+    where its image is another one.
     """
     module, (_, height, width) = build(folder), image.shape
-    gradient = torch.from_numpy(np.ascontiguousarray(v_image.transpose(1, 2, 0)))
+    captured = torch.from_numpy(target.astype(np.float32) / 255)
     white, splats = torch.ones(3), [torch.from_numpy(array) for array in _splats(projection, rows)]
-    theirs = module.both_ways(width, height, splats, white, gradient)[0].numpy().transpose(2, 0, 1)
+
+    def render(wanted: torch.Tensor) -> torch.Tensor:
+        return module.both_ways(width, height, splats, white, wanted, ssim_weight)[0]
+
+    theirs = render(captured).numpy().transpose(2, 0, 1)
     # it blends pixels behind an opaque one's stop differently
     if (off := np.abs(theirs - image).mean()) > 2e-3:
         raise ValueError(f"{folder}: its image differs by {off:.4f} on average")
     found = []
-    for wanted in (torch.empty(0), gradient):
+    for wanted in (torch.empty(0), captured):
         times = []
         for _ in range(repeats):
-            begin = clock()
-            module.both_ways(width, height, splats, white, wanted)
-            times.append(1e3 * (clock() - begin))
+            begin = perf_counter()
+            render(wanted)
+            times.append(1e3 * (perf_counter() - begin))
         found.append(statistics.median(times))
     return found[0], found[1]
 
