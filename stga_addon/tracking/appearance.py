@@ -88,13 +88,15 @@ class Texture:
     trust: np.ndarray
 
 
-def pyramid(camera: Camera, image: np.ndarray, center: np.ndarray) -> list[Level]:
-    """Levels of an image (H, W, 3) uint8: pixels of LEVELS_M at `center` (3,), or larger ones."""
+def pyramid(
+    camera: Camera, image: np.ndarray, center: np.ndarray, sizes: Sequence[float] = LEVELS_M
+) -> list[Level]:
+    """Levels of an image (H, W, 3) uint8: pixels of `sizes` meters at `center` (3,), or larger."""
     import cv2
 
     pixel = float(camera.project(center[None])[1][0]) / camera.fl_x
     levels: list[Level] = []
-    for size in LEVELS_M:
+    for size in sizes:
         small = camera.scaled(min(1.0, max(pixel, 1e-9) / size))
         image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
         colors = cv2.GaussianBlur(image.astype(np.float32) @ COLORS.T, (0, 0), BLUR_PX)

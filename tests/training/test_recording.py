@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from stga_addon.avatar.file import write_avatar
+from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
 from stga_addon.tracking.folder import (
@@ -48,7 +49,8 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
     for view in (view for views in lost[0].views.values() for view in views):
         image, mask = (np.asarray(Image.open(path)) for path in (view.image, view.mask))
         mesh, faces = lost[1][view.timestep], lost[0].faces
-        shade = 1 + SHADE * normal_images(mesh, faces, view.camera)[1][..., :1]
+        shown = rasterize(mesh, faces, view.camera)
+        shade = 1 + SHADE * normal_images(mesh, faces, shown)[1][..., :1]
         darker = np.where(mask[..., None] > 0, image * GAIN * shade + OFFSET, image)
         Image.fromarray(np.clip(darker, 0, 255).astype(np.uint8)).save(root / view.name)
     report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": True}

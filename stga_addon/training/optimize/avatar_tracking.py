@@ -20,7 +20,7 @@ from ...avatar.file import Avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import rasterize, vertex_normals
+from ...capture.mesh_geometry import ArrayPair, rasterize, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -59,12 +59,14 @@ pattern on clothes leads astray by more than its width, and renderings in each."
 ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
-POINTS, MIN_COSINE, VISIBILITY_SIDE_PX = 6000, 0.15, 160
+POINTS, MIN_COSINE, SMOOTH_SIDE_PX = 6000, 0.15, 160
 """Points of the surface; of the angle between normal and camera, below which one does not count;
-size of the depth image that hidden ones are found in."""
+size of the image in which hidden ones are found, and light by the surface's normals."""
 EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
+LEAST_GAIN = 1e-3
+"""Share of the loss by which a step has to lower it; one that does not is the last."""
 FIRST_STEP = 0.01
 """Length of the first step, as a share of the one down a loss as steep as the points say."""
 MISS_LEVELS = 24
@@ -193,11 +195,10 @@ def track_by_avatar(
     return AvatarTracking(tuple(chosen), rows, misfit, shift, scale, known)
 
 
-def normal_images(
-    mesh: np.ndarray, faces: np.ndarray, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3)."""
-    triangles, share = rasterize(mesh, faces, camera)
+def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
+    """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3);
+    shown: `rasterize` of the mesh."""
+    triangles, share = shown
     seen, found = triangles >= 0, np.zeros((*triangles.shape, 3))
     corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
     own = np.einsum("nk,nkc->nc", share[seen], corners)
@@ -247,6 +248,7 @@ class _Tracker:
         self._is_far, self._added, self._shading = is_far, SHIFT_SIZE + scales, shading
         self._is_again = is_again
         self._change: np.ndarray | None = None
+        self._shown: list[ArrayPair] = []  # `rasterize` of the timestep's views, as tracked
         self._head = HeadModel(person, "flame")
         self._points = surface_points(self._head, POINTS)
         self._posed_points = PosedPoints(person, self._points)
@@ -271,7 +273,9 @@ class _Tracker:
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
         if not views:
             return tracked, np.diag(self._precision()), 0.0
-        shots = [self._read(view, MAX_HEIGHT_PX) for view in views]
+        mesh, faces = self._capture.mesh(timestep), self._capture.faces
+        self._shown = [rasterize(mesh, faces, _small(view.camera)) for view in views]
+        shots = self._read(views, MAX_HEIGHT_PX)
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
         found, first = tracked, None
         if self._change is not None and not self._is_again:
@@ -282,7 +286,7 @@ class _Tracker:
         elif self._is_far:
             renderings = PYRAMID_RENDERINGS
             for height in PYRAMID_PX:
-                small = [self._read(view, height) for view in views]
+                small = self._read(views, height)
                 found, _ = self._minimize(timestep, small, tracked, found, renderings)
         found, known = self._minimize(timestep, shots, tracked, found, renderings, first)
         self._change = found - tracked
@@ -321,7 +325,7 @@ class _Tracker:
             found, gradient = (before, slope) if not values.any() else energy(scale * values)
             return found, scale * gradient
 
-        options = {"maxfun": renderings, "maxiter": renderings}
+        options = {"maxfun": renderings, "maxiter": renderings, "ftol": LEAST_GAIN}
         best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
         change = solve_triangular(root, scale * best.x, lower=True, trans=1)
         return start + change, known
@@ -329,24 +333,27 @@ class _Tracker:
     def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
         self._values = values
         mesh, missed, count = self._mesh(shots[0][0].timestep), 0, 0
-        for view, image in shots:
-            head = rasterize(mesh, self._capture.faces, view.camera)[0] >= 0
+        for (view, image), (triangles, _) in zip(shots, self._shown, strict=True):
+            head = _enlarged(triangles >= 0, image) > 0.5
             drawn = render_avatar(self._avatar, mesh, view.camera, self._settings.background)
             away = np.abs(255 * drawn.transpose(1, 2, 0) - image).mean(2)
             missed, count = missed + int((away[head] > MISS_LEVELS).sum()), count + int(head.sum())
         return missed / max(count, 1)
 
-    def _read(self, view: View, height: int) -> tuple[View, np.ndarray]:
-        view, image = read_small(view, height, self._settings, self._prepare)
-        if self._shading is not None:
-            mesh = self._capture.mesh(view.timestep)
-            head, normals = normal_images(mesh, self._capture.faces, view.camera)
-            ratio = np.clip(basis(normals[head]) @ self._shading, 1 / MAX_GAIN, MAX_GAIN)
-            image = image.copy()
-            image[head] = np.clip(image[head] / ratio + 0.5, 0, 255)
-        image = np.ascontiguousarray(image).view()
-        image.setflags(write=False)  # like the loader's: Numba compiles for one type only
-        return view, image
+    def _read(self, views: Sequence[View], height: int) -> list[tuple[View, np.ndarray]]:
+        shots = []
+        for whole, shown in zip(views, self._shown, strict=True):
+            view, image = read_small(whole, height, self._settings, self._prepare)
+            if self._shading is not None:
+                mesh = self._capture.mesh(view.timestep)
+                head, normals = normal_images(mesh, self._capture.faces, shown)
+                ratio = np.ones((*head.shape, 3))
+                ratio[head] = np.clip(basis(normals[head]) @ self._shading, 1 / MAX_GAIN, MAX_GAIN)
+                image = np.clip(image / _enlarged(ratio, image) + 0.5, 0, 255).astype(np.uint8)
+            image = np.ascontiguousarray(image).view()
+            image.setflags(write=False)  # like the loader's: Numba compiles for one type only
+            shots.append((view, image))
+        return shots
 
     def _precision(self) -> np.ndarray:
         """(E + 18,) inverse variances of the change; joints that the model lacks do not turn."""
@@ -396,13 +403,12 @@ class _Tracker:
         normals = self._points.on(vertex_normals(mesh, faces), faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         curvature = np.zeros((len(at), 3, 3))
-        for view, image in shots:
+        for (view, image), shown in zip(shots, self._shown, strict=True):
             camera = view.camera
-            level = appearance.pyramid(camera, image, at.mean(0))[0]
+            level = appearance.pyramid(camera, image, at.mean(0), appearance.LEVELS_M[:1])[0]
             pixels, depth = level.camera.project(at)
-            small = camera.scaled(min(1.0, VISIBILITY_SIDE_PX / max(camera.width, camera.height)))
             cosine = facing(camera, at, normals)
-            seen = (cosine > MIN_COSINE) & in_sight(small, mesh, faces, at)
+            seen = (cosine > MIN_COSINE) & in_sight(camera, mesh, faces, at, shown)
             seen &= appearance.inside(level.camera, pixels, depth)
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
@@ -412,3 +418,15 @@ class _Tracker:
         _, jacobian = self._posed_points.linearized(values[:-RIGID_SIZE], values[-RIGID_SIZE:])
         flat = jacobian.reshape(-1, jacobian.shape[2])
         return np.asarray(flat.T @ (curvature @ jacobian).reshape(flat.shape))
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.scaled(min(1.0, SMOOTH_SIDE_PX / max(camera.width, camera.height)))
+
+
+def _enlarged(values: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """(H, W) or (H, W, C) float32 as large as an image (H, W, 3), of the same of `_small`."""
+    import cv2
+
+    small = values.astype(np.float32)
+    return np.asarray(cv2.resize(small, image.shape[1::-1], interpolation=cv2.INTER_LINEAR))

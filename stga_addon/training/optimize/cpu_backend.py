@@ -98,8 +98,9 @@ class CpuBackend:
             target = over.view()
             target.setflags(write=False)  # like the loader's: Numba compiles for one type only
         rows, screen, loss = self._backward(
-            batch.view, target, batch.background, batch.sh_degree, focus
-        )
+            self._moved_frames(batch.view.timestep), batch.view, target, batch.background,
+            batch.sh_degree, focus,
+        )  # fmt: skip
         options = adam.adam_options(settings, batch.view.camera)
         signals = self._frames.signals(batch.view.timestep)
         # before the limits' gradients are added
@@ -134,6 +135,7 @@ class CpuBackend:
 
     def _backward(
         self,
+        frames: FaceFrames,
         view: View,
         target: np.ndarray,
         background: np.ndarray,
@@ -142,7 +144,7 @@ class CpuBackend:
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the trained rows' gradients; returns these rows, screen gradients (N,) and loss."""
         weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
-        state, frames = self.state, self._moved_frames(view.timestep)
+        state = self.state
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
         if focus is None:
             key = height, width, threads()
@@ -196,9 +198,10 @@ class CpuBackend:
         shift = (change[POSITION] / growth).astype(np.float32)
         splats = splats._replace(xyz=splats.xyz + shift[face])
         scaled = replace(frames, scale=frames.scale * growth[:, 0])
+        moved = self._moved_frames(timestep)
         total, by_frame = 0.0, np.zeros((len(frames.scale), 7))
         for (view, image), weight in zip(shots, weights, strict=True):
-            rows, _, loss = self._backward(view, image, background, sh_degree, None)
+            rows, _, loss = self._backward(moved, view, image, background, sh_degree, None)
             assert loss is not None
             total += weight * loss
             by_frame += weight * frame_gradient(splats, face, state.gradients, rows, scaled)

@@ -5,7 +5,6 @@ training cameras are corrected."""
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import silhouette
@@ -76,6 +75,8 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
     found = cover * image
     edge = (mask > 0) & (mask < 255)
     if edge.any() and not mask.all():
+        import cv2
+
         margin = round(3 * BLUR_SHARES[1] * len(image))
         spans = [np.flatnonzero(edge.any(axis=axis)) for axis in (1, 0)]
         box = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in spans)
@@ -84,8 +85,10 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
         shown = np.where(clear[..., None], part, 0)
         for blur, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
             sigma = max(1.0, blur * len(image))
-            total += importance * gaussian_filter(shown, (sigma, sigma, 0), truncate=3.0)
-            near = gaussian_filter(clear.astype(np.float32), sigma, truncate=3.0)
+            side = 2 * round(3 * sigma) + 1
+            options = (side, side), sigma, None, sigma, cv2.BORDER_REFLECT
+            total += importance * cv2.GaussianBlur(shown, *options)
+            near = cv2.GaussianBlur(clear.astype(np.float32), *options)
             weight += importance * near[..., None]
         foreground = np.clip(part - (1 - share) * (total / weight), 0, 255 * share)
         found[box][edge[box]] = foreground[edge[box]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar
 from ...capture.images import read_view
-from ...capture.mesh_geometry import Similarity
+from ...capture.mesh_geometry import Similarity, rasterize
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
@@ -228,6 +228,7 @@ def _head_colors(
     view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
     mesh = capture.mesh(view.timestep)
     drawn = render_avatar(avatar, mesh, view.camera, settings.background)
-    head, normals = normal_images(mesh, capture.faces, view.camera)
+    shown = rasterize(mesh, capture.faces, view.camera)
+    head, normals = normal_images(mesh, capture.faces, shown)
     head &= True if mask is None else mask >= MIN_COVER
     return drawn[:, head].astype(np.float64), image[head].T / 255, normals[head].T
