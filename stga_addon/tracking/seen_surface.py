@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..capture.camera import Camera
-from ..capture.mesh_geometry import ArrayPair, connected_parts, rasterize, vertex_normals
+from ..capture.mesh_geometry import connected_parts, rasterize, vertex_normals
 from ..flame.model import FlameModel
 from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
 from .head_model import HeadModel
@@ -84,21 +84,17 @@ def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarra
 
 
 def in_sight(
-    camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray,
-    shown: ArrayPair | None = None,
-) -> np.ndarray:  # fmt: skip
-    """(N,) bool: points (N, 3) that the mesh does not hide, by a depth image of reduced size;
-    shown: `rasterize` by the camera in any size, of this mesh or one that hardly differs."""
-    side = DEPTH_IMAGE_SIDE if shown is None else max(shown[0].shape)
-    small = camera.scaled(min(1.0, side / max(camera.width, camera.height)))
-    triangle, inside = rasterize(vertices, faces, small) if shown is None else shown
+    camera: Camera, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """(N,) bool: points (N, 3) that the mesh does not hide, by a depth image of reduced size."""
+    small = camera.scaled(min(1.0, DEPTH_IMAGE_SIDE / max(camera.width, camera.height)))
+    triangle, inside = rasterize(vertices, faces, small)
     covered = triangle >= 0
     closeness, corners = np.zeros(triangle.shape), faces[triangle[covered]]
     closeness[covered] = (inside[covered] / small.project(vertices)[1][corners]).sum(1)
     flat, depth = small.project(points)
-    height, width = triangle.shape
-    x, y = np.clip(np.nan_to_num(flat), -1, [width, height]).astype(np.int64).T
-    within = (flat >= 0).all(1) & (x < width) & (y < height) & (depth > 0)
+    x, y = np.clip(np.nan_to_num(flat), -1, [small.width, small.height]).astype(np.int64).T
+    within = (flat >= 0).all(1) & (x < small.width) & (y < small.height) & (depth > 0)
     seen = np.zeros(len(points), bool)
     seen[within] = closeness[y[within], x[within]] * (depth[within] - OCCLUSION_M) < 1
     return seen

@@ -53,7 +53,7 @@ RENDERINGS, RENDERINGS_AGAIN = 7, 3
 """Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
 MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
 """Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
-PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 10
+PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 20
 """Heights of the images in which the first timestep of another recording is tracked before, as a
 pattern on clothes leads astray by more than its width, and renderings in each."""
 ROOT = JOINTS.index("root")
@@ -66,7 +66,8 @@ EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 LEAST_GAIN = 1e-3
-"""Share of the loss by which a step has to lower it; one that does not is the last."""
+"""Share of the loss by which a step has to lower it; one that does not is the last, but not where
+the first timestep of another recording is sought: it leads all others."""
 FIRST_STEP = 0.01
 """Length of the first step, as a share of the one down a loss as steep as the points say."""
 MISS_LEVELS = 24
@@ -277,6 +278,7 @@ class _Tracker:
         self._shown = [rasterize(mesh, faces, _small(view.camera)) for view in views]
         shots = self._read(views, MAX_HEIGHT_PX)
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
+        least_gain = LEAST_GAIN
         found, first = tracked, None
         if self._change is not None and not self._is_again:
             starts = tracked, tracked + self._change
@@ -284,11 +286,13 @@ class _Tracker:
             best = min((0, 1), key=lambda number: losses[number][0])
             found, first = starts[best], losses[best]
         elif self._is_far:
-            renderings = PYRAMID_RENDERINGS
+            renderings, least_gain = PYRAMID_RENDERINGS, 0.0
             for height in PYRAMID_PX:
                 small = self._read(views, height)
-                found, _ = self._minimize(timestep, small, tracked, found, renderings)
-        found, known = self._minimize(timestep, shots, tracked, found, renderings, first)
+                found, _ = self._minimize(timestep, small, tracked, found, renderings, least_gain)
+        found, known = self._minimize(
+            timestep, shots, tracked, found, renderings, least_gain, first
+        )
         self._change = found - tracked
         misfit = self._misfit(found, shots) if self._is_again else np.nan
         return found, known, misfit
@@ -300,6 +304,7 @@ class _Tracker:
         tracked: np.ndarray,
         start: np.ndarray,
         renderings: int,
+        least_gain: float,
         first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """From `start` on, and their inverse covariance; first: the start's `_loss`, if known."""
@@ -325,7 +330,7 @@ class _Tracker:
             found, gradient = (before, slope) if not values.any() else energy(scale * values)
             return found, scale * gradient
 
-        options = {"maxfun": renderings, "maxiter": renderings, "ftol": LEAST_GAIN}
+        options = {"maxfun": renderings, "maxiter": renderings, "ftol": least_gain}
         best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
         change = solve_triangular(root, scale * best.x, lower=True, trans=1)
         return start + change, known
@@ -403,12 +408,12 @@ class _Tracker:
         normals = self._points.on(vertex_normals(mesh, faces), faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         curvature = np.zeros((len(at), 3, 3))
-        for (view, image), shown in zip(shots, self._shown, strict=True):
+        for view, image in shots:
             camera = view.camera
             level = appearance.pyramid(camera, image, at.mean(0), appearance.LEVELS_M[:1])[0]
             pixels, depth = level.camera.project(at)
             cosine = facing(camera, at, normals)
-            seen = (cosine > MIN_COSINE) & in_sight(camera, mesh, faces, at, shown)
+            seen = (cosine > MIN_COSINE) & in_sight(_small(camera), mesh, faces, at)
             seen &= appearance.inside(level.camera, pixels, depth)
             # (N, 3 channels, 2)
             slopes = np.stack(appearance.sampled(list(level.gradient), pixels), -1)
