@@ -159,7 +159,7 @@ TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 FOCAL_SOURCES = {
     "given": "as given", "file": "as the file says", "solved": "solved from the turns of the head",
-    "usual": "a guess, that of a phone",
+    "usual": "a guess, that of a phone", "avatar": "a guess, that of the avatar's camera",
 }  # fmt: skip
 """Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
@@ -179,12 +179,12 @@ def track(request: Track, report: Report, say: Say) -> Written:
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
-    person, model = None, request.model
+    person, model, camera = None, request.model, None
     if request.avatar is not None:
-        person, model = avatar_person(request.avatar)
+        person, model, camera = avatar_person(request.avatar)
     found = track_footage(
         footage, model, out, request.landmarks, request.meshes, request.world,
-        request.mattes == "auto", steps.report, steps.show, person,
+        request.mattes == "auto", steps.report, steps.show, person, camera,
     )  # fmt: skip
     lines, pixels = [f"warning: {warning}" for warning in found.warnings], found.median_px
     if found.focal_px is not None:

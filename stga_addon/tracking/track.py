@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..capture.open import BUNDLED_MODEL
@@ -92,6 +93,7 @@ def track(
     report: Report = lambda stage, done, total: None,
     show: Show = lambda draw, figures: None,
     person: HeadFit | None = None,
+    likely: Camera | None = None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -107,6 +109,8 @@ def track(
     show: given pictures and figures of how the head fits, the first one within seconds.
     person: whose head is known from another take, with `head_file`'s shapes: then only scale,
     expressions and poses are sought, and `end_tracking` is the caller's.
+    likely: which camera the only one is taken for, where neither its file nor the head's turns tell
+    the focal length.
     Raises StgaError.
     """
     if folder.is_written(out):
@@ -146,11 +150,13 @@ def track(
             raise StgaError(f"{footage.root}: {few}")
         if footage.focal == "usual":  # of one camera
             report("Focal length", 0, 1)
-            pixels = solved_focal(head, take)
+            (camera,), pixels, source_of_focal = footage.cameras, solved_focal(head, take), "solved"
+            if pixels is None and likely is not None:
+                sides = [max(own.width, own.height) for own in (camera.camera, likely)]
+                pixels, source_of_focal = likely.fl_x * sides[0] / sides[1], "avatar"
             if pixels is not None:
-                (camera,) = footage.cameras
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
-                footage = replace(footage, cameras=(moved,), focal="solved")
+                footage = replace(footage, cameras=(moved,), focal=source_of_focal)
             take = _recorded(footage, found, take, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
@@ -470,6 +476,6 @@ def _warnings(
         f"{head_fit.MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by "
         f"{scale}": is_scaled,
         "the focal length is a guess, as the head turns too little to tell; "
-        "give it if it is known": footage.focal == "usual",
+        "give it if it is known": footage.focal in ("usual", "avatar"),
     }
     return *footage.warnings, *(text for text, holds in own.items() if holds)

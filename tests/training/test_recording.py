@@ -3,16 +3,19 @@
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import write_avatar
-from stga_addon.capture.mesh_geometry import rasterize
+from stga_addon.capture.mesh_geometry import Similarity, rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
+from stga_addon.render.render import render_avatar
 from stga_addon.tracking.folder import (
     AVATAR_MISFIT,
     TorsoPoints,
@@ -24,7 +27,12 @@ from stga_addon.training.optimize.avatar_tracking import (
     track_by_avatar,
 )
 from stga_addon.training.run.folder import AVATAR, Run, write_run
-from stga_addon.training.run.recording import avatar_person, scale_capture, track_recording
+from stga_addon.training.run.recording import (
+    avatar_person,
+    fit_turn,
+    move_capture,
+    track_recording,
+)
 from stga_addon.worker.helpers import Helpers
 
 from .heads import TIMESTEPS
@@ -55,7 +63,7 @@ def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
         Image.fromarray(np.clip(darker, 0, 255).astype(np.uint8)).save(root / view.name)
     report = {"image_misfit": {}, "meters_per_unit": 1.0, "in_order": True}
     write_json(root / "tracking.json", report)
-    scale_capture(root, root / "model.npz", SCALE)
+    move_capture(root, root / "model.npz", SCALE, np.eye(3))
     write_torso_points(root, TorsoPoints(0, np.full((4, 3), SCALE)))
     return run, root
 
@@ -79,11 +87,43 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
     misfit = read_json(root / "tracking.json")["image_misfit"][AVATAR_MISFIT]
     assert sorted(misfit) == sorted(map(str, TIMESTEPS))
     assert found.misfit.max() < 0.2
-    fit, model = avatar_person(recording[0])
+    fit, model, camera = avatar_person(recording[0])
+    assert camera is None
     assert model == recording[1] / "model.npz"
     np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
     assert fit.head.model.n_identity == 0
     assert len(fit.shape) == 4
+
+
+@pytest.mark.parametrize("light_turns", [False, True])
+def test_the_world_is_turned_as_the_avatars_was(light_turns, recording, lost, person, tmp_path):  # noqa: F811
+    """Catches colors that are looked up in other directions than training saw them from, a world
+    turned though its light was too, and heads that do not turn with their world."""
+    (run, root), (avatar, settings), turn = recording, person, Rotation.from_rotvec([0.5, 0.2, 0])
+    shutil.rmtree(root)
+    shutil.copytree(lost[0].root, root)
+    write_run(run, Run(lost[0].root, root / "model.npz", "vhap", settings))
+    sh = np.full((len(avatar.splats.sh), 4, 3), 0.4, np.float32)  # brighter from one side
+    sh[:, 0] = avatar.splats.sh[:, 0]
+    shiny = replace(avatar, splats=replace(avatar.splats, sh=sh))
+    write_avatar(run / AVATAR, shiny)
+    moved = Similarity(1.0, turn.as_matrix(), np.zeros(3))
+    for view in (view for views in lost[0].views.values() for view in views):
+        world = moved if light_turns else Similarity(1.0, np.eye(3), np.zeros(3))
+        mesh, camera = world.apply(lost[1][view.timestep]), world.camera(view.camera)
+        drawn = 255 * render_avatar(shiny, mesh, camera, settings.background)
+        colors = np.clip(drawn.transpose(1, 2, 0), 0, 255).astype(np.uint8)
+        Image.fromarray(colors).save(root / view.name)
+    write_json(root / "tracking.json", {"meters_per_unit": 1.0})
+    capture = open_capture(root, root / "model.npz")
+    before = {timestep: capture.mesh(timestep) for timestep in TIMESTEPS}
+    move_capture(root, root / "model.npz", 1.0, turn.as_matrix())
+    after = open_capture(root, root / "model.npz")
+    for timestep in after.timesteps:
+        expected = moved.apply(before[timestep])
+        np.testing.assert_allclose(after.mesh(timestep), expected, atol=2e-6)
+    expected = np.eye(3) if light_turns else turn.inv().as_matrix()
+    np.testing.assert_allclose(fit_turn(run, root), expected, atol=1e-5)
 
 
 def test_another_person_is_missed(recording):

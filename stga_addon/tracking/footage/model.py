@@ -132,7 +132,7 @@ class Footage:
                 as for most images. Timesteps are numbers of frames
     focal       where focal lengths are from: "calibration"; of a single camera without one, "given"
                 (in the request), "file" (its EXIF or QuickTime's tags), "usual" (a phone's) or
-                "solved" (by tracking)
+                "solved" or "avatar" (by tracking: from the head's turns, or that of its camera)
     keeps_world  whether the calibration says that the capture is to keep its world
     warnings    one sentence each
     """

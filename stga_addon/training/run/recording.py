@@ -6,14 +6,17 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ...avatar.file import Avatar, read_avatar
+from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.mesh_geometry import Similarity, rasterize
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
+from ...flame.forward import axis_angle_matrices, joint_positions, shaped_vertices
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar
@@ -26,7 +29,7 @@ from ...worker.helpers import Helpers, Step
 from ..optimize.avatar_tracking import AvatarTracking, normal_images, track_by_avatar
 from ..optimize.image_preparation import EXPOSURE_SCALE, fit_exposure
 from ..settings import TrainingSettings
-from .folder import AVATAR, avatar_version, open_refined, read_run
+from .folder import AVATAR, avatar_version, open_refined, open_run, read_run
 
 EXPOSURE_VIEWS, EXPOSURE_HEIGHT_PX = 24, 160
 """Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
@@ -40,6 +43,7 @@ SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
 """Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
+STILL = Similarity(1.0, np.eye(3), np.zeros(3))
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]
@@ -49,17 +53,22 @@ Light = tuple[tuple[tuple[float, ...], ...], np.ndarray]
 of its light's ratio to that of the training, by the surface's normal."""
 
 
-def avatar_person(run: Path) -> tuple[HeadFit, Path | None]:
-    """The head of a run's avatar as `tracking.track` takes a person, and the file of its FLAME
-    model, None of the bundled head. Raises StgaError where its capture was not tracked with
-    either."""
-    sequence = open_refined(run).flame
+def avatar_person(run: Path) -> tuple[HeadFit, Path | None, Camera | None]:
+    """The head of a run's avatar as `tracking.track` takes a person, the file of its FLAME model,
+    None of the bundled head, and the camera that recorded it, None of several. Raises StgaError
+    where its capture was not tracked with either."""
+    capture = open_refined(run)
+    sequence = capture.flame
     if sequence is None:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
-    head, still = HeadModel(with_identity(sequence).model, "flame"), np.zeros(3)
-    place = Similarity(1.0, np.eye(3), still)
-    fit = HeadFit(head, sequence.shape, {}, place, sequence.static_offset)
-    return fit, read_run(run).flame
+    head = HeadModel(with_identity(sequence).model, "flame")
+    fit = HeadFit(head, sequence.shape, {}, STILL, sequence.static_offset)
+    cameras = list(_cameras(capture).values())
+    return fit, read_run(run).flame, cameras[0] if len(cameras) == 1 else None
+
+
+def _cameras(capture: Capture) -> dict[int, Camera]:
+    return {v.camera_index: v.camera for split in capture.views.values() for v in split}
 
 
 def track_recording(
@@ -68,13 +77,15 @@ def track_recording(
     """Refine the tracking of a capture of the run's person by the avatar, its splats fixed.
 
     Exposure and white balance of each camera, where they drift of each timestep, are fitted to the
-    avatar's colors first. The timesteps' parameter files are replaced, and the report says what
-    share of the images is left unexplained. Raises StgaError, and what `report` raises.
+    avatar's colors first, as are the scale of the world and how it is turned. The timesteps'
+    parameter files are replaced, and the report says what share of the images is left unexplained.
+    Raises StgaError, and what `report` raises.
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
     stored = read_json(root / REPORT_FILE)
     total = ROUNDS * len(timesteps)
     report(0, total)
+    move_capture(root, read_run(run).flame, 1.0, fit_turn(run, root))
     factor = _fit_scale(run, root, helpers, lambda: report(0, total))
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
     light = _light(*_open(*source, 0))
@@ -149,28 +160,65 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
     parts = [(source, light, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
-    scale_capture(root, read_run(run).flame, factor)
+    move_capture(root, read_run(run).flame, factor, STILL.rotation)
     return factor
 
 
-def scale_capture(root: Path, flame: Path | None, factor: float) -> None:
-    """Scale a tracked capture's world about its origin; the heads keep their size."""
+def fit_turn(run: Path, root: Path) -> np.ndarray:
+    """The rotation (3, 3) of the capture's world after which its cameras look the ways that the
+    avatar's did, so that light and shine lie where they lay; the identity where they are not as
+    many, or the avatar's colors explain the images worse then."""
+    stored = read_run(run)
+    capture = open_capture(root, stored.flame)
+    cameras, usual = _cameras(capture), _cameras(open_run(run).capture)
+    if set(cameras) != set(usual):
+        return STILL.rotation
+    turns = [
+        usual[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
+        for index, camera in cameras.items()
+    ]
+    turn = Rotation.from_matrix(turns).mean().as_matrix()
+    avatar, errors = read_avatar(run / AVATAR), []
+    views = [view for split in capture.views.values() for view in split]
+    chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
+    for world in (STILL, replace(STILL, rotation=turn)):
+        pixels = [_head_colors(avatar, stored.settings, capture, view, world) for view in chosen]
+        drawn, seen, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
+        gain, offset = fit_exposure(drawn, seen)[..., None]
+        missed = ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
+        errors.append(float((missed / (1 + missed)).mean()))
+    return turn if errors[1] < errors[0] else STILL.rotation
+
+
+def move_capture(root: Path, flame: Path | None, factor: float, turn: np.ndarray) -> None:
+    """Scale a tracked capture's world about its origin, and turn it by a rotation (3, 3); the heads
+    keep their size."""
     capture = open_capture(root, flame)
     assert capture.flame is not None
+    person = with_identity(capture.flame).model
     for name in SPLIT_FILES:
         document = read_json(root / name)
         for frame in document["frames"]:
-            for row in frame["transform_matrix"][:3]:
-                row[3] *= factor
+            pose = np.array(frame["transform_matrix"], np.float64)
+            pose[:3] = turn @ pose[:3] * [1, 1, 1, factor]
+            frame["transform_matrix"] = pose.tolist()
         write_json(root / name, document)
     for timestep in capture.timesteps:
-        arrays = read_npz(root / PARAMETERS / f"{timestep:05d}.npz")
-        moved = arrays["translation"] + (factor - 1) * capture.mesh(timestep).mean(0)
-        arrays["translation"] = moved.astype(np.float32)
-        write_npz(root / PARAMETERS / f"{timestep:05d}.npz", arrays)
+        frame = capture.flame.frame(timestep)
+        shaped = shaped_vertices(person, np.zeros(0), frame.expr, frame.dynamic_offset)
+        joint, center = joint_positions(person, shaped)[0], capture.mesh(timestep).mean(0)
+        turned = turn @ axis_angle_matrices(frame.rotation[None])[0]
+        from_center = turn @ (joint + frame.translation - center)
+        path = root / PARAMETERS / f"{timestep:05d}.npz"
+        arrays = read_npz(path)
+        arrays["rotation"] = Rotation.from_matrix(turned).as_rotvec()[None].astype(np.float32)
+        moved = from_center + factor * turn @ center - joint
+        arrays["translation"] = moved[None].astype(np.float32)
+        write_npz(path, arrays)
     torso = tracking_folder.read_torso_points(root)
     if torso is not None:
-        tracking_folder.write_torso_points(root, replace(torso, at=factor * torso.at))
+        at = factor * torso.at @ turn.T
+        tracking_folder.write_torso_points(root, replace(torso, at=at))
     stored = read_json(root / REPORT_FILE)
     stored["meters_per_unit"] *= factor
     write_json(root / REPORT_FILE, stored)
@@ -220,15 +268,17 @@ def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np
 
 
 def _head_colors(
-    avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colors (3, N) in 0…1 of the avatar and of the image, and normals (3, N), on the head."""
+    avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View,
+    world: Similarity = STILL,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Colors (3, N) in 0…1 of the avatar, in a world that is moved, and of the image, and normals
+    (3, N), on the head."""
     levels = [round(255 * part) for part in settings.background]
     scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
     view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
-    mesh = capture.mesh(view.timestep)
-    drawn = render_avatar(avatar, mesh, view.camera, settings.background)
-    shown = rasterize(mesh, capture.faces, view.camera)
+    mesh, camera = world.apply(capture.mesh(view.timestep)), world.camera(view.camera)
+    drawn = render_avatar(avatar, mesh, camera, settings.background)
+    shown = rasterize(mesh, capture.faces, camera)
     head, normals = normal_images(mesh, capture.faces, shown)
     head &= True if mask is None else mask >= MIN_COVER
     return drawn[:, head].astype(np.float64), image[head].T / 255, normals[head].T
