@@ -162,19 +162,39 @@ def test_focal_length_of_a_head_that_turns(head, factor, turn_deg):
     assert found == (pytest.approx(truth, rel=0.1) if turn_deg == 30 else None)
 
 
+SIZE, COUNT = (108, 192), 8
+
+
+def film(folder, head, turn_deg):
+    """A video, head.npz and points of a head that turns so far before a lens of 1.6 times a
+    phone's focal length."""
+    pytest.importorskip("av")
+    places, take = turning(head, 1.6 * usual_focal(*SIZE), turn_deg, SIZE, COUNT)
+    write_video(folder / "phone.mp4", range(60, 60 + 10 * COUNT, 10), size=SIZE, gop=COUNT)
+    write_flame(head.model, folder / "head.npz")
+    write_places(folder / "points/head_model.npz", places, np.ones(300, bool))
+    points = np.concatenate([take[t].points for t in range(COUNT)])
+    write_npz(folder / "points/phone.npz", {"timesteps": np.arange(COUNT), "points": points})
+
+
+def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head):
+    """Catches the perspective of a phone where the person was filmed before, and another
+    resolution taken for another lens."""
+    film(tmp_path, head, 3)
+    footage, (width, height) = open_footage(tmp_path / "phone.mp4"), SIZE
+    likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
+    inputs = footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points"
+    found = track(*inputs, mattes=False, likely=likely)
+    assert (found.focal, found.focal_px) == ("avatar", 250)
+    assert any("focal length is a guess" in warning for warning in found.warnings)
+
+
 def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, monkeypatch):
     """Catches a video that is decoded for each stage, backwards or by seeking, and a solved focal
     length that the capture does not have."""
-    pytest.importorskip("av")
+    film(tmp_path, head, 30)
     # no helping processes, whose decoders would not be seen
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    size, count = (108, 192), 8
-    places, take = turning(head, 1.6 * usual_focal(*size), 30, size, count)
-    write_video(tmp_path / "phone.mp4", range(60, 60 + 10 * count, 10), size=size, gop=count)
-    write_flame(head.model, tmp_path / "head.npz")
-    write_places(tmp_path / "points/head_model.npz", places, np.ones(300, bool))
-    points = np.concatenate([take[t].points for t in range(count)])
-    write_npz(tmp_path / "points/phone.npz", {"timesteps": np.arange(count), "points": points})
     decoded, decode = [], VideoFrames._frame
 
     def decode_and_note(self, number):
@@ -184,9 +204,9 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     monkeypatch.setattr(VideoFrames, "_frame", decode_and_note)
     footage, out = open_footage(tmp_path / "phone.mp4"), tmp_path / "out"
     found = track(footage, tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
-    assert decoded == list(range(count))
+    assert decoded == list(range(COUNT))
     assert found.focal == "solved"
-    assert found.focal_px == pytest.approx(1.6 * usual_focal(*size), rel=0.1)
+    assert found.focal_px == pytest.approx(1.6 * usual_focal(*SIZE), rel=0.1)
     report = read_json(tmp_path / "out/tracking.json")
     assert report["focal_length_px"] == round(found.focal_px, 1)
     assert report["focal_length_from"] == "solved"
