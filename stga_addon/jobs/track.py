@@ -193,8 +193,9 @@ def track(request: Track, report: Report, say: Say) -> Written:
         lines.append(f"torso: {found.torso.description}")
     if request.avatar is not None:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
+            keeps = {"keep": True, "head": False}.get(request.world, footage.keeps_world)
             tracked = track_recording(
-                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE)
+                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE), keeps
             )
         pixels = report_errors(out, model)
         end_tracking(out)

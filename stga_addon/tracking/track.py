@@ -150,13 +150,14 @@ def track(
             raise StgaError(f"{footage.root}: {few}")
         if footage.focal == "usual":  # of one camera
             report("Focal length", 0, 1)
-            (camera,), pixels, source_of_focal = footage.cameras, solved_focal(head, take), "solved"
+            (camera,) = footage.cameras
+            pixels, told_by = solved_focal(head, take), "solved"
             if pixels is None and likely is not None:
                 sides = [max(own.width, own.height) for own in (camera.camera, likely)]
-                pixels, source_of_focal = likely.fl_x * sides[0] / sides[1], "avatar"
+                pixels, told_by = likely.fl_x * sides[0] / sides[1], "avatar"
             if pixels is not None:
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
-                footage = replace(footage, cameras=(moved,), focal=source_of_focal)
+                footage = replace(footage, cameras=(moved,), focal=told_by)
             take = _recorded(footage, found, take, neutral)
         keep = world == "keep" or (world == "auto" and footage.keeps_world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))

@@ -430,7 +430,7 @@ def _small(camera: Camera) -> Camera:
 
 
 def _enlarged(values: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """(H, W) or (H, W, C) float32 as large as an image (H, W, 3), of the same of `_small`."""
+    """What a `_small` camera shows, (h, w) or (h, w, C), in an image's size (H, W, 3); float32."""
     import cv2
 
     small = values.astype(np.float32)

@@ -44,6 +44,7 @@ SCALE_TIMESTEPS = 6
 ROUNDS = 2
 """Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
 STILL = Similarity(1.0, np.eye(3), np.zeros(3))
+"""Of a world that stays as it is."""
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]
@@ -72,20 +73,25 @@ def _cameras(capture: Capture) -> dict[int, Camera]:
 
 
 def track_recording(
-    run: Path, root: Path, helpers: Helpers, report: Callable[[int, int], None]
+    run: Path,
+    root: Path,
+    helpers: Helpers,
+    report: Callable[[int, int], None],
+    keeps_world: bool = False,
 ) -> AvatarTracking:
     """Refine the tracking of a capture of the run's person by the avatar, its splats fixed.
 
     Exposure and white balance of each camera, where they drift of each timestep, are fitted to the
-    avatar's colors first, as are the scale of the world and how it is turned. The timesteps'
-    parameter files are replaced, and the report says what share of the images is left unexplained.
-    Raises StgaError, and what `report` raises.
+    avatar's colors first, as are the scale of the world and, unless it is kept, how it is turned.
+    The timesteps' parameter files are replaced, and the report says what share of the images is
+    left unexplained. Raises StgaError, and what `report` raises.
     """
     timesteps = open_capture(root, read_run(run).flame).timesteps
     stored = read_json(root / REPORT_FILE)
     total = ROUNDS * len(timesteps)
     report(0, total)
-    move_capture(root, read_run(run).flame, 1.0, fit_turn(run, root))
+    if not keeps_world:
+        move_capture(root, read_run(run).flame, 1.0, fit_turn(run, root))
     factor = _fit_scale(run, root, helpers, lambda: report(0, total))
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
     light = _light(*_open(*source, 0))
