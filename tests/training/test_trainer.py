@@ -92,7 +92,8 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
     view, target = large(view_of(toy, 1, camera))
     focus = toy.regions["mouth"][trainer.state.face]
     step = cpu_backend(trainer)
-    rows, screen, loss = step._backward(view, target, WHITE, degree, None)
+    frames = step._moved_frames(view.timestep)
+    rows, screen, loss = step._backward(frames, view, target, WHITE, degree, None)
     full = {name: array.copy() for name, array in trainer.state.gradients._asdict().items()}
     screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
     assert loss is not None
@@ -100,7 +101,7 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for array in trainer.state.gradients:
         array.fill(7.0)
-    rows, screen, loss = step._backward(view, target, WHITE, degree, focus)
+    rows, screen, loss = step._backward(frames, view, target, WHITE, degree, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)
