@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .model import FlameModel
-from .quaternions import from_axis_angle, to_matrices
+from .quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
 
 POSE_SIZE, TRANSLATION_SIZE = 15, 3
 """At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
@@ -67,6 +67,22 @@ def cross_matrices(vectors: np.ndarray) -> np.ndarray:
     zero = np.zeros_like(x)
     rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
     return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def moved_pose(
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    root: np.ndarray,
+    turn: np.ndarray,
+    shift: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """A frame's rotation (3,) and translation (3,) after each vertex v has moved to turn v + shift.
+
+    root (3,): its root joint, unposed, which depends on the expression; turn (3, 3), shift (3,)
+    meters.
+    """
+    turned = from_matrices(turn @ axis_angle_matrices(rotation[None]))
+    return to_axis_angle(turned)[0], turn @ (root + translation) + shift - root
 
 
 def left_jacobian(angles: np.ndarray) -> np.ndarray:

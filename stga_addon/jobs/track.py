@@ -193,10 +193,10 @@ def track(request: Track, report: Report, say: Say) -> Written:
         lines.append(f"torso: {found.torso.description}")
     if request.avatar is not None:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
-            keeps = {"keep": True, "head": False}.get(request.world, footage.keeps_world)
             tracked = track_recording(
-                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE), keeps
-            )
+                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE),
+                footage.keeps(request.world),
+            )  # fmt: skip
         pixels = report_errors(out, model)
         end_tracking(out)
         share = float(np.median(tracked.misfit))

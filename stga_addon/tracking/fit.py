@@ -9,7 +9,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.mesh_geometry import Similarity, similarity, vertex_normals
 from ..capture.model import evenly_spread
-from ..flame.forward import POSE_SIZE, RIGID_SIZE, flame_forward, frame_of
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, flame_forward, frame_of, moved_pose
 from ..worker.helpers import Step
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
@@ -178,19 +178,15 @@ def excerpt(
 
 def in_cameras_world(fit: HeadFit) -> HeadFit:
     """The same fit with the cameras where they are: only the scale of their world changes, about
-    its origin.
-
-    The head is turned and moved by its root joint, whose place depends on the expression.
-    """
-    from scipy.spatial.transform import Rotation
-
+    its origin."""
     model, world, moved = fit.head.model, fit.to_capture, {}
     for timestep, parameters in fit.parameters.items():
         expression, rigid = split(parameters.copy())
         root = model.j_regressor[0] @ (model.v_template + model.shapedirs @ expression)
-        turned = world.rotation.T @ Rotation.from_rotvec(rigid[:3]).as_matrix()
-        rigid[:3] = Rotation.from_matrix(turned).as_rotvec()
-        rigid[POSE_SIZE:] = (root + rigid[POSE_SIZE:] - world.translation) @ world.rotation - root
+        turn = world.rotation.T
+        rigid[:3], rigid[POSE_SIZE:] = moved_pose(
+            rigid[:3], rigid[POSE_SIZE:], root, turn, -turn @ world.translation
+        )
         moved[timestep] = np.concatenate([expression, rigid])
     kept = Similarity(world.scale, np.eye(3), np.zeros(3))
     return replace(fit, parameters=moved, to_capture=kept)

@@ -93,7 +93,7 @@ def track(
     report: Report = lambda stage, done, total: None,
     show: Show = lambda draw, figures: None,
     person: HeadFit | None = None,
-    likely: Camera | None = None,
+    likely_camera: Camera | None = None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -109,8 +109,8 @@ def track(
     show: given pictures and figures of how the head fits, the first one within seconds.
     person: whose head is known from another take, with `head_file`'s shapes: then only scale,
     expressions and poses are sought, and `end_tracking` is the caller's.
-    likely: which camera the only one is taken for, where neither its file nor the head's turns tell
-    the focal length.
+    likely_camera: whose focal length the only camera has, where neither its file nor the head's
+    turns tell.
     Raises StgaError.
     """
     if folder.is_written(out):
@@ -152,14 +152,14 @@ def track(
             report("Focal length", 0, 1)
             (camera,) = footage.cameras
             pixels, told_by = solved_focal(head, take), "solved"
-            if pixels is None and likely is not None:
-                sides = [max(own.width, own.height) for own in (camera.camera, likely)]
-                pixels, told_by = likely.fl_x * sides[0] / sides[1], "avatar"
+            if pixels is None and likely_camera is not None:
+                sides = [max(own.width, own.height) for own in (camera.camera, likely_camera)]
+                pixels, told_by = likely_camera.fl_x * sides[0] / sides[1], "avatar"
             if pixels is not None:
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal=told_by)
             take = _recorded(footage, found, take, neutral)
-        keep = world == "keep" or (world == "auto" and footage.keeps_world)
+        keep = footage.keeps(world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
         report("Fit", 0, head_fit.ROUNDS)
 

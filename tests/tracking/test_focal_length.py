@@ -184,7 +184,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     footage, (width, height) = open_footage(tmp_path / "phone.mp4"), SIZE
     likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
     inputs = footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points"
-    found = track(*inputs, mattes=False, likely=likely)
+    found = track(*inputs, mattes=False, likely_camera=likely)
     assert (found.focal, found.focal_px) == ("avatar", 250)
     assert any("focal length is a guess" in warning for warning in found.warnings)
 

@@ -15,6 +15,7 @@ from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.mesh_geometry import Similarity, rasterize
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
+from stga_addon.progress import Cancelled
 from stga_addon.render.render import render_avatar
 from stga_addon.tracking.folder import (
     AVATAR_MISFIT,
@@ -27,18 +28,14 @@ from stga_addon.training.optimize.avatar_tracking import (
     track_by_avatar,
 )
 from stga_addon.training.run.folder import AVATAR, Run, write_run
-from stga_addon.training.run.recording import (
-    avatar_person,
-    fit_turn,
-    move_capture,
-    track_recording,
-)
+from stga_addon.training.run.recording import avatar_person, move_capture, track_recording
 from stga_addon.worker.helpers import Helpers
 
 from .heads import TIMESTEPS
 from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
 
 SCALE, GAIN, OFFSET, SHADE = 1.02, 0.85, 12, 0.3
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 def ignore(done: int, total: int) -> None:
@@ -95,10 +92,10 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
     assert len(fit.shape) == 4
 
 
-@pytest.mark.parametrize("light_turns", [False, True])
-def test_the_world_is_turned_as_the_avatars_was(light_turns, recording, lost, person, tmp_path):  # noqa: F811
+@pytest.mark.parametrize(("light_turns", "keeps_world"), [(0, False), (1, False), (0, True)])
+def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):  # noqa: F811
     """Catches colors that are looked up in other directions than training saw them from, a world
-    turned though its light was too, and heads that do not turn with their world."""
+    turned though its light was too, or though it is kept, and heads that do not turn with it."""
     (run, root), (avatar, settings), turn = recording, person, Rotation.from_rotvec([0.5, 0.2, 0])
     shutil.rmtree(root)
     shutil.copytree(lost[0].root, root)
@@ -109,12 +106,12 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, recording, lost, pe
     write_avatar(run / AVATAR, shiny)
     moved = Similarity(1.0, turn.as_matrix(), np.zeros(3))
     for view in (view for views in lost[0].views.values() for view in views):
-        world = moved if light_turns else Similarity(1.0, np.eye(3), np.zeros(3))
+        world = moved if light_turns else IDENTITY
         mesh, camera = world.apply(lost[1][view.timestep]), world.camera(view.camera)
         drawn = 255 * render_avatar(shiny, mesh, camera, settings.background)
         colors = np.clip(drawn.transpose(1, 2, 0), 0, 255).astype(np.uint8)
         Image.fromarray(colors).save(root / view.name)
-    write_json(root / "tracking.json", {"meters_per_unit": 1.0})
+    write_json(root / "tracking.json", {"meters_per_unit": 1.0, "in_order": True})
     capture = open_capture(root, root / "model.npz")
     before = {timestep: capture.mesh(timestep) for timestep in TIMESTEPS}
     move_capture(root, root / "model.npz", 1.0, turn.as_matrix())
@@ -122,8 +119,20 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, recording, lost, pe
     for timestep in after.timesteps:
         expected = moved.apply(before[timestep])
         np.testing.assert_allclose(after.mesh(timestep), expected, atol=2e-6)
-    expected = np.eye(3) if light_turns else turn.inv().as_matrix()
-    np.testing.assert_allclose(fit_turn(run, root), expected, atol=1e-5)
+    told = list[int]()
+
+    def stop_once_turned(done: int, total: int) -> None:
+        told.append(done)
+        if len(told) == 2:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        track_recording(run, root, Helpers(1), stop_once_turned, keeps_world)
+    found = open_capture(root, root / "model.npz").views["train"][0].camera.world_to_camera
+    first = lost[0].views["train"][0].camera.world_to_camera[:3, :3]
+    stays = light_turns or keeps_world
+    expected = first @ turn.inv().as_matrix() if stays else first
+    np.testing.assert_allclose(found[:3, :3], expected, atol=1e-5)
 
 
 def test_another_person_is_missed(recording):

@@ -144,6 +144,11 @@ class Footage:
     keeps_world: bool = False
     warnings: tuple[str, ...] = ()
 
+    def keeps(self, world: str) -> bool:
+        """Whether the cameras stay where they are, of "head", "keep" and "auto" (the calibration
+        says)."""
+        return world == "keep" or (world == "auto" and self.keeps_world)
+
     @cached_property
     def timesteps(self) -> tuple[int, ...]:
         """All that any camera has a frame of, ascending."""

@@ -59,9 +59,10 @@ pattern on clothes leads astray by more than its width, and renderings in each."
 ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
-POINTS, MIN_COSINE, SMOOTH_SIDE_PX = 6000, 0.15, 160
+POINTS, MIN_COSINE, MESH_IMAGE_SIDE_PX = 6000, 0.15, 160
 """Points of the surface; of the angle between normal and camera, below which one does not count;
-size of the image in which hidden ones are found, and light by the surface's normals."""
+larger side of the images of the mesh, by which hidden ones, the head's pixels and light are
+known."""
 EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
@@ -426,7 +427,7 @@ class _Tracker:
 
 
 def _small(camera: Camera) -> Camera:
-    return camera.scaled(min(1.0, SMOOTH_SIDE_PX / max(camera.width, camera.height)))
+    return camera.scaled(min(1.0, MESH_IMAGE_SIDE_PX / max(camera.width, camera.height)))
 
 
 def _enlarged(values: np.ndarray, image: np.ndarray) -> np.ndarray:

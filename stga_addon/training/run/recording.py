@@ -16,7 +16,7 @@ from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
-from ...flame.forward import axis_angle_matrices, joint_positions, shaped_vertices
+from ...flame.forward import joint_positions, moved_pose, shaped_vertices
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar
@@ -43,8 +43,7 @@ SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
 ROUNDS = 2
 """Of tracking, each from the motion that the one before has led to, smoothed in takes in order."""
-STILL = Similarity(1.0, np.eye(3), np.zeros(3))
-"""Of a world that stays as it is."""
+IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]
@@ -63,7 +62,7 @@ def avatar_person(run: Path) -> tuple[HeadFit, Path | None, Camera | None]:
     if sequence is None:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
     head = HeadModel(with_identity(sequence).model, "flame")
-    fit = HeadFit(head, sequence.shape, {}, STILL, sequence.static_offset)
+    fit = HeadFit(head, sequence.shape, {}, IDENTITY, sequence.static_offset)
     cameras = list(_cameras(capture).values())
     return fit, read_run(run).flame, cameras[0] if len(cameras) == 1 else None
 
@@ -90,8 +89,9 @@ def track_recording(
     stored = read_json(root / REPORT_FILE)
     total = ROUNDS * len(timesteps)
     report(0, total)
-    if not keeps_world:
-        move_capture(root, read_run(run).flame, 1.0, fit_turn(run, root))
+    rotation = None if keeps_world else _fit_rotation(run, root)
+    if rotation is not None:
+        move_capture(root, read_run(run).flame, 1.0, rotation)
     factor = _fit_scale(run, root, helpers, lambda: report(0, total))
     source = run, (run / AVATAR).stat().st_mtime_ns, root, factor
     light = _light(*_open(*source, 0))
@@ -166,37 +166,37 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
     parts = [(source, light, [timestep], True) for timestep in chosen]
     found = helpers.map(_track_part, parts, lambda done: report(), True)
     factor = 1 / float(np.median([part["scale"] for part in found]))
-    move_capture(root, read_run(run).flame, factor, STILL.rotation)
+    move_capture(root, read_run(run).flame, factor, IDENTITY.rotation)
     return factor
 
 
-def fit_turn(run: Path, root: Path) -> np.ndarray:
+def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     """The rotation (3, 3) of the capture's world after which its cameras look the ways that the
-    avatar's did, so that light and shine lie where they lay; the identity where they are not as
-    many, or the avatar's colors explain the images worse then."""
+    avatar's did, so that its colors, which depend on the direction, are those of their light. None
+    where there are other cameras, or where the images are explained worse then."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
     cameras, usual = _cameras(capture), _cameras(open_run(run).capture)
     if set(cameras) != set(usual):
-        return STILL.rotation
-    turns = [
+        return None
+    rotations = [
         usual[index].world_to_camera[:3, :3].T @ camera.world_to_camera[:3, :3]
         for index, camera in cameras.items()
     ]
-    turn = Rotation.from_matrix(turns).mean().as_matrix()
+    rotation = Rotation.from_matrix(rotations).mean().as_matrix()
     avatar, errors = read_avatar(run / AVATAR), []
     views = [view for split in capture.views.values() for view in split]
     chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
-    for world in (STILL, replace(STILL, rotation=turn)):
+    for world in (IDENTITY, replace(IDENTITY, rotation=rotation)):
         pixels = [_head_colors(avatar, stored.settings, capture, view, world) for view in chosen]
         drawn, seen, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
         gain, offset = fit_exposure(drawn, seen)[..., None]
         missed = ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
         errors.append(float((missed / (1 + missed)).mean()))
-    return turn if errors[1] < errors[0] else STILL.rotation
+    return rotation if errors[1] < errors[0] else None
 
 
-def move_capture(root: Path, flame: Path | None, factor: float, turn: np.ndarray) -> None:
+def move_capture(root: Path, flame: Path | None, factor: float, rotation: np.ndarray) -> None:
     """Scale a tracked capture's world about its origin, and turn it by a rotation (3, 3); the heads
     keep their size."""
     capture = open_capture(root, flame)
@@ -206,24 +206,21 @@ def move_capture(root: Path, flame: Path | None, factor: float, turn: np.ndarray
         document = read_json(root / name)
         for frame in document["frames"]:
             pose = np.array(frame["transform_matrix"], np.float64)
-            pose[:3] = turn @ pose[:3] * [1, 1, 1, factor]
+            pose[:3] = rotation @ pose[:3] * [1, 1, 1, factor]
             frame["transform_matrix"] = pose.tolist()
         write_json(root / name, document)
     for timestep in capture.timesteps:
         frame = capture.flame.frame(timestep)
         shaped = shaped_vertices(person, np.zeros(0), frame.expr, frame.dynamic_offset)
-        joint, center = joint_positions(person, shaped)[0], capture.mesh(timestep).mean(0)
-        turned = turn @ axis_angle_matrices(frame.rotation[None])[0]
-        from_center = turn @ (joint + frame.translation - center)
+        shift = (factor - 1) * rotation @ capture.mesh(timestep).mean(0)
+        root_joint = joint_positions(person, shaped)[0]
+        turned, moved = moved_pose(frame.rotation, frame.translation, root_joint, rotation, shift)
+        values = replace(frame, rotation=turned, translation=moved).parameters
         path = root / PARAMETERS / f"{timestep:05d}.npz"
-        arrays = read_npz(path)
-        arrays["rotation"] = Rotation.from_matrix(turned).as_rotvec()[None].astype(np.float32)
-        moved = from_center + factor * turn @ center - joint
-        arrays["translation"] = moved[None].astype(np.float32)
-        write_npz(path, arrays)
+        write_npz(path, {**read_npz(path), **moving_arrays(values)})
     torso = tracking_folder.read_torso_points(root)
     if torso is not None:
-        at = factor * torso.at @ turn.T
+        at = factor * torso.at @ rotation.T
         tracking_folder.write_torso_points(root, replace(torso, at=at))
     stored = read_json(root / REPORT_FILE)
     stored["meters_per_unit"] *= factor
@@ -275,7 +272,7 @@ def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np
 
 def _head_colors(
     avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View,
-    world: Similarity = STILL,
+    world: Similarity = IDENTITY,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Colors (3, N) in 0…1 of the avatar, in a world that is moved, and of the image, and normals
     (3, N), on the head."""
