@@ -1,6 +1,6 @@
 """Tracking of other footage of a person by the avatar that a run trained."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -48,6 +48,8 @@ PART_TIMESTEPS = 16
 """Tracked by a helping process at a time."""
 Source = tuple[Path, int, Path, float, int]
 """A run, when its avatar was written, and a capture, once scaled and tracked in rounds."""
+HeadColors = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""(3, N) colors in 0…1 of the avatar and of an image, and normals, on the head."""
 Light = tuple[tuple[tuple[float, ...], ...], np.ndarray]
 """`TrainingSettings.exposure` of a capture that the avatar was not trained on, and harmonics (9, 3)
 of its light's ratio to that of the training, by the surface's normal."""
@@ -185,14 +187,14 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     ]
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
     avatar, errors = read_avatar(run / AVATAR), []
-    views = [view for split in capture.views.values() for view in split]
-    chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
     for world in (IDENTITY, replace(IDENTITY, rotation=rotation)):
-        pixels = [_head_colors(avatar, stored.settings, capture, view, world) for view in chosen]
-        drawn, seen, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
-        gain, offset = fit_exposure(drawn, seen)[..., None]
-        missed = ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
-        errors.append(float((missed / (1 + missed)).mean()))
+        missed = []
+        for _, pixels in _colors_by_camera(avatar, stored.settings, capture, world):
+            drawn, seen, _ = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
+            gain, offset = fit_exposure(drawn, seen)[..., None]
+            squared = ((seen - gain * drawn - offset) / EXPOSURE_SCALE) ** 2
+            missed.append(squared / (1 + squared))
+        errors.append(np.concatenate(missed, axis=1).mean())
     return rotation if errors[1] < errors[0] else None
 
 
@@ -237,19 +239,14 @@ def _open(
 
 
 def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Light:
-    by_camera: dict[int, list[View]] = {}
-    for view in (view for views in capture.views.values() for view in views):
-        by_camera.setdefault(view.camera_index, []).append(view)
     rows, lit = [], []
-    for camera, views in by_camera.items():
-        chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
-        pixels = [_head_colors(avatar, settings, capture, view) for view in chosen]
+    for chosen, pixels in _colors_by_camera(avatar, settings, capture):
         drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
         usual = fit_exposure(drawn, seen)
         for view, (own_drawn, own_seen, _) in zip(chosen, pixels, strict=True):
             own = fit_exposure(own_drawn, own_seen, usual, CAMERA_WEIGHT)
             scaled = own * np.array([[1.0], [255.0]])
-            rows.append((float(camera), *scaled.ravel().tolist(), float(view.timestep)))
+            rows.append((float(view.camera_index), *scaled.ravel().tolist(), float(view.timestep)))
         lit.append((drawn, (seen - usual[1][:, None]) / usual[0][:, None], normals))
     return tuple(rows), _fit_shading(*(np.concatenate(side, 1) for side in zip(*lit, strict=True)))
 
@@ -270,12 +267,22 @@ def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np
     return found
 
 
+def _colors_by_camera(
+    avatar: Avatar, settings: TrainingSettings, capture: Capture, world: Similarity = IDENTITY
+) -> Iterator[tuple[Sequence[View], list[HeadColors]]]:
+    """EXPOSURE_VIEWS of each camera, and their colors on the head; world: the capture's is moved so
+    before the avatar is drawn."""
+    by_camera: dict[int, list[View]] = {}
+    for view in (view for views in capture.views.values() for view in views):
+        by_camera.setdefault(view.camera_index, []).append(view)
+    for views in by_camera.values():
+        chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
+        yield chosen, [_head_colors(avatar, settings, capture, view, world) for view in chosen]
+
+
 def _head_colors(
-    avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View,
-    world: Similarity = IDENTITY,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Colors (3, N) in 0…1 of the avatar, in a world that is moved, and of the image, and normals
-    (3, N), on the head."""
+    avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View, world: Similarity
+) -> HeadColors:
     levels = [round(255 * part) for part in settings.background]
     scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
     view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
