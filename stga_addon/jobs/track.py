@@ -179,12 +179,12 @@ def track(request: Track, report: Report, say: Say) -> Written:
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
-    person, model, camera = None, request.model, None
+    person, model = None, request.model
     if request.avatar is not None:
-        person, model, camera = avatar_person(request.avatar)
+        person, model = avatar_person(request.avatar)
     found = track_footage(
         footage, model, out, request.landmarks, request.meshes, request.world,
-        request.mattes == "auto", steps.report, steps.show, person, camera,
+        request.mattes == "auto", steps.report, steps.show, person,
     )  # fmt: skip
     lines, pixels = [f"warning: {warning}" for warning in found.warnings], found.median_px
     if found.focal_px is not None:

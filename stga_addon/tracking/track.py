@@ -27,7 +27,7 @@ from .correspondence import calibrate
 from .dense import fit_dense
 from .dense_head import REGIONS
 from .face_networks import FaceNetworks
-from .fit import HeadFit, Pictures, RecordedTake, TimestepLandmarks, posed_mesh
+from .fit import HeadFit, KnownPerson, Pictures, RecordedTake, TimestepLandmarks, posed_mesh
 from .focal_length import scale_warnings, solved_focal
 from .footage.model import Footage, FootageCamera
 from .head_model import HeadModel, read_head_model
@@ -56,6 +56,9 @@ MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
+DRAWN_ROUNDS, DRAWN_TIMESTEPS = 3, 12
+"""Of a fit to landmarks without the networks' bias, and drawn heads of each camera that it is
+measured on."""
 LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
 
 Errors = dict[str, dict[int, tuple[float, float]]]
@@ -92,8 +95,7 @@ def track(
     mattes: bool = True,
     report: Report = lambda stage, done, total: None,
     show: Show = lambda draw, figures: None,
-    person: HeadFit | None = None,
-    likely_camera: Camera | None = None,
+    person: KnownPerson | None = None,
 ) -> TrackingReport:
     """Track the head that the footage shows, and write a capture into the folder `out`.
 
@@ -107,17 +109,16 @@ def track(
     the cameras, which is scaled about its origin where it is not in meters; "auto": as the
     calibration says, else "head".
     show: given pictures and figures of how the head fits, the first one within seconds.
-    person: whose head is known from another take, with `head_file`'s shapes: then only scale,
-    expressions and poses are sought, and `end_tracking` is the caller's.
-    likely_camera: whose focal length the only camera has, where neither its file nor the head's
-    turns tell.
+    person: known from another take, with `head_file`'s shapes: then only scale, expressions and
+    poses are sought, without the networks' bias, and `end_tracking` is the caller's. The only
+    camera has the focal length of the person's, where neither its file nor the head's turns tell.
     Raises StgaError.
     """
     if folder.is_written(out):
         raise StgaError(f"{out}: already holds a capture; give another --out")
     if Path(realpath(out)) == footage.root:
         raise StgaError(f"{out}: is the folder of the footage; give another --out")
-    head = read_head_model(head_file) if person is None else person.head
+    head = read_head_model(head_file) if person is None else person.fit.head
     footage, source = _stored(footage, out), _source(footage, head_file, landmarks, head)
     with Helpers(folder=out / folder.KEPT_FOLDER) as helpers:
         if landmarks is None:
@@ -152,25 +153,21 @@ def track(
             report("Focal length", 0, 1)
             (camera,) = footage.cameras
             pixels, told_by = solved_focal(head, take), "solved"
-            if pixels is None and likely_camera is not None:
-                sides = [max(own.width, own.height) for own in (camera.camera, likely_camera)]
-                pixels, told_by = likely_camera.fl_x * sides[0] / sides[1], "avatar"
+            if pixels is None and person is not None and person.camera is not None:
+                sides = [max(own.width, own.height) for own in (camera.camera, person.camera)]
+                pixels, told_by = person.camera.fl_x * sides[0] / sides[1], "avatar"
             if pixels is not None:
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal=told_by)
             take = _recorded(footage, found, take, neutral)
         keep = footage.keeps(world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
-        report("Fit", 0, head_fit.ROUNDS)
-
-        def count(rounds: int) -> None:
-            report("Fit", rounds, head_fit.ROUNDS)
-
-        fit: HeadFit = (
-            helpers.map(head_fit.fit_head, [(head, take)], count)[0]
-            if len(take.landmarks) < LONG_TAKE
-            else helpers.run(head_fit.fit_head, (head, take), count)
-        )
+        fit = _fitted(head, take, helpers, report)
+        if person is not None and landmarks is None:
+            detected_take = take
+            for _ in range(DRAWN_ROUNDS):
+                take = without_bias(detected_take, fit, person.draw, FaceNetworks().detect)
+                fit = _fitted(head, take, helpers, report)
         errors = reprojection_errors(fit, take, footage)
         _check_cameras(errors)
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
@@ -180,7 +177,8 @@ def track(
         take = replace(take, images=images, masks=masks)
         fit, misfits = by_images(head, fit, take, helpers, report, person is not None)
         if person is not None:
-            fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
+            known = person.fit
+            fit = replace(fit, shape=known.shape, static_offset=known.static_offset)
         fit = head_fit.in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, take, footage)
         shares = [share for own in misfits.values() for share in own.values()]
@@ -278,6 +276,55 @@ def _head_pixels(
     return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
 
 
+def _fitted(head: HeadModel, take: RecordedTake, helpers: Helpers, report: Report) -> HeadFit:
+    report("Fit", 0, head_fit.ROUNDS)
+
+    def count(rounds: int) -> None:
+        report("Fit", rounds, head_fit.ROUNDS)
+
+    fit: HeadFit = (
+        helpers.map(head_fit.fit_head, [(head, take)], count)[0]
+        if len(take.landmarks) < LONG_TAKE
+        else helpers.run(head_fit.fit_head, (head, take), count)
+    )
+    return fit
+
+
+def without_bias(
+    take: RecordedTake,
+    fit: HeadFit,
+    draw: Callable[[np.ndarray, Camera], np.ndarray],
+    detect: Callable[[np.ndarray], list[np.ndarray]],
+) -> RecordedTake:
+    """The take with landmarks moved by what the networks are off, in the median of a camera's
+    pictures, where it sees the person's avatar instead, whose head is known: that of `fit`.
+
+    From an unusual direction they are off by the same in both. draw: see `KnownPerson`; detect: see
+    `FaceNetworks.detect`.
+    """
+    points = PosedPoints(fit.head.model, take.places)
+    found: dict[str, list[np.ndarray]] = {}
+    for timestep in evenly_spread(sorted(take.landmarks), DRAWN_TIMESTEPS):
+        values, own = fit.parameters[timestep], take.landmarks[timestep]
+        mesh, head = posed_mesh(fit, values), points.positions(*split(values))
+        for name, camera in zip(own.names, map(fit.to_capture.camera, own.cameras), strict=True):
+            faces = detect(draw(mesh, camera))
+            if len(faces) == 1:
+                away = faces[0] - camera.project(head)[0]
+                found.setdefault(name, []).append(away / _face_size(faces[0]))
+    bias = {name: np.median(shares, axis=0) for name, shares in found.items()}
+    moved = {}
+    for timestep, own in take.landmarks.items():
+        seen = zip(own.names, own.points, strict=True)
+        at = [pixels - bias.get(name, 0.0) * _face_size(pixels) for name, pixels in seen]
+        moved[timestep] = replace(own, points=np.stack(at))
+    return replace(take, landmarks=moved)
+
+
+def _face_size(pixels: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(pixels, axis=0)))
+
+
 def by_images(
     head: HeadModel,
     fit: HeadFit,
@@ -322,8 +369,7 @@ def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> E
             use = take.reliable & (confidence > 0)
             away = fit.to_capture.camera(camera).project(head[use])[0] - pixels[use]
             distance = float(np.median(np.linalg.norm(away, axis=1)))
-            size = float(np.linalg.norm(np.ptp(pixels[use], axis=0)))
-            errors[name][timestep] = distance, distance / max(size, 1e-9)
+            errors[name][timestep] = distance, distance / max(_face_size(pixels[use]), 1e-9)
     return errors
 
 

@@ -9,9 +9,10 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import camera_from_gl
+from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.tracking.fit import RecordedTake, TimestepLandmarks
+from stga_addon.tracking.fit import HeadFit, KnownPerson, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import solved_focal
 from stga_addon.tracking.footage.open import open_footage, usual_focal
 from stga_addon.tracking.footage.video import VideoFrames
@@ -184,7 +185,9 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     footage, (width, height) = open_footage(tmp_path / "phone.mp4"), SIZE
     likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
     inputs = footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points"
-    found = track(*inputs, mattes=False, likely_camera=likely)
+    fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
+    known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)
+    found = track(*inputs, mattes=False, person=known)
     assert (found.focal, found.focal_px) == ("avatar", 250)
     assert any("focal length is a guess" in warning for warning in found.warnings)
 

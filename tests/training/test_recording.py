@@ -84,8 +84,9 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
     misfit = read_json(root / "tracking.json")["image_misfit"][AVATAR_MISFIT]
     assert sorted(misfit) == sorted(map(str, TIMESTEPS))
     assert found.misfit.max() < 0.2
-    fit, model, camera = avatar_person(recording[0])
-    assert camera is None
+    known, model = avatar_person(recording[0])
+    fit = known.fit
+    assert known.camera is None
     assert model == recording[1] / "model.npz"
     np.testing.assert_allclose(fit.head.model.v_template, lost[0].neutral, atol=1e-9)
     assert fit.head.model.n_identity == 0

@@ -19,9 +19,9 @@ from ...files import read_json, read_npz, write_json, write_npz
 from ...flame.forward import joint_positions, moved_pose, shaped_vertices
 from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis, uniform
-from ...render.render import render_avatar
+from ...render.render import render_avatar, to_uint8
 from ...tracking import folder as tracking_folder
-from ...tracking.fit import HeadFit
+from ...tracking.fit import HeadFit, KnownPerson
 from ...tracking.folder import REPORT_FILE, SPLIT_FILES
 from ...tracking.head_model import HeadModel
 from ...tracking.write_capture import moving_arrays
@@ -55,18 +55,23 @@ Light = tuple[tuple[tuple[float, ...], ...], np.ndarray]
 of its light's ratio to that of the training, by the surface's normal."""
 
 
-def avatar_person(run: Path) -> tuple[HeadFit, Path | None, Camera | None]:
-    """The head of a run's avatar as `tracking.track` takes a person, the file of its FLAME model,
-    None of the bundled head, and the camera that recorded it, None of several. Raises StgaError
-    where its capture was not tracked with either."""
+def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
+    """The person of a run's avatar, and the file of its FLAME model, None of the bundled head.
+    Raises StgaError where its capture was not tracked with either."""
     capture = open_refined(run)
     sequence = capture.flame
     if sequence is None:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
     head = HeadModel(with_identity(sequence).model, "flame")
     fit = HeadFit(head, sequence.shape, {}, IDENTITY, sequence.static_offset)
-    cameras = list(_cameras(capture).values())
-    return fit, read_run(run).flame, cameras[0] if len(cameras) == 1 else None
+    cameras, stored = list(_cameras(capture).values()), read_run(run)
+    avatar = read_avatar(run / AVATAR)
+
+    def draw(mesh: np.ndarray, camera: Camera) -> np.ndarray:
+        return to_uint8(render_avatar(avatar, mesh, camera, stored.settings.background))
+
+    camera = cameras[0] if len(cameras) == 1 else None
+    return KnownPerson(fit, draw, camera), stored.flame
 
 
 def _cameras(capture: Capture) -> dict[int, Camera]:
