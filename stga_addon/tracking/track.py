@@ -57,8 +57,8 @@ MAX_USUAL_SHARE = 0.04
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
 DRAWN_ROUNDS, DRAWN_TIMESTEPS = 3, 12
-"""Of a fit to landmarks without the networks' bias, and drawn heads of each camera that it is
-measured on."""
+"""In which the networks' bias is measured on an avatar, each from the landmarks without that of the
+round before, and timesteps that it is drawn at."""
 LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
 
 Errors = dict[str, dict[int, tuple[float, float]]]
@@ -162,12 +162,23 @@ def track(
             take = _recorded(footage, found, take, neutral)
         keep = footage.keeps(world)
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
-        fit = _fitted(head, take, helpers, report)
+        report("Fit", 0, head_fit.ROUNDS)
         if person is not None and landmarks is None:
-            detected_take = take
+            detected_take, some = take, evenly_spread(sorted(take.landmarks), DRAWN_TIMESTEPS)
             for _ in range(DRAWN_ROUNDS):
-                take = without_bias(detected_take, fit, person.draw, FaceNetworks().detect)
-                fit = _fitted(head, take, helpers, report)
+                part = replace(take, landmarks={t: take.landmarks[t] for t in some})
+                drawn = head_fit.fit_head(head, part)
+                take = without_bias(detected_take, drawn, person.draw, FaceNetworks().detect)
+                report("Fit", 0, head_fit.ROUNDS)
+
+        def count(rounds: int) -> None:
+            report("Fit", rounds, head_fit.ROUNDS)
+
+        fit: HeadFit = (
+            helpers.map(head_fit.fit_head, [(head, take)], count)[0]
+            if len(take.landmarks) < LONG_TAKE
+            else helpers.run(head_fit.fit_head, (head, take), count)
+        )
         errors = reprojection_errors(fit, take, footage)
         _check_cameras(errors)
         show(partial(picture_of_fit, fit, footage), {"error_px": _median_px(errors)})
@@ -177,8 +188,8 @@ def track(
         take = replace(take, images=images, masks=masks)
         fit, misfits = by_images(head, fit, take, helpers, report, person is not None)
         if person is not None:
-            known = person.fit
-            fit = replace(fit, shape=known.shape, static_offset=known.static_offset)
+            shape, offset = person.fit.shape, person.fit.static_offset
+            fit = replace(fit, shape=shape, static_offset=offset)
         fit = head_fit.in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, take, footage)
         shares = [share for own in misfits.values() for share in own.values()]
@@ -276,36 +287,23 @@ def _head_pixels(
     return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
 
 
-def _fitted(head: HeadModel, take: RecordedTake, helpers: Helpers, report: Report) -> HeadFit:
-    report("Fit", 0, head_fit.ROUNDS)
-
-    def count(rounds: int) -> None:
-        report("Fit", rounds, head_fit.ROUNDS)
-
-    fit: HeadFit = (
-        helpers.map(head_fit.fit_head, [(head, take)], count)[0]
-        if len(take.landmarks) < LONG_TAKE
-        else helpers.run(head_fit.fit_head, (head, take), count)
-    )
-    return fit
-
-
 def without_bias(
     take: RecordedTake,
     fit: HeadFit,
     draw: Callable[[np.ndarray, Camera], np.ndarray],
     detect: Callable[[np.ndarray], list[np.ndarray]],
 ) -> RecordedTake:
-    """The take with landmarks moved by what the networks are off, in the median of a camera's
-    pictures, where it sees the person's avatar instead, whose head is known: that of `fit`.
+    """The take with landmarks moved by what the networks miss, in the median of a camera's
+    pictures, where these show the person's avatar, whose head is known: that of `fit`, at some of
+    the take's timesteps.
 
-    From an unusual direction they are off by the same in both. draw: see `KnownPerson`; detect: see
+    From an unusual direction they miss the person by the same. draw: see `KnownPerson`; detect: see
     `FaceNetworks.detect`.
     """
     points = PosedPoints(fit.head.model, take.places)
     found: dict[str, list[np.ndarray]] = {}
-    for timestep in evenly_spread(sorted(take.landmarks), DRAWN_TIMESTEPS):
-        values, own = fit.parameters[timestep], take.landmarks[timestep]
+    for timestep, values in fit.parameters.items():
+        own = take.landmarks[timestep]
         mesh, head = posed_mesh(fit, values), points.positions(*split(values))
         for name, camera in zip(own.names, map(fit.to_capture.camera, own.cameras), strict=True):
             faces = detect(draw(mesh, camera))
