@@ -167,9 +167,9 @@ def track(
             detected_take, some = take, evenly_spread(sorted(take.landmarks), DRAWN_TIMESTEPS)
             for _ in range(DRAWN_ROUNDS):
                 part = replace(take, landmarks={t: take.landmarks[t] for t in some})
-                drawn = head_fit.fit_head(head, part)
+                work = head_fit.fit_head, (head, part)
+                drawn = helpers.run(*work, lambda steps: report("Fit", 0, head_fit.ROUNDS))
                 take = without_bias(detected_take, drawn, person.draw, FaceNetworks().detect)
-                report("Fit", 0, head_fit.ROUNDS)
 
         def count(rounds: int) -> None:
             report("Fit", rounds, head_fit.ROUNDS)
