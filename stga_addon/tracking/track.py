@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.camera import Camera
 from ..capture.mesh_geometry import silhouette
 from ..capture.model import evenly_spread
 from ..capture.open import BUNDLED_MODEL
@@ -56,9 +55,9 @@ MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
-DRAWN_ROUNDS, DRAWN_TIMESTEPS = 3, 12
-"""In which the networks' bias is measured on an avatar, each from the landmarks without that of the
-round before, and timesteps that it is drawn at."""
+BIAS_ROUNDS, BIAS_TIMESTEPS = 3, 12
+"""Rounds in which the networks' bias is measured, each on heads fitted without that of the round
+before, and timesteps at which the avatar is drawn for that."""
 LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
 
 Errors = dict[str, dict[int, tuple[float, float]]]
@@ -164,12 +163,7 @@ def track(
         take = replace(take, metric=keep and head_fit.is_metric(head, take))
         report("Fit", 0, head_fit.ROUNDS)
         if person is not None and landmarks is None:
-            detected_take, some = take, evenly_spread(sorted(take.landmarks), DRAWN_TIMESTEPS)
-            for _ in range(DRAWN_ROUNDS):
-                part = replace(take, landmarks={t: take.landmarks[t] for t in some})
-                work = head_fit.fit_head, (head, part)
-                drawn = helpers.run(*work, lambda steps: report("Fit", 0, head_fit.ROUNDS))
-                take = without_bias(detected_take, drawn, person.draw, FaceNetworks().detect)
+            take = _without_bias(take, person, helpers, report)
 
         def count(rounds: int) -> None:
             report("Fit", rounds, head_fit.ROUNDS)
@@ -287,36 +281,40 @@ def _head_pixels(
     return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
 
 
-def without_bias(
-    take: RecordedTake,
-    fit: HeadFit,
-    draw: Callable[[np.ndarray, Camera], np.ndarray],
-    detect: Callable[[np.ndarray], list[np.ndarray]],
+def _without_bias(
+    take: RecordedTake, person: KnownPerson, helpers: Helpers, report: Report
 ) -> RecordedTake:
-    """The take with landmarks moved by what the networks miss, in the median of a camera's
-    pictures, where these show the person's avatar, whose head is known: that of `fit`, at some of
-    the take's timesteps.
+    """The take, each camera's landmarks corrected by the networks' bias: how far, in the median,
+    they are off in pictures of the avatar, drawn with fitted heads as the camera sees them.
 
-    From an unusual direction they miss the person by the same. draw: see `KnownPerson`; detect: see
-    `FaceNetworks.detect`.
+    From an unusual direction they are off by the same in pictures of the person, whatever the
+    light.
     """
-    points = PosedPoints(fit.head.model, take.places)
-    found: dict[str, list[np.ndarray]] = {}
-    for timestep, values in fit.parameters.items():
-        own = take.landmarks[timestep]
-        mesh, head = posed_mesh(fit, values), points.positions(*split(values))
-        for name, camera in zip(own.names, map(fit.to_capture.camera, own.cameras), strict=True):
-            faces = detect(draw(mesh, camera))
-            if len(faces) == 1:
-                away = faces[0] - camera.project(head)[0]
-                found.setdefault(name, []).append(away / _face_size(faces[0]))
-    bias = {name: np.median(shares, axis=0) for name, shares in found.items()}
-    moved = {}
-    for timestep, own in take.landmarks.items():
-        seen = zip(own.names, own.points, strict=True)
-        at = [pixels - bias.get(name, 0.0) * _face_size(pixels) for name, pixels in seen]
-        moved[timestep] = replace(own, points=np.stack(at))
-    return replace(take, landmarks=moved)
+    networks, corrected = FaceNetworks(), take
+    some = evenly_spread(sorted(take.landmarks), BIAS_TIMESTEPS)
+    for _ in range(BIAS_ROUNDS):
+        part = replace(corrected, landmarks={t: corrected.landmarks[t] for t in some})
+        work = head_fit.fit_head, (person.fit.head, part)
+        fit: HeadFit = helpers.run(*work, lambda steps: report("Fit", 0, head_fit.ROUNDS))
+        points = PosedPoints(fit.head.model, take.places)
+        shares: dict[str, list[np.ndarray]] = {}
+        for timestep, values in fit.parameters.items():
+            own, mesh = take.landmarks[timestep], posed_mesh(fit, values)
+            head = points.positions(*split(values))
+            cameras = map(fit.to_capture.camera, own.cameras)
+            for name, camera in zip(own.names, cameras, strict=True):
+                faces = networks.detect(person.draw(mesh, camera))
+                if len(faces) == 1:
+                    away = faces[0] - camera.project(head)[0]
+                    shares.setdefault(name, []).append(away / _face_size(faces[0]))
+        bias = {name: np.median(found, axis=0) for name, found in shares.items()}
+        moved = {}
+        for timestep, own in take.landmarks.items():
+            seen = zip(own.names, own.points, strict=True)
+            at = [pixels - bias.get(name, 0.0) * _face_size(pixels) for name, pixels in seen]
+            moved[timestep] = replace(own, points=np.stack(at))
+        corrected = replace(take, landmarks=moved)
+    return corrected
 
 
 def _face_size(pixels: np.ndarray) -> float:
