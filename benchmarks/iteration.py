@@ -189,7 +189,7 @@ def stages(
     counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts)
     places = counts.copy()
-    arrange_tiles(places, r.tile_rows)
+    arrange_tiles(places, r.tile_blocks)
     v_image, screen_gradient = np.empty_like(r.image), np.empty(n, np.float32)
     bands = whole_image(height, width)
     zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
@@ -203,7 +203,7 @@ def stages(
         ),
         "sort by depth": (lambda: sort_by_depth(r.projection, buffers), n * 36 + len(rows) * 44),
         "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts), n * 20),
-        "arrange tiles": (lambda: arrange_tiles(counts.copy(), r.tile_rows), 2 * counts.nbytes),
+        "arrange tiles": (lambda: arrange_tiles(counts.copy(), r.tile_blocks), 2 * counts.nbytes),
         "fill pairs": (
             lambda: fill_pairs(
                 rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat
@@ -212,7 +212,7 @@ def stages(
         ),
         "blend": (
             lambda: blend_forward(
-                r.tiles, tiles_x, r.tile_rows, lists, r.projection, background, r.blended
+                r.tiles, tiles_x, r.tile_blocks, lists, r.projection, background, r.blended
             ),
             count * 42 + pixels * 20,
         ),

@@ -267,19 +267,13 @@ def _blend(count, listed, before, batch, s):
 
 
 @part_jit
-def _begin_tile(s, tile_rows, tile):
-    """Nothing in front of the pixels of a tile's needed rows; those of the others have stopped."""
+def _begin_tile(s, needed):
+    """Nothing in front of the pixels of a tile's needed blocks, a bit each; those of the others
+    have stopped."""
     for p in range(np.uint64(PIXELS)):
-        s[p] = np.float32(1.0)
+        is_needed = (np.uint64(needed) >> (p // np.uint64(BLOCK_PIXELS))) & np.uint64(1)
+        s[p] = np.float32(1.0) if is_needed != 0 else np.float32(-1.0)
         s[SUM_RED + p] = s[SUM_GREEN + p] = s[SUM_BLUE + p] = s[LAST + p] = np.float32(0.0)
-    for half in range(2):
-        first, past = tile_rows[tile, 2 * half], tile_rows[tile, 2 * half + 1]
-        if past - first == TILE:
-            continue
-        for row in range(TILE):
-            if row < first or row >= past:
-                for column in range(half * TILE // 2, (half + 1) * TILE // 2):
-                    s[_pixel(column, row)] = np.float32(-1.0)
 
 
 @part_jit
@@ -316,11 +310,11 @@ def _store_tile(s, left, top, background, blended):
 
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
-def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background, blended):
+def blend_forward(work, tiles, tiles_x, tile_blocks, lists, projection, background, blended):
     """Render the listed tiles to `blended`; the tuples are those of `layout.py`.
 
-    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_rows (tiles, 4): their rows that
-    are needed, see `find_needed_rows`; pixels of the others are undefined. background (3,):
+    tiles (T,) int32 tile numbers, with `tiles_x` tiles a row; tile_blocks (tiles,): their blocks
+    that are needed, see `find_needed_blocks`; pixels of the others are undefined. background (3,):
     composited behind the splats.
     """
     start, pair_splat, projected = lists.start, lists.pair_splat, projection.columns
@@ -337,7 +331,7 @@ def blend_forward(work, tiles, tiles_x, tile_rows, lists, projection, background
             if begin == end:
                 _store_empty_tile(left, top, background, blended)
                 continue
-            _begin_tile(s, tile_rows, np.uint64(tile))
+            _begin_tile(s, tile_blocks[tile])
             for batch_begin in range(begin, end, BATCH_PAIRS):
                 alive = _blocks_alive(s)
                 if alive == 0:

@@ -67,7 +67,7 @@ def compile_gradients() -> None:
     buffers, (splats, face, frames) = rasterize.BufferPool(), _two_splats()
     output = rasterize.RenderOutput(
         rasterize.new_image(SIZE, SIZE, lists, buffers), rasterize.new_projection(2, buffers),
-        lists, tile, tile_rows=np.zeros((1, 4), np.uint8), focus=np.ones(2, bool),
+        lists, tile, tile_blocks=np.zeros(1, np.uint16), focus=np.ones(2, bool),
         touched=np.ones((1, 1), bool), background=rasterize.BLACK_BACKGROUND, degree=3,
         depth_as_color=False, antialiased=False,
     )  # fmt: skip

@@ -22,8 +22,8 @@ BLACK_BACKGROUND = np.zeros(3, np.float32)
 class RenderOutput:
     """An image and what its backward pass needs; the tuples are those of `layout.py`.
 
-    tiles (T,) int32: the rendered tiles, tile_rows (tiles, 4) uint8: their rows that are, see
-    `find_needed_rows`; all other pixels are undefined. focus (N,) bool: the splats that need a
+    tiles (T,) int32: the rendered tiles, tile_blocks (tiles,) uint16: their blocks that are, see
+    `find_needed_blocks`; all other pixels are undefined. focus (N,) bool: the splats that need a
     gradient, or None for all; touched (tiles_y, tiles_x) bool: the tiles that they reach.
     """
 
@@ -31,7 +31,7 @@ class RenderOutput:
     projection: Projection
     lists: TileLists
     tiles: np.ndarray
-    tile_rows: np.ndarray
+    tile_blocks: np.ndarray
     focus: np.ndarray | None
     touched: np.ndarray
     background: np.ndarray
@@ -126,20 +126,20 @@ def render_forward(
     )
     if focus is None:
         project(buffers.kept("everything", (len(splats.xyz),), np.arange), everywhere)
-        tile_rows = buffers.kept("whole_tiles", (tiles_x * tiles_y,), tiling.whole_tiles)
+        tile_blocks = buffers.kept("whole_tiles", (tiles_x * tiles_y,), tiling.whole_tiles)
     else:
         focused, others = tiling.split_splats(focus)
         project(focused, everywhere)
-        touched, covered, tile_rows = tiling.find_needed_rows(
+        touched, covered, tile_blocks = tiling.find_needed_blocks(
             projection, focused, np.float32(reach), tiles_x, tiles_y
         )
         project(others, covered)
-    lists, tiles = sort_into_tiles(projection, tiles_x, tile_rows, buffers)
+    lists, tiles = sort_into_tiles(projection, tiles_x, tile_blocks, buffers)
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
-    blend_forward(tiles, tiles_x, tile_rows, lists, projection, background, blended)
+    blend_forward(tiles, tiles_x, tile_blocks, lists, projection, background, blended)
     return RenderOutput(
-        blended, projection, lists, tiles, tile_rows, focus, touched, background, degree,
+        blended, projection, lists, tiles, tile_blocks, focus, touched, background, degree,
         depth_as_color, antialiased,
     )  # fmt: skip
 
@@ -204,22 +204,22 @@ def new_image(width: int, height: int, lists: TileLists, buffers: BufferPool) ->
 
 
 def sort_into_tiles(
-    projection: Projection, tiles_x: int, tile_rows: np.ndarray, buffers: BufferPool
+    projection: Projection, tiles_x: int, tile_blocks: np.ndarray, buffers: BufferPool
 ) -> tuple[TileLists, np.ndarray]:
     """Which projected splats reach which tile, front to back; rows of several projections may
     follow each other.
 
-    tile_rows (tiles, 4): see `find_needed_rows`. Returns the lists, and the tiles (T,) int32 with a
-    needed row in the order in which they are rendered.
+    tile_blocks (tiles,): see `find_needed_blocks`. Returns the lists, and the tiles (T,) int32 with
+    a needed block in the order in which they are rendered.
     """
     rect = projection.rect
     visible, order, first_pair, pairs, total = sort_by_depth(projection, buffers)
-    counts = buffers.get("counts", (tiling.SORT_PARTS, len(tile_rows)), np.int32)
+    counts = buffers.get("counts", (tiling.SORT_PARTS, len(tile_blocks)), np.int32)
     splat_pairs, pair_splat = (
         buffers.get(name, (total,), np.int32) for name in ("splat_pairs", "pair_splat")
     )
     tiling.count_pairs(rect, order, tiles_x, counts)
-    start, tiles = tiling.arrange_tiles(counts, tile_rows)
+    start, tiles = tiling.arrange_tiles(counts, tile_blocks)
     tiling.fill_pairs(rect, order, tiles_x, counts, first_pair, splat_pairs, pair_splat)
     return TileLists(visible, first_pair, pairs, splat_pairs, start, pair_splat), tiles
 

@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from . import inline_jit, jit, part_jit
-from .blend import RUN_TILES
+from .blend import BLOCKS, BLOCKS_ALONG, RUN_TILES, SIDE
 from .elementary import prefetch
-from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR, TILE
+from .layout import MEAN_X, MEAN_Y, PRECISION_X, PRECISION_Y, SHEAR
 from .threads import parallel, pieces
 
 RADIX_BITS = 11
@@ -212,19 +212,18 @@ def count_pairs(work, rect, order, tiles_x, counts):
 
 
 @jit
-def arrange_tiles(counts, tile_rows):
+def arrange_tiles(counts, tile_blocks):
     """Turn the counts of `count_pairs` into the offset of each part's pairs in each tile's list.
 
-    tile_rows (tiles, 4) as of `find_needed_rows`. Returns start (tiles + 1,) int64: where each
-    tile's list begins, and
-    tiles (T,) int32: those with a needed row, in the order in which they are rendered.
+    tile_blocks (tiles,) as of `find_needed_blocks`. Returns start (tiles + 1,) int64: where each
+    tile's list begins, and tiles (T,) int32: those with a needed block, in the order in which they
+    are rendered.
     """
     start = sum_counts(counts)
-    tiles, count = np.empty(len(tile_rows), np.int32), 0
-    for tile in range(len(tile_rows)):
+    tiles, count = np.empty(len(tile_blocks), np.int32), 0
+    for tile in range(len(tile_blocks)):
         tiles[count] = tile
-        row = tile_rows[tile]
-        count += (row[0] < row[1]) | (row[2] < row[3])
+        count += tile_blocks[tile] != 0
     return start, heaviest_first(tiles[:count], start)
 
 
@@ -278,8 +277,8 @@ def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_
 
 
 def whole_tiles(count: int) -> np.ndarray:
-    """`find_needed_rows` of an image of `count` tiles that is needed everywhere."""
-    return np.tile(np.array([0, TILE, 0, TILE], np.uint8), (count, 1))
+    """`find_needed_blocks` of an image of `count` tiles that is needed everywhere."""
+    return np.full(count, (1 << BLOCKS) - 1, np.uint16)
 
 
 @part_jit
@@ -338,19 +337,17 @@ def sum_tiles(tiles: np.ndarray) -> np.ndarray:
 
 
 @jit
-def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
-    """The tiles that the listed splats (M,) reach, and the rows of tiles in which a pixel may be at
-    most `reach` pixels, float32, away from one that they reach.
+def find_needed_blocks(projection, splats, reach, tiles_x, tiles_y):
+    """The tiles that the listed splats (M,) reach, and the blocks of tiles in which a pixel may be
+    at most `reach` pixels, float32, away from one that they reach.
 
-    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach, which are needed whole;
-    `sum_tiles` of those with a needed row; and tile_rows (tiles, 4) uint8: first and past-the-last
-    row in the left and in the right half of each tile, both even; the first is not before the other
-    where there are none.
+    Returns touched (tiles_y, tiles_x) bool, the tiles that they reach; `sum_tiles` of those with a
+    needed block; and tile_blocks (tiles,) uint16: a bit each, in the order of `blend.BLOCKS`.
     """
     projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
-    two, half, slack = np.float32(2.0), np.float32(TILE // 2), np.float32(1e-4)
-    strips, pairs = 2 * tiles_x, TILE // 2 * tiles_y  # cells: two rows of half a tile
-    near = np.zeros((pairs + 1, strips + 1), np.int32)
+    side, slack = np.float32(SIDE), np.float32(1e-4)
+    columns, rows = BLOCKS_ALONG * tiles_x, BLOCKS_ALONG * tiles_y
+    near = np.zeros((rows + 1, columns + 1), np.int32)
     reached = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for n in range(len(splats)):
         i = np.uint64(splats[n])
@@ -362,24 +359,22 @@ def find_needed_rows(projection, splats, reach, tiles_x, tiles_y):
         ex = ey * math.sqrt(projected[i, PRECISION_Y] / projected[i, PRECISION_X] + shear * shear)
         ex = ex + slack * ex + reach + np.float32(0.5)
         ey = ey + slack * ey + reach + np.float32(0.5)
-        x0, x1 = _cell(x - ex, half, strips), _cell(x + ex + half, half, strips)
-        _add_box(near, x0, _cell(y - ey, two, pairs), x1, _cell(y + ey + two, two, pairs))
+        x0, x1 = _cell(x - ex, side, columns), _cell(x + ex + side, side, columns)
+        _add_box(near, x0, _cell(y - ey, side, rows), x1, _cell(y + ey + side, side, rows))
     _sum_boxes(reached)
     _sum_boxes(near)
-    touched = np.empty((tiles_y, tiles_x), np.bool_)
-    tile_rows = np.empty((tiles_y * tiles_x, 4), np.uint8)
+    tile_blocks = np.zeros(tiles_y * tiles_x, np.uint16)
     covered = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
-    for tile in range(tiles_y * tiles_x):
-        ty, tx = tile // tiles_x, tile % tiles_x
-        touched[ty, tx] = reached[ty, tx] > 0
-        for side in range(2):
-            first, past = TILE // 2, 0
-            for pair in range(TILE // 2):
-                if touched[ty, tx] or near[ty * (TILE // 2) + pair, 2 * tx + side] > 0:
-                    first, past, covered[ty + 1, tx + 1] = min(first, pair), pair + 1, 1
-            tile_rows[tile, 2 * side], tile_rows[tile, 2 * side + 1] = 2 * first, 2 * past
+    for row in range(rows):
+        for column in range(columns):
+            bit = column % BLOCKS_ALONG * BLOCKS_ALONG + row % BLOCKS_ALONG
+            tile = row // BLOCKS_ALONG * tiles_x + column // BLOCKS_ALONG
+            tile_blocks[tile] |= np.uint16((near[row, column] > 0) << bit)
+    for ty in range(tiles_y):
+        for tx in range(tiles_x):
+            covered[ty + 1, tx + 1] = tile_blocks[ty * tiles_x + tx] != 0
     _sum_boxes(covered)
-    return touched, covered, tile_rows
+    return reached[:-1, :-1] > 0, covered, tile_blocks
 
 
 def box_groups(tiles: np.ndarray, most_rows: int) -> np.ndarray:
