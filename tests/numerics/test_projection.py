@@ -119,8 +119,10 @@ def test_quaternions_of_any_length(back_end, norm):
 
     A quaternion of length zero counts as no rotation, as in the embedding, and has no gradient. The
     gradient of any other is 1 / length times that of the unit quaternion, up to 1e12, so that Adam
-    can square it.
+    can square it. Graphics cards may take subnormal numbers for zero.
     """
+    if back_end == "gpu" and 0 < norm < np.finfo(np.float32).tiny:
+        pytest.skip("subnormal components")
     scene = facing(30)
     unit = scene.splats["rotation"].astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
@@ -134,10 +136,10 @@ def test_quaternions_of_any_length(back_end, norm):
     for image, want in zip(images, expected_images, strict=True):
         np.testing.assert_allclose(image, want, atol=5e-6)
     expected["rotation"] *= min(1 / norm, 1e12) if norm else 0
+    lost = 2 * np.finfo(np.float32).tiny if back_end == "gpu" else 0  # of a sum of subnormal ones
     for name in NAMES:
-        np.testing.assert_allclose(
-            gradients[name], expected[name], atol=1e-5 * np.abs(expected[name]).max(), rtol=1e-4
-        )
+        atol = 1e-5 * np.abs(expected[name]).max() + lost
+        np.testing.assert_allclose(gradients[name], expected[name], atol=atol, rtol=1e-4)
 
 
 BROKEN = {name: (name, np.nan) for name in NAMES} | {
