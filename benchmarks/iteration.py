@@ -1,16 +1,16 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
     python benchmarks/iteration.py [--head ellipsoid] [--splats 60000] [--width 802] [--height 550]
-        [--repeats 30] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
+        [--repeats 30] [--device gpu] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
 
 Splats of SH degree 3 on the bundled head (23,400 triangles, denser at eyes and mouth, as heads
 are), or on an evenly covered ellipsoid, for which a selection costs most. Prints the
 instruction set, and medians over repeats in one process; beside each stage the bytes it must at
 least move and the time that takes at this machine's measured copy bandwidth, and for the image loss
-its arithmetic at the measured rate of multiply-adds. --opensplat: a checkout of OpenSplat,
-whose CPU rasterizer is compiled and run on the same splats, by wall time. Run it on an idle
-machine, or with --processor-time: instead of time that passes, that of the processor, of ours
-divided by its threads.
+its arithmetic at the measured rate of multiply-adds. --device: as of `stga train`; of a GPU, whole
+iterations only. --opensplat: a checkout of OpenSplat, whose CPU rasterizer is compiled and run on
+the same splats, by wall time. Run it on an idle machine, or with --processor-time: instead of time
+that passes, that of the processor, of ours divided by its threads.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
 from stga_addon.flame.teeth import flame_model
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
-from stga_addon.raster.cpu.layout import PROJECTED, Parameters
+from stga_addon.raster.cpu.layout import PROJECTED
 from stga_addon.raster.cpu.project import project_backward, project_forward
 from stga_addon.raster.cpu.rasterize import (
     BufferPool,
@@ -52,14 +52,16 @@ from stga_addon.raster.cpu.tiles import (
     fill_pairs,
     sum_tiles,
 )
+from stga_addon.render.device import choose_device
 from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.state import Batch, new_state
 from stga_addon.training.optimize.trainer import make_backend
+from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import make_settings
 
-RATES = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-9)
+RATES = dict.fromkeys(learning_rates(make_settings(iterations=1).rates, 0), 1e-9)
 SSIM_WEIGHT = 0.2
 """Of the image loss."""
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
@@ -240,15 +242,21 @@ def stages(
 
 
 def global_step(
-    splats: Splats, mesh: np.ndarray, faces: np.ndarray, camera: Camera, target: np.ndarray
+    splats: Splats,
+    mesh: np.ndarray,
+    faces: np.ndarray,
+    camera: Camera,
+    target: np.ndarray,
+    device: str = "cpu",
 ) -> tuple[Any, Batch]:
-    """A whole iteration on the CPU, from the posed mesh's frames on, and its global batch."""
+    """The backend of whole iterations, from the posed mesh's frames on, and their global batch;
+    device: one of `choose_device`."""
     poses = lambda timestep: mesh, lambda timestep, zero_pose: mesh
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, *poses)
     given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
     view = View(0, 0, camera, "benchmark", Path())
     batch = Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
-    return make_backend("cpu", *given), batch
+    return make_backend(device, *given), batch
 
 
 def two_regions(
@@ -270,6 +278,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=802)
     parser.add_argument("--height", type=int, default=550)
     parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--opensplat", type=Path, metavar="FOLDER")
     parser.add_argument(
         "--processor-time", action="store_true", help="of the CPU, for a loaded machine"
@@ -281,18 +290,23 @@ def main() -> None:
     splats, mesh, faces = make_head(options.splats, rng)
     camera = front_camera(options.width, options.height)
     target = rng.integers(0, 256, (options.height, options.width, 3)).astype(np.uint8)
-    backend, batch = global_step(splats, mesh, faces, camera, target)
+    device, reason = choose_device(options.device)
+    print(reason)
+    backend, batch = global_step(splats, mesh, faces, camera, target, device)
     clock = time_of_a_thread if options.processor_time else perf_counter
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
-    found = cpu_table(splats, frames, target, options.repeats, clock)
+    found = {}
+    if device == "cpu":
+        found = cpu_table(splats, frames, target, options.repeats, clock)
+        print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     if options.opensplat:
         compare_opensplat(options.opensplat, splats, frames, target, options.repeats)
 
     def measure(batch: Batch) -> float:
+        # a GPU is at most two iterations behind, so that it is its time, too
         return median_ms(lambda: backend.step(batch), options.repeats, clock)
 
     whole = measure(batch)
-    print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
     print(f"{'whole iteration':<22}{whole:8.2f}")
     parts = {}
     for share in (0.05, 0.1, 0.2, 0.4):
