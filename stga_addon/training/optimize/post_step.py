@@ -165,11 +165,16 @@ def prune_outside(
     may change, None for all. Every triangle with bound splats keeps one.
     """
     seen, outside = np.zeros((2, len(state)), np.int32)
-    for outline in outlines:
-        points = points_to_world(state.parameters.xyz, frames(outline.timestep), state.face)
-        x, y, shown = pixels_of(points, outline.camera)
-        seen += shown
-        outside += shown & outline.clear[y, x]
+    rows = np.arange(len(state))
+    for n, outline in enumerate(outlines):
+        left = len(outlines) - n  # without those that all of these could not make a stray
+        rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
+        face, frame = state.face[rows], frames(outline.timestep)
+        x, y, shown = pixels_of(
+            points_to_world(state.parameters.xyz[rows], frame, face), outline.camera
+        )
+        seen[rows] += shown
+        outside[rows] += shown & outline.clear[y, x]
     stray = outside > MAX_OUTSIDE_SHARE * seen
     if region is not None:
         stray &= region[state.face]
