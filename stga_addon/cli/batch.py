@@ -47,7 +47,9 @@ class EngineOptions:
     threads: int | None = option("threads of each job that names none", None, 1, metavar="N")
     dry_run: bool = option("print the jobs, and how long they are expected to take", False)
     engine: str = option(
-        "; ".join(f"{name}: {what}" for name, what in ENGINES.items()), "local", choices=ENGINES
+        "; ".join(f"{name}: {what}" for name, (what, _) in ENGINES.items()),
+        "local",
+        choices=ENGINES,
     )
     address: str = option("of a running cluster (ray)", "")
 

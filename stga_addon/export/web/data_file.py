@@ -11,6 +11,7 @@ import numpy as np
 
 from ...avatar.embedding import face_frames
 from ...avatar.file import Avatar
+from ...avatar.offsets import OFFSETS, POSITION
 from ...avatar.splats import Splats
 from ...capture.mesh_geometry import weighted_procrustes
 from ...flame.forward import joint_positions
@@ -22,7 +23,7 @@ from ..playback import Playback
 from ..spz import smallest_three
 
 MAGIC = b"STGA"
-FORMAT, VERSION = "stga-web", 3
+FORMAT, VERSION = "stga-web", 4
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
@@ -188,7 +189,12 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 POSITION_STEP_M, MOVED_STEP_M = 4e-6, 0.25e-6
-"""Of splats, and of how far they move with a unit of strain."""
+"""Of splats, and of how far a driven offset moves them with a unit of its signal."""
+OFFSET_STEP = 2.0**-12
+"""Of other driven offsets. Signals are at most 2 in each of three components: half a step of each
+changes a color by 0.19 / 255, a size by 0.07 %, and moves a splat by 0.75 µm along an axis."""
+PLAYER_SIGNALS = ("strain", "smoothed_strain", "normal")
+"""Those of `face_frames.js`."""
 STEPS = {
     # The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each.
     "rotation": 1 / 724,
@@ -197,13 +203,6 @@ STEPS = {
     # Of the constant SH coefficient, which a color has 0.28 times.
     "color": 0.004,
     "sh": 0.005,
-    # Signals of driven offsets are at most 2 in each of three components: half a step of each moves
-    # a splat by 0.75 µm along an axis (MOVED_STEP_M), or changes its color by 0.19 / 255, or its
-    # size by 0.07 %.
-    "strain_scale": 2.0**-12,
-    "strain_color": 2.0**-12,
-    "normal_color": 2.0**-12,
-    "older_strain_color": 2.0**-12,
     # Of the ends of a triangle's range: positions that follow strain by 2 mm err by 2 µm.
     "strain_range": 0.002,
     # Meters, so fine that no thin triangle becomes a line, or the reverse.
@@ -247,14 +246,16 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     unit = float(frames.scale.max(initial=1e-6))
     steps = STEPS | {"xyz": POSITION_STEP_M / unit, "light_lash_corners": POSITION_STEP_M / unit}
-    steps["strain_position"] = MOVED_STEP_M / unit
     if avatar.follows_strain and avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range.reshape(faces, -1)
-    for name, coefficients in avatar.driven_offsets.items():
-        if name not in steps:
-            raise ValueError(f"the web player has no driven offset {name}")
-        arrays[name] = coefficients.reshape(faces, -1)
     header = _header(avatar, rig, playback)
+    for name, coefficients in avatar.driven_offsets.items():
+        offset = OFFSETS[name]
+        if offset.signal not in PLAYER_SIGNALS:
+            raise ValueError(f"the web player has no driven offset {name}")
+        header["offsets"][name] = offset.signal, "light" if offset.of_light else offset.target
+        arrays[name] = coefficients.reshape(faces, -1)
+        steps[name] = MOVED_STEP_M / unit if offset.target == POSITION else OFFSET_STEP
     if playback.controls is not None and rig.expressions:
         controls = playback.controls
         arrays |= {"shape_linear": controls.linear, "shape_products": controls.products}
@@ -306,6 +307,7 @@ def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
         "title": playback.title,
         "convention": avatar.convention,
         "antialiased": avatar.antialiased,
+        "offsets": {},
         "background": [float(value) for value in avatar.background],
         "fps": playback.fps,
         "up": [float(value) for value in playback.up],

@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ...errors import StgaError
@@ -84,23 +84,30 @@ def free_memory_gb() -> float:
     return float(next(found, "inf")) * 1024 / 1e9
 
 
-ENGINES = {
-    "local": "this machine, as many jobs as its processors and memory allow",
-    "ray": "a Ray cluster at --address, or one started here",
-    "slurm": "a SLURM cluster, as arrays of sbatch",
-}
+def _ray(address: str) -> Engine:
+    from .ray import RayEngine  # needs the package ray
+
+    return RayEngine(address)
+
+
+def _slurm(address: str) -> Engine:
+    from .slurm import SlurmEngine
+
+    return SlurmEngine()
+
+
+ENGINES: dict[str, tuple[str, Callable[[str], Engine]]] = {
+    "local": (
+        "this machine, as many jobs as its processors and memory allow", lambda _: LocalEngine()
+    ),
+    "ray": ("a Ray cluster at --address, or one started here", _ray),
+    "slurm": ("a SLURM cluster, as arrays of sbatch", _slurm),
+}  # fmt: skip
+"""Name -> what the command line says of it, and what makes it with --address."""
 
 
 def make_engine(name: str, address: str = "") -> Engine:
     """Raises StgaError where the engine is not there; an address is that of a Ray cluster."""
     if address and name != "ray":
         raise StgaError(f"--address: is that of a Ray cluster; expected --engine ray, got {name}")
-    if name == "ray":
-        from .ray import RayEngine
-
-        return RayEngine(address)
-    if name == "slurm":
-        from .slurm import SlurmEngine
-
-        return SlurmEngine()
-    return LocalEngine()
+    return ENGINES[name][1](address)

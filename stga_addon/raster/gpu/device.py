@@ -358,6 +358,11 @@ def _source(name: str) -> str:
     return files(__package__).joinpath(f"{name}.wgsl").read_text(encoding="utf-8")
 
 
+def entry_points(file: str) -> list[str]:
+    """The kernels of a WGSL file."""
+    return re.findall(r"^@compute[^\n]*\nfn (\w+)", _source(file), re.M)
+
+
 @cache
 def _linked(file: str, entry: str) -> tuple[str, dict[str, str]]:
     """The text of an entry point with the functions that it calls, and the kind of each table that

@@ -12,18 +12,13 @@ from ...avatar.splats import SH_C0
 from ..cpu.layout import Parameters
 from ..cpu.optimizer import AdamOptions
 from ..cpu.rasterize import tile_grid
-from .device import Device, Recording
+from .device import Device, Recording, entry_points
 from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
-KERNELS = (
-    "frames.compose frames.average_strain frames.smooth_strain"
-    " frames.move_position frames.move_scale frames.move_color"
-    " project.mark_focus project.forward project.backward"
-    " tiles.mark_touched tiles.choose_rendered tiles.count_pairs tiles.add_pairs tiles.fill_pairs"
-    " tiles.find_ranges blend.forward blend.backward image_loss.gradient image_loss.total"
-    " optimizer.measure_excess optimizer.join_excess optimizer.prepare optimizer.adam"
-)
+FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer")
+"""Of the kernels of an iteration, beside those of `sort`."""
+STEP_OFFSET = "optimizer.step_offset"
 """What any iteration may dispatch beside sorting and steps of driven offsets."""
 RATES = (*Parameters._fields, "sh_rest", "strain_color")
 """Learning rates in the order of the kernels."""
@@ -161,7 +156,7 @@ def step_offsets(
     """
     for name, tables in offsets.items():
         all_tables = {**given, **tables._asdict(), "driving": signals[OFFSETS[name].signal]}
-        work.dispatch("optimizer.step_offset", triangles, all_tables, **offset_constants(name))
+        work.dispatch(STEP_OFFSET, triangles, all_tables, **offset_constants(name))
 
 
 def offset_constants(name: str) -> dict[str, float]:
@@ -176,10 +171,11 @@ def offset_constants(name: str) -> dict[str, float]:
 def compile_kernels(device: Device) -> None:
     """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to
     training."""
-    for kernel in KERNELS.split():
+    kernels = {f"{file}.{entry}" for file in FILES for entry in entry_points(file)}
+    for kernel in sorted(kernels - {STEP_OFFSET}):
         device.kernel(kernel)
     for constants in (*sort_passes(DEPTH_BITS, False), *sort_passes(MAX_TILE_BITS, True)):
         for entry in ("count", "place", "scatter"):
             device.kernel(f"sort.{entry}", **constants)
     for name in OFFSETS:
-        device.kernel("optimizer.step_offset", **offset_constants(name))
+        device.kernel(STEP_OFFSET, **offset_constants(name))

@@ -307,7 +307,8 @@ class TreeOptions(NamedTuple):
         """At most 59 characters: Blender before 5.0 has room for 63, and may add ".001". Of
         offsets, the words' initials."""
         parts = [self.convention or "world", f"SH {self.degree}"]
-        parts += ["".join(word[0] for word in name.split("_")) for name in self.offsets]
+        initials = ("".join(word[0] for word in name.split("_")) for name in self.offsets)
+        parts += [" ".join(initials)] if self.offsets else []
         return f"STGA Splats ({', '.join(parts)})"
 
 

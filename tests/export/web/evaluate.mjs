@@ -11,7 +11,7 @@ try {
   const data = await readData(new Uint8Array(await readFile(file)));
   const { header, arrays } = data;
   const [motion, rig] = [new Motion(data), new Rig(data)];
-  const frames = new FaceFrames(arrays, header.convention);
+  const frames = new FaceFrames(arrays, header.convention, header.offsets);
   const camera = header.views[0]?.world_to_camera ?? [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
   const texels = new Float32Array(FACE_FLOATS * frames.count);
   const results = [];

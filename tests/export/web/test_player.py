@@ -180,6 +180,10 @@ def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
         ("title", "title", 5),
         ("light", "light", {**LIGHT, "damping": 2}),
         ("light_transfer", "light", LIGHT),
+        ("offsets.normal_color", "offsets", "normal_color", ["wind", "color"]),
+        ("offsets.normal_color", "offsets", "normal_color", ["normal", "valueOf"]),
+        ("offsets.normal_color", "offsets", "normal_color", None),
+        ("gone", "offsets", {"gone": ["normal", "color"]}),
         ("xyz.planes", "arrays", "xyz", "planes", 9),
     ]:
         sentence = f"damaged: {field} is missing or malformed."

@@ -17,7 +17,7 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     raw = gzip.decompress(data)
     magic, version, length = struct.unpack_from("<4sII", raw)
     assert magic == b"STGA"
-    assert version == 3
+    assert version == 4
     header = json.loads(raw[12 : 12 + length])
     at = 12 + length
     arrays = {}

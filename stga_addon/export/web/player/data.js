@@ -3,11 +3,11 @@
 
 /** @import { Data, DataArray, Values } from './types.js' */
 
-import { OFFSETS } from './face_frames.js';
+import { SIGNALS, TARGETS } from './face_frames.js';
 
 export class DataError extends Error {}
 
-const VERSION = 3;
+const VERSION = 4;
 const MAX_VIEW_SIZE = 1 << 16; // pixels
 
 // Parse a data file (Uint8Array, gzipped): { header, arrays }. Throws DataError in one sentence.
@@ -107,8 +107,12 @@ function checkData(header, arrays) {
     ['strain_range', faces, 12],
     ['sh', splats, [9, 24, 45].find(count => count === arrays.sh?.shape[1]) ?? 0],
   ];
-  for (const name of Object.keys(OFFSETS)) optional.push([name, faces, 9]);
   shapesOf.push(...optional.filter(([name]) => arrays[name]));
+  for (const [name, row] of Object.entries(header.offsets ?? {})) {
+    const [signal, target] = list(row, `offsets.${name}`);
+    require(Object.hasOwn(SIGNALS, signal) && TARGETS.includes(target), `offsets.${name}`);
+    shapesOf.push([name, faces, 9]);
+  }
   if (header.shapes) {
     const controls = strings(header.shapes.names, 'shapes');
     const moved = size(arrays, 'shape_products', 1);

@@ -3,7 +3,7 @@
 // of the neutral mesh. The rules are those of STGA for Blender's embedding.py, strain.py and
 // offsets.py.
 
-/** @import { Arrays, Vector } from './types.js' */
+/** @import { Arrays, Header, Vector } from './types.js' */
 
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
 
@@ -197,20 +197,12 @@ function symmetricProduct(a, b, factor, out, at) {
 }
 
 // Three numbers a triangle, by name, which its splats may follow.
-const SIGNALS = { strain: Strain, smoothed_strain: SmoothedStrain, normal: NormalChange };
+export const SIGNALS = { strain: Strain, smoothed_strain: SmoothedStrain, normal: NormalChange };
 
-/** @typedef {{ signal: keyof SIGNALS, target: 'position' | 'scale' | 'color' | 'light' }} Offset */
-// What coefficients (faces, 9) of that name in a data file change: for each component of the signal
-// a vector in the frame, the logarithm of its scale (and two zeros), or a color; 'light': one that
-// is the light of the capture.
-/** @type {Record<string, Offset>} */
-export const OFFSETS = {
-  strain_position: { signal: 'smoothed_strain', target: 'position' },
-  strain_scale: { signal: 'smoothed_strain', target: 'scale' },
-  strain_color: { signal: 'smoothed_strain', target: 'color' },
-  normal_color: { signal: 'normal', target: 'light' },
-  older_strain_color: { signal: 'strain', target: 'color' },
-};
+// What an offset's coefficients (faces, 9) change: for each component of its signal a vector in the
+// frame, the logarithm of its scale (and two zeros), or a color; 'light': one that is the light of
+// the capture.
+export const TARGETS = ['position', 'scale', 'color', 'light'];
 
 const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
 const UPRIGHT_COSINE = 0.8;
@@ -219,9 +211,9 @@ const UPRIGHT_COSINE = 0.8;
 export const FACE_FLOATS = 20;
 
 export class FaceFrames {
-  // Arrays of the data file, and the convention of the embedding.
-  /** @param {Arrays} arrays @param {string} convention */
-  constructor(arrays, convention) {
+  // Arrays of the data file, the convention of the embedding, and the driven offsets.
+  /** @param {Arrays} arrays @param {string} convention @param {Header['offsets']} offsets */
+  constructor(arrays, convention, offsets = {}) {
     this.faces = arrays.faces.values;
     this.count = this.faces.length / 3;
     this.isStga = convention === 'stga';
@@ -237,10 +229,9 @@ export class FaceFrames {
     const range =
       arrays.strain_range?.values ??
       new Float32Array(12 * this.count).fill(MAX_DEFORMATION).map((v, k) => (k % 12 < 6 ? -v : v));
-    /** @type {Partial<Record<Offset['signal'], Strain | SmoothedStrain | NormalChange>>} */
+    /** @type {Partial<Record<keyof SIGNALS, Strain | SmoothedStrain | NormalChange>>} */
     this.signals = {};
-    this.offsets = Object.entries(OFFSETS).flatMap(([name, { signal, target }]) => {
-      if (!arrays[name]) return [];
+    this.offsets = Object.entries(offsets).map(([name, [signal, target]]) => {
       const followed = (this.signals[signal] ??= new SIGNALS[signal](this.sides, range, arrays));
       return { target, signal: followed, coefficients: arrays[name].values };
     });

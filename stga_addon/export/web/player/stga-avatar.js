@@ -31,7 +31,7 @@ export class Player {
     this.data = data;
     this.motion = new Motion(data);
     this.rig = new Rig(data);
-    this.faceFrames = new FaceFrames(arrays, header.convention);
+    this.faceFrames = new FaceFrames(arrays, header.convention, header.offsets);
     this.depthSort = new DepthSort(arrays.xyz.values, arrays.splats_per_face.values);
     this.renderer = new Renderer(this.gl, data);
     /** @type {Color} */

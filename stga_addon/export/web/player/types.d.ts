@@ -21,6 +21,11 @@ export interface Header {
   title: string;
   convention: 'stga' | 'gaussian_avatars';
   antialiased: boolean;
+  /** Name of the coefficients -> what drives them, and what they change (face_frames.js). */
+  offsets: Record<
+    string,
+    [keyof typeof import('./face_frames.js').SIGNALS, 'position' | 'scale' | 'color' | 'light']
+  >;
   background: Vector;
   fps: number;
   up: Vector;
