@@ -127,16 +127,16 @@ def _principal_point_warning(
     """A warning where another convention puts clearly more of the mesh inside the masks of a few
     views. Vertices outside count: hair lies inside the mask but beside the mesh. None without
     Pillow, which Blender lacks."""
-    if find_spec("PIL") is None:
-        return None
-    from .images import read_mask
-
     apart, outside = [], []
     for frame in frames:
         own = frame.view.camera
         cameras = [with_principal_point(own, frame.principal, name) for name in PRINCIPAL_POINTS]
         if (np.ptp([(camera.cx, camera.cy) for camera in cameras], axis=0) > 0.5).any():
             apart.append((frame.view, cameras))
+    if not apart or find_spec("PIL") is None:
+        return None
+    from .images import read_mask
+
     for view, cameras in evenly_spread(apart, MAX_COMPARED_VIEWS):
         if (mask := read_mask(view)) is not None:
             points, shares = mesh(view.timestep), []
