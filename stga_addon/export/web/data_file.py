@@ -73,9 +73,8 @@ def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, 
     # Byte planes of what is above the lowest, least significant first. Within a plane the last
     # axis varies slowest, so that equal quantities lie side by side: gzip gains a fifth.
     planes = ((above >> 8 * plane).astype(np.uint8) for plane in range(count))
-    planes = [np.moveaxis(plane, -1, 0).tobytes() for plane in planes]
     entry |= {"shape": list(integers.shape), "planes": count, "low": low}
-    return entry, b"".join(planes)
+    return entry, b"".join(np.moveaxis(plane, -1, 0).tobytes() for plane in planes)
 
 
 BAKE_TOLERANCE_M = 5e-6
