@@ -1,6 +1,6 @@
 """How long each preset would train on this machine, measured on the capture itself."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle, islice
 from time import perf_counter
 
@@ -12,6 +12,7 @@ from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
 from .optimize.image_preparation import image_preparation
+from .optimize.post_step import control_density
 from .optimize.precompile import precompile_kernels
 from .optimize.trainer import Trainer
 from .schedule import image_scales, view_order
@@ -23,6 +24,8 @@ CALIBRATION_VIEWS = 8
 """Views that the calibration trains, in turn."""
 WARM_UP_ITERATIONS = 3
 """First iterations that are not measured: they allocate memory."""
+MIN_SPLIT_SHARE = 0.1
+"""Of the splats; fewer are not split at a time."""
 MAX_ITERATIONS = 2000
 """Limit for captures of a few pixels."""
 
@@ -51,7 +54,7 @@ def time_presets(
     for name, preset in PRESETS.items():
         settings, _ = plan_effects(capture, make_settings(preset=name, effects={}), device)
         iterations = preset.iterations_for(len(capture.views["train"]))
-        pace = seconds_per_iteration(capture, settings, seconds, device)
+        pace = seconds_per_iteration(capture, settings, iterations, seconds, device)
         timings.append(PresetTiming(name, preset.purpose, iterations, iterations * pace))
     return timings
 
@@ -59,19 +62,25 @@ def time_presets(
 def seconds_per_iteration(
     capture: Capture,
     settings: TrainingSettings,
+    iterations: int,
     seconds: float = CALIBRATION_S,
     device: str = "cpu",
 ) -> float:
-    """Mean time of an iteration, measured by a short run whose result is discarded.
+    """Mean time of an iteration of a run of so many, measured by a short one whose result is
+    discarded.
 
-    The run passes through the whole schedule in `seconds`, so that coarse images, spherical
-    harmonics and local iterations have the weight that they have in a real run. Reading files is
-    not measured: in a real run, the loader's thread does it.
+    The short run passes through the whole schedule in `seconds`, so that coarse images, spherical
+    harmonics, local iterations and growing numbers of splats have the weight that they have in a
+    real run. Reading files is not measured: in a real run, the loader's thread does it.
     """
     precompile_kernels(device)
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
+    # as often as in the whole run, this one would split splats hardly ever
+    growth = expected_growth(settings, len(trainer), trainer.initial_count, iterations)
+    trainer.settings = replace(settings, density_interval=0)
+    splits_s, rng = [0.0], np.random.default_rng(settings.seed)
     trained = capture.views["train"]
     order = view_order(trained, settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
@@ -91,9 +100,31 @@ def seconds_per_iteration(
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
         view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
         begin = perf_counter()
+        missing = sum(count for share, count in growth if share <= progress) - len(trainer)
+        if missing > MIN_SPLIT_SHARE * len(trainer):
+            trainer.state = control_density(trainer.state, missing, rng, 1.0)
+            splits_s.append(perf_counter() - begin)
+            trainer.step(view, image, progress, mask, mesh)  # allocates memory
+            begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)
     # Each stands for the share of the schedule that it takes here: cheap ones are as many as they
     # are quick.
     measured = times[WARM_UP_ITERATIONS:]
-    return float(np.average(measured, weights=measured))
+    splits = (len(growth) - 1) / iterations * max(splits_s)
+    return float(np.average(measured, weights=measured)) + splits
+
+
+def expected_growth(
+    settings: TrainingSettings, first: int, whole: int, iterations: int
+) -> list[tuple[float, int]]:
+    """The first number of splats, and how many more there are from which share of a run on; whole:
+    as many as `growth` counts from."""
+    (start, end), interval = settings.density_span, settings.density_interval
+    most, count, added = round(whole * (1 + settings.growth)), first, [(0.0, first)]
+    for turn in range(interval, iterations, interval) if interval else ():
+        if start <= turn / iterations < end:
+            more = max(0, min(most - count, int(settings.split_share * count)))
+            added.append((turn / iterations, more))
+            count += more
+    return added

@@ -184,7 +184,7 @@ def test_presets(toy_root, capsys, monkeypatch):
     timed = []
 
     def time(*call):
-        timed.append(call[3])
+        timed.append(call[4])
         return 1e-3
 
     monkeypatch.setattr(preset_timing, "seconds_per_iteration", time)

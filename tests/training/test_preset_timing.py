@@ -30,17 +30,30 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     watch, seen = Stopwatch(), []
 
     class Trainer:
+        """Its state is the number of its splats; each one over the first thousand costs as much as
+        the image divided by a thousand."""
+
+        initial_count, state = 1600, 1000
+
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
+
+        def __len__(self) -> int:
+            return self.state
 
         def step(self, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> None:
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
-            watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000
+            watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000 * self.state / 1000
             seen.append(share)
+
+    def split(state: int, more: int, *_: Any) -> int:
+        watch.now += 0.5
+        return state + more
 
     monkeypatch.setattr(preset_timing, "perf_counter", watch)
     monkeypatch.setattr(preset_timing, "Trainer", Trainer)
+    monkeypatch.setattr(preset_timing, "control_density", split)
     monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 0)
     return seen
 
@@ -48,11 +61,24 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def test_the_mean_over_the_whole_course(toy, shares):
     """Catches a calibration of the cheap beginning only, with images of half the size."""
     settings = make_settings(iterations=100, coarse_share=1 / 3)
-    pace = seconds_per_iteration(toy, settings, 2.4)
+    pace = seconds_per_iteration(toy, settings, 100, 2.4)
     assert pace == pytest.approx(0.006 / 3 + 0.024 * 2 / 3, rel=0.05)
     assert shares[: WARM_UP_ITERATIONS + 1] == [0.0] * (WARM_UP_ITERATIONS + 1)
     assert shares == sorted(shares)
     assert 0.97 < shares[-1] < 1
+
+
+def test_splats_grow_as_in_the_whole_run(toy, shares):
+    """Catches a pace of the first, few splats (a half of the real one), and one that counts each
+    split of the short run as the whole run has it more seldom."""
+    settings = make_settings(
+        iterations=1000, coarse_share=0, density_interval=100, density_span=(0.1, 0.6),
+        split_share=0.5, growth=0.25,
+    )  # fmt: skip
+    pace = seconds_per_iteration(toy, settings, 1000, 6.0)
+    # 1000, from 0.1 on 1500, from 0.2 on 2000, 1.25 times the whole lattice
+    steps = 0.024 * (0.1 * 1 + 0.1 * 1.5 + 0.8 * 2)
+    assert pace == pytest.approx(steps + 5 / 1000 * 0.5, rel=0.05)
 
 
 def test_timings_of_all_presets(toy, shares):
@@ -61,7 +87,8 @@ def test_timings_of_all_presets(toy, shares):
     assert [timing.preset for timing in timings] == list(PRESETS)
     assert [timing.seconds for timing in timings] == sorted(timing.seconds for timing in timings)
     pace = 0.35 * 0.006 + 0.65 * 0.024  # 35 % at half size
-    assert timings[1].seconds == pytest.approx(PRESETS["standard"].iterations * pace, rel=0.2)
+    few = PRESETS["standard"].iterations * pace  # splats twice as many as at first, ten splits
+    assert few < timings[1].seconds < 2 * few + 10 * 0.5
     with pytest.raises(StgaError, match="has no training views"):
         time_presets(replace(toy, views={}))
 

@@ -82,7 +82,7 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
         assert isinstance(request, Train | Resume)
         prepared = prepare(request, ignore, partial(print, file=sys.stderr))
         capture = prepared.capture
-        seconds_per_iteration(capture, prepared.run.settings, WARM_UP_S)
+        seconds_per_iteration(capture, prepared.run.settings, 1, WARM_UP_S)
         avatar = read_avatar(prepared.train(turns.report))
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]

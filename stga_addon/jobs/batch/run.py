@@ -304,15 +304,15 @@ def _stated(job: Job, paces: list[float]) -> float | None:
         return None
     if request.settings.seconds is not None:
         return request.settings.seconds
-    measured = None if paces else pace(job, request)
-    if measured is not None:
-        paces.append(measured)
     # A capture of very many views takes more than its preset's own number.
     iterations = request.settings.iterations or PRESETS[str(request.settings.preset)].iterations
+    measured = None if paces else pace(job, request, iterations)
+    if measured is not None:
+        paces.append(measured)
     return paces[0] * iterations if paces else None
 
 
-def pace(job: Job, request: Train) -> float | None:
+def pace(job: Job, request: Train, iterations: int) -> float | None:
     """Measured seconds per iteration of a training here; None where it cannot be trained yet."""
     if find_spec("torch") is None or find_spec("numba") is None or not request.capture.is_dir():
         return None
@@ -330,7 +330,7 @@ def pace(job: Job, request: Train) -> float | None:
         if not capture.views.get("train"):
             return None
         settings, _ = plan_effects(capture, request.settings, device)
-        return seconds_per_iteration(capture, settings, device=device)
+        return seconds_per_iteration(capture, settings, iterations, device=device)
     except StgaError:  # the job itself will say so
         return None
     finally:
