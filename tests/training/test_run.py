@@ -14,6 +14,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
+from stga_addon.training.evaluate.forecast import saved_line
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
@@ -211,8 +212,10 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
 def test_the_best_avatar_is_kept(
     toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Catches a run that gets worse and takes its best avatar with it."""
-    scores = iter([0.3, 0.1, 0.2, 0.11, *[0.15] * 20])
+    """Catches a run that gets worse and takes its best avatar with it, and one that keeps an early
+    state because it is a hair sharper."""
+    found = (30, 0.3), (30, 0.1), (29, 0.2), (31, 0.11), *[(30.5, 0.15)] * 20
+    scores = iter(found)
     written: list[Avatar] = []
 
     def write(path: Path, avatar: Avatar) -> None:
@@ -222,16 +225,18 @@ def test_the_best_avatar_is_kept(
     run_module_write = run_module.write_avatar
 
     def evaluate(*arguments: Any) -> Quality:
-        return Quality(30.0, 0.5, detail_difference=next(scores))
+        psnr, difference = next(scores)
+        return Quality(psnr, 0.5, detail_difference=difference)
 
     monkeypatch.setattr(evaluator, "evaluate", evaluate)
     monkeypatch.setattr(run_module, "write_avatar", write)
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
-    assert len(written) == 2
-    assert read_checkpoint(tmp_path).best_difference == 0.1
+    assert len(written) == 3
+    assert read_checkpoint(tmp_path).best_difference == 0.11
+    assert saved_line(read_metrics(tmp_path), None)["psnr"] == 31
     best = read_avatar(tmp_path / "avatar.npz").splats
-    np.testing.assert_array_equal(best.xyz, written[1].splats.xyz)
+    np.testing.assert_array_equal(best.xyz, written[2].splats.xyz)
     assert not np.array_equal(written[0].splats.xyz, written[1].splats.xyz)
 
 

@@ -9,7 +9,15 @@ import numpy as np
 
 from ...capture.model import View, ViewExposure
 from ..settings import TrainingSettings
-from .forecast import DETAIL, curve_of, describe_forecast, flat_since, forecast, forecast_horizon
+from .forecast import (
+    DETAIL,
+    curve_of,
+    describe_forecast,
+    flat_since,
+    forecast,
+    forecast_horizon,
+    saved_line,
+)
 from .metrics import EvaluationView, evaluate
 
 EVALUATIONS = 10
@@ -83,16 +91,20 @@ class Evaluator:
         """Fields of a metrics line (`Quality.as_json`) of `render(view)` on the evaluation views,
         and whether the avatar is to be kept. perceptual: with LPIPS.
 
-        Kept is the sharpest so far, or what reaches the target, which ends the run (`saved_line`);
-        not by PSNR, which prefers an early, blurred state to detail that is a pixel off.
+        Kept is what reaches the target, which ends the run, and what is sharper than the one kept
+        before or has a higher PSNR (`saved_line`). PSNR alone prefers an early, blurred state to
+        detail that is a pixel off; sharpness alone one with haze beside the head.
         """
         if not self.views:
             return {}, True
         quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
         difference, target = quality.get(DETAIL), self.settings.target_psnr
         reached = target is not None and quality["psnr"] >= target
-        is_sharp = difference is None or difference <= self.best_difference
-        return quality, self.keeps_latest or reached or is_sharp
+        scored = [line for line in self.lines if "psnr" in line]
+        kept_psnr = saved_line(scored, target)["psnr"] if scored else -math.inf
+        is_better = difference is None or difference <= self.best_difference
+        is_better = is_better or quality["psnr"] > kept_psnr
+        return quality, self.keeps_latest or reached or is_better
 
     def record(self, is_kept: bool, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
         """Remember an evaluation; returns its metrics line with a forecast, to be checked later."""

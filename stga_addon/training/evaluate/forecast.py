@@ -111,9 +111,14 @@ def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
-    """The saved avatar's line, of those with a PSNR: the last at the target, or the sharpest."""
+    """The saved avatar's line, of those with a PSNR: the last at the target, or else the last that
+    was sharper, or had a higher PSNR, than the one saved before."""
     reached = [line for line in lines if target is not None and line["psnr"] >= target]
-    return reached[-1] if reached else min(lines, key=lambda line: line.get(DETAIL, np.inf))
+    saved = lines[0]
+    for line in lines:
+        is_sharper = line.get(DETAIL, np.inf) <= saved.get(DETAIL, np.inf)
+        saved = line if is_sharper or line["psnr"] > saved["psnr"] else saved
+    return reached[-1] if reached else saved
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:
