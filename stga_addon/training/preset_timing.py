@@ -1,5 +1,6 @@
 """How long each preset would train on this machine, measured on the capture itself."""
 
+from collections import deque
 from dataclasses import dataclass, replace
 from itertools import cycle, islice
 from time import perf_counter
@@ -12,7 +13,6 @@ from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
 from .optimize.image_preparation import image_preparation
-from .optimize.post_step import control_density
 from .optimize.precompile import precompile_kernels
 from .optimize.trainer import Trainer
 from .schedule import image_scales, view_order
@@ -24,8 +24,6 @@ CALIBRATION_VIEWS = 8
 """Views that the calibration trains, in turn."""
 WARM_UP_ITERATIONS = 3
 """First iterations that are not measured: they allocate memory."""
-MIN_SPLIT_SHARE = 0.1
-"""Of the splats; fewer are not split at a time."""
 MAX_ITERATIONS = 2000
 """Limit for captures of a few pixels."""
 
@@ -77,10 +75,12 @@ def seconds_per_iteration(
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
-    # as often as in the whole run, this one would split splats hardly ever
-    growth = expected_growth(settings, len(trainer), trainer.initial_count, iterations)
+    # shares of the run at which splats are split: by its own count, this one hardly ever would
+    (start, end), interval = settings.density_span, settings.density_interval
+    turns = [n / iterations for n in range(interval, iterations, interval)] if interval else []
+    turns = [share for share in turns if start <= share < end]
+    left, split_s = deque(turns), list[float]()
     trainer.settings = replace(settings, density_interval=0)
-    splits_s, rng = [0.0], np.random.default_rng(settings.seed)
     trained = capture.views["train"]
     order = view_order(trained, settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
@@ -99,32 +99,17 @@ def seconds_per_iteration(
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
         view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
+        while left and left[0] <= progress:
+            trainer.settings, begin = replace(settings, density_interval=1), perf_counter()
+            trainer.step(view, image, left.popleft(), mask, mesh)
+            split_s.append(perf_counter() - begin)
+            trainer.settings = replace(settings, density_interval=0)
+            trainer.step(view, image, progress, mask, mesh)  # not measured: it allocates memory
         begin = perf_counter()
-        missing = sum(count for share, count in growth if share <= progress) - len(trainer)
-        if missing > MIN_SPLIT_SHARE * len(trainer):
-            trainer.state = control_density(trainer.state, missing, rng, 1.0)
-            splits_s.append(perf_counter() - begin)
-            trainer.step(view, image, progress, mask, mesh)  # allocates memory
-            begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)
         times.append(perf_counter() - begin)
     # Each stands for the share of the schedule that it takes here: cheap ones are as many as they
     # are quick.
     measured = times[WARM_UP_ITERATIONS:]
-    splits = (len(growth) - 1) / iterations * max(splits_s)
-    return float(np.average(measured, weights=measured)) + splits
-
-
-def expected_growth(
-    settings: TrainingSettings, first: int, whole: int, iterations: int
-) -> list[tuple[float, int]]:
-    """The first number of splats, and how many more there are from which share of a run on; whole:
-    as many as `growth` counts from."""
-    (start, end), interval = settings.density_span, settings.density_interval
-    most, count, added = round(whole * (1 + settings.growth)), first, [(0.0, first)]
-    for turn in range(interval, iterations, interval) if interval else ():
-        if start <= turn / iterations < end:
-            more = max(0, min(most - count, int(settings.split_share * count)))
-            added.append((turn / iterations, more))
-            count += more
-    return added
+    step_s = float(np.average(measured, weights=measured))
+    return step_s + max(0.0, sum(split_s) - len(split_s) * step_s) / iterations

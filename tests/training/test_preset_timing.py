@@ -30,30 +30,25 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     watch, seen = Stopwatch(), []
 
     class Trainer:
-        """Its state is the number of its splats; each one over the first thousand costs as much as
-        the image divided by a thousand."""
+        """Its state is the number of its splats, of which a turn adds 500, up to 2,000."""
 
-        initial_count, state = 1600, 1000
+        state, settings = 1000, make_settings(iterations=1)
 
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
-
-        def __len__(self) -> int:
-            return self.state
 
         def step(self, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> None:
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
             watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000 * self.state / 1000
-            seen.append(share)
-
-    def split(state: int, more: int, *_: Any) -> int:
-        watch.now += 0.5
-        return state + more
+            if self.settings.density_interval == 1:
+                watch.now += 0.5
+                self.state = min(2000, self.state + 500)
+            else:
+                seen.append(share)
 
     monkeypatch.setattr(preset_timing, "perf_counter", watch)
     monkeypatch.setattr(preset_timing, "Trainer", Trainer)
-    monkeypatch.setattr(preset_timing, "control_density", split)
     monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 0)
     return seen
 
@@ -72,11 +67,10 @@ def test_splats_grow_as_in_the_whole_run(toy, shares):
     """Catches a pace of the first, few splats (a half of the real one), and one that counts each
     split of the short run as the whole run has it more seldom."""
     settings = make_settings(
-        iterations=1000, coarse_share=0, density_interval=100, density_span=(0.1, 0.6),
-        split_share=0.5, growth=0.25,
+        iterations=1000, coarse_share=0, density_interval=100, density_span=(0.1, 0.6)
     )  # fmt: skip
     pace = seconds_per_iteration(toy, settings, 1000, 6.0)
-    # 1000, from 0.1 on 1500, from 0.2 on 2000, 1.25 times the whole lattice
+    # 1000, from 0.1 on 1500, from 0.2 on 2000
     steps = 0.024 * (0.1 * 1 + 0.1 * 1.5 + 0.8 * 2)
     assert pace == pytest.approx(steps + 5 / 1000 * 0.5, rel=0.05)
 

@@ -16,7 +16,7 @@ from .device import Device, Recording, entry_points
 from .layout import SH, WORKGROUP, XYZ
 from .rasterize import DEPTH_BITS, MAX_TILE_BITS, sort_passes
 
-FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer")
+KERNEL_FILES = ("frames", "project", "tiles", "blend", "image_loss", "optimizer")
 """Of the kernels of an iteration, beside those of `sort`."""
 STEP_OFFSET = "optimizer.step_offset"
 """What any iteration may dispatch beside sorting and steps of driven offsets."""
@@ -171,7 +171,7 @@ def offset_constants(name: str) -> dict[str, float]:
 def compile_kernels(device: Device) -> None:
     """Compile what an iteration of up to 2²² tiles dispatches, before the time that is given to
     training."""
-    kernels = {f"{file}.{entry}" for file in FILES for entry in entry_points(file)}
+    kernels = {f"{file}.{entry}" for file in KERNEL_FILES for entry in entry_points(file)}
     for kernel in sorted(kernels - {STEP_OFFSET}):
         device.kernel(kernel)
     for constants in (*sort_passes(DEPTH_BITS, False), *sort_passes(MAX_TILE_BITS, True)):
