@@ -220,10 +220,12 @@ class SplatRenderer:
             if not count:
                 return
             gpu.state.blend_set("ALPHA_PREMULT")
-            shader, blocks = self._splat_shader, -(-count // shaders.BLOCK_SPLATS)
+            shader = self._splat_shader
+            blocks = -(-count // shaders.BLOCK_SPLATS)
             shader.bind()
             for name in PROJECTED_TEXTURES:
                 shader.uniform_sampler(name, self._projected[name])
+            shader.uniform_int("first_block", 0)  # after the samplers: see `splat_shader`
             rectangles = self._splat_rectangles
             rectangles.draw_instanced(shader, instance_start=0, instance_count=blocks)
             gpu.state.blend_set("NONE")

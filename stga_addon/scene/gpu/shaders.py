@@ -309,7 +309,7 @@ void main()
 _SPLAT_VERTEX = """
 void main()
 {
-  int index = gl_InstanceID * BLOCK_SPLATS + gl_VertexID / 4;
+  int index = (first_block + gl_InstanceID) * BLOCK_SPLATS + gl_VertexID / 4;
   ivec2 texel = ivec2(index % WIDTH, index / WIDTH);
   vec4 place = texelFetch(places, texel, 0), half_axes = texelFetch(sides, texel, 0);
   offset = place.w * corner;
@@ -399,12 +399,23 @@ def projection_shader(relit: bool = False) -> Any:
 
 def splat_shader() -> Any:
     """Second pass: draws PROJECTED_TEXTURES, a rectangle for each splat, in instances of
-    BLOCK_SPLATS of them. Two color targets: sRGB premultiplied, and (depth · alpha, alpha)."""
+    BLOCK_SPLATS of them, beginning with the instance `first_block`. Two color targets: sRGB
+    premultiplied, and (depth · alpha, alpha).
+
+    In Blender 5.3 on OpenGL, binding a texture also writes its slot to a shader's first uniform:
+    to its first sampler, which then reads another texture, if there is no push constant. Hence
+    `first_block`, which has to be set after the textures.
+    """
     outputs = dict.fromkeys(("color_out", "depth_out"), "VEC4")
-    passed = {"offset": ("no_perspective", "VEC2"), "shade": ("flat", "VEC4")}
-    passed["depth"] = "flat", "FLOAT"
-    shader = _SPLAT_VERTEX, _SPLAT_FRAGMENT, outputs
-    return _shader(*shader, {}, PROJECTED_TEXTURES, _DEFINES, passed)
+    constants = {"first_block": "INT"}
+    passed = {
+        "offset": ("no_perspective", "VEC2"),
+        "shade": ("flat", "VEC4"),
+        "depth": ("flat", "FLOAT"),
+    }
+    vertex = _SPLAT_VERTEX
+    fragment = _SPLAT_FRAGMENT
+    return _shader(vertex, fragment, outputs, constants, PROJECTED_TEXTURES, _DEFINES, passed)
 
 
 def composite_shader() -> Any:
