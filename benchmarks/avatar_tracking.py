@@ -28,8 +28,10 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--timesteps", type=int, default=16)
     options = parser.parse_args()
-    opened, avatar = open_run(options.run), read_avatar(options.run / AVATAR)
-    capture, settings = opened.capture, opened.run.settings
+    opened = open_run(options.run)
+    avatar = read_avatar(options.run / AVATAR)
+    capture = opened.capture
+    settings = opened.run.settings
     chosen = evenly_spread(capture.timesteps, options.timesteps)
     views = [view for split in capture.views.values() for view in split]
     count = sum(view.timestep in chosen for view in views)
@@ -38,9 +40,11 @@ def main() -> None:
     print("| images | tracked | processor s | s | unexplained |\n| --- | --- | --- | --- | --- |")
     ways = {"in training": (False, False), "a recording": (True, False), "again": (False, True)}
     for how, (is_far, is_again) in ways.items():
-        begin, busy = perf_counter(), process_time()
+        begin = perf_counter()
+        busy = process_time()
         found = track_by_avatar(avatar, settings, capture, chosen, is_far=is_far, is_again=is_again)
-        busy, taken = (process_time() - busy) / count, (perf_counter() - begin) / count
+        busy = (process_time() - busy) / count
+        taken = (perf_counter() - begin) / count
         missed = "" if np.isnan(found.misfit).any() else f"{np.median(found.misfit):.0%}"
         print(f"| {size} | {how} | {busy:.2f} | {taken:.2f} | {missed} |")
 

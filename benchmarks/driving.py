@@ -74,10 +74,8 @@ class Head:
 
     def free_fit(self, wanted: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Expressions and jaw by Gauss-Newton, without a map."""
-        values, columns = (
-            start[: self.count + 3].copy(),
-            [*range(self.count), *range(self.count + JAW, self.count + JAW + 3)],
-        )
+        values = start[: self.count + 3].copy()
+        columns = [*range(self.count), *range(self.count + JAW, self.count + JAW + 3)]
         for _ in range(FREE_STEPS):
             at, slopes = self.posed.linearized(
                 values[: self.count], self.rigid(values[self.count :])
@@ -124,16 +122,15 @@ def leaks(driver: Head, driven: Head, poses: int) -> None:
     theirs = quiet_neutral(tracked)
     relative = exchanged_neutral(tracked, theirs)
     back = arkit_weights(relative, driver.map, driver.sequence)[QUIET_FRAMES:]
-    copied, apart = _values(tracked), _values(relative)
+    copied = _values(tracked)
+    apart = _values(relative)
     rest = driver.points(np.concatenate([theirs["face"], theirs["jaw"]]))
     scale = np.linalg.norm(driven.rest - driven.rest.mean(axis=0)) / np.linalg.norm(
         driver.rest - driver.rest.mean(axis=0)
     )
     displaced = [driven.rest + scale * (driver.points(row) - rest) for row in copied]
-    own, true = (
-        _values(driven.map.frames(take)),
-        [driven.true_points(row) for row in weights[QUIET_FRAMES:]],
-    )
+    own = _values(driven.map.frames(take))
+    true = [driven.true_points(row) for row in weights[QUIET_FRAMES:]]
     through = driven.map.parameters(back)[:, : driven.count + 3]
     ways = {
         "coefficients copied": copied,
@@ -210,7 +207,8 @@ def main() -> None:
     options = parser.parse_args()
     model = generated_flame(options.data, options.components)
     heads = [Head(model, seed) for seed in range(IDENTITIES)]
-    used, seconds = heads[0].map.used.sum(), heads[0].seconds
+    used = heads[0].map.used.sum()
+    seconds = heads[0].seconds
     print(f"{used} face points, {model.n_expression} expressions; the map took {seconds:.1f} s\n")
     combinations(heads, options.poses)
     leaks(heads[1], heads[2], options.leak_poses)

@@ -123,7 +123,8 @@ def comparisons(
 ) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
     """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of
     each."""
-    parent, unused = options.parent, options.folder / "unused"
+    parent = options.parent
+    unused = options.folder / "unused"
     if parent is None:
         old, new = split_takes(
             options.capture, options.flame, options.folder / options.capture.name
@@ -156,7 +157,8 @@ def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Pat
     timesteps = sorted({view.timestep for view in capture.views["train"]})
     selection = select_capture(capture, SelectionOptions())
     ranked = sorted(timesteps, key=lambda timestep: selection[timestep].mean())
-    first, second = ranked[::2], ranked[1::2]
+    first = ranked[::2]
+    second = ranked[1::2]
     return (
         derive(
             root,
@@ -186,11 +188,9 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     """Name -> arm."""
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
-    settings, continuation, capture = (
-        prepared.run.settings,
-        prepared.run.continuation,
-        prepared.capture,
-    )
+    settings = prepared.run.settings
+    continuation = prepared.run.continuation
+    capture = prepared.capture
     parent = read_run(continuation.parent).settings
     before: dict[str, Any] = {"driven_offsets": parent.driven_offsets}
     now: dict[str, Any] = {"driven_offsets": settings.driven_offsets}
@@ -217,11 +217,9 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     """Name -> arm."""
     assert prepared.run.continuation is not None
     assert prepared.selection is not None
-    settings, continuation, capture = (
-        prepared.run.settings,
-        prepared.run.continuation,
-        prepared.capture,
-    )
+    settings = prepared.run.settings
+    continuation = prepared.run.continuation
+    capture = prepared.capture
     region = np.any(list(prepared.selection.values()), axis=0)
     base = Trainer(
         capture,
@@ -245,7 +243,8 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
 
 def alternating(old: list[View], new: list[View], seed: int) -> Iterator[View]:
     """All views of both takes, in turn."""
-    first, second = view_order(new, 1, seed), view_order(old, 1, seed + 1)
+    first = view_order(new, 1, seed)
+    second = view_order(old, 1, seed + 1)
     while True:
         yield next(first)
         yield next(second)
@@ -254,7 +253,8 @@ def alternating(old: list[View], new: list[View], seed: int) -> Iterator[View]:
 def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace) -> list[Line]:
     """Train one arm; returns and prints its quality before, during and after."""
     assert prepared.run.continuation is not None
-    capture, clock = prepared.capture, CLOCKS[options.clock]
+    capture = prepared.capture
+    clock = CLOCKS[options.clock]
     state = (
         None
         if arm.anew
@@ -266,7 +266,9 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     evaluation_views = continued_evaluation_views(prepared.run, capture, region)
     rows = arm.settings.exposure
     exposure = known_exposure(rows, capture.views["train"]) if rows else None
-    spent, due, budget = 0.0, 0.0, options.seconds * (ANEW_BUDGET if arm.anew else 1)
+    spent = 0.0
+    due = 0.0
+    budget = options.seconds * (ANEW_BUDGET if arm.anew else 1)
     lines: list[Line] = []
     red, green, blue = (round(255 * level) for level in arm.settings.background)
     prepare = image_preparation(capture, arm.settings)
@@ -409,7 +411,8 @@ def time_to(lines: list[Line], quality: str, level: float) -> float:
     """Seconds until the quality is first reached, between two evaluations by interpolation;
     infinite if never."""
     for before, after in pairwise(lines):
-        low, high = before[quality], after[quality]
+        low = before[quality]
+        high = after[quality]
         if high >= level:
             part = 0.0 if low >= level else (level - low) / (high - low)
             return float(before["seconds"] + part * (after["seconds"] - before["seconds"]))

@@ -80,7 +80,8 @@ def bundled_head(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarr
     """`count` splats on the bundled head, sized like its triangles; with its vertices (V, 3) and
     faces (F, 3)."""
     model = flame_model(None)
-    vertices, faces = model.v_template, model.faces
+    vertices = model.v_template
+    faces = model.faces
     spacing = np.sqrt(2 * face_areas(vertices, faces)) * np.sqrt(len(faces) / count)
     return _splats(count, 0.6 * np.maximum(spacing, 1e-5), rng), vertices, faces
 
@@ -89,7 +90,8 @@ def ellipsoid(count: int, rng: np.random.Generator) -> tuple[Splats, np.ndarray,
     """`count` splats of one size on an ellipsoid of about 20,000 triangles; with its vertices and
     faces."""
     sphere = trimesh.creation.icosphere(subdivisions=5)
-    vertices, faces = sphere.vertices * [0.08, 0.11, 0.09], np.asarray(sphere.faces, np.int32)
+    vertices = sphere.vertices * [0.08, 0.11, 0.09]
+    faces = np.asarray(sphere.faces, np.int32)
     return _splats(count, np.full(len(faces), 0.0012), rng), vertices, faces
 
 
@@ -177,24 +179,34 @@ def stages(
     splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
 ) -> dict[str, tuple[float, int]]:
     """stage -> (median ms, bytes that it must move at least)."""
-    n, (width, height) = len(splats), frames.size.tolist()
-    pixels, background = width * height, np.ones(3, np.float32)
+    n = len(splats)
+    (width, height) = frames.size.tolist()
+    pixels = width * height
+    background = np.ones(3, np.float32)
     tiles_x, tiles_y = tile_grid(width, height)
-    state, buffers = new_state(splats), BufferPool()
-    parameters, gradients, face = state.parameters, state.gradients, state.face
+    state = new_state(splats)
+    buffers = BufferPool()
+    parameters = state.parameters
+    gradients = state.gradients
+    face = state.face
     r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
-    lists, columns, rect = r.lists, r.projection.columns, r.projection.rect
+    lists = r.lists
+    columns = r.projection.columns
+    rect = r.projection.rect
     rows = lists.visible
-    everything, everywhere = np.arange(n), sum_tiles(np.ones((tiles_y, tiles_x), bool))
+    everything = np.arange(n)
+    everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
     _, order, first_pair, *_ = sort_by_depth(r.projection, BufferPool())
     count = len(lists.pair_splat)
     counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts)
     places = counts.copy()
     arrange_tiles(places, r.tile_blocks)
-    v_image, screen_gradient = np.empty_like(r.image), np.empty(n, np.float32)
+    v_image = np.empty_like(r.image)
+    screen_gradient = np.empty(n, np.float32)
     bands = whole_image(height, width)
-    zero, wanted = np.zeros_like(r.transmittance), np.ones(n, bool)
+    zero = np.zeros_like(r.transmittance)
+    wanted = np.ones(n, bool)
     pair_gradients = np.empty((count, PROJECTED), np.float32)
     work = {
         "project": (
@@ -224,20 +236,38 @@ def stages(
         ),
         "blend backward": (
             lambda: blend_backward(
-                r.tiles, tiles_x, lists, r.blended, wanted, columns, background, v_image, zero,
+                r.tiles,
+                tiles_x,
+                lists,
+                r.blended,
+                wanted,
+                columns,
+                background,
+                v_image,
+                zero,
                 pair_gradients,
             ),
             count * (46 + 36) + pixels * 24,
         ),
         "project backward": (
             lambda: project_backward(
-                rows, parameters, face, frames, 3, False, False, columns, lists, pair_gradients,
-                gradients, screen_gradient,
+                rows,
+                parameters,
+                face,
+                frames,
+                3,
+                False,
+                False,
+                columns,
+                lists,
+                pair_gradients,
+                gradients,
+                screen_gradient,
             ),
             count * 36 + len(rows) * (59 * 2 + 16) * 4,
         ),
         "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 9),
-    }  # fmt: skip
+    }
     return {name: (median_ms(call, repeats, clock), moved) for name, (call, moved) in work.items()}
 
 
@@ -340,7 +370,8 @@ def cpu_table(
     for name, (ms, moved) in found.items():
         floor = 1e3 * moved / bandwidth
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
-    rate, ms = arithmetic_rate(clock), found["L1 + SSIM, both ways"][0]
+    rate = arithmetic_rate(clock)
+    ms = found["L1 + SSIM, both ways"][0]
     floor = 1e3 * target.shape[0] * target.shape[1] * LOSS_OPERATIONS / rate
     print(f"{rate / 1e9:.0f} billion multiply-adds a second:", end=" ")
     print(f"L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}")
@@ -353,9 +384,13 @@ def compare_opensplat(
     """Print the wall time of both rasterizers for an image, its loss and the splats' gradients."""
     import opensplat  # needs a C++ compiler
 
-    state, buffers, background = new_state(splats), BufferPool(), np.ones(3, np.float32)
-    face, gradients = state.face, state.gradients
-    rectangles, v_image = whole_image(*target.shape[:2]), np.empty((3, *target.shape[:2]), "f4")
+    state = new_state(splats)
+    buffers = BufferPool()
+    background = np.ones(3, np.float32)
+    face = state.face
+    gradients = state.gradients
+    rectangles = whole_image(*target.shape[:2])
+    v_image = np.empty((3, *target.shape[:2]), "f4")
 
     def forward():
         return render_forward(state.parameters, face, frames, 3, background, buffers=buffers)
@@ -366,7 +401,8 @@ def compare_opensplat(
         render_backward(output, state.parameters, face, frames, v_image, gradients, buffers=buffers)
 
     output = forward()
-    visible, image = output.lists.visible, output.image.copy()
+    visible = output.lists.visible
+    image = output.image.copy()
     theirs = opensplat.both_ways_ms(
         folder, output.projection, visible, image, target, SSIM_WEIGHT, min(repeats, 9)
     )

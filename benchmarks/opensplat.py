@@ -55,18 +55,25 @@ def build(folder: Path) -> Any:
 
 
 def both_ways_ms(
-    folder: Path, projection: layout.Projection, rows: np.ndarray, image: np.ndarray,
-    target: np.ndarray, ssim_weight: float, repeats: int,
-) -> tuple[float, float]:  # fmt: skip
+    folder: Path,
+    projection: layout.Projection,
+    rows: np.ndarray,
+    image: np.ndarray,
+    target: np.ndarray,
+    ssim_weight: float,
+    repeats: int,
+) -> tuple[float, float]:
     """Median milliseconds of wall time of its forward pass, and of forward pass, loss and backward
     pass together, over a white background.
 
     rows (M,): the visible splats; image (3, H, W): ours; target (H, W, 3) uint8. Raises ValueError
     where its image is another one.
     """
-    module, (_, height, width) = build(folder), image.shape
+    module = build(folder)
+    (_, height, width) = image.shape
     captured = torch.from_numpy(target.astype(np.float32) / 255)
-    white, splats = torch.ones(3), [torch.from_numpy(array) for array in _splats(projection, rows)]
+    white = torch.ones(3)
+    splats = [torch.from_numpy(array) for array in _splats(projection, rows)]
 
     def render(wanted: torch.Tensor) -> torch.Tensor:
         return module.both_ways(width, height, splats, white, wanted, ssim_weight)[0]
@@ -90,12 +97,16 @@ def _splats(projection: layout.Projection, rows: np.ndarray) -> list[np.ndarray]
     """Center, conic, color, opacity, covariance and depth of the listed splats; its pixels have
     their centers at whole numbers."""
     columns = projection.columns[rows]
-    px, shear, py = columns[:, PRECISION_X], columns[:, SHEAR], columns[:, PRECISION_Y]
+    px = columns[:, PRECISION_X]
+    shear = columns[:, SHEAR]
+    py = columns[:, PRECISION_Y]
     conic = np.stack([px, -px * shear, px * shear * shear + py], 1)
     covariance = np.zeros((len(rows), 2, 2), np.float32)
-    covariance[:, 0, 0], covariance[:, 1, 1] = 1 / px + shear * shear / py, 1 / py
+    covariance[:, 0, 0] = 1 / px + shear * shear / py
+    covariance[:, 1, 1] = 1 / py
     center = columns[:, [layout.MEAN_X, layout.MEAN_Y]] - np.float32(0.5)
-    color, opacity = columns[:, RED : BLUE + 1].copy(), columns[:, OPACITY, None].copy()
+    color = columns[:, RED : BLUE + 1].copy()
+    opacity = columns[:, OPACITY, None].copy()
     return [
         np.ascontiguousarray(array)
         for array in (center, conic, color, opacity, covariance, projection.depth[rows])

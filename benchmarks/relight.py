@@ -145,7 +145,8 @@ class Bench:
         """Mean PSNR in the mask, LPIPS, PSNR of eyes and mouth."""
         found = []
         for view, image in self.images(name, relighter, **options):
-            target, levels = read_image(view), read_mask(view)
+            target = read_image(view)
+            levels = read_mask(view)
             assert levels is not None
             mask = levels > 127
             distance = np.nan

@@ -97,7 +97,8 @@ def quality_table(run: Path) -> str:
         for name, suffix in PARTS:
             if f"psnr{suffix}" in quality:
                 lpips = f"{quality[f'lpips{suffix}']:.4f}" if f"lpips{suffix}" in quality else ""
-                psnr, ssim = f"{quality[f'psnr{suffix}']:.2f}", f"{quality[f'ssim{suffix}']:.4f}"
+                psnr = f"{quality[f'psnr{suffix}']:.2f}"
+                ssim = f"{quality[f'ssim{suffix}']:.4f}"
                 rows.append(
                     f"| {split}, {quality['views']} views | {name} | {psnr} | {ssim} | {lpips} |"
                 )
@@ -125,7 +126,8 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name, python = [*names, platform.machine()][0], platform.python_version()
+    name = [*names, platform.machine()][0]
+    python = platform.python_version()
     return f"{os.cpu_count()} cores of {name}, Python {python}"
 
 
@@ -138,13 +140,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/results.md"))
     parser.add_argument("--folder", type=Path, default=Path("out/results"))
     options = parser.parse_args()
-    capture, folder = options.capture.resolve(), options.folder.resolve()
+    capture = options.capture.resolve()
+    folder = options.folder.resolve()
     text = [HEADER.format(capture=capture.name, machine=machine())]
     for name, section in sections(capture.name, options.share).items():
         done = folder / f"{name}.md"
         if not done.exists():
             measure(section.commands, folder / name, capture)
-            commands, table = "\n".join(section.commands), section.table(folder / name).strip()
+            commands = "\n".join(section.commands)
+            table = section.table(folder / name).strip()
             source = f"Version {__version__}:\n\n```\n{commands}\n```\n{section.note}"
             done.write_text(f"## {section.title}\n\n{source}\n{table}\n", encoding="utf-8")
         text.append(done.read_text(encoding="utf-8"))

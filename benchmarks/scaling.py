@@ -26,7 +26,9 @@ from stga_addon.raster.cpu.threads import set_threads, threads
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-SPLATS, WIDTH, HEIGHT = 60_000, 802, 550
+SPLATS = 60_000
+WIDTH = 802
+HEIGHT = 550
 
 
 @dataclass(frozen=True)

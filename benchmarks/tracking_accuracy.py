@@ -37,7 +37,9 @@ from stga_addon.tracking.track import track
 
 SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}
 """Of ARKit's shapes, how the names of those begin that move a part of the face."""
-MIN_MOTION, STILL_SHARE, MAX_DISTANCE_M = 0.5, 0.35, 0.006
+MIN_MOTION = 0.5
+STILL_SHARE = 0.35
+MAX_DISTANCE_M = 0.006
 """Of the largest motion by such shapes, from which on a vertex belongs to the part; share of the
 face that moves least, by which heads are laid on each other; of a true vertex from the tracked
 surface, up to which it lies on it."""
@@ -86,7 +88,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         order = np.argsort(np.linalg.norm(at - at.mean(0), axis=1), kind="stable")
         chosen = order[: 2 * options.cameras : 2].tolist()
         footage = replace(footage, cameras=tuple(footage.cameras[row] for row in chosen))
-    true, file = open_capture(options.capture, options.flame), head_file(options.model, folder)
+    true = open_capture(options.capture, options.flame)
+    file = head_file(options.model, folder)
     begin = perf_counter()
     result = track(footage, file, folder / "out", options.landmarks, mattes=False)
     seconds = perf_counter() - begin
@@ -105,7 +108,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     print("| --- | --- | --- | --- |")
     meshes = []
     for timestep in footage.timesteps:
-        camera, known = first[0], footage.cameras[0].camera
+        camera = first[0]
+        known = footage.cameras[0].camera
         local = (
             found.mesh(timestep) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         )
@@ -113,11 +117,10 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
             :3, :3
         ]
         meshes.append((true.mesh(timestep), local))
-        mesh, middle = true.mesh(timestep), places.on(local, found.faces)[used].mean(0)
-        centers, normals = (
-            mesh[true.faces].mean(1),
-            vertex_normals(mesh, true.faces)[true.faces].mean(1),
-        )
+        mesh = true.mesh(timestep)
+        middle = places.on(local, found.faces)[used].mean(0)
+        centers = mesh[true.faces].mean(1)
+        normals = vertex_normals(mesh, true.faces)[true.faces].mean(1)
         seen = np.zeros(len(centers), bool)
         for view in (own.camera for own in footage.cameras if timestep in own.timesteps):
             seen |= (facing(view, centers, normals) > MIN_COSINE) & in_sight(
@@ -127,7 +130,8 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
         distance = 1000 * nearest_points(local, found.faces, centers[seen])[1]
         same = len(found.faces) == len(true.faces) or len(mesh) - len(local) == TEETH_VERTICES
         shift = 1000 * np.linalg.norm(local[face] - mesh[face], axis=1).mean() if same else np.nan
-        median, most = np.median(distance), np.percentile(distance, 90)
+        median = np.median(distance)
+        most = np.percentile(distance, 90)
         print(f"| {timestep} | {median:.2f} | {most:.2f} | {shift:.2f} |")
     if options.model is None and len(meshes) > 2:
         heads, own = (np.stack(every) for every in zip(*meshes, strict=True))
@@ -162,7 +166,8 @@ def report_motion(true: np.ndarray, tracked: np.ndarray, faces: np.ndarray, scal
     print("\n| part | followed | correlation | median error, mm |\n| --- | --- | --- | --- |")
     for part, where in parts.items():
         one, other = (own[:, where] for own in motion)
-        both, size = (one * other).sum(), np.square(one).sum()
+        both = (one * other).sum()
+        size = np.square(one).sum()
         error = 1000 * scale * np.median(np.linalg.norm(one - other, axis=2))
         correlation = both / np.sqrt(size * np.square(other).sum())
         print(f"| {part} | {both / size:.2f} | {correlation:.2f} | {error:.2f} |")

@@ -47,7 +47,8 @@ def measure(request: MakeAvatar) -> None:
         nonlocal last, stage
         now = perf_counter()
         seconds[stage] = seconds.get(stage, 0.0) + now - last
-        last, stage = now, re.sub(r": \d+ of \d+$", "", progress.stage)
+        last = now
+        stage = re.sub(r": \d+ of \d+$", "", progress.stage)
         return False
 
     perform(request, report)

@@ -34,7 +34,8 @@ def _part_property(name: str, what: str) -> Any:
 
 
 def _gain_property(part: str, what: str) -> Any:
-    about, limits = f"Of a face performance: factor of {what}", {"min": 0.0, "max": 10.0}
+    about = f"Of a face performance: factor of {what}"
+    limits = {"min": 0.0, "max": 10.0}
     return options.number(f"{part} Gain", about, default=1.0, soft_max=2.0, options=ONCE, **limits)
 
 
@@ -160,7 +161,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         return self.execute(context) if self.source else super().invoke(context, event)
 
     def run(self, context: Any) -> None:
-        head, scene = head_of(context), context.scene
+        head = head_of(context)
+        scene = context.scene
         parts = [part for part in PARTS if getattr(self, part)]
         if not parts:
             chosen = "choose expression, jaw, eyes, neck or head"
@@ -180,16 +182,19 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     ) -> tuple[str, int]:
         """Apply a FLAME motion: of the file, read with this head's model, because expressions mean
         the same in both, or of another head. Returns its name and the number of frames."""
-        render, other = context.scene.render, bpy.data.objects.get(self.source)
+        render = context.scene.render
+        other = bpy.data.objects.get(self.source)
         if path is not None:
             model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
-            name, motion = path.stem, common.flame_motion(str(path), path, model)
+            name = path.stem
+            motion = common.flame_motion(str(path), path, model)
         elif not is_head(other):
             raise StgaError(f"{self.source}: is not an imported head")
         elif other == head:
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
         else:
-            name, frames = other.name, common.scene_frames(context.scene)
+            name = other.name
+            frames = common.scene_frames(context.scene)
             motion = rig_motion.sample_motion(other, own_motion(other), frames, self.warn)
         rate = self.fps * render.fps_base / render.fps if self.fps else 1.0
         step = float(self.speed * rate)  # timesteps of the recording in a frame of the scene
@@ -210,14 +215,17 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
     ) -> tuple[str, int]:
         """Apply a face performance to expressions and bones, or to shape keys of its names. Returns
         its name and the number of frames."""
-        performance, options, name = read_performance(path), self._options(), path.stem
+        performance = read_performance(path)
+        options = self._options()
+        name = path.stem
         rate = context.scene.render.fps / context.scene.render.fps_base / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
         rig = rig_or_none(head)
         if rig is not None and not (self.sliders and has_shapes(head)):
-            own, trained = own_motion(head), self._trained(head)
+            own = own_motion(head)
+            trained = self._trained(head)
             motion = open_motion.performed(performance, own, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
@@ -230,7 +238,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             where = self.start, name, self.place == "strip"
             apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, *where)
             return name, len(weights)
-        still, turns = np.zeros(3), head_turns(performance.head)
+        still = np.zeros(3)
+        turns = head_turns(performance.head)
         frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
         # on the expression the sliders would act
         self._apply(head, frames, name, list({*parts, "expression"}), weights=weights)

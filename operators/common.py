@@ -54,7 +54,8 @@ class Action:
     def execute(self, context: Any) -> set[str]:
         """A StgaError becomes an error report, without a traceback, and nothing that is returned
         FINISHED; the pointer says that Blender is busy, and how far it is (`show_progress`)."""
-        manager, window = context.window_manager, context.window
+        manager = context.window_manager
+        window = context.window
         manager.stga_message = ""
         if window is not None:
             manager.progress_begin(0, 1)
@@ -78,7 +79,8 @@ class Action:
     def tell(self: Any, kind: str, sentence: str) -> None:
         """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in
         the panel."""
-        brief, manager = short_sentence(sentence), bpy.context.window_manager
+        brief = short_sentence(sentence)
+        manager = bpy.context.window_manager
         self.report({kind}, sentence if bpy.app.background else brief)
         # an operator that was called by another has told it at length
         if brief != short_sentence(manager.stga_message):
@@ -104,7 +106,8 @@ class Stepwise(Action):
     def begin(self, context: Any, steps: Iterator[Any], interval_s: float) -> set[str]:
         """Do the steps, each one until the iterator yields. Closed before its end, it cleans up."""
         manager = context.window_manager
-        self._steps, self._timer = steps, manager.event_timer_add(interval_s, window=context.window)
+        self._steps = steps
+        self._timer = manager.event_timer_add(interval_s, window=context.window)
         manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -195,7 +198,8 @@ def rig_or_none(head: Any) -> Any:
 def capture_source(head: Any) -> tuple[Path, Path | None, str]:
     """The capture that a head was imported from, its FLAME model and its convention of principal
     points, as `open_capture` takes them."""
-    model, point = head.get(tags.FLAME_MODEL), tags.PRINCIPAL_POINT
+    model = head.get(tags.FLAME_MODEL)
+    point = tags.PRINCIPAL_POINT
     capture = Path(head[tags.CAPTURE])
     return capture, Path(model) if model else None, head.get(point, DEFAULT_PRINCIPAL_POINT)
 
@@ -296,7 +300,8 @@ def given_values(operator: Any, kind: Any, *names: str) -> dict[str, Any]:
     """Field -> value of an operator's properties, of those that are not left at None."""
     found = {}
     for name in names:
-        value, hints = getattr(operator, name), alternatives(type_hints(kind)[name])
+        value = getattr(operator, name)
+        hints = alternatives(type_hints(kind)[name])
         if Path in hints and value:
             value = file_path(value, name.replace("_", " ")).resolve()
         if value or NoneType not in hints:

@@ -100,13 +100,21 @@ class LiveSession:
     """
 
     def __init__(
-        self, scene: str, pose: LivePose, found: HeadMap | None,
-        trained: open_motion.TrainedRange | None, receiver: sources.Receiver,
-    ) -> None:  # fmt: skip
-        self.scene, self.receiver, self.stream = scene, receiver, sources.Stream(receiver.source)
+        self,
+        scene: str,
+        pose: LivePose,
+        found: HeadMap | None,
+        trained: open_motion.TrainedRange | None,
+        receiver: sources.Receiver,
+    ) -> None:
+        self.scene = scene
+        self.receiver = receiver
+        self.stream = sources.Stream(receiver.source)
         self.rest: Performance | None = None
         self.recording: sources.Recording | None = None
-        self._head, self._map, self._trained = pose, found, trained
+        self._head = pose
+        self._map = found
+        self._trained = trained
         self._recent: deque[FacePacket] = deque(maxlen=sources.RESTING_PACKETS)
         self._shown: Performance | None = None
         self._shown_at = self._drawn_at = float("-inf")
@@ -133,7 +141,8 @@ class LiveSession:
                 self.recording.add(packet, begin)
         # Blender crashes where a mesh changes while it renders.
         if newest is not None and not bpy.app.is_job_running("RENDER"):
-            options, since = self.options(), begin - self._shown_at
+            options = self.options()
+            since = begin - self._shown_at
             row = open_motion.corrected(sources.row_of(newest), options, self.rest)
             self._shown = sources.eased(self._shown, row, since, options.smoothing)
             self._shown_at = begin
@@ -229,8 +238,10 @@ class DriveLive(Action, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         global _session
-        head, settings = head_of(context), context.scene.stga.drive
-        source, where = SOURCES[settings.source], (settings.address, settings.phone)
+        head = head_of(context)
+        settings = context.scene.stga.drive
+        source = SOURCES[settings.source]
+        where = (settings.address, settings.phone)
         if sources.leaves_this_machine(source, *where) and not bpy.app.online_access:
             raise StgaError(
                 f"{source.label}: receives from other devices, but online access is off in "
@@ -259,7 +270,8 @@ class _OfSession(Action):
 
     def keep_recording(self: Any, context: Any, running: LiveSession, min_faces: int) -> None:
         """End the recording: write the take and apply it. Raises StgaError."""
-        recording, running.recording = running.recording, None
+        recording = running.recording
+        running.recording = None
         if recording is None or len(recording) < min_faces:
             return
         folder, warning = takes_folder(context)
@@ -271,7 +283,8 @@ class _OfSession(Action):
         names = (f"take_{number:03d}.csv" for number in count(1))
         path = next(folder / name for name in names if not (folder / name).exists())
         write_performance(path, performance)
-        options, rested = context.scene.stga.drive, recording.rest is not None
+        options = context.scene.stga.drive
+        rested = recording.rest is not None
         names = ("strength", "smoothing", "mirror", "stay_trained")
         chosen = {name: getattr(options, name) for name in names}
         chosen |= {"start": recording.start, "neutral": "calibrated" if rested else "none"}
@@ -309,7 +322,8 @@ class RecordLive(_OfSession, Edit, bpy.types.Operator):
     def run(self, context: Any) -> None:
         running = _session
         if running.recording is None:
-            frame, exchange = context.scene.frame_current, running.options().exchange
+            frame = context.scene.frame_current
+            exchange = running.options().exchange
             running.recording = sources.Recording(frame, running.rest, exchange)
             return
         self.keep_recording(context, running, min_faces=0)
@@ -330,7 +344,8 @@ class FollowLive(_OfSession, bpy.types.Operator):
 
 def takes_folder(context: Any) -> tuple[Path, str]:
     """The folder of takes, made here, and a warning where it does not last, or ""."""
-    folder, warning = context.scene.stga.drive.takes, ""
+    folder = context.scene.stga.drive.takes
+    warning = ""
     if folder.startswith("//") and not bpy.data.filepath:
         path = Path(bpy.app.tempdir)
         remedy = "save the .blend file to keep takes beside it"
@@ -366,14 +381,18 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         return super().invoke(context, event)
 
     def run(self, context: Any) -> None:
-        video, head = file_path(self.filepath, "video"), head_of(context)
+        video = file_path(self.filepath, "video")
+        head = head_of(context)
         if not is_video(video):
             raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
         folder, _ = takes_folder(context)
-        given, suffix = common.given_values(self, ConvertMotion, "avatar"), SHAPES_SUFFIX
+        given = common.given_values(self, ConvertMotion, "avatar")
+        suffix = SHAPES_SUFFIX
         is_trained_on = bool(given) and rig_or_none(head) is not None
         if is_trained_on and read_run(given["avatar"]).capture == Path(head[tags.CAPTURE]):
-            suffix, render = ".npz", context.scene.render  # exact, a timestep for each frame
+            # exact, a timestep for each frame
+            suffix = ".npz"
+            render = context.scene.render
             given["fps"] = render.fps / render.fps_base
         names = (video.stem, *(f"{video.stem}_{number}" for number in count(2)))
         output = next(path for name in names if not (path := folder / f"{name}{suffix}").exists())

@@ -76,7 +76,8 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
             for suffix in SUFFIXES:
                 path = path.removesuffix(suffix)
             path += self.filename_ext
-        changed, self.filepath = path != self.filepath, path
+        changed = path != self.filepath
+        self.filepath = path
         return changed
 
     def draw(self, context: Any) -> None:
@@ -85,7 +86,8 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         for name in shown:
             self.layout.prop(self, name)
         if FORMATS[self.format].source == "range":
-            frames, column = scene_frames(context.scene), self.layout.column()
+            frames = scene_frames(context.scene)
+            column = self.layout.column()
             column.label(text=f"Frames {frames[0]} to {frames[-1]} of the scene", icon="TIME")
             try:
                 source = self._source(context)
@@ -103,14 +105,19 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         return super().invoke(context, event)
 
     def run(self, context: Any) -> set[str] | None:
-        head, scene, path = head_of(context), context.scene, file_path(self.filepath, "export")
-        format, frames, fps = FORMATS[self.format], scene_frames(scene), frames_per_second(scene)
+        head = head_of(context)
+        scene = context.scene
+        path = file_path(self.filepath, "export")
+        format = FORMATS[self.format]
+        frames = scene_frames(scene)
+        fps = frames_per_second(scene)
         if format.suffixes and not path.suffix:
             path = path.with_suffix(self.filename_ext)
         formats.check_suffix(path, self.format)
         avatar = read_avatar(self._source(context))
         check_head(avatar, head)
-        motion, playback = None, Playback(fps=fps)
+        motion = None
+        playback = Playback(fps=fps)
         if self.format == "web":
             motion = None if self.motion_only else exact_motion(head, frames, self.warn)
             playback = scene_playback(context, head, frames, self.motion_only)
@@ -145,7 +152,9 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
                     raise item
                 yield item
 
-        posing, is_fed, done = iterate_frames(frames), False, 0
+        posing = iterate_frames(frames)
+        is_fed = False
+        done = 0
         pool = ThreadPoolExecutor(1, "stga export")
         written = pool.submit(write, meshes())
         pool.shutdown(wait=False)
@@ -243,7 +252,8 @@ class ExportPerformance(Action, bpy.types.Operator, ExportHelper):
     filter_glob: options.file_filter(".csv")
 
     def run(self, context: Any) -> None:
-        head, frames = head_of(context), scene_frames(context.scene)
+        head = head_of(context)
+        frames = scene_frames(context.scene)
         path = file_path(self.filepath, "curves").with_suffix(self.filename_ext)
         motion = sample_motion(head, own_motion(head), frames, self.warn)
         fps = frames_per_second(context.scene)

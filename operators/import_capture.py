@@ -83,7 +83,9 @@ class ImportCapture(Edit, bpy.types.Operator, FileImport):
         folder = next((parent for parent in inside if transforms_files(parent)), path)
         if folder.is_file():
             raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
-        point, set_up, correctives = self.principal_point, self.set_up_scene, self.correctives
+        point = self.principal_point
+        set_up = self.set_up_scene
+        correctives = self.correctives
         bring_in(self, context, folder, self.flame, point, set_up, correctives)
 
 
@@ -138,16 +140,23 @@ class OpenDemo(Edit, bpy.types.Operator):
         runs = Path.home() / "STGA Demo"
         names = ("run", *(f"run {number}" for number in range(2, 1000)))
         free = next(runs / name for name in names if not has_run(runs / name))
-        context.scene.stga.run_folder, context.scene.stga.minutes = str(free), DEMO_MINUTES
+        context.scene.stga.run_folder = str(free)
+        context.scene.stga.minutes = DEMO_MINUTES
 
 
 def bring_in(
-    operator: Any, context: Any, source: Path, flame: str = "",
-    principal_point: str = DEFAULT_PRINCIPAL_POINT, set_up_scene: bool = False,
+    operator: Any,
+    context: Any,
+    source: Path,
+    flame: str = "",
+    principal_point: str = DEFAULT_PRINCIPAL_POINT,
+    set_up_scene: bool = False,
     correctives: str = "all",
-) -> None:  # fmt: skip
+) -> None:
     """Import what `open_capture` reads, and make it the scene's head. Raises StgaError."""
-    warn, scene, objects = operator.warn, context.scene, context.view_layer.objects
+    warn = operator.warn
+    scene = context.scene
+    objects = context.view_layer.objects
     has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
     model = None if has_model else flame_model_path(context, flame)
     capture = open_capture(source, flame=model, principal_point=principal_point)
@@ -160,7 +169,8 @@ def bring_in(
     head[tags.PRINCIPAL_POINT] = principal_point
     head[tags.TRACKED] = is_tracked(capture.root)
     scene.stga.head = head
-    scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+    scene.frame_start = capture.timesteps[0]
+    scene.frame_end = capture.timesteps[-1]
     scene.frame_set(capture.timesteps[0])
     leave_edit_mode()
     for thing in objects.selected:

@@ -221,7 +221,8 @@ def _locate(scene: Any, state: RequestState) -> Path | None:
 
 
 def _read_status(scene: Any, state: RequestState) -> states.StatusRead:
-    folder, settings = _locate(scene, state), scene.stga
+    folder = _locate(scene, state)
+    settings = scene.stga
     snapshot = inspect_status(folder)
     if state.kind not in STORED:
         return states.StatusRead(folder, snapshot)

@@ -75,9 +75,12 @@ def field(
     label: in place of the field's name; labels: in place of the names of its choices; more: what
     differs in Blender.
     """
-    spec, (hint, *none) = kind.__dataclass_fields__[name], alternatives(type_hints(kind)[name])
-    asked, is_optional = spec.metadata, none == [NoneType]
-    help, default = DEFAULT.sub("", asked["help"]), DEFAULT.search(asked["help"])
+    spec = kind.__dataclass_fields__[name]
+    (hint, *none) = alternatives(type_hints(kind)[name])
+    asked = spec.metadata
+    is_optional = none == [NoneType]
+    help = DEFAULT.sub("", asked["help"])
+    default = DEFAULT.search(asked["help"])
     if is_optional and (default is not None or hint is not Path):
         help += f"; {'empty' if hint is Path else 0}: {'none' if default is None else default[1]}"
     label = label or name.replace("_", " ").title()
@@ -95,7 +98,8 @@ def field(
         about = {"default": spec.default, **about}
     if hint is bool:
         return bpy.props.BoolProperty(**about)
-    low, high = 0 if is_optional else max(asked["minimum"], asked["above"]), asked["maximum"]
+    low = 0 if is_optional else max(asked["minimum"], asked["above"])
+    high = asked["maximum"]
     limits = {"min": low} if low > -inf else {}
     limits |= {"max": min(high, MAX_COUNT)} if high < inf else {}
     make = bpy.props.IntProperty if hint is int else bpy.props.FloatProperty

@@ -28,7 +28,8 @@ class PoseHead(Edit, bpy.types.Operator):
     needs = (needs_rig,)
 
     def run(self, context: Any) -> None:
-        head, objects = head_of(context), context.view_layer.objects
+        head = head_of(context)
+        objects = context.view_layer.objects
         rig = rig_of(head)
         was_posing = is_posing(context, rig)
         leave_edit_mode()
@@ -124,7 +125,8 @@ class _Sliders:
     """What a thread computes for a head, which is looked up by its name: undo moves it."""
 
     def __init__(self, head: Any) -> None:
-        self._head, self._made = head.name, list[Any]()
+        self._head = head.name
+        self._made = list[Any]()
         arguments = common.capture_source(head), needs_sliders(head)
         self._thread = Thread(target=self._make, args=arguments, daemon=True)
         self._thread.start()

@@ -97,7 +97,8 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
         path = self.filepath.removesuffix(".mp4")
         if self.format == "mp4":
             path = bpy.path.ensure_ext(path, ".mp4")
-        changed, self.filepath = path != self.filepath, path
+        changed = path != self.filepath
+        self.filepath = path
         return changed
 
     def run(self, context: Any) -> set[str] | None:
@@ -124,22 +125,26 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
         Until the worker takes over, this process is that of the request in the folder, and writes
         its status. Raises StgaError, as on a full disk or where the head is gone, and Cancelled.
         """
-        scene, view_layer = context.scene, context.view_layer
+        scene = context.scene
+        view_layer = context.view_layer
         frames = list(scene_frames(scene))
         cameras: Sequence[Camera] | None = None  # the scene's own
         if self.path == "turntable":
-            asked, stga = round(self.seconds * frames_per_second(scene)), scene.stga
+            asked = round(self.seconds * frames_per_second(scene))
+            stga = scene.stga
             frames = to_and_fro(frames, max(len(frames), asked))
             subject = stga.head if is_head(stga.head) else stga.splats
             depsgraph = context.evaluated_depsgraph_get()
             cameras = turntable_cameras(subject, depsgraph, len(frames), self.angle)
         check_output(output)
-        fps, background = frames_per_second(scene), srgb_background(scene)
+        fps = frames_per_second(scene)
+        background = srgb_background(scene)
         with ExitStack() as kept:
             folder = _temporary_folder()
             kept.callback(shutil.rmtree, folder, ignore_errors=True)
             with ExitStack() as recording:
-                shown, subframe = scene.frame_current, scene.frame_subframe
+                shown = scene.frame_current
+                subframe = scene.frame_subframe
                 recording.callback(_unless_closed, scene.frame_set, shown, subframe=subframe)
                 status = recording.enter_context(status_writer(folder))
                 recorder = Recorder(folder / RECORDING)
@@ -150,7 +155,9 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
                 kept.callback(_unless_closed, monitor.handle, scene, Kind.VIDEO, Dismissed())
                 monitor.check_now(scene, Kind.VIDEO)
                 yield
-                cache, posed, before = SplatCache(), list[PosedSplats](), None
+                cache = SplatCache()
+                posed = list[PosedSplats]()
+                before = None
                 for number, frame in enumerate(frames):
                     # The recorded scene, which the window may no longer show.
                     with bpy.context.temp_override(scene=scene, view_layer=view_layer):

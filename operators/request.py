@@ -57,7 +57,8 @@ def start(
     waited for, also with the error of the worker or of its result.
     """
     job = table.JOBS[type(request)]
-    kind, subject = job.kind, getattr(request, job.subject)
+    kind = job.kind
+    subject = getattr(request, job.subject)
     if folder is None and kind in table.STORED:
         folder = perform.request_folder(subject)
     folder = folder or Path(tempfile.mkdtemp(prefix="stga_"))
@@ -216,8 +217,11 @@ class _Test:
 
     def begin(self, python: str) -> None:
         """Raises StgaError where the interpreter cannot be started."""
-        self.process, self._begun_s = start_check(python), monotonic()
-        self.python, self.found, self.error = python, None, ""
+        self.process = start_check(python)
+        self._begun_s = monotonic()
+        self.python = python
+        self.found = None
+        self.error = ""
 
     def end(self, timeout_s: float = 1.0) -> None:
         """Wait for what the test finds."""

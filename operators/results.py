@@ -74,10 +74,12 @@ def _run_object(scene: Any, state: RequestState) -> Any:
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
     """Show the avatar that was loaded, in the run's object or in a new one, a slice at a time."""
-    loading, run = _loading[scene.session_uid], _run(state)
+    loading = _loading[scene.session_uid]
+    run = _run(state)
     if not loading.done():
         return None
-    head, shown = scene.stga.head, _run_object(scene, state)
+    head = scene.stga.head
+    shown = _run_object(scene, state)
     if not is_head(head):
         raise StgaError("No head in the scene to show the avatar on; import the capture")
     avatar, attributes = loading.result()
@@ -110,7 +112,8 @@ def _show_made(scene: Any, state: RequestState) -> Answer:
     answer = _show_avatar(scene, state)
     is_refined = state.loading.name == AVATAR and state.files.tracking is not None
     if isinstance(answer, Shown) and is_refined:
-        refined, first = str(state.run / TRACKING), head[tags.TIMESTEPS][0]
+        refined = str(state.run / TRACKING)
+        first = head[tags.TIMESTEPS][0]
         _operate(scene, bpy.ops.stga.apply_motion, filepath=refined, own_offsets=True, start=first)
     return answer
 
@@ -163,15 +166,20 @@ def _select_for_take(scene: Any, state: RequestState) -> Answer:
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
     if not is_head(scene.stga.head):
         raise StgaError(f"{state.subject}: was written, but the scene has no head to apply it to")
-    path, first = str(state.subject), scene.frame_start
+    path = str(state.subject)
+    first = scene.frame_start
     return _operate(scene, bpy.ops.stga.apply_motion, filepath=path, start=first)
 
 
 SHOW = {
-    Kind.TRAINING: _show_avatar, Kind.TRACKING: _import, Kind.AVATAR: _show_made,
-    Kind.ANALYSIS: _fill_effects, Kind.SELECTION: _select_for_take,
-    Kind.PERFORMANCE: _apply_performance, Kind.LIGHT: _store_light,
-}  # fmt: skip
+    Kind.TRAINING: _show_avatar,
+    Kind.TRACKING: _import,
+    Kind.AVATAR: _show_made,
+    Kind.ANALYSIS: _fill_effects,
+    Kind.SELECTION: _select_for_take,
+    Kind.PERFORMANCE: _apply_performance,
+    Kind.LIGHT: _store_light,
+}
 """Puts the result of a kind of request into the scene. Raises StgaError or RuntimeError."""
 CHANGED = dict.fromkeys((Kind.TRAINING, Kind.AVATAR), _run_object) | dict.fromkeys(
     (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE), lambda scene, state: scene.stga.head

@@ -124,7 +124,8 @@ class HeatMap(Edit, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        head, splats = head_of(context), context.scene.stga.splats
+        head = head_of(context)
+        splats = context.scene.stga.splats
         if not self.show:
             groups.hide_heat_map(head)
         elif self.of == "RESIDUAL":
@@ -182,7 +183,8 @@ def count_selected(scene: Any, head: Any) -> None:
     settings.selected_frames.clear()
     for timestep, selected in groups.read_selection(head).items():
         row = settings.selected_frames.add()
-        row.frame, row.triangles = timestep, int(selected.sum())
+        row.frame = timestep
+        row.triangles = int(selected.sum())
         counted = row.triangles * every if per_face is None else per_face[selected].sum()
         row.splats = int(counted)
 

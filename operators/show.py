@@ -45,7 +45,8 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
     filter_glob: options.file_filter(".npz")
 
     def run(self, context: Any) -> None:
-        path, head = file_path(self.filepath, "avatar"), head_of(context)
+        path = file_path(self.filepath, "avatar")
+        head = head_of(context)
         settings = context.scene.stga
         avatar = read_avatar(path)
         show_progress(0.3)
@@ -123,7 +124,8 @@ class PreviewImages(Edit, bpy.types.Operator):
     needs = (need(_own_as_trained, "No splats are displayed as trained"),)
 
     def run(self, context: Any) -> None:
-        scene, space = context.scene, context.space_data
+        scene = context.scene
+        space = context.space_data
         mode = QUADS if scene.camera is not None else POINTS
         for thing in _own_as_trained(context):
             splat_object.set_input(thing, splat_nodes.DISPLAY, mode)
@@ -154,7 +156,8 @@ class StandardView(Edit, bpy.types.Operator):
 
 def _needs_splats(operator: Any, context: Any) -> bool:
     """Poll: whether there are splats that follow a head."""
-    splats, head = context.scene.stga.splats, None
+    splats = context.scene.stga.splats
+    head = None
     with suppress(StgaError):
         head = None if splats is None else splat_object.get_input(splats, splat_nodes.HEAD)
     return common.polled(operator, head is not None, "Show an avatar first")

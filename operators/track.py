@@ -70,7 +70,8 @@ class TrackFootage(Action, bpy.types.Operator, TrackOptions):
 
     def run(self, context: Any) -> None:
         given = {"model": None, **common.given_values(self, Track, *TRACK_FIELDS, "focal")}
-        out, mattes = file_path(self.directory, "capture").resolve(), self.mattes
+        out = file_path(self.directory, "capture").resolve()
+        mattes = self.mattes
         if mattes == "folder":
             mattes = str(file_path(self.matte_folder, "mattes").resolve())
         request = Track(**given, out=out, mattes=mattes)
@@ -96,7 +97,9 @@ class ViewFootage(Edit, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        head, space, scene = head_of(context), context.space_data, context.scene
+        head = head_of(context)
+        space = context.space_data
+        scene = context.scene
         cameras = tags.find(tags.CAMERA, Path(head[tags.CAPTURE]))
         cameras = sorted(cameras, key=lambda camera: camera[tags.CAMERA_INDEX])
         if not cameras:
@@ -105,13 +108,15 @@ class ViewFootage(Edit, bpy.types.Operator):
         # a hidden camera shows no images
         show_kind(head.parent, tags.CAMERA, context.view_layer, not leave)
         if leave:
-            space.region_3d.view_perspective, space.shading.show_xray = "PERSP", False
+            space.region_3d.view_perspective = "PERSP"
+            space.shading.show_xray = False
             return
         row = cameras.index(scene.camera) if scene.camera in cameras else 0
         scene.camera = cameras[(row + self.step) % len(cameras)]
         scene.render.resolution_x, scene.render.resolution_y = scene.camera[tags.IMAGE_SIZE]
         space.region_3d.view_perspective = "CAMERA"
-        space.shading.type, space.shading.show_xray = "SOLID", True
+        space.shading.type = "SOLID"
+        space.shading.show_xray = True
         space.shading.xray_alpha = XRAY_ALPHA
 
 
@@ -129,7 +134,8 @@ class MarkKey(Edit, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        head, frame = head_of(context), context.scene.frame_current
+        head = head_of(context)
+        frame = context.scene.frame_current
         keys = tracking_keys(head)
         if frame in keys:
             del keys[frame]
@@ -155,7 +161,8 @@ class SolveAgain(Action, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         head = head_of(context)
-        capture, model = Path(head[tags.CAPTURE]), Path(head[tags.FLAME_MODEL])
+        capture = Path(head[tags.CAPTURE])
+        model = Path(head[tags.FLAME_MODEL])
         request = jobs.SolveAgain(capture, model, tracking_keys(head))
         if start(context.scene, request, training_python(context)):
             self.inform(f"Tracked {capture}")

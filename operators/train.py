@@ -32,7 +32,8 @@ class AnalyzeCapture(Action, bpy.types.Operator):
     needs = (idle(Kind.ANALYSIS), needs_head)
 
     def run(self, context: Any) -> None:
-        settings, source = context.scene.stga, capture_source(head_of(context))
+        settings = context.scene.stga
+        source = capture_source(head_of(context))
         effects = dict(map(parse_choice, chosen_effects(settings)))
         request = Analyze(*source, effects, settings.device, timed=True)
         start(context.scene, request, training_python(context))
@@ -166,7 +167,8 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        head, run = head_of(context), file_path(self.directory, "run folder").resolve()
+        head = head_of(context)
+        run = file_path(self.directory, "run folder").resolve()
         capture, *source = capture_source(head)
         if not capture.is_dir():
             expected = "expected the capture that the head was imported from"
@@ -177,7 +179,8 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
             moved = None if read_run(run).takes else capture
             self.start(context, jobs.Resume(run, moved, *source, **how))
             return
-        preset, effects = None if self.preset == "none" else self.preset, None
+        preset = None if self.preset == "none" else self.preset
+        effects = None
         if self.strategy != "gaussian-avatars":
             effects = dict(map(parse_choice, self.effects.split()))
         budget = self.budget(60 * self.minutes)

@@ -9,7 +9,9 @@ MAX_MESSAGE_CHARACTERS = 1000
 MAX_VALUE_CHARACTERS = 80
 
 _repr = reprlib.Repr()
-_repr.maxlevel, _repr.maxstring, _repr.maxother = 2, MAX_VALUE_CHARACTERS, MAX_VALUE_CHARACTERS
+_repr.maxlevel = 2
+_repr.maxstring = MAX_VALUE_CHARACTERS
+_repr.maxother = MAX_VALUE_CHARACTERS
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 

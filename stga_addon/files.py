@@ -29,7 +29,8 @@ MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
 )  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
-RENAME_PATIENCE_S, RENAME_INTERVAL_S = 5.0, 0.1
+RENAME_PATIENCE_S = 5.0
+RENAME_INTERVAL_S = 0.1
 """How long, and how often, a rename is tried again while another program has the file open, on
 Windows."""
 WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
@@ -103,7 +104,9 @@ class NumberedFiles:
 
     def __init__(self, folder: Path, names: re.Pattern[str]) -> None:
         """Raises StgaError where the folder holds one of these names that is not listed."""
-        self.folder, self._names, self._written = folder, names, dict[str, str]()
+        self.folder = folder
+        self._names = names
+        self._written = dict[str, str]()
         self._list = folder / SEQUENCE_FILE
         text = self._list.read_text(errors="replace") if self._list.is_file() else ""
         listed = set(text.splitlines())

@@ -45,11 +45,14 @@ def describe_figures(figures: Mapping[str, float]) -> list[str]:
         matched = ("psnr", "PSNR {:.2f} dB (exposure fitted)")
         quality = ((matched, ("psnr_unmatched", "{:.2f} dB without")), (loss,))
     pairs = (
-        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")), *quality,
-        (("error_px", "{:.1f} px off landmarks"),
-         ("unexplained", "{:.0%} of the face unexplained")),
+        (("per_second", "{:.1f} it/s"), ("left_s", "{} left")),
+        *quality,
+        (
+            ("error_px", "{:.1f} px off landmarks"),
+            ("unexplained", "{:.0%} of the face unexplained"),
+        ),
         (("splats", "{:,.0f} splats"), ("memory_mb", "{:.0f} MB memory")),
-    )  # fmt: skip
+    )
     lines = []
     for pair in pairs:
         parts = []

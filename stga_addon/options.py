@@ -20,12 +20,20 @@ MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 
 def option(
-    help: str, default: Any = dataclasses.MISSING, minimum: float = -math.inf,
-    maximum: float = math.inf, *, flag: str = "", metavar: str = "",
-    parse: Callable[[str], Any] | None = None, bare: Any = None,
-    offered: Collection[str] | None = None, group: str = "",
-    needs: tuple[str | tuple[str, ...], ...] = (), **limits: Any,
-) -> Any:  # fmt: skip
+    help: str,
+    default: Any = dataclasses.MISSING,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    *,
+    flag: str = "",
+    metavar: str = "",
+    parse: Callable[[str], Any] | None = None,
+    bare: Any = None,
+    offered: Collection[str] | None = None,
+    group: str = "",
+    needs: tuple[str | tuple[str, ...], ...] = (),
+    **limits: Any,
+) -> Any:
     """A dataclass field that people choose, with its limits (`schema.setting`).
 
     help     what it is, for command line and tooltip; of a field that is a dataclass, the title of
@@ -66,9 +74,11 @@ def option_fields(kind: Any) -> Iterator[Any]:
 def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] = ()) -> None:
     """Add an argument for each option of a dataclass, or those of `names`; its dataclasses are
     groups. may_lack: fields without a default that need not be given."""
-    hints, groups = type_hints(kind), {"": parser}
+    hints = type_hints(kind)
+    groups = {"": parser}
     for spec in option_fields(kind):
-        hint, asked = hints[spec.name], spec.metadata
+        hint = hints[spec.name]
+        asked = spec.metadata
         if names and spec.name not in names:
             continue
         if dataclasses.is_dataclass(hint):
@@ -85,8 +95,11 @@ def add_options(parser: Any, kind: Any, *names: str, may_lack: Collection[str] =
 def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
     """What `add_argument` takes for a field, by its type."""
     (kind,) = (k for k in alternatives(hint) if k is not NoneType)
-    asked, default, flag = spec.metadata, spec.default, flag_of(spec)
-    is_named, help = flag.startswith("-"), str(asked["help"])
+    asked = spec.metadata
+    default = spec.default
+    flag = flag_of(spec)
+    is_named = flag.startswith("-")
+    help = str(asked["help"])
     is_told = isinstance(default, str | int | float) and default and default is not True
     if is_told and "default" not in help:
         help += f" (default {default})"
@@ -112,9 +125,11 @@ def _form(spec: Any, hint: Any, is_required: bool) -> dict[str, Any]:
 
 def given_options(options: Namespace, kind: Any) -> dict[str, Any]:
     """Field -> value of what was given on the command line."""
-    hints, found = type_hints(kind), dict[str, Any]()
+    hints = type_hints(kind)
+    found = dict[str, Any]()
     for spec in option_fields(kind):
-        hint, value = hints[spec.name], getattr(options, spec.name, None)
+        hint = hints[spec.name]
+        value = getattr(options, spec.name, None)
         if dataclasses.is_dataclass(hint):
             value = hint(**given_options(options, hint))  # type: ignore[operator]
         elif isinstance(value, list):
@@ -133,7 +148,8 @@ def refuse_useless(value: Any) -> None:
             names = (needed,) if isinstance(needed, str) else needed
             if any(_is_changed(value, specs[name]) for name in names):
                 continue
-            useless, without = spec, " or ".join(flag_of(specs[name]) for name in names)
+            useless = spec
+            without = " or ".join(flag_of(specs[name]) for name in names)
             nested = getattr(value, spec.name)
             if dataclasses.is_dataclass(nested):
                 inner: Any = type(nested)

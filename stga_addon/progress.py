@@ -60,14 +60,16 @@ class TimeLeft:
 
     def after(self, share: float) -> float:
         """Once `share` of the work is done; NaN where the pace is not known yet."""
-        now, (before, begun) = self._clock(), self._last
+        now = self._clock()
+        (before, begun) = self._last
         self._last = now, share
         if 0 <= share - begun <= MAX_STEP_SHARE:
             self._steps.append((now - before, share - begun))
         seconds, done = map(sum, zip(*self._steps, strict=True)) if self._steps else (0.0, 0.0)
         while done > PACE_SHARE and done - self._steps[0][1] >= PACE_SHARE:
             first = self._steps.popleft()
-            seconds, done = seconds - first[0], done - first[1]
+            seconds = seconds - first[0]
+            done = done - first[1]
         return (1 - share) * seconds / done if done >= PACE_SHARE / 10 else math.nan
 
 

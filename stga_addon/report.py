@@ -34,7 +34,8 @@ class CurveUpdater:
     """Keeps the curve in a run's folder up to date; call it as often as convenient."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._drawn_size = folder, -1
+        self._folder = folder
+        self._drawn_size = -1
         self._next_update = perf_counter() + FIRST_DRAWING_S
 
     def __call__(self) -> None:
@@ -62,7 +63,8 @@ def write_curve(folder: Path) -> None:
 def report_run(folder: Path) -> list[str]:
     """Write the curve of a finished run and return the lines of its summary."""
     write_curve(folder)
-    run, metrics = read_run(folder), read_metrics(folder)
+    run = read_run(folder)
+    metrics = read_metrics(folder)
     lines = summarize_run(metrics, run.settings.target_psnr)
     if run.continuation is not None:
         lines = summarize_continuation(metrics)
@@ -78,7 +80,9 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     """Lines on accuracy, target (dB), checked forecasts, and cost of evaluation and memory."""
     if not metrics:
         return []
-    lines, curve, last = [], curve_of(metrics), metrics[-1]
+    lines = []
+    curve = curve_of(metrics)
+    last = metrics[-1]
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
         best = forecasts.saved_line(evaluations, target)
@@ -116,7 +120,8 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     """Lines on the accuracy before and after, by region and group of held-out views."""
     if not metrics:
         return []
-    first, last = metrics[0], metrics[-1]
+    first = metrics[0]
+    last = metrics[-1]
     lines = [f"splats: {first['splats']} before, {last['splats']} after"]
     fitted = " (exposure fitted)" if UNMATCHED in first else ""
     all_views = {"psnr": f"held-out views{fitted}"}
@@ -124,7 +129,8 @@ def summarize_continuation(metrics: Sequence[Mapping[str, Any]]) -> list[str]:
     parts = [name for name in first if name.startswith("psnr_") and name != UNMATCHED]
     for name in (*(name for name in all_views if name in first), *parts):
         label = all_views.get(name, name.removeprefix("psnr_").replace("_", " ") + fitted)
-        before, after = first[name], last.get(name, math.nan)
+        before = first[name]
+        after = last.get(name, math.nan)
         change = f"{before:.2f} dB before, {after:.2f} dB after ({after - before:+.2f})"
         lines.append(f"{label}: {change}")
     return lines
@@ -152,8 +158,10 @@ def run_chart(metrics: Sequence[Mapping[str, Any]]) -> "Figure":
         if curve:
             axes.plot(*np.array(curve).T, marker=".", label=name)
     if metrics and "forecast" in metrics[-1]:
-        last, ahead = metrics[-1], metrics[-1]["forecast"]
-        seconds, psnr = [last["seconds"], ahead["seconds"]], np.array([last["psnr"], ahead["psnr"]])
+        last = metrics[-1]
+        ahead = metrics[-1]["forecast"]
+        seconds = [last["seconds"], ahead["seconds"]]
+        psnr = np.array([last["psnr"], ahead["psnr"]])
         error = np.array([0, ahead["error"]])
         (line,) = axes.plot(seconds, psnr, linestyle="--", label="forecast")
         axes.fill_between(
@@ -206,8 +214,11 @@ def finish_axes(axes: "Axes") -> None:
 SIZE = 256  # Width and height in pixels: Blender's icons are square
 MARGIN = 6.0
 LINE_WIDTH = 3.0
-BACKGROUND_COLOR, GRID_COLOR = (0.11, 0.11, 0.11), (0.25, 0.25, 0.25)
-CURVE_COLOR, FORECAST_COLOR, DETAIL_COLOR = (0.34, 0.71, 0.91), (0.90, 0.62, 0.0), (0.0, 0.62, 0.45)
+BACKGROUND_COLOR = (0.11, 0.11, 0.11)
+GRID_COLOR = (0.25, 0.25, 0.25)
+CURVE_COLOR = (0.34, 0.71, 0.91)
+FORECAST_COLOR = (0.90, 0.62, 0.0)
+DETAIL_COLOR = (0.0, 0.62, 0.45)
 BAND_OPACITY = 0.35  # Of the band that shows a forecast's error
 GRID_STEPS_DB = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """The first step is used that gives at most MAX_GRID_STEPS."""
@@ -231,18 +242,22 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
         return None
     seconds, psnr = np.array(curve, np.float64).T
     forecast = lines[-1].get("forecast")
-    end, high = seconds[-1], psnr.max()
+    end = seconds[-1]
+    high = psnr.max()
     if forecast is not None:
-        end, high = forecast["seconds"], max(high, forecast["psnr"] + forecast["error"])
+        end = forecast["seconds"]
+        high = max(high, forecast["psnr"] + forecast["error"])
     low = min(float(np.interp(end / 10, seconds, psnr)), psnr[-1])
     step = next(
         (step for step in GRID_STEPS_DB if (high - low) / step <= MAX_GRID_STEPS), GRID_STEPS_DB[-1]
     )
-    low, high = step * np.floor(low / step), step * np.ceil(high / step + 1e-9)
+    low = step * np.floor(low / step)
+    high = step * np.ceil(high / step + 1e-9)
     plot = _Plot((0.0, end), (low, high))
     plot.grid(np.arange(low, high + step / 2, step))
     if forecast is not None:
-        x, y = np.array([seconds[-1], end]), np.array([psnr[-1], forecast["psnr"]])
+        x = np.array([seconds[-1], end])
+        y = np.array([psnr[-1], forecast["psnr"]])
         error = np.array([0.0, forecast["error"]])
         plot.band(x, y - error, y + error, FORECAST_COLOR)
         plot.line(x, y, FORECAST_COLOR)
@@ -252,7 +267,8 @@ def curve_image(lines: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, str, st
         lowest = min(float(np.interp(when[-1] / 10, when, detail)), float(detail[-1]))
         share = (detail - lowest) / max(float(detail.max()) - lowest, 1e-9)
         plot.line(when, low + share * (high - low), DETAIL_COLOR)
-        worst, best = 10 ** (-lowest / 20), min(value for _, value in curve_of(lines, DETAIL))
+        worst = 10 ** (-lowest / 20)
+        best = min(value for _, value in curve_of(lines, DETAIL))
         detail_range = f"Detail difference {worst:.3f} to {best:.3f} (green)"
     plot.line(seconds, psnr, CURVE_COLOR)
     unmatched = lines[-1].get(UNMATCHED)
@@ -266,7 +282,8 @@ class _Plot:
     def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
         self.pixels = np.ones((SIZE, SIZE, 4), np.float32)
         self.pixels[..., :3] = BACKGROUND_COLOR
-        self._x, self._y = x, y
+        self._x = x
+        self._y = y
 
     def grid(self, y: np.ndarray) -> None:
         self.pixels[self._rows(y).astype(int), :, :3] = GRID_COLOR

@@ -23,12 +23,17 @@ Arrays = dict[str, np.ndarray]
 
 
 def setting(
-    default: Any = dataclasses.MISSING, minimum: float = -math.inf, maximum: float = math.inf,
-    above: float = -math.inf, choices: Collection[str] | None = None,
-    accepts: Callable[[Any], bool] | None = None, expected: str = "",
-    is_path: Callable[[str], bool] | None = None, default_factory: Any = dataclasses.MISSING,
+    default: Any = dataclasses.MISSING,
+    minimum: float = -math.inf,
+    maximum: float = math.inf,
+    above: float = -math.inf,
+    choices: Collection[str] | None = None,
+    accepts: Callable[[Any], bool] | None = None,
+    expected: str = "",
+    is_path: Callable[[str], bool] | None = None,
+    default_factory: Any = dataclasses.MISSING,
     **option: Any,
-) -> Any:  # fmt: skip
+) -> Any:
     """A dataclass field with its allowed values; the bounds hold for each number of a tuple.
 
     minimum, maximum  inclusive; above: exclusive lower bound
@@ -54,7 +59,8 @@ def validate(value: Any, prefix: str = "") -> None:
     in common, a dataclass says in a method `check()` that raises StgaError."""
     hints = type_hints(type(value))  # type: ignore[arg-type]
     for spec in dataclasses.fields(value):
-        found, hint = getattr(value, spec.name), hints[spec.name]
+        found = getattr(value, spec.name)
+        hint = hints[spec.name]
         expected = expectation(found, hint, spec.metadata)
         if expected is not None:
             raise StgaError(complaint(prefix + spec.name, expected, found))
@@ -113,7 +119,8 @@ def _expected_kind(value: Any, kind: Any, limits: Mapping[str, Any]) -> str | No
             return None
         return "texts by name" if (names, values) == (str, str) else "values by name"
     if kind in (int, float):
-        low, above = limits.get("minimum", -math.inf), limits.get("above", -math.inf)
+        low = limits.get("minimum", -math.inf)
+        above = limits.get("above", -math.inf)
         high = limits.get("maximum", math.inf)
         if kind is int:
             fits = isinstance(value, int)

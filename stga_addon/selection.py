@@ -33,9 +33,12 @@ class SelectionOptions:
 
 
 def select_faces(
-    mesh: np.ndarray, neutral: np.ndarray, faces: np.ndarray, regions: Mapping[str, np.ndarray],
+    mesh: np.ndarray,
+    neutral: np.ndarray,
+    faces: np.ndarray,
+    regions: Mapping[str, np.ndarray],
     threshold: float,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """(F,) bool: the triangles whose splats this frame trains. mesh, neutral (V, 3) meters without
     rigid head motion; faces (F, 3); regions name -> (F,) bool. A region whose mean offset of
     triangle centers exceeds the threshold is selected as a whole; a triangle outside of the regions

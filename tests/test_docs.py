@@ -69,11 +69,14 @@ def test_what_a_page_names_is_there(page):
 def test_readme_renders_a_ply(tmp_path, monkeypatch):
     """Catches a public rendering function that is not the one which the README shows."""
     splats = Splats(
-        xyz=np.zeros((1, 3), np.float32), rotation=np.array([[1, 0, 0, 0]], np.float32),
-        log_scale=np.full((1, 3), np.log(0.05), np.float32), opacity=np.full(1, 5, np.float32),
-        sh=np.full((1, 1, 3), -0.5 / SH_C0, np.float32), face=np.zeros(1, np.int32),
+        xyz=np.zeros((1, 3), np.float32),
+        rotation=np.array([[1, 0, 0, 0]], np.float32),
+        log_scale=np.full((1, 3), np.log(0.05), np.float32),
+        opacity=np.full(1, 5, np.float32),
+        sh=np.full((1, 1, 3), -0.5 / SH_C0, np.float32),
+        face=np.zeros(1, np.int32),
         unbound=np.zeros(1, bool),
-    )  # fmt: skip
+    )
     write_ply(tmp_path / "splats.ply", splats)
     monkeypatch.chdir(tmp_path)
     (example,) = re.findall(r"```python\n(.*?)```", TEXTS[ROOT / "README.md"], re.DOTALL)

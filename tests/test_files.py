@@ -51,9 +51,17 @@ def test_replacing_is_all_or_nothing(tmp_path):
 
 
 UNWRITABLE = (
-    "file/a.json", "file/inner/a.json", "folder", "pipe", ".", "/", "x" * 250, "y" * 5000, "a\0",
+    "file/a.json",
+    "file/inner/a.json",
+    "folder",
+    "pipe",
+    ".",
+    "/",
+    "x" * 250,
+    "y" * 5000,
+    "a\0",
     "\ud800",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("name", UNWRITABLE)
@@ -195,7 +203,8 @@ def test_temporary_name_is_new(tmp_path, monkeypatch):
 def refused(times: int, winerror: int | None):
     """An os.replace that fails `times` times as Windows does (None: as POSIX does), and the number
     of its calls."""
-    calls, replace = [], os.replace
+    calls = []
+    replace = os.replace
 
     def fake(source, target):
         calls.append(target)
@@ -212,10 +221,13 @@ def refused(times: int, winerror: int | None):
 @pytest.mark.parametrize(
     ("winerror", "times", "patience", "most_calls"),
     [
-        (5, 3, (), 4), (32, 3, (), 4), (32, 10**6, (0.25,), 4), (32, 10**6, (0.0,), 1),
+        (5, 3, (), 4),
+        (32, 3, (), 4),
+        (32, 10**6, (0.25,), 4),
+        (32, 10**6, (0.0,), 1),
         (None, 10**6, (60.0,), 1),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_another_program_has_open(
     winerror, times, patience, most_calls, tmp_path, monkeypatch
 ):
@@ -224,7 +236,8 @@ def test_a_file_that_another_program_has_open(
     write_json(tmp_path / "a.json", 1)
     fake, calls = refused(times, winerror)
     monkeypatch.setattr(files.os, "replace", fake)
-    begin, sentence = time.monotonic(), r"a\.json: cannot be written \(Permission denied\)"
+    begin = time.monotonic()
+    sentence = r"a\.json: cannot be written \(Permission denied\)"
     with pytest.raises(StgaError, match=sentence) if patience else nullcontext():
         write_json(tmp_path / "a.json", 2, *patience)
     assert time.monotonic() - begin < 10

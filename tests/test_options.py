@@ -64,24 +64,38 @@ def test_what_is_given_reaches_its_field():
     line = "--count 4 --time 1m --style bold --turn --frames 2-7 --color 0,1,0.5"
     more = "--tones dark --tones light --shifts left=3 --shifts x=1 --shaded --again 3 --width 4"
     assert Drawing(**parsed(*line.split(), *more.split())) == Drawing(
-        Path("a.png"), Path("b"), 4, 60.0, None, "bold", 0.0, (2, 7), (0.0, 1.0, 0.5),
+        Path("a.png"),
+        Path("b"),
+        4,
+        60.0,
+        None,
+        "bold",
+        0.0,
+        (2, 7),
+        (0.0, 1.0, 0.5),
         ("dark", "light"),
-        {"left": 3, "x": 1}, True, 3.0, Frame(4.0),
-    )  # fmt: skip
+        {"left": 3, "x": 1},
+        True,
+        3.0,
+        Frame(4.0),
+    )
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    ("--count 0", "argument --count: expected a whole number from 1 up to 9, got '0'"),
-    ("--count 1.5", "argument --count: expected a whole number"),
-    ("--turn 361", "argument --turn: expected a finite number from 0 up to 360"),
-    ("--width nan", "argument --width: expected a finite number from 0 up to 9"),
-    ("--time soon", "argument --time: 'soon' is not a time"),
-    ("--time 1s --strokes 3", "not allowed with argument"),
-    ("--style own", "invalid choice: 'own'"),
-    ("--color 0,1,2", "argument --color: '0,1,2' is not white, black or R,G,B"),
-    ("--frames 7-2", "argument --frames: '7-2' is not a range"),
-    ("--hidden 3", "unrecognized arguments: --hidden 3"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--count 0", "argument --count: expected a whole number from 1 up to 9, got '0'"),
+        ("--count 1.5", "argument --count: expected a whole number"),
+        ("--turn 361", "argument --turn: expected a finite number from 0 up to 360"),
+        ("--width nan", "argument --width: expected a finite number from 0 up to 9"),
+        ("--time soon", "argument --time: 'soon' is not a time"),
+        ("--time 1s --strokes 3", "not allowed with argument"),
+        ("--style own", "invalid choice: 'own'"),
+        ("--color 0,1,2", "argument --color: '0,1,2' is not white, black or R,G,B"),
+        ("--frames 7-2", "argument --frames: '7-2' is not a range"),
+        ("--hidden 3", "unrecognized arguments: --hidden 3"),
+    ],
+)
 def test_values_without_meaning(words, message, capsys):
     """Catches limits that the command line does not know, and a refusal that does not name the
     option."""
@@ -91,11 +105,21 @@ def test_values_without_meaning(words, message, capsys):
 
 
 DURATIONS = {
-    "90": 90, "90s": 90, "10m": 600, "1h30m": 5400, "1h": 3600, "1.5m": 90, "1m30": 90, " 2m ": 120
-}  # fmt: skip
+    "90": 90,
+    "90s": 90,
+    "10m": 600,
+    "1h30m": 5400,
+    "1h": 3600,
+    "1.5m": 90,
+    "1m30": 90,
+    " 2m ": 120,
+}
 COLORS = {
-    "white": (1, 1, 1), "black": (0, 0, 0), "0.25,1,0": (0.25, 1, 0), "0, .5 ,1.0": (0, 0.5, 1)
-}  # fmt: skip
+    "white": (1, 1, 1),
+    "black": (0, 0, 0),
+    "0.25,1,0": (0.25, 1, 0),
+    "0, .5 ,1.0": (0, 0.5, 1),
+}
 NO_DURATIONS = "", "s", "m", "-5", "ten", "5d", "1e3", "nan", "inf", "5 m", "30s10m", "1,5m", "٣"
 NO_COLORS = "", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "nan,0,0", "0,0,inf", "a,b,c"
 
@@ -114,11 +138,14 @@ def test_times_and_colors():
                 read(text)
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    ("--shaded", "--shaded: has no effect without --time or --strokes"),
-    ("--tones dark", "--tones: has no effect without --shaded"),
-    ("--width 3", "--width: has no effect without --shaded"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--shaded", "--shaded: has no effect without --time or --strokes"),
+        ("--tones dark", "--tones: has no effect without --shaded"),
+        ("--width 3", "--width: has no effect without --shaded"),
+    ],
+)
 def test_options_that_need_others(words, message):
     """Catches an option that is ignored without a message, and one that is refused where it has an
     effect."""

@@ -21,19 +21,29 @@ def parts(tmp_path: Path) -> dict[str, Path]:
     capture = open_capture(folder, model)
     factory.write_avatar_of(capture, tmp_path / "a.npz", is_colored=True)
     rng = np.random.default_rng(1)
-    pose, expr = rng.normal(0, 0.3, (2, 15)), rng.normal(size=(2, 2))
+    pose = rng.normal(0, 0.3, (2, 15))
+    expr = rng.normal(size=(2, 2))
     np.savez(tmp_path / "other.npz", expr=expr, pose=pose, shape=np.full(4, 2.0))
     return {
-        "avatar": tmp_path / "a.npz", "model": model, "motion": tmp_path / "other.npz",
-        "cameras": folder / "transforms_train.json", "capture": folder,
-    }  # fmt: skip
+        "avatar": tmp_path / "a.npz",
+        "model": model,
+        "motion": tmp_path / "other.npz",
+        "cameras": folder / "transforms_train.json",
+        "capture": folder,
+    }
 
 
 def render(parts: dict[str, Path], out: Path, *more: object) -> int:
     arguments = [
-        "render", parts["avatar"], "--cameras", parts["cameras"], "--motion", parts["motion"],
-        "--out", out,
-    ]  # fmt: skip
+        "render",
+        parts["avatar"],
+        "--cameras",
+        parts["cameras"],
+        "--motion",
+        parts["motion"],
+        "--out",
+        out,
+    ]
     return main([str(a) for a in [*arguments, *more]])
 
 
@@ -45,10 +55,8 @@ def test_the_other_person_moves_the_avatar(parts, tmp_path):
         f"{t:05d}_{c:02d}.png" for t in (0, 1) for c in (0, 1)
     ]
     capture = open_capture(parts["capture"], parts["model"])
-    own, view = (
-        capture.flame,
-        next(view for view in capture.views["train"] if view.camera_index == 1),
-    )
+    own = capture.flame
+    view = next(view for view in capture.views["train"] if view.camera_index == 1)
     assert own is not None
     arrays = np.load(parts["motion"])
     pose = arrays["pose"][1]

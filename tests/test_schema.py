@@ -58,10 +58,19 @@ class Drawing:
 
 
 EVERYTHING = Drawing(
-    count=0, span=(0.0, 1), steps=(1, 2), style="bold", title="Zoë", path=Path("/a/b"), filled=True,
-    colors={"sky": "blue"}, frames={-3: Square(9), 12: Square(1)}, main=Square(2),
-    others=(Circle(9.0), Square(3)), last=Square(4, np.arange(6.0).reshape(2, 3)),
-)  # fmt: skip
+    count=0,
+    span=(0.0, 1),
+    steps=(1, 2),
+    style="bold",
+    title="Zoë",
+    path=Path("/a/b"),
+    filled=True,
+    colors={"sky": "blue"},
+    frames={-3: Square(9), 12: Square(1)},
+    main=Square(2),
+    others=(Circle(9.0), Square(3)),
+    last=Square(4, np.arange(6.0).reshape(2, 3)),
+)
 
 
 SHARES = "expected a tuple, each item a finite number from 0.0 up to 1.0"
@@ -147,11 +156,13 @@ OTHER_FORMS: list[tuple[dict[str, Any], str]] = [
     ({"main": None}, f"setting d.main.kind: {KINDS}, got None"),
     ({"others": [{"kind": "Circle"}]}, "d.others.0: fields are missing or unknown (radius)"),
     ({"last": 3}, "d.last: fields are missing or unknown (points, side)"),
-    ({"last": {"side": 1, "points": {"array": "nowhere"}, "more": 1}},
-     "d.last: fields are missing or unknown (more)"),
+    (
+        {"last": {"side": 1, "points": {"array": "nowhere"}, "more": 1}},
+        "d.last: fields are missing or unknown (more)",
+    ),
     ({"last": {"side": 0, "points": None}}, f"setting last.side: {SIDE}, got 0"),
     ({"more": 1}, "d: fields are missing or unknown (more)"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("changes", "message"), OTHER_FORMS)

@@ -20,7 +20,8 @@ NEUTRAL = np.random.default_rng(0).normal(size=(3 * COUNT, 3))
 
 def moved(offsets: dict[int, float]) -> np.ndarray:
     """The neutral mesh with some triangles shifted by so many meters, each in its own direction."""
-    mesh, rng = NEUTRAL.copy(), np.random.default_rng(1)
+    mesh = NEUTRAL.copy()
+    rng = np.random.default_rng(1)
     for face, distance in offsets.items():
         direction = rng.normal(size=3)
         mesh[FACES[face]] += distance * direction / np.linalg.norm(direction)
@@ -73,11 +74,17 @@ def capture(given_selection: dict[int, np.ndarray], asked: list[tuple[int, str]]
         return moved({timestep: 0.03})
 
     return Capture(
-        root=Path(), layout="test", faces=FACES, neutral=NEUTRAL, views={}, timesteps=(1, 4, 6),
+        root=Path(),
+        layout="test",
+        faces=FACES,
+        neutral=NEUTRAL,
+        views={},
+        timesteps=(1, 4, 6),
         regions={"mouth": region(1, 2), "ears": region(3, 4, 5)},
         mesh=lambda timestep: pytest.fail("selection must not look at the mesh with head motion"),
-        expression_mesh=expression_mesh, given_selection=given_selection,
-    )  # fmt: skip
+        expression_mesh=expression_mesh,
+        given_selection=given_selection,
+    )
 
 
 def numbers(chosen: dict[int, np.ndarray]) -> dict[int, list[int]]:

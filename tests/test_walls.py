@@ -107,7 +107,8 @@ def import_graph(sources: tuple[Path, ...]) -> dict[Path, set[Path]]:
 
 def reached(graph: dict[T, set[T]], path: T) -> set[T]:
     """All files, or parts, that one imports, or that those import in turn."""
-    seen, left = set[T](), [path]
+    seen = set[T]()
+    left = [path]
     while left:
         new = graph[left.pop()] - seen
         seen |= new

@@ -24,9 +24,11 @@ class MotionPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "5 Motion"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga
+        layout = self.layout
+        settings = context.scene.stga
         layout.operator("stga.apply_motion", text="Apply Motion…", icon="IMPORT")
-        row, other = layout.row(align=True), settings.motion_source
+        row = layout.row(align=True)
+        other = settings.motion_source
         row.prop(settings, "motion_source")
         if other is not None:
             row.operator("stga.apply_motion", text="", icon="CHECKMARK").source = other.name
@@ -48,7 +50,8 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
         if needs_sliders(head):
             self.layout.operator("stga.add_arkit_controls", icon="ADD")
             return
-        keys, column = head.data.shape_keys.key_blocks, self.layout.column(align=True)
+        keys = head.data.shape_keys.key_blocks
+        column = self.layout.column(align=True)
         for name in [name for name in ARKIT_SHAPES if name in keys]:
             column.prop(keys[name], "value", text=name, slider=True)
 
@@ -102,7 +105,8 @@ class DrivePanel(ClosedPanel, bpy.types.Panel):
     bl_parent_id = MotionPanel.bl_idname
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga.drive
+        layout = self.layout
+        settings = context.scene.stga.drive
         running = drive.session()
         if running is None:
             source = SOURCES[settings.source]
@@ -136,8 +140,10 @@ class DrivePanel(ClosedPanel, bpy.types.Panel):
 
 
 def _draw_status(column: Any, running: Any) -> None:
-    now, stream = monotonic(), running.stream
-    silent, delay_s = stream.silent_s(now), stream.delay_s()
+    now = monotonic()
+    stream = running.stream
+    silent = stream.silent_s(now)
+    delay_s = stream.delay_s()
     if silent is None:
         column.label(text=f"Waiting on port {running.receiver.port}", icon="INFO")
     elif silent > SILENT_S:

@@ -29,7 +29,9 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "Next Step"
 
     def draw(self, context: Any) -> None:
-        layout, settings, scene = self.layout, context.scene.stga, context.scene
+        layout = self.layout
+        settings = context.scene.stga
+        scene = context.scene
         _draw_message(layout, context)
         if draw_running(layout, context, Kind.AVATAR):
             draw_text(layout, context, f"Head, then splats appear. {GO_ON}", "INFO")
@@ -50,7 +52,8 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
             hint = f"Choose a video of a face. Or import a capture: {tracked}"
             draw_text(layout, context, hint)
             draw_missing_python(layout, context)
-            text, icon = "Avatar from Video…", "FILE_MOVIE"
+            text = "Avatar from Video…"
+            icon = "FILE_MOVIE"
             layout.operator("stga.avatar_from_video", text=text, icon=icon)
             layout.operator("stga.import_capture", icon="IMPORT")
             if OpenDemo.poll(context):
@@ -80,7 +83,8 @@ def _draw_message(layout: Any, context: Any) -> None:
     row = box.row()
     row.label(text="Not Done", icon="ERROR")
     close = row.operator("wm.context_set_string", text="", icon="X", emboss=False)
-    close.data_path, close.value = "window_manager.stga_message", ""
+    close.data_path = "window_manager.stga_message"
+    close.value = ""
     draw_text(box, context, text)
     if PYTHON_VARIABLE in text:
         draw_missing_python(box, context)

@@ -5,15 +5,25 @@ from . import motion_panel, next_step, select_panel, show_panel, sidebar, track_
 
 CLASSES = (
     next_step.NextStepPanel,
-    track_panel.TrackPanel, track_panel.TrackOptionsPanel, track_panel.TrackCheckPanel,
-    select_panel.CapturePanel, select_panel.SelectedFrames, select_panel.SelectPanel,
-    train_panel.TrainPanel, train_panel.TrainOptionsPanel, train_panel.ContinuePanel,
+    track_panel.TrackPanel,
+    track_panel.TrackOptionsPanel,
+    track_panel.TrackCheckPanel,
+    select_panel.CapturePanel,
+    select_panel.SelectedFrames,
+    select_panel.SelectPanel,
+    train_panel.TrainPanel,
+    train_panel.TrainOptionsPanel,
+    train_panel.ContinuePanel,
     train_panel.EffectsPanel,
-    show_panel.ShowPanel, show_panel.LightingPanel,
-    motion_panel.MotionPanel, motion_panel.FacePanel, motion_panel.DrivePanel,
-    motion_panel.TrainedPanel, motion_panel.CoefficientsPanel,
+    show_panel.ShowPanel,
+    show_panel.LightingPanel,
+    motion_panel.MotionPanel,
+    motion_panel.FacePanel,
+    motion_panel.DrivePanel,
+    motion_panel.TrainedPanel,
+    motion_panel.CoefficientsPanel,
     show_panel.RenderPanel,
-)  # fmt: skip
+)
 """In the order of the tab."""
 
 

@@ -179,9 +179,15 @@ class Preferences(bpy.types.AddonPreferences):
 
 
 CLASSES = (
-    SelectedFrame, EffectRow, TrackSettings, RefineSettings, ExtendSettings, DriveSettings,
-    SceneSettings, Preferences,
-)  # fmt: skip
+    SelectedFrame,
+    EffectRow,
+    TrackSettings,
+    RefineSettings,
+    ExtendSettings,
+    DriveSettings,
+    SceneSettings,
+    Preferences,
+)
 
 
 def register(at_end: AtEnd) -> None:

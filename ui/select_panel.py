@@ -20,7 +20,8 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
     bl_label = "1 Capture"
 
     def draw(self, context: Any) -> None:
-        layout, head = self.layout, context.scene.stga.head
+        layout = self.layout
+        head = context.scene.stga.head
         layout.operator("stga.import_capture", icon="IMPORT")
         row = layout.row(align=True)
         row.operator("stga.import_motion", text="FLAME Motion", icon="ARMATURE_DATA")
@@ -28,9 +29,11 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         layout.prop(context.scene.stga, "head")
         if not is_head(head):
             return
-        timesteps, triangles = len(head[tags.TIMESTEPS]), len(head.data.polygons)
+        timesteps = len(head[tags.TIMESTEPS])
+        triangles = len(head.data.polygons)
         layout.label(text=f"{timesteps} timesteps, {triangles} triangles")
-        row, root = layout.row(align=True), head.parent
+        row = layout.row(align=True)
+        root = head.parent
         for kind, text, icon in LAYERS if root is not None else ():
             how = {"text": text, "icon": icon, "toggle": True, "invert_checkbox": True}
             for layer in layers_of(root, kind, context.view_layer):
@@ -55,12 +58,14 @@ class SelectPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "2 Select"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga
+        layout = self.layout
+        settings = context.scene.stga
         head = settings.head
         layout.operator("stga.select", icon="GROUP_VERTEX")
         if not is_head(head):
             return
-        possible, ticked = possible_regions(head), key_regions(head)
+        possible = possible_regions(head)
+        ticked = key_regions(head)
         if possible:
             layout.label(text="Whole Regions")
             grid = layout.grid_flow(columns=2, align=True, row_major=True)

@@ -26,9 +26,13 @@ from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
 from .sidebar import SidebarPanel, draw_running, draw_text
 
 DISPLAY_INPUTS = (
-    splat_nodes.SIZE, splat_nodes.OPACITY_THRESHOLD, splat_nodes.PERCENTAGE,
-    splat_nodes.VIEW_DEPENDENT, splat_nodes.SHOW_SELECTION, splat_nodes.SELECTED_ONLY,
-)  # fmt: skip
+    splat_nodes.SIZE,
+    splat_nodes.OPACITY_THRESHOLD,
+    splat_nodes.PERCENTAGE,
+    splat_nodes.VIEW_DEPENDENT,
+    splat_nodes.SHOW_SELECTION,
+    splat_nodes.SELECTED_ONLY,
+)
 _is_told = False
 """Whether the render job in progress has said that it does not show the scene's light."""
 
@@ -37,7 +41,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "4 Show"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga
+        layout = self.layout
+        settings = context.scene.stga
         layout.prop(settings, "avatar")
         layout.operator("stga.show_avatar", icon="HIDE_OFF").filepath = settings.avatar
         layout.operator("stga.export_avatar", icon="EXPORT").avatar = settings.avatar
@@ -88,7 +93,8 @@ class LightingPanel(SidebarPanel, bpy.types.Panel):
         return context.scene.stga.splats is not None
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, lighting_settings(context.scene)
+        layout = self.layout
+        settings = lighting_settings(context.scene)
         light = splat_object.stored_light(context.scene.stga.splats)
         if light is None:
             draw_text(layout, context, "The avatar does not know the light of its capture", "INFO")
@@ -171,7 +177,8 @@ class RenderPanel(bpy.types.Panel):
         return bool(context.scene.render.engine == ENGINE)
 
     def draw(self, context: Any) -> None:
-        layout, has_python = self.layout, has_training_python(context)
+        layout = self.layout
+        has_python = has_training_python(context)
         layout.use_property_split = True
         layout.prop(context.scene.render, "film_transparent", text="Transparent Film")
         layout.prop(context.view_layer, "use_pass_z", text="Depth Pass")

@@ -75,7 +75,8 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
         draw_text(layout, context, state.error, "ERROR")
     if not state.is_running:
         return False
-    now, percent = state.snapshot, 100 * state.snapshot.status.progress
+    now = state.snapshot
+    percent = 100 * state.snapshot.status.progress
     text = WAITING
     if now.state in (WorkerState.STARTING, WorkerState.CANCELLING):
         text = now.state.value.capitalize()
@@ -94,7 +95,8 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
 def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
     """Draw how a request has ended, its failure with the end of the log and a button that copies
     the report, and its Dismiss button; returns the box, for more."""
-    box, now = layout.box(), state.snapshot
+    box = layout.box()
+    now = state.snapshot
     worker = WorkerState.FAILED if now.state.failed else now.state
     row = box.row()
     icons = {WorkerState.FINISHED: "CHECKMARK", WorkerState.CANCELLED: "INFO"}
@@ -105,7 +107,8 @@ def draw_end(layout: Any, context: Any, state: RequestState) -> Any:
         row.operator("stga.dismiss", text="", icon="X", emboss=False).request = state.kind
     if now.state.failed:
         draw_text(box, context, now.status.error)
-        width, log = _columns(context), box.column(align=True)
+        width = _columns(context)
+        log = box.column(align=True)
         log.active = False
         for line in now.log_tail:
             short = textwrap.shorten(line, width, placeholder="…")
@@ -124,7 +127,8 @@ def draw_curve(layout: Any, folder: Path) -> None:
         return
     name = str(folder)
     if _shown.get(folder) is not curve:
-        _shown[folder], pixels = curve, curve[0]
+        _shown[folder] = curve
+        pixels = curve[0]
         _previews.pop(name, None)  # a new one, because Blender keeps the texture of the old one
         preview = _previews.new(name)
         preview.image_size = pixels.shape[1], pixels.shape[0]

@@ -19,7 +19,8 @@ class TrackPanel(ClosedPanel, bpy.types.Panel):
     bl_label = "Track Footage"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga.track
+        layout = self.layout
+        settings = context.scene.stga.track
         if draw_running(layout, context, Kind.TRACKING):
             return
         tracking = monitor.state_of(context.scene, Kind.TRACKING)
@@ -27,7 +28,8 @@ class TrackPanel(ClosedPanel, bpy.types.Panel):
             box = draw_end(layout, context, tracking)
             draw_text(box, context, tracking.snapshot.status.detail)
         column = layout.column()
-        column.use_property_split, column.use_property_decorate = True, False
+        column.use_property_split = True
+        column.use_property_decorate = False
         for name in ("footage", "cameras", "model", "avatar", "directory"):
             column.prop(settings, name)
         text = "Track with Avatar" if settings.avatar else "Track"
@@ -57,7 +59,8 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
         return is_head(head) and bool(head.get(tags.TRACKED))
 
     def draw(self, context: Any) -> None:
-        layout, head = self.layout, context.scene.stga.head
+        layout = self.layout
+        head = context.scene.stga.head
         sheet = layout.operator("wm.path_open", text="Open Contact Sheet", icon="IMAGE_DATA")
         sheet.filepath = str(Path(head[tags.CAPTURE]) / SHEET_FILE)
         row = layout.row(align=True)
@@ -66,12 +69,14 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
         row.operator("stga.view_footage", icon="VIEW_CAMERA", depress=through)
         row.operator("stga.view_footage", text="", icon="TRIA_RIGHT").step = 1
         layout.operator("stga.pose_head", icon="ARMATURE_DATA")
-        keys, now = tracking_keys(head), context.scene.frame_current
+        keys = tracking_keys(head)
+        now = context.scene.frame_current
         text, icon = ("Unmark Key", "KEYFRAME_HLT") if now in keys else ("Mark as Key", "KEYFRAME")
         layout.operator("stga.mark_key", text=text, icon=icon, depress=now in keys)
         flow = layout.grid_flow(columns=5, align=True) if keys else None
         for timestep in sorted(keys):
             at = {"text": str(timestep), "depress": timestep == now}
             jump = flow.operator("wm.context_set_int", **at)
-            jump.data_path, jump.value = "scene.frame_current", timestep
+            jump.data_path = "scene.frame_current"
+            jump.value = timestep
         layout.operator("stga.solve_again", icon="FILE_REFRESH")

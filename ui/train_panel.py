@@ -31,12 +31,14 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
     bl_label = "3 Train"
 
     def draw(self, context: Any) -> None:
-        layout, settings = self.layout, context.scene.stga
+        layout = self.layout
+        settings = context.scene.stga
         if draw_running(layout, context, Kind.TRAINING):
             return
         training = monitor.state_of(context.scene, Kind.TRAINING)
         if training.subject is not None:
-            box, run = draw_end(layout, context, training), training.place
+            box = draw_end(layout, context, training)
+            run = training.place
             state = training.snapshot.state
             if state == WorkerState.NONE:
                 remedy = "choose its new folder and press Resume"
@@ -46,9 +48,11 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
                     draw_text(box, context, line)
                 draw_curve(box, run)
                 if training.files.tracking is not None:  # the splats were trained with it
-                    head, text = context.scene.stga.head, "Apply Refined Tracking"
+                    head = context.scene.stga.head
+                    text = "Apply Refined Tracking"
                     apply = box.operator("stga.apply_motion", text=text, icon="CON_FOLLOWTRACK")
-                    apply.filepath, apply.own_offsets = str(run / TRACKING), True
+                    apply.filepath = str(run / TRACKING)
+                    apply.own_offsets = True
                     apply.start = head[tags.TIMESTEPS][0] if is_head(head) else 1
         layout.prop(settings, "run_folder", text="Folder")
         layout.prop(settings, "preset")
@@ -67,7 +71,8 @@ def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
     text, icon = ("Resume", "FRAME_NEXT") if resume else ("Train", "MOD_PARTICLES")
     button = layout.operator("stga.train", text=text, icon=icon)
     set_options(button, settings, train.TrainOptions)
-    button.directory, button.resume = settings.run_folder, resume
+    button.directory = settings.run_folder
+    button.resume = resume
     button.effects = " ".join(train.chosen_effects(settings))
 
 
@@ -104,11 +109,15 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         settings = context.scene.stga
-        column, head, options = self.layout.column(), settings.head, settings.refine
-        shown, editing = shows_residuals(head), head.mode == "EDIT"
+        column = self.layout.column()
+        head = settings.head
+        options = settings.refine
+        shown = shows_residuals(head)
+        editing = head.mode == "EDIT"
         text = "Hide Residuals" if shown else "Show Residuals"
         residuals = column.operator("stga.heat_map", text=text, icon="BRUSHES_ALL", depress=shown)
-        residuals.show, residuals.of = not shown, "RESIDUAL"
+        residuals.show = not shown
+        residuals.of = "RESIDUAL"
         if not editing:
             column.prop_search(options, "group", head, "vertex_groups", text="Region")
         row = column.row(align=True)
@@ -126,7 +135,8 @@ class ContinuePanel(ClosedPanel, bpy.types.Panel):
         set_options(refine, options, train.RefineOptions)
         refine.directory = residuals.directory = settings.run_folder
         if not options.all_frames:
-            refine.first, refine.last = options.first, max(options.first, options.last)
+            refine.first = options.first
+            refine.last = max(options.first, options.last)
         column = self.layout.column()
         column.prop(settings.extend, "take")
         column.prop(settings.extend, "seconds")
@@ -147,13 +157,15 @@ class EffectsPanel(ClosedPanel, bpy.types.Panel):
         if not draw_running(self.layout, context, Kind.ANALYSIS):
             self.layout.operator("stga.analyze_capture", icon="VIEWZOOM")
         for row in context.scene.stga.effects:
-            effect, box = EFFECTS[row.name], self.layout.column(align=True)
+            effect = EFFECTS[row.name]
+            box = self.layout.column(align=True)
             line = box.row(align=True)
             arrow = "DISCLOSURE_TRI_DOWN" if row.is_open else "DISCLOSURE_TRI_RIGHT"
             line.prop(row, "is_open", text="", icon=arrow, emboss=False)
             line.label(text=effect.title, icon="CHECKMARK" if row.on else "REMOVE")
             price = line.row()
-            price.active, price.alignment = row.on, "RIGHT"
+            price.active = row.on
+            price.alignment = "RIGHT"
             price.label(text=effect.price)
             if row.is_open:
                 box.row().prop(row, "choice", expand=True)

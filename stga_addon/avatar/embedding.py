@@ -50,9 +50,13 @@ WORLD = FaceFrames(np.zeros((1, 3)), np.eye(3)[None], np.ones(1))
 
 
 def face_frames(
-    vertices: np.ndarray, faces: np.ndarray, neutral: np.ndarray, convention: str = "stga",
-    strain: StrainBasis | None = None, neutral_areas: np.ndarray | None = None,
-) -> FaceFrames:  # fmt: skip
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    neutral: np.ndarray,
+    convention: str = "stga",
+    strain: StrainBasis | None = None,
+    neutral_areas: np.ndarray | None = None,
+) -> FaceFrames:
     """Local frame of every triangle of a posed mesh.
 
     vertices, neutral (V, 3) meters; faces (F, 3). Computed and returned in float64. strain: the
@@ -75,7 +79,8 @@ def face_frames(
         ratio = triangles.twice_area / 2 / np.maximum(before, MIN_DIVISOR)
         scale = np.where(before > 0, np.sqrt(ratio), 1.0)
     elif convention == "gaussian_avatars":
-        edge, side = _length(to_p1), _length(to_p2)
+        edge = _length(to_p1)
+        side = _length(to_p2)
         first, normal = _orthonormal(to_p1, triangles)
         axes = first, normal, _cross(first, normal)
         no_edge = edge <= MIN_AREA_RATIO * np.sqrt(triangles.longest_squared)
@@ -89,7 +94,8 @@ def face_frames(
         products = first_squared, _dot(to_p1, to_p2), second_squared
         deformed = gram_deformation(strain, *products, triangles.normal)
     p0, p1, p2 = triangles.corners
-    origin, rotation = np.ascontiguousarray(((p0 + p1 + p2) / 3).T), np.empty((len(faces), 3, 3))
+    origin = np.ascontiguousarray(((p0 + p1 + p2) / 3).T)
+    rotation = np.empty((len(faces), 3, 3))
     for column, axis in enumerate(axes):
         for row in range(3):
             rotation[:, row, column] = axis[row]
@@ -107,9 +113,12 @@ def frame_backward(
     logarithm of its scale. Deformation passes no gradient on, and a line (see MIN_AREA_RATIO)
     only its force.
     """
-    force, torque, growth = by_frame[:, :3], by_frame[:, 3:6], by_frame[:, 6]
+    force = by_frame[:, :3]
+    torque = by_frame[:, 3:6]
+    growth = by_frame[:, 6]
     corners = (np.asarray(vertices, np.float64)[faces] - frames.origin[:, None]) @ frames.rotation
-    x, y = corners[..., 0], corners[..., 1]
+    x = corners[..., 0]
+    y = corners[..., 1]
     twice = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (y[:, 1] - y[:, 0]) * (x[:, 2] - x[:, 0])
     edges = corners - corners[:, [1, 2, 0]]
     longest_squared = np.einsum("fkc,fkc->fk", edges, edges).max(1)
@@ -134,7 +143,8 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area (F,) in square meters of every triangle; exactly 0 where it counts as a line (see
     MIN_AREA_RATIO)."""
     triangles = _triangles(vertices, faces)
-    area, least = triangles.twice_area / 2, MIN_AREA_RATIO * triangles.longest_squared
+    area = triangles.twice_area / 2
+    least = MIN_AREA_RATIO * triangles.longest_squared
     return np.where(area > np.maximum(least, MIN_DIVISOR), area, 0.0)
 
 
@@ -150,7 +160,8 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
 
     The frames' color is added to the constant coefficient.
     """
-    face, scale = splats.face, frames.scale[splats.face]
+    face = splats.face
+    scale = frames.scale[splats.face]
     xyz = points_to_world(splats.xyz, frames, face)
     rotation = multiply(frames.quaternion[face], normalized(splats.rotation))
     log_scale = splats.log_scale + np.log(np.maximum(scale, MIN_DIVISOR))[:, None]
@@ -211,7 +222,8 @@ def _triangles(vertices: np.ndarray, faces: np.ndarray) -> _Triangles:
     corners = np.take(rows, np.ascontiguousarray(faces.T), axis=1).transpose(1, 0, 2)
     edges = corners[1] - corners[0], corners[2] - corners[0]
     third = corners[2] - corners[1]
-    first, second = _dot(edges[0], edges[0]), _dot(edges[1], edges[1])
+    first = _dot(edges[0], edges[0])
+    second = _dot(edges[1], edges[1])
     longest = np.maximum(np.maximum(first, second), _dot(third, third))
     normal = _cross(*edges)
     return _Triangles(corners, edges, (first, second), longest, normal, _length(normal))
@@ -238,15 +250,19 @@ def _orthonormal(first: np.ndarray, triangles: _Triangles) -> tuple[np.ndarray, 
     is negligible beside the longest edge, the x axis is used for it. `scene.display.frame_nodes`
     follows the same rules.
     """
-    longest, length, normal = triangles.longest_squared, _length(first), triangles.normal
-    no_first, x_axis = length <= MIN_AREA_RATIO * np.sqrt(longest), np.array([[1.0], [0.0], [0.0]])
+    longest = triangles.longest_squared
+    length = _length(first)
+    normal = triangles.normal
+    no_first = length <= MIN_AREA_RATIO * np.sqrt(longest)
+    x_axis = np.array([[1.0], [0.0], [0.0]])
     if no_first.any():
         first = np.where(no_first, x_axis, first / np.where(no_first, 1.0, length))
     else:
         first = first / length
     no_normal = triangles.twice_area <= 2 * MIN_AREA_RATIO * longest
     if no_normal.any():
-        upright, z_axis = np.abs(first[2]) > UPRIGHT_COSINE, np.array([[0.0], [0.0], [1.0]])
+        upright = np.abs(first[2]) > UPRIGHT_COSINE
+        z_axis = np.array([[0.0], [0.0], [1.0]])
         substitute = _cross(first, np.where(upright, x_axis, z_axis))
         normal = np.where(no_normal, substitute, normal)
     normal = normal - _dot(normal, first) * first

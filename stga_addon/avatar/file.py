@@ -22,9 +22,13 @@ FORMAT = "stga-avatar"
 VERSIONS = 2, 3
 """Read; the last is written. In version 2, each splat has strain colors of its own."""
 _HEADER = {
-    "convention": str, "background": list, "antialiased": bool, "principal_point": str,
-    "regions": list, "settings": dict,
-}  # fmt: skip
+    "convention": str,
+    "background": list,
+    "antialiased": bool,
+    "principal_point": str,
+    "regions": list,
+    "settings": dict,
+}
 """Field of the avatar -> what JSON holds of it; of the regions their names."""
 
 SOURCES = "estimated", "gray_card", "file"
@@ -37,7 +41,9 @@ _LIGHT_ARRAYS = {
 }
 """Field -> shape, -1: vertices."""
 _PREFIX = "light_"
-MIN_COLOR_CHANGE, MIN_SHIFT_M, MIN_SCALE_CHANGE = 1 / 255, 2e-4, 0.02
+MIN_COLOR_CHANGE = 1 / 255
+MIN_SHIFT_M = 2e-4
+MIN_SCALE_CHANGE = 0.02
 """Of splats that follow a signal: what never changes them by as much is not kept."""
 
 
@@ -119,7 +125,8 @@ class Avatar:
     def without_invisible_offsets(self) -> "Avatar":
         """With coefficients of 0 where they do not change a triangle's splats by MIN_COLOR_CHANGE,
         MIN_SHIFT_M or a share of MIN_SCALE_CHANGE anywhere in `strain_range`."""
-        basis, kept = self._strain, {}
+        basis = self._strain
+        kept = {}
         if basis is None:
             return self
         rest = at_rest(basis.range)
@@ -141,7 +148,8 @@ class Avatar:
     def frames(self, mesh: np.ndarray) -> FaceFrames:
         """The triangles' local frames on a posed mesh (V, 3), moved and colored by the driven
         offsets."""
-        basis, offsets = self._strain, self.driven_offsets
+        basis = self._strain
+        offsets = self.driven_offsets
         frames = face_frames(mesh, self.faces, self.neutral, self.convention, basis, self._areas)
         if basis is None:
             return frames
@@ -191,7 +199,8 @@ def read_avatar(path: Path) -> Avatar:
     missing = [name for name in needed if name not in arrays]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
-    names, masks = header["regions"], arrays["region_faces"]
+    names = header["regions"]
+    masks = arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
         expected = f"expected ({len(names)}, faces)"
         raise StgaError(f"{path}: region_faces has shape {masks.shape}, {expected}")
@@ -223,7 +232,8 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
     if header.get("version") not in VERSIONS:
-        version, reads = shorten(header.get("version")), " and ".join(map(str, VERSIONS))
+        version = shorten(header.get("version"))
+        reads = " and ".join(map(str, VERSIONS))
         raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {reads}")
     for name, kind in _HEADER.items():
         if not isinstance(header.get(name), kind):
@@ -242,7 +252,9 @@ def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """
     if arrays["faces"].ndim != 2 or arrays["xyz"].ndim != 2:
         return  # as `_check` says
-    faces, count, known = len(arrays["faces"]), len(arrays["xyz"]), (2, STRAIN_COMPONENTS)
+    faces = len(arrays["faces"])
+    count = len(arrays["xyz"])
+    known = (2, STRAIN_COMPONENTS)
     limits = arrays.get("strain_range")
     if limits is not None:
         check_array(path, "strain_range", limits, "float32", (faces, *known))
@@ -285,7 +297,9 @@ def _check(path: Path, avatar: Avatar) -> None:
         if kind.sizes and array.shape[1] not in kind.sizes:
             found = f"{array.shape[1]} coefficients"
             raise StgaError(f"{path}: {name} has {found}, expected one of {kind.sizes}")
-    faces, limits, color = len(avatar.faces), avatar.strain_range, avatar.background
+    faces = len(avatar.faces)
+    limits = avatar.strain_range
+    color = avatar.background
     if limits is not None:
         check_array(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
     for name, coefficients in avatar.driven_offsets.items():

@@ -6,7 +6,8 @@ from .embedding import face_areas, face_frames
 from .splats import Splats
 
 NORMAL_AXIS = {"stga": 2, "gaussian_avatars": 1}  # which local axis is the triangle's normal
-SCALE, FLATNESS = 0.6, 0.5
+SCALE = 0.6
+FLATNESS = 0.5
 """Standard deviation per spacing of the lattice, and along the normal per that in the triangle's
 plane."""
 INSET = 0.1
@@ -20,9 +21,13 @@ def splats_per_triangle(order: int) -> int:
 
 
 def lattice_splats(
-    neutral: np.ndarray, faces: np.ndarray, order: int = 2, sh_degree: int = 3,
-    opacity_logit: float = 0.0, convention: str = "stga",
-) -> Splats:  # fmt: skip
+    neutral: np.ndarray,
+    faces: np.ndarray,
+    order: int = 2,
+    sh_degree: int = 3,
+    opacity_logit: float = 0.0,
+    convention: str = "stga",
+) -> Splats:
     """(order + 1)(order + 2) / 2 splats on every triangle, triangle by triangle, in its local
     frame.
 
@@ -43,7 +48,8 @@ def lattice_splats(
     sigma = SCALE * np.maximum(spacing, MIN_SPACING_M) / scale
     stretch = np.ones(3)
     stretch[NORMAL_AXIS[convention]] = FLATNESS
-    count, log_scale = len(xyz), np.log(sigma[:, None] * stretch).astype(np.float32)
+    count = len(xyz)
+    log_scale = np.log(sigma[:, None] * stretch).astype(np.float32)
     return Splats(
         xyz=xyz.astype(np.float32),
         rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),

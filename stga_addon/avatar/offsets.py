@@ -16,7 +16,9 @@ SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
 }
 """By name: (F, 3) float32 of a posed mesh's triangles, from the neutral mesh's basis and the
 frames; 0 where it is at rest. "normal": the change of the unit normal, world axes."""
-POSITION, SCALE, COLOR = "position", "scale", "color"
+POSITION = "position"
+SCALE = "scale"
+COLOR = "color"
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ def moved_frames(
 ) -> FaceFrames:
     """The frames, moved, scaled and colored by every driven offset of which there are coefficients;
     signal: name of SIGNALS -> (F, 3)."""
-    color, unit = np.zeros((len(frames.scale), 3), np.float32), frames.scale
+    color = np.zeros((len(frames.scale), 3), np.float32)
+    unit = frames.scale
     for name, values in coefficients.items():
         offset = OFFSETS[name]
         change = offset_of(values, signal(offset.signal))

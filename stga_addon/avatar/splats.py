@@ -101,7 +101,9 @@ def harmonics(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 
     Shaders have the same lines, from `harmonics_text`.
     """
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     return (
         0.28209479177387814,
         -0.4886025119029199 * y,

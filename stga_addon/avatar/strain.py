@@ -10,7 +10,8 @@ import numpy as np
 
 STRAIN_COMPONENTS = 3
 """Stretch along two directions of the triangle's plane, and the shear between them."""
-STRAIN_GAIN, MAX_STRAIN = 5.0, 2.0
+STRAIN_GAIN = 5.0
+MAX_STRAIN = 2.0
 """Unit and bounds: a stretch of 18 % (E = 0.2) counts as 1, and strain is clipped to ±2."""
 MIN_COMPRESSION = 0.2
 """Compression that colors do not follow yet (E = 0.04): coefficients fitted to so little are mostly
@@ -18,10 +19,12 @@ noise."""
 MAX_NORMAL_CHANGE = 2.0
 """Of a unit normal, in each component."""
 TRAINED_RANGE = np.array(
-    [[-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN, *3 * [-MAX_NORMAL_CHANGE]],
-     [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN, *3 * [MAX_NORMAL_CHANGE]]],
+    [
+        [-MAX_STRAIN, -MAX_STRAIN, -MAX_STRAIN, *3 * [-MAX_NORMAL_CHANGE]],
+        [-MIN_COMPRESSION, -MIN_COMPRESSION, MAX_STRAIN, *3 * [MAX_NORMAL_CHANGE]],
+    ],
     np.float32,
-)  # fmt: skip
+)
 """Lowest and highest deformation that colors and positions are trained to follow. Folds and their
 shadows come with compression and shear; what is fitted to compression is not to be continued into
 stretch. Within this range, a mesh at rest has a strain of −MIN_COMPRESSION, not 0."""
@@ -53,7 +56,8 @@ class IndexLists:
         """Lists by falling length; for each rank, the index at that place of every list that is
         long enough. So numpy adds along them without a loop over lists."""
         order = np.argsort(-self.counts, kind="stable")
-        starts, counts = self.indptr[:-1][order], self.counts[order]
+        starts = self.indptr[:-1][order]
+        counts = self.counts[order]
         lengths = ((counts > rank).sum() for rank in range(int(counts.max(initial=0))))
         return order, [self.indices[starts[:n] + rank] for rank, n in enumerate(lengths)]
 
@@ -97,13 +101,15 @@ def strain_basis(
     limits: (F, 2, 6) `StrainBasis.range`; None: ±MAX_STRAIN and ±MAX_NORMAL_CHANGE.
     """
     p0, p1, p2 = np.asarray(neutral, np.float64)[faces.T]
-    d1, d2 = p1 - p0, p2 - p0
+    d1 = p1 - p0
+    d2 = p2 - p0
     normal = np.cross(d1, d2)
     square = _dot(normal, normal)
     flat = square < MIN_SQUARED_NORMAL
     inverse = np.where(flat, 0.0, 1 / np.where(flat, 1.0, square))[:, None]
     # The dual edges: a1·d1 = a2·d2 = 1, a1·d2 = a2·d1 = 0, both in the triangle's plane.
-    a1, a2 = np.cross(d2, normal) * inverse, np.cross(normal, d1) * inverse
+    a1 = np.cross(d2, normal) * inverse
+    a2 = np.cross(normal, d1) * inverse
     along = np.where(flat, 0.0, 1 / np.sqrt(np.where(flat, 1.0, _dot(d1, d1))))[:, None] * d1
     across = np.cross(normal, along) * np.sqrt(inverse)
     corners = np.ascontiguousarray(faces.T, np.intp)
@@ -157,11 +163,13 @@ def edge_neighbors(faces: np.ndarray) -> IndexLists:
 
     An edge of more than two triangles makes all of them neighbors.
     """
-    start, end = np.asarray(faces, np.int64).ravel(), np.roll(faces, -1, axis=1).ravel()
+    start = np.asarray(faces, np.int64).ravel()
+    end = np.roll(faces, -1, axis=1).ravel()
     number = np.minimum(start, end) * (int(start.max(initial=0)) + 1) + np.maximum(start, end)
     _, edge, count = np.unique(number, return_inverse=True, return_counts=True)
     order = np.argsort(edge, kind="stable")
-    owner, size = order // 3, count[edge[order]]
+    owner = order // 3
+    size = count[edge[order]]
     place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
     pairs = [np.zeros((0, 2), np.intp)]
     for step in range(1, int(count.max(initial=1))):
@@ -234,7 +242,8 @@ def deformation(basis: StrainBasis, vertices: np.ndarray) -> np.ndarray:
     """
     rows = np.ascontiguousarray(np.asarray(vertices, np.float64).T)
     p0, p1, p2 = np.take(rows, basis.corners, axis=1).transpose(1, 0, 2)
-    e1, e2 = p1 - p0, p2 - p0
+    e1 = p1 - p0
+    e2 = p2 - p0
     products = _dot(e1.T, e1.T), _dot(e1.T, e2.T), _dot(e2.T, e2.T)
     return gram_deformation(basis, *products, np.cross(e1, e2, axis=0))
 

@@ -49,7 +49,8 @@ class Camera:
     @property
     def position(self) -> np.ndarray:
         """Camera center (3,) in world meters."""
-        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        rotation = self.world_to_camera[:3, :3]
+        translation = self.world_to_camera[:3, 3]
         return np.asarray(-rotation.T @ translation)
 
     @property
@@ -77,8 +78,10 @@ class Camera:
 
     def scaled(self, factor: float) -> "Camera":
         """The camera with an image `factor` times as large (sizes rounded, at least one pixel)."""
-        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
-        x, y = width / self.width, height / self.height
+        width = max(1, round(self.width * factor))
+        height = max(1, round(self.height * factor))
+        x = width / self.width
+        y = height / self.height
         intrinsics = self.fl_x * x, self.fl_y * y, self.cx * x, self.cy * y
         return Camera(width, height, *intrinsics, self.world_to_camera)
 
@@ -107,18 +110,27 @@ def most_central(directions: np.ndarray) -> int:
 
 
 def camera_from_gl(
-    camera_to_world: np.ndarray, width: int, height: int, fl_x: float, fl_y: float, cx: float,
+    camera_to_world: np.ndarray,
+    width: int,
+    height: int,
+    fl_x: float,
+    fl_y: float,
+    cx: float,
     cy: float,
-) -> Camera:  # fmt: skip
+) -> Camera:
     """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
     return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
 
 
 def look_at(
-    eye: Sequence[float], target: Sequence[float], width: int, height: int, focal_length: float,
+    eye: Sequence[float],
+    target: Sequence[float],
+    width: int,
+    height: int,
+    focal_length: float,
     up: Sequence[float] = UP,
-) -> Camera:  # fmt: skip
+) -> Camera:
     """Camera at `eye` that looks at `target`, both (3,) in world meters; the principal point is the
     image's center. width, height, focal_length in pixels. up: the world direction that points up in
     the image. Raises ValueError where it is parallel to the viewing direction, or that is none."""
@@ -126,7 +138,8 @@ def look_at(
     right = np.cross(forward, np.asarray(up, np.float64))
     if not np.linalg.norm(right):
         raise ValueError(f"the viewing direction {forward} is parallel to up {up}")
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
     pose = np.eye(4)
     pose[:3, :3] = right, np.cross(forward, right), forward
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(eye, np.float64)
@@ -134,9 +147,12 @@ def look_at(
 
 
 def turntable(
-    start: Camera, center: np.ndarray, count: int, angles: tuple[float, float],
+    start: Camera,
+    center: np.ndarray,
+    count: int,
+    angles: tuple[float, float],
     up: Sequence[float] = UP,
-) -> list[Camera]:  # fmt: skip
+) -> list[Camera]:
     """`count` cameras that orbit the vertical axis through `center` (3,), from where `start` is.
     angles: radians from `start`, from `covered_angles`; a full turn goes around once, less swings
     to both sides."""
@@ -164,7 +180,8 @@ def covered_angles(
     if gaps.max() < MAX_GAP_RAD:
         return -np.pi, np.pi
     widest = int(gaps.argmax())
-    low, high = seen[(widest + 1) % len(seen)], seen[widest]
+    low = seen[(widest + 1) % len(seen)]
+    high = seen[widest]
     return (low - 2 * np.pi if low > 0 else low), (high + 2 * np.pi if high < 0 else high)
 
 

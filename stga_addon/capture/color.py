@@ -13,14 +13,17 @@ CHROMATICITIES = {
 """Code of color primaries -> CIE xy of red, green and blue (white: D65). Others are sRGB's."""
 D65 = (0.3127, 0.3290)
 SRGB = 1
-LINEAR, PQ, HLG = 8, 16, 18
+LINEAR = 8
+PQ = 16
+HLG = 18
 Conversion = Callable[[np.ndarray], np.ndarray]  # Of pixels
 GAMMAS = {4: 2.2, 5: 2.8}
 """Code of transfer characteristics -> exponent. Codes that are not named here are sRGB's curve."""
 
 REFERENCE_WHITE_CD_M2 = 203.0
 """Of diffuse white in HDR (ITU-R BT.2408), which becomes sRGB's; what is brighter is clipped."""
-HLG_PEAK, HLG_SYSTEM_GAMMA = 1000.0 / REFERENCE_WHITE_CD_M2, 1.2
+HLG_PEAK = 1000.0 / REFERENCE_WHITE_CD_M2
+HLG_SYSTEM_GAMMA = 1.2
 BT2020_LUMINANCE = np.array([0.2627, 0.6780, 0.0593])
 BAND_PIXELS = 1 << 18
 """Converted at a time: wide intermediate numbers of a large image would fill the memory."""
@@ -87,7 +90,9 @@ def _linear(transfer: int, levels: int) -> np.ndarray:
         ratio = np.maximum(root - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * root)
         light = 10000 / REFERENCE_WHITE_CD_M2 * ratio ** (16384 / 2610)
     elif transfer == HLG:  # ITU-R BT.2100, table 5
-        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        a = 0.17883277
+        b = 0.28466892
+        c = 0.55991073
         light = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
     elif transfer in GAMMAS:
         light = signal ** GAMMAS[transfer]

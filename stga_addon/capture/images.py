@@ -23,7 +23,9 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 """Pillow opens more than these, some by running other programs."""
 ORIENTATION_TAG = 0x0112
 """EXIF's: 1 upright, 2 to 4 mirrored or upside down, 5 to 8 with width and height exchanged."""
-SRGB_GAMMA, GAMMA_TOLERANCE = 0.45455, 0.02  # PNG's gAMA of what is shown as sRGB
+# PNG's gAMA of what is shown as sRGB
+SRGB_GAMMA = 0.45455
+GAMMA_TOLERANCE = 0.02
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Once, not by `catch_warnings`, which is not safe in threads. Sizes have limits of their own; what
@@ -117,7 +119,8 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
     """Pixels (H, W) gray or (H, W, 2 to 4) uint8, the last of an even number of channels alpha."""
     expected = view.camera.width, view.camera.height
     with _opened(path) as image:
-        stored, size = image.size, _displayed_size(image)
+        stored = image.size
+        size = _displayed_size(image)
         # before any pixel is unpacked
         if expected in (stored, size) and is_image_size(*expected):
             convert = _conversion(image, path) if kind == "image" else None
@@ -200,7 +203,8 @@ def _cicp(path: Path) -> tuple[int, int] | None:
         if stream.read(8) != PNG_SIGNATURE:
             return None
         while len(head := stream.read(8)) == 8:
-            length, name = int.from_bytes(head[:4], "big"), head[4:]
+            length = int.from_bytes(head[:4], "big")
+            name = head[4:]
             if name in (b"IDAT", b"IEND"):
                 return None
             if name == b"cICP":
@@ -240,7 +244,8 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
         return pixels
 
     def blend(band: np.ndarray) -> np.ndarray:
-        alpha, behind = band[..., -1:].astype(np.uint32), np.array(background, np.uint32)
+        alpha = band[..., -1:].astype(np.uint32)
+        behind = np.array(background, np.uint32)
         return np.asarray((band[..., :-1] * alpha + behind * (255 - alpha) + 127) // 255)
 
     return in_bands(pixels, 3, blend)

@@ -49,19 +49,28 @@ class ViewLoader:
     """
 
     def __init__(
-        self, views: Iterable[View], scale: Callable[[int], float] = lambda position: 1.0,
-        background: tuple[int, int, int] = WHITE, queue_bytes: int = 16 << 20,
-        cache_bytes: int = 224 << 20, prepare: Preparation | None = None,
+        self,
+        views: Iterable[View],
+        scale: Callable[[int], float] = lambda position: 1.0,
+        background: tuple[int, int, int] = WHITE,
+        queue_bytes: int = 16 << 20,
+        cache_bytes: int = 224 << 20,
+        prepare: Preparation | None = None,
         mesh: Callable[[int], np.ndarray | None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.waited_s = 0.0
-        self._scale, self._background, self._prepare, self._mesh = scale, background, prepare, mesh
+        self._scale = scale
+        self._background = background
+        self._prepare = prepare
+        self._mesh = mesh
         self._queue_bytes = queue_bytes
         # The first views of one scale. They come in random order, each once per epoch: one evicted
         # to make room would be needed sooner than what replaces it, so nothing is evicted until
         # another scale is asked for.
         self._cache: dict[tuple[Path, Path | None, int, int, float], LoadedView] = {}
-        self._cache_bytes, self._cached_bytes, self._cached_scale = cache_bytes, 0, 1.0
+        self._cache_bytes = cache_bytes
+        self._cached_bytes = 0
+        self._cached_scale = 1.0
         self._ready: deque[LoadedView] = deque()
         self._ready_bytes = 0
         self._error: BaseException | None = None
@@ -140,7 +149,8 @@ class ViewLoader:
                     array.setflags(write=False)
             if scale != self._cached_scale:
                 self._cache.clear()
-                self._cached_bytes, self._cached_scale = 0, scale
+                self._cached_bytes = 0
+                self._cached_scale = scale
             if self._cached_bytes + kept.nbytes <= self._cache_bytes:
                 self._cache[key] = kept
                 self._cached_bytes += kept.nbytes

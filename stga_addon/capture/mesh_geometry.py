@@ -17,7 +17,8 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V, 3) unit normals, weighted by the area of triangles; 0 where a vertex has none."""
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat, count = faces.ravel(), len(vertices)
+    flat = faces.ravel()
+    count = len(vertices)
     total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20))
 
@@ -68,7 +69,8 @@ def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     fitted = np.asarray(mesh, np.float64)
     for _ in range(MAX_ITERATIONS):
         rotation, translation = weighted_procrustes(mesh, neutral, weights)
-        before, fitted = fitted, mesh @ rotation.T + translation
+        before = fitted
+        fitted = mesh @ rotation.T + translation
         residual = np.linalg.norm(fitted - neutral, axis=1)
         # Geman-McClure weights, scaled by the median residual: they fall with its fourth power.
         scale = max(float(np.median(residual)), MIN_RESIDUAL * size)
@@ -82,7 +84,8 @@ def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndar
     """Rotation (3, 3) and translation (3,) with least Σ w·|R·source + t − target|² (Kabsch); points
     (N, 3)."""
     share = (weights / weights.sum())[:, None]
-    source_center, target_center = (share * source).sum(0), (share * target).sum(0)
+    source_center = (share * source).sum(0)
+    target_center = (share * target).sum(0)
     u, _, vt = np.linalg.svd((target - target_center).T @ (share * (source - source_center)))
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation, target_center - rotation @ source_center
@@ -92,7 +95,8 @@ def similarity(source: np.ndarray, target: np.ndarray, metric: bool = False) -> 
     """The similarity with the least Σ |apply(source) − target|² over points (N, 3) that do not
     coincide (Umeyama). metric: of those with a scale of 1."""
     rotation, _ = weighted_procrustes(source, target, np.ones(len(source)))
-    a, b = source - source.mean(0), target - target.mean(0)
+    a = source - source.mean(0)
+    b = target - target.mean(0)
     scale = 1.0 if metric else float((b * (a @ rotation.T)).sum() / (a**2).sum())
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
@@ -101,7 +105,8 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates (N, K, 3) of the points of triangles, corners (N, K, 3, D), that are
     nearest to points (N, D)."""
     a, b, c = np.moveaxis(corners, 2, 0)
-    from_a, from_b = points[:, None] - a, points[:, None] - b
+    from_a = points[:, None] - a
+    from_b = points[:, None] - b
 
     def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         return np.asarray((first * second).sum(axis=-1))
@@ -109,13 +114,20 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     def along(edge: np.ndarray, offset: np.ndarray) -> np.ndarray:
         return np.asarray(np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1))
 
-    ab, ac = b - a, c - a
-    d00, d01, d11 = dot(ab, ab), dot(ab, ac), dot(ac, ac)
-    d20, d21 = dot(from_a, ab), dot(from_a, ac)
+    ab = b - a
+    ac = c - a
+    d00 = dot(ab, ab)
+    d01 = dot(ab, ac)
+    d11 = dot(ac, ac)
+    d20 = dot(from_a, ab)
+    d21 = dot(from_a, ac)
     determinant = np.maximum(d00 * d11 - d01**2, 1e-20)
-    second, third = (d11 * d20 - d01 * d21) / determinant, (d00 * d21 - d01 * d20) / determinant
+    second = (d11 * d20 - d01 * d21) / determinant
+    third = (d00 * d21 - d01 * d20) / determinant
     inside = (second >= 0) & (third >= 0) & (second + third <= 1)
-    on_ab, on_ac, on_bc = along(ab, from_a), along(ac, from_a), along(c - b, from_b)
+    on_ab = along(ab, from_a)
+    on_ac = along(ac, from_a)
+    on_bc = along(c - b, from_b)
     zero = np.zeros_like(on_ab)
     second = np.stack([second, on_ab, zero, 1 - on_bc])
     third = np.stack([third, zero, on_ac, on_bc])
@@ -140,7 +152,8 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
     nearest = np.zeros(camera.width * camera.height)
     owner = np.full(len(nearest), -1)
     # triangles that may show a pixel, in groups whose bounding boxes hold about CHUNK_PIXELS
-    low, high = corners.min(1), corners.max(1)
+    low = corners.min(1)
+    high = corners.max(1)
     size = np.minimum(high, [camera.width, camera.height]) - np.maximum(low, 0)
     drawn = np.flatnonzero((size >= 0).all(1))
     groups = np.cumsum(np.ceil(size[drawn] + 1).prod(1)) // CHUNK_PIXELS
@@ -149,7 +162,8 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
         face, line = _counted(group, *_whole(low[group, 1], high[group, 1], camera.height))
         left, right = _crossings(corners, face, line + 0.5)
         row, x = _counted(np.arange(len(face)), *_whole(left, right, camera.width))
-        face, y = face[row], line[row]
+        face = face[row]
+        y = line[row]
         closeness = _at(closeness_slopes[face], x, y)
         pixel = y * camera.width + x
         np.maximum.at(nearest, pixel, closeness)
@@ -157,7 +171,8 @@ def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayP
         wins = (closeness > 0) & (closeness == nearest[pixel])
         owner[pixel[wins]] = face[wins]
     shown = np.flatnonzero(owner >= 0)
-    triangle, weights = np.full(len(nearest), -1, np.int32), np.zeros((len(nearest), 3))
+    triangle = np.full(len(nearest), -1, np.int32)
+    weights = np.zeros((len(nearest), 3))
     triangle[shown] = rows[owner[shown]]
     y, x = np.divmod(shown, camera.width)
     weights[shown] = np.maximum(_at(slopes[owner[shown]], x[:, None], y[:, None]), 0)
@@ -195,9 +210,11 @@ def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> ArrayPai
     """x (R,) of the leftmost and the rightmost point of a triangle on a line of the image; face, y
     (R,). An edge's ends are taken in the order of y, so that two triangles with a common edge agree
     where it lies to the last bit and leave no pixel between them."""
-    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    left = np.full(len(y), np.inf)
+    right = np.full(len(y), -np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        first, second = corners[:, a], corners[:, b]
+        first = corners[:, a]
+        second = corners[:, b]
         turned = second[:, 1] < first[:, 1]
         x0, y0 = np.where(turned, second.T, first.T)
         x1, y1 = np.where(turned, first.T, second.T)
@@ -213,8 +230,10 @@ def _crossings(corners: np.ndarray, face: np.ndarray, y: np.ndarray) -> ArrayPai
 def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
     """(T, 3, 3): the barycentric coordinate of corner k at pixel (x, y) is [k, 0]·x + [k, 1]·y +
     [k, 2]. Zero for triangles that are seen edge-on."""
-    x, y = corners[..., 0] - 0.5, corners[..., 1] - 0.5
-    along_x, along_y = np.roll(y, -1, 1) - np.roll(y, 1, 1), np.roll(x, 1, 1) - np.roll(x, -1, 1)
+    x = corners[..., 0] - 0.5
+    y = corners[..., 1] - 0.5
+    along_x = np.roll(y, -1, 1) - np.roll(y, 1, 1)
+    along_y = np.roll(x, 1, 1) - np.roll(x, -1, 1)
     constant = -(along_x * np.roll(x, -1, 1) + along_y * np.roll(y, -1, 1))
     area = _at(np.stack([along_x[:, 0], along_y[:, 0], constant[:, 0]], -1), x[:, 0], y[:, 0])
     with np.errstate(divide="ignore"):

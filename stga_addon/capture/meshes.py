@@ -17,8 +17,11 @@ from .camera import MAX_COORDINATE_M
 from .model import Capture
 
 Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
-MAGIC, VERSION, JSON_KIND = b"glTF", 2, b"JSON"
-HEADER_BYTES, CHUNK_HEADER_BYTES = 20, 8
+MAGIC = b"glTF"
+VERSION = 2
+JSON_KIND = b"JSON"
+HEADER_BYTES = 20
+CHUNK_HEADER_BYTES = 8
 """The file's header and that of its first chunk; and that of any later chunk."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
 CACHE_BYTES = 8 << 20
@@ -87,9 +90,12 @@ def check_extent(source: str, vertices: np.ndarray) -> np.ndarray:
 
 
 def tracked_meshes(
-    files: Mapping[int, Path], count: int, faces: np.ndarray, canonical: Path,
+    files: Mapping[int, Path],
+    count: int,
+    faces: np.ndarray,
+    canonical: Path,
     read: Callable[[Path], Mesh],
-) -> Callable[[int], np.ndarray]:  # fmt: skip
+) -> Callable[[int], np.ndarray]:
     """timestep -> its vertices (V, 3), parsed when called and cached. Raises StgaError where a file
     has not exactly the `count` vertices and the `faces` of the file `canonical`."""
 
@@ -100,7 +106,8 @@ def tracked_meshes(
             other = f"has {len(triangles)} triangles, but {canonical} has {len(faces)}"
         elif not np.array_equal(triangles, faces):
             row = int(np.argmax((triangles != faces).any(axis=1)))
-            found, expected = triangles[row].tolist(), faces[row].tolist()
+            found = triangles[row].tolist()
+            expected = faces[row].tolist()
             other = f"triangle {row} joins vertices {found}, but {expected} in {canonical}"
         elif len(vertices) != count:
             other = f"has {len(vertices)} vertices, but {canonical} has {count}"
@@ -198,7 +205,8 @@ def _parse_obj(path: Path, data: bytes) -> Mesh:
         vertices = np.array([lines[n].split()[1:4] for n in points], np.float64)
     except ValueError as error:
         raise StgaError(f"{path}: a vertex line does not hold three numbers") from error
-    text, earlier = b"\n".join([lines[n] for n in polygons]), (0,) * len(polygons)
+    text = b"\n".join([lines[n] for n in polygons])
+    earlier = (0,) * len(polygons)
     if b"-" in text:
         earlier = tuple(np.searchsorted(points, polygons))
     try:
@@ -236,7 +244,8 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
     """(F,) bool: a region of the capture, a vertex mask of FLAME, or the triangles of a region
     file. Raises StgaError where there is none, or it holds no triangle."""
     masks = {} if capture.flame is None else capture.flame.model.masks
-    path, shape = Path(name), (len(capture.faces),)
+    path = Path(name)
+    shape = (len(capture.faces),)
     if name in capture.regions:
         region = np.asarray(capture.regions[name])
     elif name in masks:

@@ -158,7 +158,8 @@ def join_takes(takes: Sequence[Capture]) -> Capture:
         return first
     for other in takes[1:]:
         require_same_head(first, other)
-    starts, views = first_timesteps(takes), dict[str, tuple[View, ...]]()
+    starts = first_timesteps(takes)
+    views = dict[str, tuple[View, ...]]()
     selected: dict[int, np.ndarray] = {}
     numbered = list(zip(takes, starts, strict=True))
     for take, start in numbered:
@@ -228,7 +229,8 @@ def _share_of_images(take: Capture) -> float:
     """Size of the head in pixels by that of the image, the median of some training views."""
     shares = []
     for view in evenly_spread(take.views["train"], COMPARED):
-        camera, mesh = view.camera, take.mesh(view.timestep)
+        camera = view.camera
+        mesh = take.mesh(view.timestep)
         distance = float(np.linalg.norm(mesh.mean(0) - camera.position))
         shares.append(camera.fl_x * _extent(mesh) / (distance * max(camera.width, camera.height)))
     return float(np.median(shares))
@@ -248,7 +250,8 @@ def _renumbered(take: Capture, start: int, first: Capture, taken: set[int]) -> V
         free = 1 + max(taken)
 
     def moved(view: View) -> View:
-        pose, index = poses.get(view.camera_index), free + view.camera_index
+        pose = poses.get(view.camera_index)
+        index = free + view.camera_index
         if pose is not None and np.allclose(pose, view.camera.world_to_camera, atol=1e-6):
             index = view.camera_index
         return replace(view, timestep=start + view.timestep, camera_index=index)

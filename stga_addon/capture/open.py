@@ -40,11 +40,14 @@ from .transforms import (
     with_principal_point,
 )
 
-MIN_HEAD_EXTENT_M, TYPICAL_HEAD_EXTENT_M, MAX_HEAD_EXTENT_M = 0.05, 0.3, 3.0
+MIN_HEAD_EXTENT_M = 0.05
+TYPICAL_HEAD_EXTENT_M = 0.3
+MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
 MAX_COMPARED_VIEWS = 4
 MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
-CANONICAL_NAME, PARAMETERS = "canonical_flame_param.npz", "flame_param"
+CANONICAL_NAME = "canonical_flame_param.npz"
+PARAMETERS = "flame_param"
 OWN_MODELS = ("flame_model.npz", "flame_model.pkl")
 """Names of a FLAME model file in the folder of a capture, which is used where none is given."""
 BUNDLED_MODEL = "bundled_head.npz"
@@ -76,11 +79,13 @@ def open_capture(
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
     if not isdir(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
-    root, transforms = folder.resolve(), Transforms({}, None, None)
+    root = folder.resolve()
+    transforms = Transforms({}, None, None)
     if transforms_files(root):
         transforms = read_splits(root, principal_point)
     # A missing file is reported now rather than an hour into the training.
-    seen, keys = set[Path](), ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
+    seen = set[Path]()
+    keys = ("file_path", "fg_mask_path", "mesh_path", "flame_param_path")
     for frame in transforms.frames:
         files = frame.view.image, frame.view.mask, frame.mesh, frame.flame
         for key, file in zip(keys, files, strict=True):
@@ -102,7 +107,8 @@ def open_capture(
 
 
 def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capture:
-    frames, given = transforms.frames, transforms.splits
+    frames = transforms.frames
+    given = transforms.splits
     paths = [] if given else sorted(root.iterdir())
     bare = [p for p in paths if p.suffix.lower() in meshes.MESH_SUFFIXES and p.is_file()]
     if (root / CANONICAL_NAME).is_file() or any(frame.flame for frame in frames):
@@ -127,7 +133,8 @@ def _principal_point_warning(
     """A warning where another convention puts clearly more of the mesh inside the masks of a few
     views. Vertices outside count: hair lies inside the mask but beside the mesh. None without
     Pillow, which Blender lacks."""
-    apart, outside = [], []
+    apart = []
+    outside = []
     for frame in frames:
         own = frame.view.camera
         cameras = [with_principal_point(own, frame.principal, name) for name in PRINCIPAL_POINTS]
@@ -139,7 +146,8 @@ def _principal_point_warning(
 
     for view, cameras in evenly_spread(apart, MAX_COMPARED_VIEWS):
         if (mask := read_mask(view)) is not None:
-            points, shares = mesh(view.timestep), []
+            points = mesh(view.timestep)
+            shares = []
             for camera in cameras:
                 pixels, depth = camera.project(points)
                 size = np.array([camera.width, camera.height])
@@ -163,7 +171,8 @@ def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep. Timesteps are the
     numbers at the end of the names, or the alphabetical order where a name has none. A mesh called
     `neutral` or `canonical` is the canonical one, and `regions.json` the regions file."""
-    names, regions = ("neutral", "canonical"), root / "regions.json"
+    names = ("neutral", "canonical")
+    regions = root / "regions.json"
     canonical = next((path for path in listed if path.stem.lower() in names), None)
     tracked = [path for path in listed if path != canonical]
     if not tracked:
@@ -178,10 +187,15 @@ def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
 
 
 def _mesh_capture(
-    root: Path, layout: str, files: dict[int, Path], transforms: Transforms,
+    root: Path,
+    layout: str,
+    files: dict[int, Path],
+    transforms: Transforms,
     read: Callable[[Path], meshes.Mesh] = meshes.read_mesh,
-) -> Capture:  # fmt: skip
-    warnings, canonical, regions_file = [], transforms.canonical_mesh, transforms.regions
+) -> Capture:
+    warnings = []
+    canonical = transforms.canonical_mesh
+    regions_file = transforms.regions
     if canonical is None:
         canonical = files[min(files)]
         first = f"{canonical.name}, the first timestep, is the neutral mesh"
@@ -260,7 +274,8 @@ def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | N
     vertices gets teeth, because VHAP and GaussianAvatars use them."""
     model_file = _model_file(root, model_file)
     model = flame_model(model_file)
-    frames, folder = transforms.frames, root / PARAMETERS
+    frames = transforms.frames
+    folder = root / PARAMETERS
     if any(frame.flame for frame in frames):
         files = tracked_files(frames, "flame")
     elif frames:
@@ -290,7 +305,8 @@ def sequence_capture(
     root: Path, sequence: FlameSequence, model_file: Path | None, views: Views
 ) -> Capture:
     """The capture of layout "flame" whose meshes a sequence makes; where both are from."""
-    model, regions = sequence.model, key_regions(sequence.model)
+    model = sequence.model
+    regions = key_regions(sequence.model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it)"
     return Capture(
         root=root,

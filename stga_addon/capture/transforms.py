@@ -18,14 +18,16 @@ from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, 
 from .model import FPS_LIMIT, Item, View, Views
 
 SPLITS = ("train", "val", "test")
-WHOLE_FILE, SPLIT_FILES = "transforms.json", {s: f"transforms_{s}.json" for s in SPLITS}
+WHOLE_FILE = "transforms.json"
+SPLIT_FILES = {s: f"transforms_{s}.json" for s in SPLITS}
 PRINCIPAL_POINTS = ("vhap", "opencv", "center")
 DEFAULT_PRINCIPAL_POINT = PRINCIPAL_POINTS[0]
 ROTATION_TOLERANCE = 1e-3  # exporters write float32 poses, some rounded to a few decimals
 MAX_NUMBER = sys.float_info.max  # JSON does not limit whole numbers
 INDEX_LIMIT = 1 << 31
 MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
-MAX_PATH_CHARACTERS, MAX_NAME_BYTES = 2000, 255
+MAX_PATH_CHARACTERS = 2000
+MAX_NAME_BYTES = 255
 MATRIX = "a 4x4 matrix of finite numbers"
 
 
@@ -151,9 +153,13 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
     all training. Cameras without `camera_index` are numbered alike in all splits. Raises
     StgaError."""
     names = {split: name for split, name in SPLIT_FILES.items() if (folder / name).is_file()}
-    frames, meshes, regions, rates = dict[str, list[Frame]](), [], [], []
+    frames = dict[str, list[Frame]]()
+    meshes = []
+    regions = []
+    rates = []
     for split, name in (names or {"train": WHOLE_FILE}).items():
-        path, values = folder / name, read_json(folder / name)
+        path = folder / name
+        values = read_json(folder / name)
         frames[split] = _read_frames(path, values, principal_point)
         record = Record(path, folder.resolve(), "", values)
         meshes.append(record.path_of("canonical_mesh_path"))
@@ -183,7 +189,8 @@ def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
     files: dict[int, Path] = {}
     key = "mesh_path" if field == "mesh" else "flame_param_path"
     for frame in frames:
-        path, timestep = getattr(frame, field), frame.view.timestep
+        path = getattr(frame, field)
+        timestep = frame.view.timestep
         if path is None:
             expected = f"expected the tracked file of timestep {timestep}"
             raise StgaError(f"{frame.where}.{key}: is missing; {expected}")
@@ -223,7 +230,8 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         record = replace(shared, place=f"frames[{number}].", values=entry)
-        image, where = record.path_of("file_path"), record.where
+        image = record.path_of("file_path")
+        where = record.where
         if image is None:
             raise StgaError(f"{where('file_path')}: is missing; expected the path of the image")
         if not image.suffix:  # as Blender's NeRF exporters write it
@@ -247,7 +255,8 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         name = entry["file_path"].replace("\\", "/")  # files are named after views
         view = View(timestep, index, cameras[known], name, image, record.path_of("fg_mask_path"))
         camera_id = str(entry["camera_id"]) if record.has("camera_id") else None
-        mesh, flame = record.path_of("mesh_path"), record.path_of("flame_param_path")
+        mesh = record.path_of("mesh_path")
+        flame = record.path_of("flame_param_path")
         whole = replace(record, values=values | entry)
         frames.append(Frame(view, written, camera_id, mesh, flame, whole))
     return frames
@@ -276,7 +285,8 @@ def _image_size(record: Record, shared: Record, image: Path) -> tuple[int, int]:
         from .images import image_size
 
         return image_size(image)
-    width, height = source.number("w", low=0), source.number("h", low=0)
+    width = source.number("w", low=0)
+    height = source.number("h", low=0)
     if not is_image_size(width, height):
         expected = f"expected an image size in pixels, not {width:g} x {height:g}"
         raise StgaError(f"{source.where('w')}: {expected}")

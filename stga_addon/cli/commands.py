@@ -42,7 +42,10 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 BLEND = "avatar.blend"
-TRAIN_SECONDS, REFINE_SECONDS, EXTEND_SECONDS = 120.0, 20.0, 60.0  # Budgets where none is given
+# Budgets where none is given
+TRAIN_SECONDS = 120.0
+REFINE_SECONDS = 20.0
+EXTEND_SECONDS = 60.0
 
 
 LAYOUT = "{desc}{percentage:3.0f}%|{bar}| {elapsed}{postfix}"
@@ -133,7 +136,8 @@ class Command:
         if head is not None and options.capture is not None:
             head = None
         elif head is not None:
-            options.capture, options.flame = head.capture, options.flame or head.flame
+            options.capture = head.capture
+            options.flame = options.flame or head.flame
             if "source" not in options:  # of an avatar's cameras: as in its training
                 options.principal_point = options.principal_point or head.principal_point
         self.run(options, head)
@@ -185,7 +189,8 @@ def _settings(options: Namespace) -> TrainingSettings:
         given["seconds"] = TRAIN_SECONDS
     if not (paper or other_method):
         given.setdefault("effects", {})
-    settings, selection = make_settings(**given), given_options(options, SelectionOptions)
+    settings = make_settings(**given)
+    selection = given_options(options, SelectionOptions)
     if selection and settings.strategy != "selective":
         problem = "has no effect without --strategy selective, or --schedule paper"
         raise StgaError(f"--threshold: {problem}")
@@ -196,7 +201,8 @@ def _refuse_changes(options: Namespace, run: Run) -> None:
     """Raise StgaError for an option that differs from what the run to be resumed began with."""
     for began_with in (run.settings, run.settings.selection):
         for spec in option_fields(type(began_with)):
-            value, given = getattr(began_with, spec.name), getattr(options, spec.name, None)
+            value = getattr(began_with, spec.name)
+            given = getattr(options, spec.name, None)
             if given not in (None, value) and spec.name != "effects":
                 problem = f"this run began with {value}, which cannot change; use another --out"
                 raise StgaError(f"{flag_of(spec)}: {problem}")
@@ -214,7 +220,9 @@ class AvatarOptions:
 
 
 def _avatar(options: Namespace, head: OpenHead | None) -> None:
-    settings, out, run = _settings(options), options.out, options.out / RUN_FOLDER
+    settings = _settings(options)
+    out = options.out
+    run = options.out / RUN_FOLDER
     if has_run(run):
         _refuse_changes(options, read_run(run))
     track = Track(**{"model": None, **given_options(options, Track), "out": out / CAPTURE_FOLDER})
@@ -245,9 +253,11 @@ def write_blend(
     from ..scene.objects import empty_file, save_file
     from ..tracking.folder import is_flame
 
-    inputs, run = read_inputs(out), out / RUN_FOLDER
+    inputs = read_inputs(out)
+    run = out / RUN_FOLDER
     flame = Path(inputs["model"]) if inputs["model"] and is_flame(out / CAPTURE_FOLDER) else None
-    capture, avatar = open_capture(out / CAPTURE_FOLDER, flame), read_avatar(run / AVATAR)
+    capture = open_capture(out / CAPTURE_FOLDER, flame)
+    avatar = read_avatar(run / AVATAR)
     empty_file()
     head = set_up_head(refine(capture))
     show_on_head(avatar, head, f"//{RUN_FOLDER}/{AVATAR}", playback_fps(capture, numbered=True))
@@ -265,7 +275,8 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
 
     def run(options: Namespace, head: OpenHead | None) -> None:
         given = given_options(options, kind)
-        takes, only = given.get("captures"), getattr(options, "select_only", None)
+        takes = given.get("captures")
+        only = getattr(options, "select_only", None)
         if options.resume:
             flags = [flag_of(spec) for spec in option_fields(kind) if given.get(spec.name)]
             flags += ["--select-only"] if only else []
@@ -385,31 +396,54 @@ TRACKED_AS = [s.name for s in option_fields(Track) if s.name not in ("out", "ava
 COMMANDS = {
     "avatar": Command(
         "Make an avatar from footage: track, train, and write a report and a .blend file. Called "
-        "again with the same arguments, it continues where it was interrupted.", _avatar,
-        ((Track, *TRACKED_AS), AvatarOptions, TrainingSettings,
-         (SelectionOptions, "threshold"), (Train, "device")),
-        may_lack=("model",)
+        "again with the same arguments, it continues where it was interrupted.",
+        _avatar,
+        (
+            (Track, *TRACKED_AS),
+            AvatarOptions,
+            TrainingSettings,
+            (SelectionOptions, "threshold"),
+            (Train, "device"),
+        ),
+        may_lack=("model",),
     ),
     "track": _asking(Track, may_lack=("model",)),
     "train": Command(
-        _about(Train), _train,
-        (Train, TrainingSettings, (SelectionOptions, "threshold"),
-         _lone("resume", bool, "continue the run in the folder", False)), uses_head=True
+        _about(Train),
+        _train,
+        (
+            Train,
+            TrainingSettings,
+            (SelectionOptions, "threshold"),
+            _lone("resume", bool, "continue the run in the folder", False),
+        ),
+        uses_head=True,
     ),
     "refine": _continuing(Refine, REFINE_SECONDS),
-    "extend": _continuing(Extend, EXTEND_SECONDS, _lone(
-        "select_only", Path | None,
-        "only write which triangles it would train: timestep of the take -> triangles", None, "NPZ"
-    )),
+    "extend": _continuing(
+        Extend,
+        EXTEND_SECONDS,
+        _lone(
+            "select_only",
+            Path | None,
+            "only write which triangles it would train: timestep of the take -> triangles",
+            None,
+            "NPZ",
+        ),
+    ),
     "relight": _asking(Relight),
     "perform": Command(
         "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
         "farm does. The folder holds request.json; status, previews and result are written beside "
-        "it.", _perform, (PerformOptions,)
+        "it.",
+        _perform,
+        (PerformOptions,),
     ),
     "batch": Command(
         "Carry out a plan of many jobs, or train many captures, on this machine or on the engine "
-        "that is there.", run_batch_command, (BatchOptions, EngineOptions)
+        "that is there.",
+        run_batch_command,
+        (BatchOptions, EngineOptions),
     ),
     "render": Command(_about(Render), _render, (RenderOutput, Render), uses_head=True),
     "eval": _asking(Evaluate, with_bar=False),
@@ -417,13 +451,15 @@ COMMANDS = {
         _about(Select),
         lambda options, _: _write_selection(Select(**given_options(options, Select)), options.out),
         (Select, _lone("out", Path | None, "also write timestep -> triangles", None, "NPZ")),
-        uses_head=True
+        uses_head=True,
     ),
     "export": Command(_about(Export), _export, (Export,), uses_head=True),
     "drive": _asking(ConvertMotion),
     "info": Command(
-        _about(Analyze), _info,
-        (Analyze, _lone("json", bool, "print the effects alone, as JSON", False)), uses_head=True
+        _about(Analyze),
+        _info,
+        (Analyze, _lone("json", bool, "print the effects alone, as JSON", False)),
+        uses_head=True,
     ),
     "presets": _asking(TimePresets, with_bar=False, uses_head=True),
-}  # fmt: skip
+}

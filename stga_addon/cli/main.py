@@ -63,7 +63,8 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         return _fail(f"'{command}': its input is nested too deeply")
     except KeyboardInterrupt as error:
         # without what destructors of objects that were half made say
-        hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+        hook = sys.unraisablehook
+        sys.unraisablehook = lambda _: None
         error.__traceback__ = error.__context__ = None
         gc.collect()  # frames that refer to themselves
         sys.unraisablehook = hook
@@ -140,7 +141,9 @@ def _safe(stream: Any, original: Any) -> Any:
         return stream
     stream.flush()
     return io.TextIOWrapper(
-        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)), encoding=stream.encoding,
-        errors="backslashreplace", line_buffering=stream.line_buffering,
+        io.BufferedWriter(Output(stream.fileno(), "w", closefd=False)),
+        encoding=stream.encoding,
+        errors="backslashreplace",
+        line_buffering=stream.line_buffering,
         write_through=stream.write_through,
-    )  # fmt: skip
+    )

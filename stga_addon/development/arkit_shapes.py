@@ -26,7 +26,8 @@ ARKit's."""
 def main(source: Path) -> None:
     """Write the file for the ICT-FaceKit arrays in `source`."""
     arrays = read_npz(source)
-    neutral, faces = METERS_PER_UNIT * arrays["neutral"].astype(np.float64), arrays["tris"]
+    neutral = METERS_PER_UNIT * arrays["neutral"].astype(np.float64)
+    faces = arrays["tris"]
     model = linear_model(
         source, {"mean": neutral, "faces": faces, "expression": np.zeros((*neutral.shape, 1))}
     )

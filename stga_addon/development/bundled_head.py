@@ -20,9 +20,15 @@ from .arkit_shapes import METERS_PER_UNIT, ict_names
 
 # First and last vertex of the model's parts, and how many triangles of each are kept. Its second
 # shells of the eyeballs, tear films and lashes are left out.
-FACE, HEAD, MOUTH_INSIDE, EYE_SOCKETS = (0, 9409), (9409, 11248), (11248, 13294), (13294, 14062)
-SKIN, GUMS, TEETH = (0, 14062), (14062, 17039), (17039, 21451)
-LEFT_EYEBALL, RIGHT_EYEBALL = (21451, 22221), (23021, 23791)
+FACE = (0, 9409)
+HEAD = (9409, 11248)
+MOUTH_INSIDE = (11248, 13294)
+EYE_SOCKETS = (13294, 14062)
+SKIN = (0, 14062)
+GUMS = (14062, 17039)
+TEETH = (17039, 21451)
+LEFT_EYEBALL = (21451, 22221)
+RIGHT_EYEBALL = (23021, 23791)
 KEPT_TRIANGLES = {SKIN: 19000, GUMS: 900, TEETH: 2500, LEFT_EYEBALL: 500, RIGHT_EYEBALL: 500}
 # Factors of the skin's geometric error, by which triangles are distributed over it.
 DETAIL = {FACE: 1.0, HEAD: 0.3, MOUTH_INSIDE: 0.03, EYE_SOCKETS: 0.03}
@@ -34,26 +40,31 @@ MIN_FLIP_COSINE = 0.3
 EDGE_WEIGHT = 10.0
 """Of a mesh's open edges in the quadrics."""
 
-NECK_JOINT_CM, ROOT_JOINT_CM = (0.0, 0.4, 0.0), (0.0, -13.2, -2.7)
+NECK_JOINT_CM = (0.0, 0.4, 0.0)
+ROOT_JOINT_CM = (0.0, -13.2, -2.7)
 """Where the skull turns on the spine, between the ears' canals; where the neck leaves the torso."""
 JOINT_BAND_CM = 1.5
 """Half height of the band of skin whose average is a joint."""
 NECK_SLOPE = 0.35
 """Of the planes that divide the neck: it leans forward, and its nape ends higher than its front."""
-NECK_BOTTOM_CM, NECK_TOP_CM = -13.7, -4.7
+NECK_BOTTOM_CM = -13.7
+NECK_TOP_CM = -4.7
 """Heights on the axis between which skin follows root and neck joint in part."""
-EYEBALL_SETBACK_CM, EYEBALL_RETRACTION_CM = 0.07, 0.1
+EYEBALL_SETBACK_CM = 0.07
+EYEBALL_RETRACTION_CM = 0.1
 """How far eyeballs lie behind ICT-FaceKit's, and how far lids that close push them back, as they do
 in life (Evinger et al. 1984): else, eyeballs of other identities poke through their lids, which
 move along straight lines."""
-MIN_EYE_SHARE, MIN_LIPS_SHARE = 0.15, 0.45
+MIN_EYE_SHARE = 0.15
+MIN_LIPS_SHARE = 0.45
 """Of a shape's largest displacement, at the edge of the region that it moves."""
 
 
 def main(source: Path) -> None:
     """Write the file for the ICT-FaceKit arrays in `source`."""
     arrays = read_npz(source)
-    neutral, triangles = arrays["neutral"].astype(np.float64), arrays["tris"].astype(np.int64)
+    neutral = arrays["neutral"].astype(np.float64)
+    triangles = arrays["tris"].astype(np.int64)
     names, shapes = arkit_displacements(arrays)
     moved = dict(zip(names, np.linalg.norm(shapes, axis=2), strict=True))
     kept, faces = _thinned(neutral, triangles, _detail(moved))
@@ -149,7 +160,9 @@ def _thinned(
     vertices: np.ndarray, triangles: np.ndarray, detail: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ids (N,) of the vertices that are kept, and the triangles (F, 3) between them."""
-    kept, faces, count = [], [], 0
+    kept = []
+    faces = []
+    count = 0
     for part, wanted in KEPT_TRIANGLES.items():
         own = triangles[_within(part, triangles).all(axis=1)]
         own = collapsed(vertices, own, detail, wanted)
@@ -255,7 +268,8 @@ def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
     share = np.clip((_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM), 0, 1)
     share = np.where(_within(SKIN, kept), share * share * (3 - 2 * share), 1.0)
     weights = np.zeros((len(kept), len(JOINTS)))
-    weights[:, JOINTS.index("root")], weights[:, JOINTS.index("neck")] = 1 - share, share
+    weights[:, JOINTS.index("root")] = 1 - share
+    weights[:, JOINTS.index("neck")] = share
     for joint, part in (("left_eye", LEFT_EYEBALL), ("right_eye", RIGHT_EYEBALL)):
         weights[_within(part, kept)] = np.eye(len(JOINTS))[JOINTS.index(joint)]
     return weights

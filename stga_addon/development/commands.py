@@ -75,10 +75,11 @@ def run_benchmark_command(options: Namespace, head: object) -> None:
         if not capture.views.get(split):
             raise StgaError(f"{capture.root}: has no views to {purpose} (split '{split}')")
     flame = None if given.flame is None else given.flame.resolve()
-    out, root = given.out.resolve(), given.capture.resolve()
+    out = given.out.resolve()
+    root = given.capture.resolve()
     request = Benchmark(
         out, root, given.seconds, flame, given.principal_point, knobs=given.knobs, only=given.only
-    )  # fmt: skip
+    )
     values = {"out": str(out), "job": benchmark_jobs(SLICES, request, given.seeds)}
     plan = with_threads(make_plan(values, out, "stga benchmark"), engine.threads or processors())
     if engine.dry_run:

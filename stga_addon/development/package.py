@@ -208,7 +208,8 @@ def target_of(blender: Sequence[str]) -> Target:
             f"{shlex.join(blender)}: did not say which Python it has "
             f"(exit status {done.returncode})"
         )
-    python, (major, minor) = ".".join(answer[:2]), map(int, answer[2:])
+    python = ".".join(answer[:2])
+    (major, minor) = map(int, answer[2:])
     return Target(this_platform(), python, (f"{major}.{minor}.0", f"{major}.{minor + 1}.0"))
 
 

@@ -18,7 +18,8 @@ from typing import Any
 
 from ..errors import StgaError, exit_code
 
-INDEX, PAGE = "index.json", "index.html"
+INDEX = "index.json"
+PAGE = "index.html"
 TEXT = """<!DOCTYPE html>
 <html lang="en">
 <meta charset="utf-8">

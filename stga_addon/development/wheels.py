@@ -45,18 +45,24 @@ PLATFORM_TAGS = {
 newer."""
 MARKERS = {
     "linux-x64": {
-        "sys_platform": "linux", "platform_system": "Linux", "platform_machine": "x86_64",
+        "sys_platform": "linux",
+        "platform_system": "Linux",
+        "platform_machine": "x86_64",
         "os_name": "posix",
     },
     "windows-x64": {
-        "sys_platform": "win32", "platform_system": "Windows", "platform_machine": "AMD64",
+        "sys_platform": "win32",
+        "platform_system": "Windows",
+        "platform_machine": "AMD64",
         "os_name": "nt",
     },
     "macos-arm64": {
-        "sys_platform": "darwin", "platform_system": "Darwin", "platform_machine": "arm64",
+        "sys_platform": "darwin",
+        "platform_system": "Darwin",
+        "platform_machine": "arm64",
         "os_name": "posix",
     },
-}  # fmt: skip
+}
 """Values of environment markers on each platform."""
 BLENDER_RANGES = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", "")}
 """Python -> first Blender that brings it, and the first that no longer does."""
@@ -64,13 +70,21 @@ PROVIDED = frozenset({"numpy"})
 """Packages that Blender brings."""
 PINS = {
     "": (
-        "filelock==4.2.11", "trimesh==5.2.0", "tqdm==4.70.1", "torch==2.13.0", "numba==0.68.1",
-        "llvmlite==0.50.0", "pillow==13.0.0", "platformdirs==4.14.7", "av==18.1.0", "wgpu==0.32.0",
+        "filelock==4.2.11",
+        "trimesh==5.2.0",
+        "tqdm==4.70.1",
+        "torch==2.13.0",
+        "numba==0.68.1",
+        "llvmlite==0.50.0",
+        "pillow==13.0.0",
+        "platformdirs==4.14.7",
+        "av==18.1.0",
+        "wgpu==0.32.0",
         "opencv-python-headless==4.14.0.94",
     ),
     # The last that run with numpy 1.24, which Blender 4.2 and 4.3 bring.
     "3.11": ("scipy==1.15.3", "matplotlib==3.10.8", "contourpy==1.3.2"),
-}  # fmt: skip
+}
 """Versions that the complete edition bundles, on every Python and on one; what these need
 follows."""
 
@@ -107,8 +121,11 @@ class Target:
         """Tags of the wheels that run on the target."""
         version = tuple(int(part) for part in self.python.split("."))
         own = cpython_tags(version, platforms=PLATFORM_TAGS[self.platform])
-        pure = (Tag(f"py{name}", "none", where) for name in ("3", self.python.replace(".", ""))
-                for where in ("any", *PLATFORM_TAGS[self.platform]))  # fmt: skip
+        pure = (
+            Tag(f"py{name}", "none", where)
+            for name in ("3", self.python.replace(".", ""))
+            for where in ("any", *PLATFORM_TAGS[self.platform])
+        )
         return frozenset((*own, *pure))
 
 
@@ -163,7 +180,8 @@ def collect_wheels(folder: Path, target: Target) -> list[Path]:
 def check_wheels(wheels: Sequence[Path], target: Target) -> None:
     """Raise StgaError unless every wheel runs on the target and all that they need, and training
     needs, is there."""
-    tags, versions = target.tags(), {}
+    tags = target.tags()
+    versions = {}
     for wheel in wheels:
         name, version, _, own = parse_wheel_filename(wheel.name)
         if not own & tags:
@@ -208,10 +226,8 @@ def needs(wheel: Path, target: Target, extras: Iterable[str] = ()) -> list[str]:
 def _present(folder: Path, requirement: Requirement, target: Target) -> Path | None:
     """The wheel that is already in the folder; its version is the pinned one, or any that fits."""
     pins = {Requirement(text).name: Requirement(text).specifier for text in pins_of(target)}
-    specifier, tags = (
-        requirement.specifier & pins.get(requirement.name, requirement.specifier),
-        target.tags(),
-    )
+    specifier = requirement.specifier & pins.get(requirement.name, requirement.specifier)
+    tags = target.tags()
     for wheel in sorted(folder.glob("*.whl"), reverse=True):
         name, version, _, own = parse_wheel_filename(wheel.name)
         fits = name == canonicalize_name(requirement.name) and specifier.contains(

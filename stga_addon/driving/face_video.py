@@ -31,7 +31,9 @@ def watched_performance(path: Path, report: Report) -> Performance:
     numbers = {timestep: number for number, timestep in enumerate(video.timesteps)}
     frames = VideoFrames(video, numbers)
     networks = FaceNetworks()
-    times, rows, rotations = [], [], []
+    times = []
+    rows = []
+    rotations = []
     for number, timestep in enumerate(frames.timesteps):
         if report(Progress(number / len(frames.timesteps), "Detecting the face")):
             frames.close()

@@ -65,8 +65,10 @@ class HeadMap:
 
     def frames(self, performance: Performance) -> list[FlameFrame]:
         """One frame per row of the performance; the head's rotation turns the neck."""
-        values, zero = self.parameters(performance.weights), np.zeros(3)
-        count, turns = self.expressions.shape[1], head_turns(performance.head)
+        values = self.parameters(performance.weights)
+        zero = np.zeros(3)
+        count = self.expressions.shape[1]
+        turns = head_turns(performance.head)
         return [
             FlameFrame(row[:count], zero, turn, row[count : count + 3], zero, row[count + 3 :])
             for row, turn in zip(values, turns, strict=True)
@@ -157,7 +159,8 @@ class _Fit:
 
     def expressions(self) -> np.ndarray:
         """(FEATURES, E) that best give single shapes and random combinations."""
-        rows, solutions = [], []
+        rows = []
+        solutions = []
         for number, pose in enumerate(JAW_POSES):
             weights = _combinations(pose, np.random.default_rng(number))
             jaw = np.zeros(COUNT)
@@ -174,7 +177,8 @@ class _Fit:
         at = self.count + 3 * JOINTS.index("jaw")
         columns = [*range(self.count), at, at + 1, at + 2]
         for name in JAW_SHAPES:
-            wanted, values = self.neutral + self.targets[COLUMN[name]], np.zeros(len(columns))
+            wanted = self.neutral + self.targets[COLUMN[name]]
+            values = np.zeros(len(columns))
             for _ in range(JAW_STEPS):
                 expressions, jaw = np.split(values, [self.count])
                 start, slopes = self.posed.linearized(expressions, self.rigid(jaw))

@@ -16,7 +16,8 @@ from .shapes import JAW_OPEN, MOUTH_CLOSE
 
 MAX_SWEEPS = 60
 CONVERGED = 1e-5  # Largest change of a weight in a sweep, below which the descent stops
-NEWTON_STEPS, STEP_SHARES = 12, (1.0, 0.5, 0.2, 0.05, 0.0)
+NEWTON_STEPS = 12
+STEP_SHARES = (1.0, 0.5, 0.2, 0.05, 0.0)
 CHUNK = 256  # Rows whose matrices are held at once
 RIDGE = 1e-9  # Share of the mean squared displacement, for weights that a head cannot tell apart
 TIMECODE_BASE = 60
@@ -64,18 +65,22 @@ def arkit_weights(
     fixed = {*jaw_columns, *looks, *(COLUMN[name] for name in OPTIONAL)}
     free = np.array([column for column in range(COUNT) if column not in fixed])
     opened = weights[:, JAW_OPEN]
-    linear, by_jaw = found.expressions[:COUNT], np.zeros((COUNT, found.expressions.shape[1]))
+    linear = found.expressions[:COUNT]
+    by_jaw = np.zeros((COUNT, found.expressions.shape[1]))
     by_jaw[PRODUCTS] = found.expressions[COUNT:]
     known = weights @ linear + opened[:, None] * (weights @ by_jaw)
     wanted = np.stack([frame.expr for frame in frames]) - known
     # The length of coefficients times the metric is how far they move the face's points.
     person = with_identity(sequence).model
-    count, posed = person.n_expression, PosedPoints(person, found.points)
+    count = person.n_expression
+    posed = PosedPoints(person, found.points)
     _, slopes = posed.linearized(np.zeros(count), np.zeros(RIGID_SIZE))
     moves = slopes[..., :count].reshape(-1, count)
     values, vectors = np.linalg.eigh(moves.T @ moves)
     metric = vectors * np.sqrt(np.maximum(values, 0))
-    first, second, wanted = linear[free] @ metric, by_jaw[free] @ metric, wanted @ metric
+    first = linear[free] @ metric
+    second = by_jaw[free] @ metric
+    wanted = wanted @ metric
     cross = first @ second.T
     gram = np.stack([first @ first.T, cross + cross.T, second @ second.T])
     right = wanted @ first.T + opened[:, None] * (wanted @ second.T)
@@ -94,7 +99,8 @@ def _descended(
 ) -> np.ndarray:
     """(T, K) minimizers in 0…`limits` of ½ wᵀGw − rᵀw, G = Σ powers[:, p] gram[p], row by row."""
     powers = np.ones((len(right), 1)) if powers is None else powers
-    limits, weights = np.broadcast_to(limits, right.shape), np.zeros_like(right)
+    limits = np.broadcast_to(limits, right.shape)
+    weights = np.zeros_like(right)
     ridge = RIDGE * float(np.trace(gram[0])) / max(len(gram[0]), 1)
     rows = [powers @ gram[:, column] for column in range(right.shape[1])]
     for _ in range(MAX_SWEEPS):

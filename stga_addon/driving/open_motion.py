@@ -32,7 +32,9 @@ from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_p
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
-QUIET_SHARE, MAX_COMPARED_FRAMES = 0.2, 1000  # Of frames that count as quiet; compared ones
+# Of frames that count as quiet; compared ones
+QUIET_SHARE = 0.2
+MAX_COMPARED_FRAMES = 1000
 NEUTRALS = {
     "none": "as recorded",
     "quiet": "both recordings are at rest in the fifth of their frames that are most alike",
@@ -75,10 +77,12 @@ def _with_parts(frames: Sequence[FlameFrame], parts: Mapping[str, np.ndarray]) -
 
 def trained_range(frames: Sequence[FlameFrame]) -> TrainedRange:
     """The range of the frames that an avatar was trained on."""
-    middle, width = {}, {}
+    middle = {}
+    width = {}
     for part, values in _by_part(frames).items():
         low, high = np.quantile(values, [OUTER_QUANTILE, 1 - OUTER_QUANTILE], axis=0)
-        middle[part], width[part] = (low + high) / 2, np.maximum((high - low) / 2, MIN_WIDTH[part])
+        middle[part] = (low + high) / 2
+        width[part] = np.maximum((high - low) / 2, MIN_WIDTH[part])
     return TrainedRange(middle, width, quiet_neutral(frames), quiet_neutral(frames[:1]))
 
 
@@ -112,7 +116,8 @@ def exchanged_neutral(
     Parameters of the parts are subtracted and added, rotations as axis-angle: jaw and eyes turn by
     small angles.
     """
-    own, theirs = own or dict.fromkeys(PART_FIELDS, 0.0), theirs or dict.fromkeys(PART_FIELDS, 0.0)
+    own = own or dict.fromkeys(PART_FIELDS, 0.0)
+    theirs = theirs or dict.fromkeys(PART_FIELDS, 0.0)
     parts = _by_part(frames).items()
     return _with_parts(frames, {part: each + (own[part] - theirs[part]) for part, each in parts})
 
@@ -138,7 +143,8 @@ def led_back(
     """
     changed = {}
     for part, values in _by_part(frames).items():
-        middle, width = trained.middle[part], trained.width[part]
+        middle = trained.middle[part]
+        width = trained.width[part]
         offset = (values - middle) / width
         beyond = np.maximum(np.abs(offset) - 1, 0)
         soft = np.sign(offset) * (np.minimum(np.abs(offset), 1) + 0.25 * (1 - np.exp(-beyond)))
@@ -146,7 +152,8 @@ def led_back(
     return _with_parts(frames, changed)
 
 
-MAX_FACTOR, MAX_SMOOTHING_S = 100.0, 10.0
+MAX_FACTOR = 100.0
+MAX_SMOOTHING_S = 10.0
 
 
 def parsed_gain(text: str) -> tuple[str, float]:
@@ -171,30 +178,48 @@ class MotionOptions:
 
     strength: float = option(
         "of the motion; 1: as recorded, above 1: exaggerated; the head's is scaled about its first "
-        "pose", 1.0, 0, MAX_FACTOR,
-    )  # fmt: skip
+        "pose",
+        1.0,
+        0,
+        MAX_FACTOR,
+    )
     neutral: str = option(
         "what the motion is taken relative to, so that this head's own face is moved, not the "
-        "performer's", "none", choices=NEUTRALS,
-    )  # fmt: skip
+        "performer's",
+        "none",
+        choices=NEUTRALS,
+    )
     smoothing: float = option(
         "smooth a face performance in time, by this standard deviation",
-        0.0, 0, MAX_SMOOTHING_S, flag="--smooth", metavar="SECONDS",
-    )  # fmt: skip
+        0.0,
+        0,
+        MAX_SMOOTHING_S,
+        flag="--smooth",
+        metavar="SECONDS",
+    )
     mirror: bool = option("exchange left and right of a face performance", False)
     gains: Mapping[str, float] = option(
         "scale a part of a performance (face, jaw, eyes, head) or one shape, such as jawOpen; may "
-        "be repeated", default_factory=dict, flag="--gain", metavar="NAME=FACTOR",
+        "be repeated",
+        default_factory=dict,
+        flag="--gain",
+        metavar="NAME=FACTOR",
         parse=parsed_gain,
-    )  # fmt: skip
+    )
     stay_trained: float | None = option(
         "lead the motion softly back to the range that the run was trained on, and print how far "
-        "it was outside; 0: print only, 1 (default): fully", None, 0, 1, metavar="SHARE", bare=1.0,
-    )  # fmt: skip
+        "it was outside; 0: print only, 1 (default): fully",
+        None,
+        0,
+        1,
+        metavar="SHARE",
+        bare=1.0,
+    )
     exchange: tuple[str, ...] = option(
         "exchange left and right of one pair alone, which some senders exchange; may be repeated",
-        (), choices=EXCHANGEABLE,
-    )  # fmt: skip
+        (),
+        choices=EXCHANGEABLE,
+    )
 
 
 @dataclass(frozen=True)
@@ -214,10 +239,14 @@ class Motion:
 
 
 def open_motion(
-    path: Path, flame: Path | None, neutral: np.ndarray, faces: np.ndarray,
-    options: MotionOptions | None = None, trained: TrainedRange | None = None,
+    path: Path,
+    flame: Path | None,
+    neutral: np.ndarray,
+    faces: np.ndarray,
+    options: MotionOptions | None = None,
+    trained: TrainedRange | None = None,
     fps: float | None = None,
-) -> Motion:  # fmt: skip
+) -> Motion:
     """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles
     `faces` (F, 3).
 
@@ -236,7 +265,8 @@ def open_motion(
             problem = "needs the FLAME model file (.pkl or .npz) of the head that it moves"
             raise StgaError(f"{path}: {problem}; give it with --flame")
         _check_faces(path, model, faces)
-        person, name = person_of(model, neutral), str(flame or path)
+        person = person_of(model, neutral)
+        name = str(flame or path)
         return performed(read_performance(path), person, name, options, trained, fps)
     capture = open_capture(path, flame)
     if capture.flame is None:
@@ -251,9 +281,13 @@ def open_motion(
 
 
 def performed(
-    performance: Performance, person: FlameSequence, name: str, options: MotionOptions,
-    trained: TrainedRange | None = None, fps: float | None = None,
-) -> Motion:  # fmt: skip
+    performance: Performance,
+    person: FlameSequence,
+    name: str,
+    options: MotionOptions,
+    trained: TrainedRange | None = None,
+    fps: float | None = None,
+) -> Motion:
     """A performance on a person's head, a timestep per 1/fps seconds; `name` is for errors."""
     # `finished` applies it
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
@@ -284,7 +318,8 @@ def prepared_performance(
     if performance.times[-1] * rate > MAX_ROWS:
         length = f"{performance.times[-1]:.0f} s at {rate:g} frames per second"
         raise StgaError(f"a performance of {length} is too long")
-    weights, rest = performance.weights[0], None
+    weights = performance.weights[0]
+    rest = None
     if options.neutral == "quiet":
         weights = quiet_weights(performance)
     if options.neutral in ("quiet", "first"):

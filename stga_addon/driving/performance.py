@@ -115,7 +115,8 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
         columns = [np.interp(times, performance.times, column) for column in values.T]
         return np.stack(columns, axis=1)
 
-    weights, head = interpolated(performance.weights), interpolated(performance.head)
+    weights = interpolated(performance.weights)
+    head = interpolated(performance.head)
     return Performance(times, weights, head, rate)
 
 
@@ -129,7 +130,8 @@ def exchanged_sides(performance: Performance, pairs: tuple[str, ...]) -> Perform
     """jawLeft and jawRight exchanged, mouthLeft and mouthRight, or both (`EXCHANGEABLE`)."""
     weights = performance.weights.copy()
     for pair in pairs:
-        left, right = COLUMN[f"{pair}Left"], COLUMN[f"{pair}Right"]
+        left = COLUMN[f"{pair}Left"]
+        right = COLUMN[f"{pair}Right"]
         weights[:, [left, right]] = weights[:, [right, left]]
     return replace(performance, weights=weights)
 
@@ -147,7 +149,8 @@ def smoothed(performance: Performance, seconds: float) -> Performance:
         padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
         return np.stack([np.convolve(column, kernel, "valid") for column in padded.T], axis=1)
 
-    weights, head = convolved(performance.weights), convolved(performance.head)
+    weights = convolved(performance.weights)
+    head = convolved(performance.head)
     return replace(performance, weights=weights, head=head)
 
 

@@ -70,7 +70,9 @@ def parse_packet(data: bytes) -> FacePacket | None:
         text = data.decode("ascii")
     except UnicodeDecodeError:
         return None
-    weights, names, head = np.zeros(COUNT), [], None
+    weights = np.zeros(COUNT)
+    names = []
+    head = None
     for field in text.strip().split("|"):
         value = _VALUE.fullmatch(field)
         if value is not None:
@@ -92,16 +94,19 @@ def parse_packet(data: bytes) -> FacePacket | None:
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
 DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
-MIN_FPS, MAX_FPS = 1.0, 1000.0
+MIN_FPS = 1.0
+MAX_FPS = 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
-COUNT_COLUMN, TIMECODE_COLUMN = "blendshapecount", "timecode"
+COUNT_COLUMN = "blendshapecount"
+TIMECODE_COLUMN = "timecode"
 SECONDS_COLUMNS = (TIMECODE_COLUMN, "time", "timestamp", "seconds")
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
 FRAME_KEYS = ("frames", "weightMat", "weights")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
-NAMED, SCORED = ("categoryName", "category_name", "name"), ("score", "value", "weight")
+NAMED = ("categoryName", "category_name", "name")
+SCORED = ("score", "value", "weight")
 
 
 def is_performance(path: Path) -> bool:
@@ -268,9 +273,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _performance(
-    path: Path, times: np.ndarray | None, weights: np.ndarray, head: np.ndarray,
+    path: Path,
+    times: np.ndarray | None,
+    weights: np.ndarray,
+    head: np.ndarray,
     fps: float | None = None,
-) -> Performance:  # fmt: skip
+) -> Performance:
     """The checked performance in the order of its times; of rows with the same time the first."""
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")

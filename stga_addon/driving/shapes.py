@@ -26,7 +26,8 @@ from .performance import ARKIT_SHAPES, COLUMN, COUNT, OPTIONAL
 SHAPES_FILE = Path(__file__).with_name("arkit_shapes.npz")
 PUPILS = (468, 473)
 SKIN_POINTS = 468  # The points after these are the irises', which move with the eyeballs
-MOUTH_CLOSE, JAW_OPEN = COLUMN["mouthClose"], COLUMN["jawOpen"]
+MOUTH_CLOSE = COLUMN["mouthClose"]
+JAW_OPEN = COLUMN["jawOpen"]
 
 
 @dataclass(frozen=True)
@@ -66,19 +67,25 @@ def effective_weights(weights: np.ndarray) -> np.ndarray:
 
 
 EYE_JOINTS = (JOINTS.index("right_eye"), JOINTS.index("left_eye"))
-MIN_EYE_DISTANCE_M, MAX_EYE_DISTANCE_M = 0.03, 0.15
+MIN_EYE_DISTANCE_M = 0.03
+MAX_EYE_DISTANCE_M = 0.15
 EYEBALL_RADIUS_M = 0.012
 """Of a head without eyeballs: its pupils are taken to lie in front of the eyes' joints."""
 ITERATIONS = 12
 CANDIDATES = 24
 """Triangles whose centers are nearest to a point, among which the nearest is looked for."""
-NEIGHBOURS, MAX_MOVE_M = 200, 0.01
+NEIGHBOURS = 200
+MAX_MOVE_M = 0.01
 """Triangles around each point that are kept for the next search, until a point has moved so far."""
 MIN_COSINE = 0.5  # Between the normals of a point and of the triangle that it may lie on
 FAR_M = 1.0  # Added to the distance of triangles that face another way
-MAX_MATCH_M, MEDIANS = 0.003, 4.0
+MAX_MATCH_M = 0.003
+MEDIANS = 4.0
 """A nearest point counts up to this distance, or this many times the median of all."""
-TANGENTIAL_WEIGHT, PUPIL_WEIGHT, IDENTITY_DEVIATION_M, AFFINE_WEIGHT = 0.1, 30.0, 0.002, 0.09
+TANGENTIAL_WEIGHT = 0.1
+PUPIL_WEIGHT = 30.0
+IDENTITY_DEVIATION_M = 0.002
+AFFINE_WEIGHT = 0.09
 SMOOTHINGS = (0.3, 0.1, 0.03, 0.01)  # Ridge of the warp's kernel, in meters
 MAX_WARP_MATCH_M = 0.006
 MAX_SURFACE_DISTANCE_M = 0.003
@@ -87,7 +94,8 @@ MAX_SURFACE_DISTANCE_M = 0.003
 def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray]:
     """The 478 points on the neutral head, and (478,) bool which lie reliably on its skin. Raises
     StgaError, with `name`, where its eyes are not where a head has them."""
-    source, surface = face_shapes(), _Surface(model.v_template, model.faces)
+    source = face_shapes()
+    surface = _Surface(model.v_template, model.faces)
     joints = joint_positions(model, model.v_template)
     foremost = []  # points of right and left eyeball
     for joint in EYE_JOINTS:
@@ -98,7 +106,8 @@ def face_points(model: FlameModel, name: str) -> tuple[SurfacePoints, np.ndarray
             foremost.append(joints[joint] + [0, 0, EYEBALL_RADIUS_M])
     apart = float(foremost[1][0] - foremost[0][0])
     if not MIN_EYE_DISTANCE_M <= apart <= MAX_EYE_DISTANCE_M:
-        low, high = 1000 * MIN_EYE_DISTANCE_M, 1000 * MAX_EYE_DISTANCE_M
+        low = 1000 * MIN_EYE_DISTANCE_M
+        high = 1000 * MAX_EYE_DISTANCE_M
         raise StgaError(
             f"{name}: its eyes lie {1000 * apart:.0f} mm apart along x, expected {low:.0f} to "
             f"{high:.0f}: ARKit's shapes need a head in meters that looks along +z with y up"
@@ -130,8 +139,10 @@ class _Surface:
             centers = (self.centers - middle).astype(np.float32)
             squared = (points - middle).astype(np.float32) @ (-2 * centers.T)
             squared += (centers**2).sum(1)
-            self._seen, self._around = points, _least(squared, NEIGHBOURS)
-            self._centers, self._normals = self.centers[self._around], self.normals[self._around]
+            self._seen = points
+            self._around = _least(squared, NEIGHBOURS)
+            self._centers = self.centers[self._around]
+            self._normals = self.normals[self._around]
         away = self._centers - points[:, None]
         squared = np.einsum("nkc,nkc->nk", away, away)
         squared += FAR_M * (np.einsum("nkc,nc->nk", self._normals, normals) < MIN_COSINE)
@@ -174,7 +185,9 @@ def _aligned(
         found = surface.nearest(points, normals)
         face, _, target, distance = (values[skin] for values in found)
         kept = distance < max(MEDIANS * float(np.median(distance)), MAX_MATCH_M)
-        moved, normal, target = basis[skin][kept], surface.normals[face[kept]], target[kept]
+        moved = basis[skin][kept]
+        normal = surface.normals[face[kept]]
+        target = target[kept]
         towards = np.einsum("na,nak->nk", normal, moved)
         along = TANGENTIAL_WEIGHT * moved.reshape(-1, 12 + count)
         rows = np.concatenate([towards, along, anchors, prior])

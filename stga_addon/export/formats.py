@@ -81,21 +81,31 @@ def _moving_color(avatar: Avatar) -> bool:
 
 FORMATS = {
     "ply": Format(
-        "PLY", "The current frame in world space, for any 3D Gaussian Splatting viewer",
-        (".ply",), "frame", lambda path, item: write_ply(path, item.first_frame(path)),
+        "PLY",
+        "The current frame in world space, for any 3D Gaussian Splatting viewer",
+        (".ply",),
+        "frame",
+        lambda path, item: write_ply(path, item.first_frame(path)),
     ),
     "ply-sequence": Format(
-        "PLY Sequence", "One PLY in world space for each frame of the scene",
-        (), "range", lambda path, item: write_ply_sequence(path, item.frames(path)),
+        "PLY Sequence",
+        "One PLY in world space for each frame of the scene",
+        (),
+        "range",
+        lambda path, item: write_ply_sequence(path, item.frames(path)),
     ),
     "gaussian-avatars": Format(
         "GaussianAvatars",
         "The frames of the scene as point_cloud.ply and flame_param.npz; FLAME heads",
-        (), "motion", lambda path, item: write_gaussian_avatars(path, item.avatar, item.sequence),
+        (),
+        "motion",
+        lambda path, item: write_gaussian_avatars(path, item.avatar, item.sequence),
     ),
     "usd": Format(
-        "USD", "The frames of the scene as an animated particle field",
-        (".usdc", ".usdz"), "range",
+        "USD",
+        "The frames of the scene as an animated particle field",
+        (".usdc", ".usdz"),
+        "range",
         lambda path, item: write_usd(
             path, item.frames(path), item.playback.fps, _moving_color(item.avatar)
         ),
@@ -103,27 +113,40 @@ FORMATS = {
         has_rate=True,
     ),
     "web": Format(
-        "Web Page", "The frames of the scene as a page that plays them, or as data for a server",
-        (".html", ".stga"), "range",
+        "Web Page",
+        "The frames of the scene as a page that plays them, or as data for a server",
+        (".html", ".stga"),
+        "range",
         lambda path, item: write_web(path, item.avatar, item.playback, item.meshes, item.sequence),
-        lambda avatar, frames: web_bytes(avatar), has_rate=True, is_page=True,
+        lambda avatar, frames: web_bytes(avatar),
+        has_rate=True,
+        is_page=True,
     ),
     "gltf": Format(
-        "glTF", "The current frame, for viewers with KHR_gaussian_splatting",
-        (".glb",), "frame", lambda path, item: write_gltf(path, item.first_frame(path)),
+        "glTF",
+        "The current frame, for viewers with KHR_gaussian_splatting",
+        (".glb",),
+        "frame",
+        lambda path, item: write_gltf(path, item.first_frame(path)),
     ),
     "spz": Format(
-        "SPZ", "The current frame compressed, a tenth of a PLY's size",
-        (".spz",), "frame",
+        "SPZ",
+        "The current frame compressed, a tenth of a PLY's size",
+        (".spz",),
+        "frame",
         lambda path, item: write_spz(path, item.first_frame(path), item.avatar.antialiased),
     ),
-}  # fmt: skip
+}
 
 
 def export_avatar(
-    path: Path, avatar: Avatar, format: str, meshes: Meshes = (),
-    sequence: FlameSequence | None = None, playback: Playback | None = None,
-) -> list[Path]:  # fmt: skip
+    path: Path,
+    avatar: Avatar,
+    format: str,
+    meshes: Meshes = (),
+    sequence: FlameSequence | None = None,
+    playback: Playback | None = None,
+) -> list[Path]:
     """Write an avatar in one of FORMATS, all of its files or none; returns the files written.
 
     path     the file, or the folder of "ply-sequence" (one 00012.ply a mesh, named after its
@@ -154,5 +177,6 @@ def check_free_space(path: Path, size: int) -> None:
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     free = shutil.disk_usage(folder).free
     if size > free:
-        needed, found = format_bytes(size), format_bytes(free)
+        needed = format_bytes(size)
+        found = format_bytes(free)
         raise StgaError(f"{path}: needs {needed}, but {found} are free there; choose fewer frames")

@@ -13,8 +13,13 @@ from ..capture.color import srgb_to_linear
 from ..files import replacing
 
 EXTENSION = "KHR_gaussian_splatting"
-_MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
-_POINTS, _VERTICES = 0, 34962  # primitive mode; buffer target ARRAY_BUFFER
+_MAGIC = b"glTF"
+_VERSION = 2
+_JSON_CHUNK = b"JSON"
+_BINARY_CHUNK = b"BIN\0"
+# primitive mode; buffer target ARRAY_BUFFER
+_POINTS = 0
+_VERTICES = 34962
 _COMPONENTS = {
     "float32": {"componentType": 5126},
     "uint8": {"componentType": 5121, "normalized": True},
@@ -44,7 +49,9 @@ def write_gltf(path: Path, world: Splats) -> None:
         degree = math.isqrt(k)
         name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
         attributes[name] = world.sh[:, k]
-    views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
+    views = list[dict[str, Any]]()
+    accessors = list[dict[str, Any]]()
+    offset = 0
     for array in attributes.values():
         view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
         accessor = {"bufferView": len(views), "count": len(array)}

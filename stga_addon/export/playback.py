@@ -12,7 +12,8 @@ from ..capture.model import Capture
 from ..errors import StgaError
 
 DEFAULT_FPS = 25.0
-MIN_FPS, MAX_FPS = 0.01, 1000.0
+MIN_FPS = 0.01
+MAX_FPS = 1000.0
 """Frame rates that videos, USD files and the web player (player/data.js) take."""
 MAX_VIEWS = 32
 """Cameras that a page offers."""

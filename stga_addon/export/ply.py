@@ -102,7 +102,8 @@ def read_ply(path: Path) -> Splats:
 
 def splat_columns(splats: Splats) -> np.ndarray:
     """(N, 62) float32 in the order of PROPERTIES."""
-    count, normals = len(splats), np.zeros_like(splats.xyz)
+    count = len(splats)
+    normals = np.zeros_like(splats.xyz)
     rest = np.zeros((count, 3, REST_COEFFICIENTS // 3), np.float32)
     rest[..., : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
     parts = splats.xyz, normals, splats.sh[:, 0], rest.reshape(count, REST_COEFFICIENTS)
@@ -190,7 +191,8 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dt
                     raise ValueError(line)
     except (ValueError, KeyError) as error:
         raise StgaError(f"{path}: PLY header cannot be understood ({error})") from error
-    is_ascii, skipped = order == "=", 0
+    is_ascii = order == "="
+    skipped = 0
     for name, (number, properties) in elements.items():
         if number < 0 or not order or not properties:
             break

@@ -11,7 +11,8 @@ from ..avatar.splats import Splats
 from ..files import replacing
 from ..flame.quaternions import normalized
 
-MAGIC, VERSION = b"NGSP", 3
+MAGIC = b"NGSP"
+VERSION = 3
 """The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
 ANTIALIASED = 1
 MAX_FRACTION_BITS = 16

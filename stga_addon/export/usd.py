@@ -80,7 +80,9 @@ def _write_layer(
     usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
-    types, vt, prim = usd.Sdf.ValueTypeNames, usd.Vt, None
+    types = usd.Sdf.ValueTypeNames
+    vt = usd.Vt
+    prim = None
     for number, world in frames:
         if prim is None:
             prim = _define(usd, stage, world, moving_color)
@@ -107,7 +109,8 @@ def _write_layer(
 def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
     """The prim with what does not change. By names, not by USD's class of it, which older versions
     lack."""
-    types, uniform = usd.Sdf.ValueTypeNames, usd.Sdf.VariabilityUniform
+    types = usd.Sdf.ValueTypeNames
+    uniform = usd.Sdf.VariabilityUniform
     root = stage.DefinePrim("/Avatar", "Xform")
     stage.SetDefaultPrim(root)
     prim = stage.DefinePrim("/Avatar/Splats", PRIM_TYPE)

@@ -7,7 +7,8 @@ import numpy as np
 from .model import FlameModel
 from .quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
 
-POSE_SIZE, TRANSLATION_SIZE = 15, 3
+POSE_SIZE = 15
+TRANSLATION_SIZE = 3
 """At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 SMALL_ANGLE = 1e-4  # Radians, below which a quotient by the squared angle is its limit
@@ -135,7 +136,8 @@ def parameters_gradient(
     outer = (vertex_gradient[:, :, None] * posed.corrected[:, None]).reshape(-1, 9)
     by_world = (model.weights.T @ outer).reshape(-1, 3, 3)
     by_world = by_world - force[:, :, None] * posed.joints[:, None]
-    by_place, by_joint = force.copy(), -np.einsum("jab,ja->jb", posed.world, force)
+    by_place = force.copy()
+    by_joint = -np.einsum("jab,ja->jb", posed.world, force)
     by_local = np.zeros_like(by_world)
     for joint in reversed(range(len(model.parents))):
         parent = int(model.parents[joint])
@@ -143,7 +145,8 @@ def parameters_gradient(
             by_local[joint] = by_world[joint]
             by_joint[joint] += by_place[joint]
             continue
-        turn, bone = posed.world[parent], posed.joints[joint] - posed.joints[parent]
+        turn = posed.world[parent]
+        bone = posed.joints[joint] - posed.joints[parent]
         by_local[joint] = turn.T @ by_world[joint]
         by_world[parent] += by_world[joint] @ posed.local[joint].T + np.outer(by_place[joint], bone)
         by_place[parent] += by_place[joint]
@@ -173,9 +176,11 @@ class _Posed:
 
 
 def _posed(model: FlameModel, shaped: np.ndarray, frame: FlameFrame) -> _Posed:
-    joints, local = joint_positions(model, shaped), axis_angle_matrices(frame.pose)
+    joints = joint_positions(model, shaped)
+    local = axis_angle_matrices(frame.pose)
     corrected = shaped + model.posedirs @ (local[1:] - np.eye(3)).ravel()
-    world, places = local.copy(), joints.copy()
+    world = local.copy()
+    places = joints.copy()
     for joint, parent in enumerate(model.parents.tolist()):
         if parent >= 0:
             world[joint] = world[parent] @ local[joint]

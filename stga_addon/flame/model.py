@@ -15,7 +15,8 @@ Shape = tuple[int | None, ...]  # None: any number of them
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
 POSE_FEATURES = 9 * (len(JOINTS) - 1)
 # FLAME 2020 and 2023: 300 identity then 100 expression components
-FULL_COMPONENTS, FULL_IDENTITY = 400, 300
+FULL_COMPONENTS = 400
+FULL_IDENTITY = 300
 MASK_FILE = "FLAME_masks.pkl"
 MASK_PREFIX = "masks/"  # an npz model may carry its vertex masks itself
 MODEL_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
@@ -171,9 +172,11 @@ def _integers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
 def _masks(path: Path, arrays: Arrays, vertices: int) -> dict[str, np.ndarray]:
     own = {key: value for key, value in arrays.items() if key.startswith(MASK_PREFIX)}
     found = {key.removeprefix(MASK_PREFIX): value for key, value in own.items()}
-    source, beside = path, path.with_name(MASK_FILE)
+    source = path
+    beside = path.with_name(MASK_FILE)
     if not found and beside.is_file():
-        source, found = beside, read_pickled_arrays(beside)
+        source = beside
+        found = read_pickled_arrays(beside)
     masks = {}
     for name, ids in found.items():
         flat = _integers(source, name, ids).astype(np.int64)

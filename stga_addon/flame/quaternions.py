@@ -41,7 +41,8 @@ def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarra
     """(..., 4) on the shortest arc from `first` (share 0) to `second` (share 1), and beyond; share
     (...,). Spherical linear interpolation (Shoemake 1985)."""
     cosine = (first * second).sum(-1, keepdims=True)
-    second, cosine = np.where(cosine < 0, -second, second), np.abs(cosine)
+    second = np.where(cosine < 0, -second, second)
+    cosine = np.abs(cosine)
     angle = np.arctan2(np.linalg.norm(second - cosine * first, axis=-1, keepdims=True), cosine)
     share = np.asarray(share)[..., None]
     # Ratios of sines as sinc, which is finite where the rotations are equal.
@@ -77,7 +78,9 @@ def from_matrices(matrices: np.ndarray) -> np.ndarray:
     outer product 4·qqᵀ from the matrix and takes its best-conditioned row, so rotations by 180°
     (trace −1) lose no precision."""
     m = np.asarray(matrices, np.float64)
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    xx = m[..., 0, 0]
+    yy = m[..., 1, 1]
+    zz = m[..., 2, 2]
     outer = np.empty((*m.shape[:-2], 4, 4))
     for axis, (x, y, z) in enumerate(((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))):
         outer[..., axis, axis] = 1 + x * xx + y * yy + z * zz

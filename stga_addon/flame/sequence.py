@@ -29,14 +29,21 @@ ZERO_POSES = {
 FRAME_FIELDS = ("expr", "rotation", "neck_pose", "jaw_pose", "translation", "eyes_pose")
 # What trackers other than VHAP call the fields.
 FIELD_ALIASES = {
-    "exp": "expr", "expression": "expr", "global_orient": "rotation", "transl": "translation",
-    "jaw": "jaw_pose", "neck": "neck_pose", "eyes": "eyes_pose", "eye_pose": "eyes_pose",
+    "exp": "expr",
+    "expression": "expr",
+    "global_orient": "rotation",
+    "transl": "translation",
+    "jaw": "jaw_pose",
+    "neck": "neck_pose",
+    "eyes": "eyes_pose",
+    "eye_pose": "eyes_pose",
     "betas": "shape",
-}  # fmt: skip
+}
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
-TORSO_SHIFT, SHIFT_SIZE = "torso_shift", 3
+TORSO_SHIFT = "torso_shift"
+SHIFT_SIZE = 3
 MAX_PARAMETER = 1e6  # of coefficients, radians and meters; beyond it, vertices would overflow
 MAX_TIMESTEP = 1 << 20  # Blender's last frame
 
@@ -90,7 +97,8 @@ def below_neck(sequence: FlameSequence, timestep: int, points: np.ndarray) -> np
     """(N,) bool: world points (N, 3) that lie lower than the root joint, at the base of the neck,
     seen by the torso. The joint is that of the model without offsets, which may draw the torso over
     clothes, and the joint with it."""
-    model, frame = sequence.model, sequence.frame(timestep)
+    model = sequence.model
+    frame = sequence.frame(timestep)
     shaped = shaped_vertices(model, sequence.shape, frame.expr)
     root = joint_positions(model, shaped)[JOINTS.index("root")] + frame.translation
     up = axis_angle_matrices(frame.rotation[None])[0][:, 1]
@@ -101,7 +109,8 @@ def with_identity(sequence: FlameSequence) -> FlameSequence:
     """The motion with the identity in the template: a mesh needs a quarter of the blend shapes."""
     model = sequence.model
     shapes = model.shapedirs[:, :, model.n_identity :]
-    none, offset = np.zeros(shapes.shape[2]), sequence.static_offset
+    none = np.zeros(shapes.shape[2])
+    offset = sequence.static_offset
     template = shaped_vertices(model, sequence.shape, none, offset)
     shapes = np.ascontiguousarray(shapes)
     person = replace(model, v_template=template, shapedirs=shapes, n_identity=0)
@@ -166,7 +175,8 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
         if pose.ndim < 2 or not len(pose) or pose[0].size not in POSE_LAYOUTS:
             sizes = " or ".join(f"(timesteps, {size})" for size in POSE_LAYOUTS)
             raise StgaError(f"{path}: pose has shape {pose.shape}, expected {sizes}")
-        fields, columns = POSE_LAYOUTS[pose[0].size], pose.reshape(len(pose), -1)
+        fields = POSE_LAYOUTS[pose[0].size]
+        columns = pose.reshape(len(pose), -1)
         parts = np.split(columns, range(3, 3 * len(fields), 3), axis=1)
         arrays = dict(zip(fields, parts, strict=True)) | arrays
     moving = {name: arrays[name] for name in (*FRAME_FIELDS, "dynamic_offset") if name in arrays}
@@ -189,7 +199,8 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
         raise StgaError(f"{path}: timesteps: expected {count} whole numbers {limits}")
     timesteps = tuple(found.tolist())
     row = {timestep: number for number, timestep in enumerate(timesteps)}
-    shift, torso = arrays.get(TORSO_SHIFT, np.zeros((count, SHIFT_SIZE))), torso_shapes(model)
+    shift = arrays.get(TORSO_SHIFT, np.zeros((count, SHIFT_SIZE)))
+    torso = torso_shapes(model)
     if shift.shape != (count, SHIFT_SIZE) or not (np.abs(shift) < MAX_PARAMETER).all():
         raise StgaError(f"{path}: {TORSO_SHIFT}: expected finite numbers ({count}, {SHIFT_SIZE})")
 
@@ -210,7 +221,8 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
     (T, 3), eyes_pose (T, 6), static_offset (V, 3), dynamic_offset (T, V, 3), zero where the
     sequence has none; 300 and 100 for I and E with a published FLAME."""
     frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    none, static = np.zeros_like(sequence.model.v_template), sequence.static_offset
+    none = np.zeros_like(sequence.model.v_template)
+    static = sequence.static_offset
     offsets = [none if frame.dynamic_offset is None else frame.dynamic_offset for frame in frames]
     moving = {name: [getattr(frame, name) for frame in frames] for name in FRAME_FIELDS}
     return {
@@ -278,9 +290,12 @@ def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray 
 
 # Part of a motion that can be transferred -> fields of a frame.
 PARTS = {
-    "expression": ("expr",), "jaw": ("jaw_pose",), "eyes": ("eyes_pose",), "neck": ("neck_pose",),
+    "expression": ("expr",),
+    "jaw": ("jaw_pose",),
+    "eyes": ("eyes_pose",),
+    "neck": ("neck_pose",),
     "head": ("rotation", "translation"),
-}  # fmt: skip
+}
 ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 
@@ -299,7 +314,8 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     values = {}
     for name in FRAME_FIELDS:
         tracked = np.stack([getattr(frame, name) for frame in frames])
-        start, end = tracked[row], tracked[after]
+        start = tracked[row]
+        end = tracked[after]
         if name in ROTATIONS:
             values[name] = _turned(start, end, share)
         else:
@@ -311,7 +327,9 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
     """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the
     neutral face. Rotation and translation of the head are scaled about the first frame's."""
-    first, here, changed = frames[0], np.array([strength]), []
+    first = frames[0]
+    here = np.array([strength])
+    changed = []
     for frame in frames:
         turns = {}
         for name in ROTATIONS:

@@ -17,7 +17,8 @@ from ..errors import StgaError
 from .model import BUNDLED_HEAD, JOINTS, FlameModel, read_flame
 
 TEMPLATE_VERTICES = 5023
-TEETH_VERTICES, TEETH_FACES = 120, 168
+TEETH_VERTICES = 120
+TEETH_FACES = 168
 TEETH_PER_ROW = 15
 # Index layout. Order of the eight rows among the added vertices: upper, lower; root, edge; B for
 # back. Each row runs from the person's left to the right.
@@ -36,9 +37,11 @@ TEETH_STRIPS = {
 # Sizes as shares of the width between the corners of the mouth, about 50 mm.
 ARCH_WIDTH = 0.85
 CLEARANCE = 0.03  # Between the lips' inner surface and the teeth
-OVERBITE, OVERJET = 0.06, 0.02
+OVERBITE = 0.06
+OVERJET = 0.02
 """How far the upper edge reaches below the lower one, and stands in front of it."""
-EDGE_THICKNESS, ROOT_THICKNESS = 0.05, 0.1
+EDGE_THICKNESS = 0.05
+ROOT_THICKNESS = 0.1
 MAX_MOUTH_RINGS = 12
 MAX_LIP_DISTANCE_M = 0.002  # Between opposite vertices of closed lips
 
@@ -48,7 +51,9 @@ def flame_model(path: Path | None) -> FlameModel:
     Raises StgaError."""
     path = path or BUNDLED_HEAD
     try:
-        state, masks = path.stat(), path.parent.stat()  # its masks may lie beside it
+        # its masks may lie beside it
+        state = path.stat()
+        masks = path.parent.stat()
     except OSError:  # which reading it names
         return read_flame(path)
     return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
@@ -96,9 +101,11 @@ def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:
     ARKit's names. Raises StgaError for another mesh without an open mouth."""
     if "jawOpen" in model.expression_names:  # which moves one lip and leaves the other
         column = model.n_identity + model.expression_names.index("jawOpen")
-        lips, at = model.masks["lips"], model.v_template
+        lips = model.masks["lips"]
+        at = model.v_template
         opened = np.linalg.norm(model.shapedirs[lips, :, column], axis=1)
-        upper, lower = lips[opened < opened.max() / 4], lips[opened > opened.max() / 2]
+        upper = lips[opened < opened.max() / 4]
+        lower = lips[opened > opened.max() / 2]
         distances = np.linalg.norm(at[upper, None] - at[lower], axis=2)
         near = np.flatnonzero(distances.min(axis=1) < MAX_LIP_DISTANCE_M)
         return upper[near], lower[distances[near].argmin(axis=1)]
@@ -149,7 +156,8 @@ def _mouth(model: FlameModel) -> tuple[list[np.ndarray], np.ndarray]:
 def _holes(edges: np.ndarray) -> list[np.ndarray]:
     """Vertex ids of each hole of the mesh, from its directed edges (E, 2)."""
     key = edges.max() + 1
-    forth, back = edges @ (key, 1), edges @ (1, key)
+    forth = edges @ (key, 1)
+    back = edges @ (1, key)
     following = dict(edges[~np.isin(forth, back)].tolist())
     holes = []
     while following:
@@ -183,9 +191,12 @@ def _ring_order(edges: np.ndarray, ring: np.ndarray) -> np.ndarray:
 def _positions(vertices: np.ndarray, rings: list[np.ndarray], lip_ids: np.ndarray) -> np.ndarray:
     """(120, 3) teeth: an upper arch curved like the lips, as far forward as their inner surface
     allows, and a lower one behind it."""
-    lips, inside = vertices[lip_ids], vertices[np.concatenate(rings)]
-    left, right = lips[0], lips[len(lips) // 2]
-    width, middle = left[0] - right[0], (left[0] + right[0]) / 2
+    lips = vertices[lip_ids]
+    inside = vertices[np.concatenate(rings)]
+    left = lips[0]
+    right = lips[len(lips) // 2]
+    width = left[0] - right[0]
+    middle = (left[0] + right[0]) / 2
     curvature = max(0.0, -float(np.polyfit((lips[:, 0] - middle) ** 2, lips[:, 2], 1)[0]))
     arch, outward = _arch(ARCH_WIDTH * width / 2, curvature)
     bite = (lips[:, 1].max() + lips[:, 1].min()) / 2
@@ -193,7 +204,8 @@ def _positions(vertices: np.ndarray, rings: list[np.ndarray], lip_ids: np.ndarra
     edge = bite - OVERBITE * width
     # on the axis
     reach = inside[:, 2] + curvature * (inside[:, 0] - middle) ** 2 - CLEARANCE * width
-    upper, lower = reach[inside[:, 1] > edge].min(), reach[inside[:, 1] < bite].min()
+    upper = reach[inside[:, 1] > edge].min()
+    lower = reach[inside[:, 1] < bite].min()
     rows = {"UE": arch + np.array([middle, edge, upper])}
     rows["UR"] = rows["UE"] + [0, bite + height - edge, 0]
     rows["LE"] = rows["UE"] - (EDGE_THICKNESS + OVERJET) * width * outward + [0, bite - edge, 0]
@@ -222,12 +234,14 @@ def _followed(points: np.ndarray, displacements: np.ndarray, teeth: np.ndarray) 
     """Displacements (T, 3, K) of the teeth (T, 3): those (M, 3, K) of the mouth's points (M, 3)
     fitted linearly in width and height and quadratically in width, so that the arch grows and bends
     as a whole."""
-    center, size = points.mean(0), np.ptp(points[:, 0]) / 2
+    center = points.mean(0)
+    size = np.ptp(points[:, 0]) / 2
 
     def terms(at: np.ndarray) -> np.ndarray:
         x, y = ((at - center) / size)[:, :2].T
         return np.stack([np.ones_like(x), x, y, x**2], axis=1)
 
-    known, wanted = terms(points), terms(teeth)
+    known = terms(points)
+    wanted = terms(teeth)
     weights = wanted @ np.linalg.pinv(known)
     return np.asarray(np.einsum("tm,mck->tck", weights, displacements))

@@ -58,9 +58,12 @@ def _inert(source: str) -> type[_Inert]:
     return type("_Inert", (_Inert,), {"source": source})
 
 
-ARRAY, DTYPE, SCALAR = "numpy.ndarray", "numpy.dtype", "numpy.scalar"
+ARRAY = "numpy.ndarray"
+DTYPE = "numpy.dtype"
+SCALAR = "numpy.scalar"
 BUFFER = "numpy.frombuffer"  # an array of pickle protocol 5: buffer, dtype, shape, order
-CORES, BUILTINS = ("numpy.core", "numpy._core"), ("__builtin__", "builtins")
+CORES = ("numpy.core", "numpy._core")
+BUILTINS = ("__builtin__", "builtins")
 CLASSES = {
     ARRAY: ARRAY,
     DTYPE: DTYPE,
@@ -232,7 +235,8 @@ def _sparse(value: _Inert, form: str) -> np.ndarray:
         pair = coords if len(coords) == 2 else (state.get("row"), state.get("col"))
         rows, columns = map(_integers, pair)
     else:
-        inner, starts = _integers(state.get("indices")), _integers(state.get("indptr"))
+        inner = _integers(state.get("indices"))
+        starts = _integers(state.get("indptr"))
         counts = np.diff(starts)
         if len(starts) == 0 or (counts < 0).any() or counts.sum() != len(inner):
             raise _NotAnArray("a sparse matrix whose index pointers do not match its indices")
@@ -261,7 +265,8 @@ def _chumpy(value: _Inert) -> np.ndarray:
     if "x" in state:
         return _dense(state["x"])
     if "a" in state and "idxs" in state:
-        source, chosen = _dense(state["a"]).ravel(), _dense(state["idxs"])
+        source = _dense(state["a"]).ravel()
+        chosen = _dense(state["idxs"])
         inside = not chosen.size or 0 <= chosen.min() <= chosen.max() < source.size
         if chosen.dtype.kind not in "iu" or not inside:
             raise _NotAnArray(f"a {value.source} with indices outside its array")

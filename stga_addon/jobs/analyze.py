@@ -48,9 +48,11 @@ class Select(_OfCapture):
 
     threshold: float = like(SelectionOptions, "threshold")
     zero_pose: str | None = like(
-        SelectionOptions, "zero_pose", default=None,
+        SelectionOptions,
+        "zero_pose",
+        default=None,
         help="motion that does not count as expression (default head)",
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

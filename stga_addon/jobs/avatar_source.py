@@ -58,8 +58,10 @@ def motion_field() -> Any:
     return option(
         "another person's motion at every timestep of it: FLAME parameters (.npz, or a capture), "
         "or a performance in ARKit's shapes (CSV of Live Link Face or Audio2Face, its take folder, "
-        "JSON, iFacialMocap's text)", None, metavar="FILE",
-    )  # fmt: skip
+        "JSON, iFacialMocap's text)",
+        None,
+        metavar="FILE",
+    )
 
 
 def motion_options_field(*needs: str) -> Any:
@@ -69,7 +71,9 @@ def motion_options_field(*needs: str) -> Any:
 def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
     """The avatar of a run folder or file, and the capture given or trained on, or what an open head
     plays. Raises StgaError for a capture that has changed, or of other triangles."""
-    source, given, capture = request.source, request.capture, None
+    source = request.source
+    given = request.capture
+    capture = None
     if source.is_dir() and given is None:
         capture = open_refined(source, flame=request.flame)
     elif source.is_dir():  # another capture's meshes
@@ -106,7 +110,8 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
     timesteps = tuple(timestep for timestep in capture.timesteps if first <= timestep <= last)
     if not timesteps:
         raise StgaError(f"{capture.root}: has no timestep from {first} to {last}")
-    begin, end = min(capture.timesteps), max(capture.timesteps)
+    begin = min(capture.timesteps)
+    end = max(capture.timesteps)
     if first < begin or last > end:
         say(f"--frames {first}:{last}: the capture has timesteps {begin} to {end}")
     return timesteps
@@ -127,7 +132,8 @@ def _as_played(capture: Capture, played: Played) -> Capture:
             if array.dtype.kind != kind or array.shape != shape or not np.isfinite(array).all():
                 found = f"expected {expected} {shape}, got {array.dtype} {array.shape}"
                 raise StgaError(f"played: {name} {frame}: {found}")
-    flame, count = None, len(played.meshes)
+    flame = None
+    count = len(played.meshes)
     if capture.flame is not None and played.motion is not None:
         flame = motion_of(Path("played"), played.motion, capture.flame.model)
         if len(flame.timesteps) != count:
@@ -144,7 +150,9 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     """The request's motion on its avatar; says how far it is outside the trained range, where that
     is asked for. Raises StgaError."""
     assert request.motion is not None
-    source, options, trained = request.source, request.motion_options, None
+    source = request.source
+    options = request.motion_options
+    trained = None
     run = read_run(source) if source.is_dir() else None
     flame = request.flame or (run.flame if run is not None else None)
     if run is not None and (options.neutral != "none" or options.stay_trained is not None):
@@ -169,7 +177,8 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
 
 def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, say: Say) -> Capture:
     """The motion as a capture, seen by the cameras of the run's own one."""
-    motion, views = open_avatar_motion(request, avatar, say), {} if own is None else own.views
+    motion = open_avatar_motion(request, avatar, say)
+    views = {} if own is None else own.views
     capture = sequence_capture(request.motion, motion.sequence, request.flame, views)
     return replace(capture, fps=motion.fps)
 
@@ -179,7 +188,8 @@ def findings(motion: Motion) -> list[str]:
     lines = [f"{motion.lost} rows are missing and were interpolated"] if motion.lost else []
     for part, beyond in motion.outside.items():
         if beyond.any():
-            share, frame = float(np.mean(beyond > 0)), int(beyond.argmax())
+            share = float(np.mean(beyond > 0))
+            frame = int(beyond.argmax())
             lines.append(
                 f"{part}: {100 * share:.0f} % of the frames are outside the trained range, "
                 f"by up to {beyond.max():.1f} of its half width (frame {frame})"
@@ -191,7 +201,8 @@ def findings(motion: Motion) -> list[str]:
 
 
 FOLDER = "STGA_HEAD"  # The environment variable that names the folder
-HEAD, ARRAYS = "head.json", "head.npz"
+HEAD = "head.json"
+ARRAYS = "head.npz"
 
 
 @dataclass(frozen=True)
@@ -231,9 +242,14 @@ def write_head(folder: Path, head: OpenHead, played: bool) -> None:
     StgaError."""
     arrays: Arrays = {}
     stored = _Stored(
-        head.capture, head.flame, head.avatar, head.selection(), head.played() if played else None,
-        head.principal_point, head.fps,
-    )  # fmt: skip
+        head.capture,
+        head.flame,
+        head.avatar,
+        head.selection(),
+        head.played() if played else None,
+        head.principal_point,
+        head.fps,
+    )
     write_json(folder / HEAD, to_json(stored, arrays))
     write_npz(folder / ARRAYS, arrays)
 

@@ -54,7 +54,9 @@ class RenderRecording:
 def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
     """Render the recorded images and remove the recording; cancelled, no video is written, finished
     PNGs stay."""
-    output, count, to_video = request.output, request.images, is_video(request.output)
+    output = request.output
+    count = request.images
+    to_video = is_video(request.output)
     try:
         images = recorded_images(request.recording, count, Composer(request.device))
         writer = video_writer(output, request.fps) if to_video else sequence_writer(output)
@@ -127,20 +129,38 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
         shutil.rmtree(left, ignore_errors=True)
     with TemporaryDirectory(prefix=PARTIAL, dir=request.output) as partial:
         names = str(Path(partial).absolute() / ("#" * FRAME_DIGITS))
-        process = _start([
-            *blender_command(), "--background", str(request.blend.absolute()),
-            "--engine", request.engine, "--render-output", names, "--render-format", "PNG",
-            "--use-extension", "1", "--frame-start", str(first), "--frame-end", str(last),
-            "--frame-jump", "1", "--render-anim",
-        ])  # fmt: skip
+        process = _start(
+            [
+                *blender_command(),
+                "--background",
+                str(request.blend.absolute()),
+                "--engine",
+                request.engine,
+                "--render-output",
+                names,
+                "--render-format",
+                "PNG",
+                "--use-extension",
+                "1",
+                "--frame-start",
+                str(first),
+                "--frame-end",
+                str(last),
+                "--frame-jump",
+                "1",
+                "--render-anim",
+            ]
+        )
         printed: deque[str] = deque(maxlen=LAST_LINES)
-        pictures, expected = request.pictures, first
+        pictures = request.pictures
+        expected = first
         assert process.stdout is not None
         try:
             for line in process.stdout:
                 printed.append(line.strip())
                 say(line.rstrip())
-                picture, found = pictures[min(expected, last)], SAVED.search(line)
+                picture = pictures[min(expected, last)]
+                found = SAVED.search(line)
                 if found is not None and Path(found["path"]).name == picture.name:
                     os.replace(Path(partial, picture.name), picture)
                     expected += 1
@@ -175,10 +195,16 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     try:
         return subprocess.Popen(
-            command, env={PYTHON_VARIABLE: sys.executable, **kept}, stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8",
-            errors="replace", preexec_fn=end_with_this_process(),
-        )  # fmt: skip
+            command,
+            env={PYTHON_VARIABLE: sys.executable, **kept},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            preexec_fn=end_with_this_process(),
+        )
     except OSError as error:
         expected = f"expected it on PATH, or the command that starts it in {BLENDER_VARIABLE}"
         message = f"Blender cannot be started ({error.strerror or error}); {expected}"

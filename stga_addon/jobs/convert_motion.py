@@ -30,7 +30,8 @@ from .track import MAX_MISFIT, Track, track
 from .train import Train
 
 SHAPES_SUFFIX = ".csv"
-TRACKING_SUFFIX, CHECK_SUFFIX = ".tracking", ".check"
+TRACKING_SUFFIX = ".tracking"
+CHECK_SUFFIX = ".check"
 """Of the folders beside the result, in which an avatar tracks, and in which it does a few
 timesteps first."""
 CHECKED_TIMESTEPS = 8
@@ -43,8 +44,9 @@ class ConvertMotion:
 
     source: Path = option(
         "a performance (CSV, JSON, text, take folder), a video of a face (with --avatar: footage), "
-        "FLAME parameters (.npz), or a capture tracked with FLAME", flag="MOTION",
-    )  # fmt: skip
+        "FLAME parameters (.npz), or a capture tracked with FLAME",
+        flag="MOTION",
+    )
     output: Path = option(
         "ARKit's shapes (.csv) or FLAME parameters (.npz)", flag="--out", metavar="FILE"
     )
@@ -54,8 +56,10 @@ class ConvertMotion:
     )
     avatar: Path | None = option(
         "run of the performer's avatar, which tracks the footage; where that shows somebody else, "
-        "the face networks do", None, metavar="RUN",
-    )  # fmt: skip
+        "the face networks do",
+        None,
+        metavar="RUN",
+    )
     fps: float | None = option("of the result (default: as recorded)", None, above=0)
     options: MotionOptions = motion_options_field()
 
@@ -74,7 +78,8 @@ class ConvertMotion:
 def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     """Write the motion or the performance. Raises StgaError."""
     report(Progress(stage="Converting"))
-    options, tracked = request.options, None
+    options = request.options
+    tracked = None
     if request.avatar is not None:
         tracked = _tracked_by_avatar(request, request.avatar, report, say)
     if tracked is not None:
@@ -122,7 +127,8 @@ def _tracked_by_avatar(
     request goes on; None where some of its timesteps look like somebody else."""
     from ..tracking.footage.open import open_footage
 
-    count, flame = len(open_footage(request.source).timesteps), read_run(avatar).flame
+    count = len(open_footage(request.source).timesteps)
+    flame = read_run(avatar).flame
     for suffix, step in ((CHECK_SUFFIX, max(1, count // CHECKED_TIMESTEPS)), (TRACKING_SUFFIX, 1)):
         out = Path(f"{request.output}{suffix}")
         if is_written(out) and read_json(out / REPORT_FILE)["avatar"] != avatar_version(avatar):
@@ -132,8 +138,10 @@ def _tracked_by_avatar(
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]
         share = float(np.median(list(misfit.values())))
         if share > MAX_MISFIT:
-            say(f"warning: the avatar does not explain {share:.0%} of the head's pixels: is it of "
-                "another person? The face networks detect the motion")  # fmt: skip
+            say(
+                f"warning: the avatar does not explain {share:.0%} of the head's pixels: is it of "
+                "another person? The face networks detect the motion"
+            )
             return None
     say(f"avatar: does not explain {share:.0%} of the head's pixels (median)")
     return open_capture(out, flame)
@@ -163,7 +171,8 @@ def _resampled(tracked: Capture, request: ConvertMotion) -> Motion:
 
 def _shapes_of_motion(request: ConvertMotion) -> Performance:
     """ARKit's shapes of a FLAME motion or capture."""
-    source, neutral = request.source, request.options.neutral
+    source = request.source
+    neutral = request.options.neutral
     if not request.writes_shapes:
         instead = f"--out takes a {SHAPES_SUFFIX} of ARKit's shapes"
         raise StgaError(f"{source}: holds FLAME parameters already; {instead}")

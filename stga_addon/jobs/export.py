@@ -33,9 +33,10 @@ class Export:
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")
     file_format: str = option(
-        "file format", flag="--format",
+        "file format",
+        flag="--format",
         choices={name: format.description for name, format in FORMATS.items()},
-    )  # fmt: skip
+    )
     capture: Path | None = option("whose frames to bake (default: the run's)", None)
     flame: Path | None = like(
         Train, "flame", help="FLAME model file of that capture, or of the motion"
@@ -49,12 +50,15 @@ class Export:
     )
     fps: float | None = option(
         "frames per second of usd and web (default: the scene's or the capture's, else "
-        f"{DEFAULT_FPS:g})", None, above=0,
-    )  # fmt: skip
+        f"{DEFAULT_FPS:g})",
+        None,
+        above=0,
+    )
     motion_only: bool = option(
         "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
-        "stay in the page, and FLAME's licence decides who may receive it either way", False,
-    )  # fmt: skip
+        "stay in the page, and FLAME's licence decides who may receive it either way",
+        False,
+    )
     motion: Path | None = avatar_source.motion_field()
     motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     albedo: bool = option(
@@ -88,7 +92,8 @@ def export(request: Export, report: Report, say: Say) -> Written:
     if request.motion is not None:
         capture = avatar_source.motion_capture(request, avatar, capture, say)
     fps = playback_fps(capture, request.fps, numbered=request.file_format == "usd")
-    format, timestep = FORMATS[request.file_format], request.timestep
+    format = FORMATS[request.file_format]
+    timestep = request.timestep
     playback = Playback(fps=fps)
     flame = None if capture is None else capture.flame
     meshes: Meshes = [(0, avatar.neutral)]
@@ -127,9 +132,13 @@ SPLITS = ("val", "train", "test")
 
 
 def capture_playback(
-    request: Export, avatar: Avatar, capture: Capture, timesteps: tuple[int, ...], fps: float,
+    request: Export,
+    avatar: Avatar,
+    capture: Capture,
+    timesteps: tuple[int, ...],
+    fps: float,
     say: Say,
-) -> tuple[Playback, FlameSequence | None]:  # fmt: skip
+) -> tuple[Playback, FlameSequence | None]:
     """What a page shows of timesteps, and its FLAME motion. Says what of FLAME it holds."""
     # what each timestep trains: the open file's or the run's selection, else by the rule
     chosen: Mapping[int, np.ndarray] | None = None
@@ -142,13 +151,18 @@ def capture_playback(
         chosen = read_selection(request.source, len(capture.faces))
     if not chosen and request.played is None:
         chosen = select_capture(capture, SelectionOptions())
-    everything, motion_only = np.ones(len(capture.faces), bool), request.motion_only
+    everything = np.ones(len(capture.faces), bool)
+    motion_only = request.motion_only
     sequence = capture.flame
     playback = Playback(
-        title=_title(request), fps=fps, views=capture_views(capture), up=_up(capture),
+        title=_title(request),
+        fps=fps,
+        views=capture_views(capture),
+        up=_up(capture),
         selection=[chosen.get(t, everything) for t in timesteps] if chosen else None,
-        motion_only=motion_only, controls=None if motion_only else page_controls(sequence),
-    )  # fmt: skip
+        motion_only=motion_only,
+        controls=None if motion_only else page_controls(sequence),
+    )
     if sequence is not None:  # an open head numbers the capture's timesteps by the scene's frames
         numbered = dict(zip(capture.timesteps, sequence.timesteps, strict=True))
         sequence = replace(sequence, timesteps=tuple(numbered[t] for t in timesteps))

@@ -34,8 +34,13 @@ class Relight:
     )
     card: tuple[float, float, float] | None = option(
         "sRGB in 0…1 of an 18 % gray card at the face that faces the central camera: level and "
-        "white balance", None, 0, 1, flag="--gray-card", metavar="R,G,B",
-    )  # fmt: skip
+        "white balance",
+        None,
+        0,
+        1,
+        flag="--gray-card",
+        metavar="R,G,B",
+    )
     flame: Path | None = option("FLAME model file, if it has moved", None, metavar="FILE")
     capture: Path | None = option("the run's capture, if it has moved", None)
 
@@ -109,7 +114,8 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     did. Raises StgaError."""
     from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
 
-    folder, split = request.run, request.split
+    folder = request.run
+    split = request.split
     report(Progress(stage="Evaluating"))
     tracked = run_folder.open_run(folder, request.capture, request.flame).capture
     capture = run_folder.with_refined_tracking(tracked, folder)
@@ -126,7 +132,8 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     lines = [f"{split}: {len(views)} views, {_describe(quality)}"]
     trained = {view.timestep for view in capture.views.get("train", ())}
     if tracked.flame is not None and capture.flame is not None:
-        before, after = tracked.flame.frame, capture.flame.frame
+        before = tracked.flame.frame
+        after = capture.flame.frame
         unseen = {view.timestep for view in views} - trained
         if any(not np.array_equal(after(t).parameters, before(t).parameters) for t in unseen):
             how = "with heads tracked by the avatar, its splats fixed; as tracked before"

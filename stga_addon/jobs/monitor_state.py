@@ -164,9 +164,16 @@ class Failed:
 
 
 Event = (
-    Started | CancelAsked | Dismissed | SceneRead | StatusRead | SceneFree | SliceBuilt | Shown
+    Started
+    | CancelAsked
+    | Dismissed
+    | SceneRead
+    | StatusRead
+    | SceneFree
+    | SliceBuilt
+    | Shown
     | Failed
-)  # fmt: skip
+)
 
 
 # Effects
@@ -226,9 +233,17 @@ class Redraw:
 
 
 Effect = (
-    Store | StoreAvatar | LoadAvatar | Show | ReadCurve | StopWorker | KillWorker | RemoveFiles
-    | PushUndo | Redraw
-)  # fmt: skip
+    Store
+    | StoreAvatar
+    | LoadAvatar
+    | Show
+    | ReadCurve
+    | StopWorker
+    | KillWorker
+    | RemoveFiles
+    | PushUndo
+    | Redraw
+)
 Outcome = tuple[RequestState, tuple[Effect, ...]]
 
 
@@ -282,18 +297,24 @@ def _forgotten(state: RequestState, first: Effect | None = None, error: str = ""
 
 def _status_read(state: RequestState, event: StatusRead) -> Outcome:
     effects: list[Effect] = []
-    before, error = state, "" if state.stopped else state.error
+    before = state
+    error = "" if state.stopped else state.error
     state = replace(
-        state, folder=event.folder, files=event.files, snapshot=event.snapshot, error=error,
+        state,
+        folder=event.folder,
+        files=event.files,
+        snapshot=event.snapshot,
+        error=error,
         stopped=False,
-    )  # fmt: skip
+    )
     drawn = [(each.folder, each.files.metrics, each.files.picture) for each in (before, state)]
     if drawn[0] != drawn[1] and state.kind in (*TRAINS, Kind.TRACKING):
         effects.append(ReadCurve(state.run))
     seen = [(each.folder, each.files, each.snapshot) for each in (before, state)]
     if seen[0] != seen[1]:
         effects.append(Redraw())
-    is_alive, files = state.snapshot.state.is_alive, state.files
+    is_alive = state.snapshot.state.is_alive
+    files = state.files
     if state.loading is not None:
         return state, tuple(effects)
     if state.kind not in TRAINS:
@@ -331,7 +352,10 @@ def _loading_ended(state: RequestState, undoable: bool = False, error: str = "")
         forgotten, removed = _forgotten(state, error=error)
         return forgotten, (*undo, *removed)
     state = replace(
-        state, loading=None, building=False, error=error,
+        state,
+        loading=None,
+        building=False,
+        error=error,
         result_shown=state.result_shown or was_result,
-    )  # fmt: skip
+    )
     return state, (*(_stored(state) if was_result else ()), *undo, Redraw())

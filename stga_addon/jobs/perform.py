@@ -31,8 +31,10 @@ from .table import JOBS, Request, Result, request_hint
 from .track import MakeAvatar, SolveAgain, Track, check_inputs
 from .train import Extend, Refine, Resume, Train, refuse_run, resumed
 
-FORMAT, VERSION = "stga-request", 1
-REQUEST, RESULT = "request.json", "result.json"
+FORMAT = "stga-request"
+VERSION = 1
+REQUEST = "request.json"
+RESULT = "result.json"
 FILES = (REQUEST, "request.npz", RESULT, "result.npz", PREVIEW, PICTURE)
 LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
 """Rooms that a worker which trains loads before it begins."""

@@ -32,9 +32,14 @@ def start_check(python: str) -> "subprocess.Popen[str]":
     from ..worker.launch import start_python  # needs a package that this Python may lack
 
     return start_python(
-        python, ["stga_addon.jobs.python_check"], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, text=True, errors="replace",
-    )  # fmt: skip
+        python,
+        ["stga_addon.jobs.python_check"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+    )
 
 
 def finish_check(
@@ -59,7 +64,9 @@ def finish_check(
 
 def describe_check(python: str, report: dict[str, Any]) -> str:
     """The line of a check by the JSON of `main`. Raises StgaError for what is missing."""
-    version, versions, failures = report["python"], report["versions"], report["failures"]
+    version = report["python"]
+    versions = report["versions"]
+    failures = report["failures"]
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_PYTHON:
         raise StgaError(f"{python}: is Python {version}, training needs 3.11 or newer")
     missing = [package_name(text) for module, text in REQUIREMENTS.items() if module in failures]
@@ -73,14 +80,16 @@ def describe_check(python: str, report: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    versions, failures = {}, {}
+    versions = {}
+    failures = {}
     for name in REQUIREMENTS:
         try:
             versions[name] = str(getattr(importlib.import_module(name), "__version__", "?"))
         except Exception as error:  # a library that fails to load raises what it likes
             failures[name] = f"{type(error).__name__}: {error}".splitlines()[0]
     # the device to report, which `choose_device` tries later, and GPUs for `--device gpu:NAME`
-    device, names = f"CPU with {os.cpu_count()} threads", list[str]()
+    device = f"CPU with {os.cpu_count()} threads"
+    names = list[str]()
     with suppress(Exception):  # a package is missing, or a driver fails: the CPU trains
         from ..raster.gpu.adapters import adapters, is_software
 
@@ -88,9 +97,12 @@ def main() -> None:
         names = list(found)
         device = next((name for name in names if not is_software(found[name])), device)
     report = {
-        "python": platform.python_version(), "versions": versions, "failures": failures,
-        "device": device, "adapters": names,
-    }  # fmt: skip
+        "python": platform.python_version(),
+        "versions": versions,
+        "failures": failures,
+        "device": device,
+        "adapters": names,
+    }
     print(json.dumps(report))
 
 

@@ -44,23 +44,35 @@ class Render:
     video: bool = False
     cameras: Path | None = option(
         "one PNG per entry; for a video, where its camera is from (default: the capture)",
-        None, metavar="TRANSFORMS.json",
-    )  # fmt: skip
+        None,
+        metavar="TRANSFORMS.json",
+    )
     turntable: float | None = option(
         "move one camera around the head: 360 for a full turn, less to both sides (default: what "
-        "cameras saw)", None, 0, 360, metavar="DEGREES", bare=0.0,
-    )  # fmt: skip
+        "cameras saw)",
+        None,
+        0,
+        360,
+        metavar="DEGREES",
+        bare=0.0,
+    )
     camera: int | None = option(
-        "camera of the video (default: the central one)", None, 0, metavar="INDEX",
+        "camera of the video (default: the central one)",
+        None,
+        0,
+        metavar="INDEX",
         needs=(("video", "turntable"),),
-    )  # fmt: skip
+    )
     fps: float | None = option(
         f"frames per second of the video (default: the capture's, else {DEFAULT_FPS:g})", None, 0
     )
     seconds: float = option(
         f"least duration of a turntable (default {TURNTABLE_S:g}); shorter motion is repeated to "
-        "and fro", TURNTABLE_S, 0, metavar="S",
-    )  # fmt: skip
+        "and fro",
+        TURNTABLE_S,
+        0,
+        metavar="S",
+    )
     frames: tuple[int, int] | None = option(
         "timesteps to render (default: all), not of a turntable", None, 0, metavar="FIRST:LAST"
     )
@@ -74,18 +86,25 @@ class Render:
         "white (default), black or R,G,B in 0…1", (1.0, 1.0, 1.0), 0, 1
     )
     principal_point: str | None = like(
-        Train, "principal_point", default=None, needs=("cameras",),
+        Train,
+        "principal_point",
+        default=None,
+        needs=("cameras",),
         help="what cy means in the file of --cameras (default: as in training; of a PLY vhap)",
-    )  # fmt: skip
+    )
     device: str = like(Train, "device")
     motion_options: MotionOptions = avatar_source.motion_options_field("motion")
     light: Path | None = option(
         "environment (.hdr) or lights (.toml) that light the avatar", None, metavar="FILE"
     )
     light_turn: float = option(
-        "turn that light around the head during the video", 0.0, -36000, 36000,
-        metavar="DEGREES", needs=("light", ("video", "turntable")),
-    )  # fmt: skip
+        "turn that light around the head during the video",
+        0.0,
+        -36000,
+        36000,
+        metavar="DEGREES",
+        needs=("light", ("video", "turntable")),
+    )
     world: bool = option(
         "put the run's world behind the avatar (train with --effect world=on)", False
     )
@@ -159,8 +178,10 @@ def _pictures(request: Render, subject: _Subject, views: Sequence[View], report:
 
     from ..render.render import to_uint8
 
-    folder, names = request.output, unique_names([view.name for view in views])
-    captured, target = {view.image for view in views}, folder.resolve()
+    folder = request.output
+    names = unique_names([view.name for view in views])
+    captured = {view.image for view in views}
+    target = folder.resolve()
     overwritten = next((name for name in names if target / name in captured), None)
     if overwritten is not None:
         raise StgaError(f"{folder / overwritten}: is an image of the capture; choose another --out")
@@ -176,7 +197,8 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     from ..render.render import to_uint8
 
     first = {view.camera_index: view for view in reversed(views)}
-    indices, index = sorted(first), request.camera
+    indices = sorted(first)
+    index = request.camera
     if not first:
         raise StgaError(f"{request.source}: there is no camera to render from; give --cameras")
     if index is None:
@@ -189,7 +211,8 @@ def _film(request: Render, subject: _Subject, views: Sequence[View], report: Rep
     if request.turntable is not None:
         count = max(len(timesteps), _turntable_images(request, subject.fps), 1)
         timesteps = to_and_fro(timesteps, count)
-        center, half = subject.center(), np.radians(request.turntable) / 2
+        center = subject.center()
+        half = np.radians(request.turntable) / 2
         angles = (-half, half)
         if not half:
             angles = covered_angles([view.camera for view in views], start.camera, center)
@@ -238,18 +261,22 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
 
         splats = read_ply(source)
         return _Subject(
-            lambda view, _: render(splats, view.camera, request.background, composer=composer), (),
-            lambda: np.median(splats.xyz, axis=0), playback_fps(None, request.fps),
-        )  # fmt: skip
+            lambda view, _: render(splats, view.camera, request.background, composer=composer),
+            (),
+            lambda: np.median(splats.xyz, axis=0),
+            playback_fps(None, request.fps),
+        )
     if request.motion is not None:
         avatar = read_avatar(avatar_source.avatar_path(source))
         motion = avatar_source.open_avatar_motion(request, avatar, say)
-        sequence, fps = motion.sequence, request.fps or motion.fps or DEFAULT_FPS
+        sequence = motion.sequence
+        fps = request.fps or motion.fps or DEFAULT_FPS
         return _Subject(
             _pictured(request, avatar, lambda v: sequence_mesh(sequence, v.timestep), composer),
             tuple(sequence.timesteps),
-            lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])), fps,
-        )  # fmt: skip
+            lambda: _middle(sequence_mesh(sequence, sequence.timesteps[0])),
+            fps,
+        )
     avatar, capture = avatar_source.open_avatar(request)
     if capture is None:
         problem = "an avatar needs the meshes of a capture to follow; give --capture"
@@ -262,10 +289,12 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         return np.asarray(capture.mesh(view.timestep))
 
     return _Subject(
-        _pictured(request, avatar, mesh, composer), capture.timesteps,
-        lambda: _middle(capture.mesh(capture.timesteps[0])), playback_fps(capture, request.fps),
+        _pictured(request, avatar, mesh, composer),
+        capture.timesteps,
+        lambda: _middle(capture.mesh(capture.timesteps[0])),
+        playback_fps(capture, request.fps),
         [view for views in capture.views.values() for view in views],
-    )  # fmt: skip
+    )
 
 
 def _pictured(
@@ -274,7 +303,8 @@ def _pictured(
     """The picture of an avatar on the mesh of a view, as recorded or under the asked light."""
     from ..render.render import render_avatar, render_colors
 
-    background, behind = request.background, None
+    background = request.background
+    behind = None
     if request.world:
         path = avatar_source.avatar_path(request.source).with_name(WORLD_FILE)
         if not path.is_file():
@@ -285,10 +315,12 @@ def _pictured(
         return lambda view, _: render_avatar(
             avatar, mesh(view), view.camera, background, composer, behind
         )
-    relighter, lighting = Relighter(avatar), read_lighting(request.light)
+    relighter = Relighter(avatar)
+    lighting = read_lighting(request.light)
 
     def picture(view: View, share: float) -> np.ndarray:
-        posed, light = mesh(view), lighting
+        posed = mesh(view)
+        light = lighting
         if request.light_turn:
             light = turned(lighting, _middle(posed), request.light_turn * share)
         colors = relighter.colors(posed, view.camera.position, light)
@@ -305,7 +337,8 @@ def _middle(vertices: np.ndarray) -> np.ndarray:
 def unique_names(paths: list[str]) -> list[str]:
     """Names ending in .png; where entries share one, with their folders, then numbered."""
     pngs = [PurePosixPath(path).with_suffix(".png") for path in paths]
-    names, unique = [png.name for png in pngs], dict[str, None]()
+    names = [png.name for png in pngs]
+    unique = dict[str, None]()
     if len(set(names)) < len(names):
         names = ["_".join(part for part in png.parts if part not in ("..", "/")) for png in pngs]
     for name in names:

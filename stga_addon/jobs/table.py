@@ -16,10 +16,25 @@ from .track import MakeAvatar, SolveAgain, Track, make_avatar, solve_again, trac
 from .train import Extend, Refine, Resume, Selected, SelectForTake, Train, select_for_take, train
 
 Request = (
-    Train | Resume | Refine | Extend | Select | SelectForTake | Track | MakeAvatar | SolveAgain
-    | Render | RenderBlend | RenderRecording | Export | ConvertMotion | Analyze | TimePresets
-    | Evaluate | Relight
-)  # fmt: skip
+    Train
+    | Resume
+    | Refine
+    | Extend
+    | Select
+    | SelectForTake
+    | Track
+    | MakeAvatar
+    | SolveAgain
+    | Render
+    | RenderBlend
+    | RenderRecording
+    | Export
+    | ConvertMotion
+    | Analyze
+    | TimePresets
+    | Evaluate
+    | Relight
+)
 Result = Written | Selected | Analyzed
 Work = Callable[..., Result]
 """Called with a request, a `Report` and a `Say`; raises what `perform` does."""
@@ -51,19 +66,25 @@ class Job:
 
 
 JOBS: dict[type[Any], Job] = {
-    Train: Job(train, Kind.TRAINING, "run"), Resume: Job(train, Kind.TRAINING, "run"),
-    Refine: Job(train, Kind.TRAINING, "run"), Extend: Job(train, Kind.TRAINING, "run"),
+    Train: Job(train, Kind.TRAINING, "run"),
+    Resume: Job(train, Kind.TRAINING, "run"),
+    Refine: Job(train, Kind.TRAINING, "run"),
+    Extend: Job(train, Kind.TRAINING, "run"),
     SelectForTake: Job(select_for_take, Kind.SELECTION, "capture"),
     Track: Job(track, Kind.TRACKING, "out"),
     SolveAgain: Job(solve_again, Kind.TRACKING, "capture"),
     MakeAvatar: Job(make_avatar, Kind.AVATAR, "out"),
     Analyze: Job(analyze, Kind.ANALYSIS, "capture"),
-    TimePresets: Job(time_each_preset), Select: Job(select), Evaluate: Job(evaluate),
-    Relight: Job(relight, Kind.LIGHT, "run"), Render: Job(render),
+    TimePresets: Job(time_each_preset),
+    Select: Job(select),
+    Evaluate: Job(evaluate),
+    Relight: Job(relight, Kind.LIGHT, "run"),
+    Render: Job(render),
     RenderRecording: Job(render_recording, Kind.VIDEO, "output"),
-    RenderBlend: Job(render_blend), Export: Job(export),
+    RenderBlend: Job(render_blend),
+    Export: Job(export),
     ConvertMotion: Job(convert_motion, Kind.PERFORMANCE, "output"),
-}  # fmt: skip
+}
 """Every request; `development.commands` adds its own in a checkout."""
 
 
@@ -95,21 +116,30 @@ class RequestKind:
 
 KINDS = {
     Kind.TRAINING: RequestKind(
-        "Training", "Stop training and keep the avatar trained so far; Resume continues from there",
+        "Training",
+        "Stop training and keep the avatar trained so far; Resume continues from there",
         ("Trained", "Cancelled, avatar kept", "Training failed", "Run not found"),
-        is_stored=True, trains=True
+        is_stored=True,
+        trains=True,
     ),
     Kind.TRACKING: RequestKind(
-        "Tracking", "Stop tracking; the landmarks of whole cameras are kept, and Track continues "
+        "Tracking",
+        "Stop tracking; the landmarks of whole cameras are kept, and Track continues "
         "with the others",
         ("Tracked", "Cancelled; Track continues", "Tracking failed", "Capture not found"),
-        is_stored=True
+        is_stored=True,
     ),
     Kind.AVATAR: RequestKind(
-        "Making an avatar", "Stop, and keep what there is so far; Avatar from Video with the same "
-        "video continues",
-        ("Avatar made", "Cancelled; Avatar from Video continues", "Making the avatar failed",
-         "Its folder was not found"), is_stored=True, trains=True
+        "Making an avatar",
+        "Stop, and keep what there is so far; Avatar from Video with the same video continues",
+        (
+            "Avatar made",
+            "Cancelled; Avatar from Video continues",
+            "Making the avatar failed",
+            "Its folder was not found",
+        ),
+        is_stored=True,
+        trains=True,
     ),
     Kind.ANALYSIS: RequestKind(
         "The analysis", "Stop the analysis; earlier results stay", is_transient=True
@@ -118,17 +148,19 @@ KINDS = {
         "The selection", "Stop selecting; the groups stay as they are", is_transient=True
     ),
     Kind.PERFORMANCE: RequestKind(
-        "The performance of the video", "Stop watching the video; nothing is written",
-        is_transient=True
+        "The performance of the video",
+        "Stop watching the video; nothing is written",
+        is_transient=True,
     ),
     Kind.LIGHT: RequestKind(
         "The estimate of light", "Stop; the avatar stays as it is", is_transient=True
     ),
     Kind.VIDEO: RequestKind(
-        "The video", "Stop making the video; nothing is written, or the PNGs that are finished "
-        "stay", ("Video rendered", "Video cancelled", "Video failed", "")
+        "The video",
+        "Stop making the video; nothing is written, or the PNGs that are finished stay",
+        ("Video rendered", "Video cancelled", "Video failed", ""),
     ),
-}  # fmt: skip
+}
 STORED, TRAINS, TRANSIENT = (
     {kind for kind, shown in KINDS.items() if getattr(shown, name)}
     for name in ("is_stored", "trains", "is_transient")

@@ -35,7 +35,9 @@ SYNC = {
 }
 MATTES = {"auto": "made for frames without a mask", "none": "only those of the footage"}
 """What `Track.mattes` may be but a folder of masks."""
-CAPTURE_FOLDER, RUN_FOLDER, INPUTS = "capture", "run", "inputs.json"
+CAPTURE_FOLDER = "capture"
+RUN_FOLDER = "run"
+INPUTS = "inputs.json"
 """In the folder of `MakeAvatar`: capture, run, and what was asked for when they began, which alone
 continues."""
 
@@ -61,43 +63,61 @@ class Track:
     )
     model: Path | None = option(
         "FLAME (.pkl, .npz), linear model (.npz) or morph targets (.glb) (default: the bundled "
-        "head)", flag="--model", metavar="HEAD",
-    )  # fmt: skip
+        "head)",
+        flag="--model",
+        metavar="HEAD",
+    )
     out: Path = option("folder of the capture", flag="--out", metavar="CAPTURE")
     cameras: Path | None = option(
         "calibration: COLMAP, Metashape, RealityCapture or transforms.json (default: that in the "
-        "footage's folder)", None, metavar="FILE",
-    )  # fmt: skip
+        "footage's folder)",
+        None,
+        metavar="FILE",
+    )
     avatar: Path | None = option(
         "run of the same person's avatar: its head is tracked, in place of --model's, and posed "
-        "such that the avatar looks like the images", None, metavar="RUN",
-    )  # fmt: skip
+        "such that the avatar looks like the images",
+        None,
+        metavar="RUN",
+    )
     landmarks: Path | None = option("landmark files of another detector", None, metavar="FOLDER")
     focal: float | None = option(
         "focal length of a single camera without calibration, in pixels (default: as its file "
-        "says, or from the head's turns)", None, above=0, metavar="PIXELS",
-    )  # fmt: skip
+        "says, or from the head's turns)",
+        None,
+        above=0,
+        metavar="PIXELS",
+    )
     start: int = option("first timestep of the footage, counted from 0", 0, 0)
     stop: int | None = option("timestep to stop before (default: all)", None, 1)
     step: int = option("use every nth timestep", 1, 1)
     offset: Mapping[str, int] | None = option(
         "frames by which a camera's recording is later; may be repeated",
-        None, metavar="CAMERA=FRAMES", parse=_parsed_offset,
-    )  # fmt: skip
+        None,
+        metavar="CAMERA=FRAMES",
+        parse=_parsed_offset,
+    )
     meshes: bool = option("write an OBJ per timestep as well", False)
     world: str = option(
         "the capture's: in meters with the head near the origin, or the cameras' own (default: the "
-        "cameras' where they were exported from a Blender scene)", "auto", choices=WORLDS,
-    )  # fmt: skip
+        "cameras' where they were exported from a Blender scene)",
+        "auto",
+        choices=WORLDS,
+    )
     sync: str = option(
         "find offsets that are not given by the videos' sound, or by what moves; auto: sound where "
-        "all have it", "none", choices=SYNC,
-    )  # fmt: skip
+        "all have it",
+        "none",
+        choices=SYNC,
+    )
     mattes: str = option(
         "masks of the person: made where the footage has none (default), only the footage's, or a "
-        "folder's", "auto", is_path=lambda text: text not in MATTES, metavar="auto|none|FOLDER",
+        "folder's",
+        "auto",
+        is_path=lambda text: text not in MATTES,
+        metavar="auto|none|FOLDER",
         parse=_parsed_mattes,
-    )  # fmt: skip
+    )
 
     def check(self) -> None:
         """Raise StgaError where two options contradict each other."""
@@ -144,12 +164,20 @@ class MakeAvatar:
 
 
 STAGES = {
-    "Opening the footage": (0.0, 0.0), "Head model": (0.0, 0.01), "Landmarks": (0.01, 0.06),
-    "Focal length": (0.06, 0.07), "Fit": (0.07, 0.12), "Dense tracking": (0.12, 0.3),
-    "Surface": (0.3, 0.34), "Refinement": (0.34, 0.51), "Mattes": (0.51, 0.64),
-    "Torso": (0.64, 0.97), "Contact sheet": (0.97, 0.985), "Images": (0.985, 0.99),
+    "Opening the footage": (0.0, 0.0),
+    "Head model": (0.0, 0.01),
+    "Landmarks": (0.01, 0.06),
+    "Focal length": (0.06, 0.07),
+    "Fit": (0.07, 0.12),
+    "Dense tracking": (0.12, 0.3),
+    "Surface": (0.3, 0.34),
+    "Refinement": (0.34, 0.51),
+    "Mattes": (0.51, 0.64),
+    "Torso": (0.64, 0.97),
+    "Contact sheet": (0.97, 0.985),
+    "Images": (0.985, 0.99),
     "Heads": (0.99, 1.0),
-}  # fmt: skip
+}
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
 share of the time on two processors where one camera recorded a video of 1080p."""
 AVATAR_STAGE = "Avatar"
@@ -158,9 +186,12 @@ MAX_MISFIT = 0.5
 TRACKING_SHARE = 0.5
 """Of the progress, before an avatar tracks or is trained."""
 FOCAL_SOURCES = {
-    "given": "as given", "file": "as the file says", "solved": "solved from the turns of the head",
-    "usual": "a guess, that of a phone", "avatar": "a guess, that of the avatar's camera",
-}  # fmt: skip
+    "given": "as given",
+    "file": "as the file says",
+    "solved": "solved from the turns of the head",
+    "usual": "a guess, that of a phone",
+    "avatar": "a guess, that of the avatar's camera",
+}
 """Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
 
@@ -173,20 +204,31 @@ def track(request: Track, report: Report, say: Say) -> Written:
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
-    steps, out = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE), request.out
+    steps = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE)
+    out = request.out
     steps.report("Opening the footage", 0, 1)
     offset = dict(request.offset or {})
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
     footage = open_footage(request.footage, request.cameras, frames, request.focal, mattes=given)
-    person, model = None, request.model
+    person = None
+    model = request.model
     if request.avatar is not None:
         person, model = avatar_person(request.avatar)
     found = track_footage(
-        footage, model, out, request.landmarks, request.meshes, request.world,
-        request.mattes == "auto", steps.report, steps.show, person,
-    )  # fmt: skip
-    lines, pixels = [f"warning: {warning}" for warning in found.warnings], found.median_px
+        footage,
+        model,
+        out,
+        request.landmarks,
+        request.meshes,
+        request.world,
+        request.mattes == "auto",
+        steps.report,
+        steps.show,
+        person,
+    )
+    lines = [f"warning: {warning}" for warning in found.warnings]
+    pixels = found.median_px
     if found.focal_px is not None:
         lines.append(f"focal length: {found.focal_px:.0f} px, {FOCAL_SOURCES[found.focal]}")
     if found.torso is not None:
@@ -194,9 +236,12 @@ def track(request: Track, report: Report, say: Say) -> Written:
     if request.avatar is not None:
         with Helpers(folder=out / KEPT_FOLDER) as helpers:
             tracked = track_recording(
-                request.avatar, out, helpers, partial(steps.report, AVATAR_STAGE),
+                request.avatar,
+                out,
+                helpers,
+                partial(steps.report, AVATAR_STAGE),
                 footage.keeps(request.world),
-            )  # fmt: skip
+            )
         pixels = report_errors(out, model)
         end_tracking(out)
         share = float(np.median(tracked.misfit))
@@ -221,14 +266,18 @@ class _Steps:
     """A tracking's steps as progress, with the time that is left and how well the head fits."""
 
     def __init__(self, report: Report, tracking_share: float = 1.0) -> None:
-        self._report, self._time_left, self._share = report, TimeLeft(), tracking_share
-        self._now, self._quality = Progress(), dict[str, float]()
+        self._report = report
+        self._time_left = TimeLeft()
+        self._share = tracking_share
+        self._now = Progress()
+        self._quality = dict[str, float]()
 
     def report(self, stage: str, done: int, total: int) -> None:
         """Raises Cancelled where the report says to stop."""
         begin, end = (self._share * share for share in STAGES.get(stage, (0.0, 0.9)))
         if stage == AVATAR_STAGE:
-            begin, end = self._share, 1.0
+            begin = self._share
+            end = 1.0
         share = begin + (end - begin) * done / max(total, 1)
         figures = {"left_s": self._time_left.after(share), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""
@@ -246,10 +295,12 @@ class _Steps:
 
 def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     """Track unless that is done, then train or continue. Raises StgaError for other inputs."""
-    capture, run = request.track.out, request.train.run
+    capture = request.track.out
+    run = request.train.run
 
     def report_tracking(progress: Progress) -> bool:
-        share, stage = TRACKING_SHARE * progress.share, f"Tracking: {progress.stage}"
+        share = TRACKING_SHARE * progress.share
+        stage = f"Tracking: {progress.stage}"
         figures = {"left_s": math.nan, **progress.figures()}
         figures["left_s"] += request.train.settings.seconds or 0.0
         return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
@@ -265,7 +316,8 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
     tracked = perf_counter()
     new = replace(request.train, flame=request.track.model if is_flame(capture) else None)
     trained = train(resumed(new) if has_run(run) else new, report_training, say)
-    tracking, training = tracked - begin, perf_counter() - tracked
+    tracking = tracked - begin
+    training = perf_counter() - tracked
     values = read_json(capture / REPORT_FILE)
     try:
         errors = values["reprojection_px"]
@@ -305,7 +357,8 @@ def _track(request: Track, report: Report, say: Say) -> None:
 
 def check_inputs(track: Track) -> None:
     """Raise StgaError where the folder began with other inputs, or holds something else."""
-    out, inputs = track.out.parent, _inputs(track)
+    out = track.out.parent
+    inputs = _inputs(track)
     if (out / INPUTS).exists():
         stored = read_inputs(out)
         for name, value in inputs.items():

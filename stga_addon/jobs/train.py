@@ -48,9 +48,12 @@ class Train:
     device: str = option(
         "gpu: the first graphics adapter; gpu:NAME: the one whose name has this part; auto "
         "(default): that of the run, else a GPU if it is right and faster than the CPU in a trial "
-        "of a second, else the CPU", "auto", accepts=is_device,
-        expected=EXPECTED_DEVICE, metavar="{auto,cpu,gpu,gpu:NAME}",
-    )  # fmt: skip
+        "of a second, else the CPU",
+        "auto",
+        accepts=is_device,
+        expected=EXPECTED_DEVICE,
+        metavar="{auto,cpu,gpu,gpu:NAME}",
+    )
     selection: Selection | None = None
 
 
@@ -83,15 +86,19 @@ class _Continue:
     """Continue a finished run in a run of its own. seconds, iterations: one of the two."""
 
     run: Path = option(
-        "folder of the run that continues it (default: RUN_2, RUN_3, …)", flag="--out",
+        "folder of the run that continues it (default: RUN_2, RUN_3, …)",
+        flag="--out",
         metavar="NEW",
-    )  # fmt: skip
+    )
     parent: Path = option("folder of a run", flag="RUN")
     _: KW_ONLY
     growth: float = option(
-        "splats to add, as a share of those on the triangles that are trained", 0.0, 0, MAX_GROWTH,
+        "splats to add, as a share of those on the triangles that are trained",
+        0.0,
+        0,
+        MAX_GROWTH,
         metavar="SHARE",
-    )  # fmt: skip
+    )
     seconds: float | None = like(
         TrainingSettings, "seconds", help="training time (default 20s to refine, 1m to extend)"
     )
@@ -116,8 +123,11 @@ class Refine(_Continue):
 
     region: str = option(
         "region of the capture, vertex mask of FLAME, or file of triangle weights "
-        "(docs/formats.md)", "", metavar="NAME|FILE", is_path=is_region_file,
-    )  # fmt: skip
+        "(docs/formats.md)",
+        "",
+        metavar="NAME|FILE",
+        is_path=is_region_file,
+    )
     weights: np.ndarray | None = None
     frames: tuple[int, int] | None = option(
         "timesteps to train on (default: all)", None, 0, metavar="FIRST-LAST"
@@ -178,7 +188,8 @@ class Prepared:
         """The path of the avatar. Raises as `training.run.session.train`."""
         from ..training.run.session import train
 
-        folder, resumes = self.request.run, isinstance(self.request, Resume)
+        folder = self.request.run
+        resumes = isinstance(self.request, Resume)
         falls_back = self.request.device == "auto"
         return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
@@ -188,18 +199,22 @@ def train(request: Training, report: Report, say: Say) -> Written:
     after Ctrl-C."""
     from ..training.effects.plan import describe_effects
 
-    prepared, folder = prepare(request, report, say), request.run
+    prepared = prepare(request, report, say)
+    folder = request.run
     for warning in prepared.capture.warnings:
         say(f"warning: {warning}")
     for line in format_table(describe_effects(prepared.run.effect_plan)):
         say(line)
     on = {decision.effect for decision in prepared.run.effect_plan if decision.on}
-    draw, latest, is_stopped = CurveUpdater(folder), Progress(), False
+    draw = CurveUpdater(folder)
+    latest = Progress()
+    is_stopped = False
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
         draw()
-        latest, is_stopped = progress, report(progress)
+        latest = progress
+        is_stopped = report(progress)
         return is_stopped
 
     def report_afterwards(progress: Progress) -> bool:
@@ -256,7 +271,8 @@ def refuse_run(folder: Path) -> None:
 def prepare(request: Training, report: Report, say: Say) -> Prepared:
     """Check what is asked for, and decide what is trained and on which device. Raises StgaError."""
     if isinstance(request, Resume):
-        flame, principal_point = request.flame, request.principal_point
+        flame = request.flame
+        principal_point = request.principal_point
         opened = run_folder.open_run(request.run, request.capture, flame, principal_point)
         device, why = run_folder.device_of(opened.run, request.device)
         say(why)
@@ -275,7 +291,8 @@ def prepare(request: Training, report: Report, say: Say) -> Prepared:
 def select_for_take(request: SelectForTake, report: Report, say: Say) -> Selected:
     """timestep -> (F,) bool: what extending the run by the take would train. Raises StgaError."""
     report(Progress(stage="Comparing the avatar with the images"))
-    parent, takes = request.parent, (request.capture,)
+    parent = request.parent
+    takes = (request.capture,)
     wanted = Extend(parent, parent, takes, iterations=1, flame=request.flame)
     _, _, selection, run = _joined_takes(wanted, say)
     start = run.takes[-1].start
@@ -309,15 +326,18 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
     """Raises StgaError without run, region or frames, or where no camera sees the region."""
     from ..training.run.continuation import continued_settings, is_faced
 
-    parent, weights = request.parent, request.weights
+    parent = request.parent
+    weights = request.weights
     report(Progress(stage="Opening the run"))
     opened = run_folder.open_run(parent, flame=request.flame)
     capture = run_folder.with_refined_tracking(opened.capture, parent)
     count = len(capture.faces)
     if weights is None:
-        region, name = find_region(capture, request.region), request.region
+        region = find_region(capture, request.region)
+        name = request.region
     elif weights.shape == (count,):
-        region, name = weights >= SELECTED_WEIGHT, "painted"
+        region = weights >= SELECTED_WEIGHT
+        name = "painted"
     else:
         expected = f"one for each triangle ({count},)"
         raise StgaError(f"weights: expected {expected}, got {weights.shape}")
@@ -371,7 +391,8 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
     from ..training.run.continuation import select_for_takes
 
     opened = run_folder.open_run(request.parent, flame=request.flame)
-    run, new = opened.run, list[Capture]()
+    run = opened.run
+    new = list[Capture]()
     for path in request.captures:
         take = open_capture(path, run.flame, run.principal_point)
         capture_model.require_same_head(opened.capture, take)
@@ -391,7 +412,8 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
         run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))
         for take, start in zip(new, starts, strict=True)
     ]
-    parent, last = request.parent, max(capture.timesteps)
+    parent = request.parent
+    last = max(capture.timesteps)
     continuation = Continuation(parent.resolve(), file_digest(parent / AVATAR), starts[0], last)
     selection, unlike = select_for_takes(continuation, capture, run.settings, starts)
     if unlike:

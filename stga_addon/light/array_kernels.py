@@ -9,7 +9,9 @@ CHUNK_TEXELS = 1 << 17
 """Texels in the boxes around triangles that are drawn at a time, to bound the memory."""
 CHUNK_POINTS = 1 << 13
 """Points that are computed at a time, whose arrays stay in the processor's cache."""
-SUN, SPOT, AREA = 0, 2, 3
+SUN = 0
+SPOT = 2
+AREA = 3
 MIN_FACING = np.float32(0.05)
 
 
@@ -17,7 +19,8 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
     """As `raster.cpu.shadow.add_depths`."""
     size = len(depth)
     corners = np.stack([points[faces[:, k]].T for k in range(3)]).astype(np.float64)
-    low, high = np.clip(corners.min(0)[:2], 0, size), np.clip(corners.max(0)[:2], 0, size)
+    low = np.clip(corners.min(0)[:2], 0, size)
+    high = np.clip(corners.max(0)[:2], 0, size)
     area = _crossed(corners[1] - corners[0], corners[2] - corners[0], 0, 1)
     drawn = np.isfinite(corners).all((0, 1)) & (np.abs(area) > 1e-12)
     drawn &= (low < size).all(0) & (high > 0).all(0)
@@ -31,8 +34,11 @@ def add_depths(points: np.ndarray, faces: np.ndarray, depth: np.ndarray) -> None
 
 def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None:
     """Draw triangles (3 corners, 3, F) row by row, from texel to texel."""
-    size, u, v = len(depth), corners[1] - corners[0], corners[2] - corners[0]
-    across, down = _crossed(u, v, 2, 1) / area, _crossed(u, v, 0, 2) / area
+    size = len(depth)
+    u = corners[1] - corners[0]
+    v = corners[2] - corners[0]
+    across = _crossed(u, v, 2, 1) / area
+    down = _crossed(u, v, 0, 2) / area
     plane = across, down, corners[0, 2] - across * corners[0, 0] - down * corners[0, 1]
     order = np.argsort(corners[:, 1], axis=0)[:, None]
     high, middle, low = np.take_along_axis(corners, order, axis=0)
@@ -53,11 +59,13 @@ def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None
         along = np.arange(int(texels.sum())) - np.repeat(np.cumsum(texels) - texels, texels)
         at = np.repeat(row * size + begin.astype(np.int64), texels) + along
         z, steepness = (np.repeat(values.astype(np.float32), texels) for values in (z, steepness))
-        z, flat = z + steepness * along.astype(np.float32), depth.reshape(-1)
+        z = z + steepness * along.astype(np.float32)
+        flat = depth.reshape(-1)
         # As `np.minimum.at`, slow in older NumPy: what is less after writing is written again.
         while len(at):
             less = z < flat[at]
-            at, z = at[less], z[less]
+            at = at[less]
+            z = z[less]
             flat[at] = z
 
 
@@ -76,20 +84,26 @@ def lit_shares(
     depth: np.ndarray, points: np.ndarray, bias: np.ndarray, step: float, lit: np.ndarray
 ) -> None:
     """As `raster.cpu.shadow.lit_shares`; step: a whole number."""
-    size, reach = len(depth), int(step)
+    size = len(depth)
+    reach = int(step)
     border = 2 * reach + 3
     # The map with a border that blocks nothing; farther places are moved onto it.
     padded = np.full((size + 2 * border,) * 2, np.inf, np.float32)
     padded[border:-border, border:-border] = depth
-    flat, width, taps = padded.reshape(-1), len(padded), (-reach, 0, reach) if reach else (0,)
+    flat = padded.reshape(-1)
+    width = len(padded)
+    taps = (-reach, 0, reach) if reach else (0,)
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
         x, y = (
             np.clip(points[part, k] - np.float32(0.5), -1.5 - reach, size + reach + 0.5) + border
             for k in range(2)
         )
-        z, left, top = points[part, 2] - bias[part], np.floor(x), np.floor(y)
-        right, lower = x - left, y - top
+        z = points[part, 2] - bias[part]
+        left = np.floor(x)
+        top = np.floor(y)
+        right = x - left
+        lower = y - top
         at = top.astype(np.int64) * width + left.astype(np.int64)
         found = np.zeros(len(z), np.float32)
         for row, (below, weight) in product(taps, ((0, 1 - lower), (1, lower))):
@@ -103,10 +117,16 @@ def lit_shares(
 
 
 def add_lights(
-    points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
-    reflectance: np.ndarray, lights: np.ndarray, lit: np.ndarray, irradiance: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    eye: np.ndarray,
+    roughness: np.ndarray,
+    reflectance: np.ndarray,
+    lights: np.ndarray,
+    lit: np.ndarray,
+    irradiance: np.ndarray,
     highlight: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """As `raster.cpu.shade.add_lights`."""
     for start in range(0, len(points), CHUNK_POINTS):
         part = slice(start, start + CHUNK_POINTS)
@@ -114,8 +134,10 @@ def add_lights(
         view = eye[:, None] - place
         view *= 1 / np.sqrt(np.maximum(_dot(view, view), np.float32(1e-20)))
         toward_eye = np.maximum(_dot(normal, view), MIN_FACING)
-        alpha, share = roughness[part] ** 2, reflectance[part]
-        arriving, reflected = np.zeros_like(view), np.zeros_like(view)
+        alpha = roughness[part] ** 2
+        share = reflectance[part]
+        arriving = np.zeros_like(view)
+        reflected = np.zeros_like(view)
         for light in lights:
             toward, strength, width = toward_light(light, place)
             facing = np.maximum(_dot(normal, toward), 0)
@@ -161,7 +183,8 @@ def toward_light(
     square = np.maximum(_dot(toward, toward), np.float32(1e-8))
     away = 1 / np.sqrt(square)
     toward *= away
-    strength, along = 1 / square, -_dot(toward, light[4:7])
+    strength = 1 / square
+    along = -_dot(toward, light[4:7])
     if light[0] == AREA:
         strength = strength * np.maximum(along, 0)
     elif light[0] == SPOT:

@@ -25,7 +25,8 @@ def read_hdr(path: Path) -> np.ndarray:
     """(H, W, 3) float32 radiance of a .hdr picture, from the top. Raises StgaError."""
     import cv2  # Blender, which reads the pictures of its worlds itself, may have none
 
-    data, flags = np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+    data = np.frombuffer(read_bytes(path), np.uint8)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     try:
         found = cv2.imdecode(data, flags)
     except (cv2.error, MemoryError):  # empty, or claims too many pixels
@@ -59,7 +60,8 @@ def split_environment(
     image = np.asarray(squares, np.float64).mean((1, 3))
     vectors, angle = pixel_directions(*image.shape[:2])
     vectors = vectors @ rotation.T
-    rest, level = image.copy(), image.sum(2)
+    rest = image.copy()
+    level = image.sum(2)
     limit = SUN_CONTRAST * (level * angle).sum() / (angle.sum() * image.shape[1])
     suns: list[Light] = []
     while len(suns) < max_suns and level.max() > limit:
@@ -70,12 +72,14 @@ def split_environment(
         toward = (arriving.sum(2)[..., None] * vectors).sum((0, 1))
         opening = 2 * np.arccos(1 - (near * angle).sum() / (2 * np.pi))
         suns.append(Light("sun", power, direction=-toward, angle=float(opening)))
-        rest[near], level = 0, np.where(near, 0, level)
+        rest[near] = 0
+        level = np.where(near, 0, level)
     values = (rest * angle[..., None]).reshape(-1, 3)
     return np.asarray(basis(vectors.reshape(-1, 3)).T @ values), tuple(suns)
 
 
-MAX_LIGHTS, MAX_NUMBER = 64, 1e6
+MAX_LIGHTS = 64
+MAX_NUMBER = 1e6
 
 
 @dataclass(frozen=True)

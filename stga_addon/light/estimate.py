@@ -16,14 +16,17 @@ from .lamps import ShadowMap
 from .surface import Bounce, transfer_of
 from .values import Light
 
-MAX_TIMESTEPS, MAX_CAMERAS, MAX_SIDE_PX = 10, 12, 800
+MAX_TIMESTEPS = 10
+MAX_CAMERAS = 12
+MAX_SIDE_PX = 800
 """Views that are looked at, evenly spread, and the size that larger images are reduced to."""
 MIN_FACING = 0.35
 """Least cosine between a triangle's normal and the direction to the camera."""
 HIDDEN_M = 0.003  # A triangle is hidden by what is nearer to the camera by as much
 POINTS = (np.eye(3) + 1 / 3) / 2
 """(3, 3) barycentric coordinates of the points of a triangle whose pixels are read."""
-SATURATED_LEVEL, DARK_LEVEL = 252, 4
+SATURATED_LEVEL = 252
+DARK_LEVEL = 4
 """Levels of 255 from which on, and up to which, a channel says nothing."""
 
 
@@ -32,7 +35,8 @@ def observe(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean linear color (T, F, 3) of triangles in the darker half of the cameras that face them
     (fewest highlights), NaN where none does; and how many (T, F) do. times: the views of each."""
-    colors, cameras = [], []
+    colors = []
+    cameras = []
     for n, (time, views) in enumerate(times.items()):
         report(Progress(n / len(times), "Estimating the light"))
         mesh = np.asarray(capture.mesh(time), np.float64)
@@ -57,7 +61,8 @@ def _view_colors(
     usable = (level < SATURATED_LEVEL) & (level > DARK_LEVEL)
     if mask is not None:
         # without pixels within two of the mask's border
-        inside, (height, width) = np.pad(mask > 127, 2), mask.shape
+        inside = np.pad(mask > 127, 2)
+        (height, width) = mask.shape
         for y, x in ((0, 2), (4, 2), (2, 0), (2, 4), (1, 1), (1, 3), (3, 1), (3, 3)):
             usable &= inside[y : y + height, x : x + width]
     corners = mesh[capture.faces]
@@ -67,7 +72,8 @@ def _view_colors(
     facing = (normal * to_camera).sum(1) > MIN_FACING * lengths
     depths = ShadowMap(mesh, capture.faces, Light("point", np.ones(3), view.camera.position))
     facing &= depths.lit(corners.mean(1), HIDDEN_M, step=0) > 0.5
-    total, count = np.zeros((len(facing), 3)), np.zeros((len(facing), 1))
+    total = np.zeros((len(facing), 3))
+    count = np.zeros((len(facing), 1))
     for weights in POINTS:
         pixels, _ = view.camera.project(np.einsum("k,fkc->fc", weights, corners))
         places = np.floor(pixels).astype(np.int64)
@@ -90,13 +96,15 @@ LOSS_SCALE = 3.0  # Residual at which an observation's weight has halved, in med
 RIDGE = 1e-4
 MIN_ARRIVING = 0.02  # Least irradiance that a color is divided by, as a share of the mean
 TYPICAL_ALBEDO = 0.36  # Of skin (green): the level of an estimated light, until it is corrected
-HARD_RESIDUAL, VERY_HARD_RESIDUAL = 0.12, 0.25
+HARD_RESIDUAL = 0.12
+VERY_HARD_RESIDUAL = 0.25
 """Residuals from which on the light is too hard to be taken away, and albedo is damped most."""
 MAX_DAMPING = 0.6
 CARD_REFLECTANCE = 0.18
 
 EYE_ROUGHNESS = 0.2  # Of highlights on eyes: as sharp as splats of half a millimeter can show
-MIN_RADIUS_M, MAX_RADIUS_M = 0.007, 0.017
+MIN_RADIUS_M = 0.007
+MAX_RADIUS_M = 0.017
 MAX_DEVIATION = 0.12
 """Share of the radius by which the vertices of an eyeball may leave the sphere, on average."""
 MIN_VERTICES = 24
@@ -129,7 +137,8 @@ def estimate_light(
     if not by_time:
         problem = "has no training views, from which its light could be estimated"
         raise StgaError(f"{capture.root}: {problem}")
-    chosen, faces = evenly_spread(sorted(by_time), MAX_TIMESTEPS), capture.faces
+    chosen = evenly_spread(sorted(by_time), MAX_TIMESTEPS)
+    faces = capture.faces
     times = {time: evenly_spread(by_time[time], MAX_CAMERAS) for time in chosen}
     transfer, occlusion = transfer_of(capture.neutral, faces)
     color, cameras = observe(capture, times, known.exposure, report)
@@ -144,15 +153,21 @@ def estimate_light(
         arriving = np.maximum((basis(known.toward) * LAMBERT @ radiance).mean(0), 1e-6)
         radiance = radiance * (np.pi * known.card.mean(0) / CARD_REFLECTANCE / arriving)
         source = "gray_card"
-    bounce, direct = Bounce(capture.neutral, faces, occlusion), np.maximum(posed @ radiance, DARK)
+    bounce = Bounce(capture.neutral, faces, occlusion)
+    direct = np.maximum(posed @ radiance, DARK)
     irradiance = recorded_irradiance(direct, cameras, faces, bounce)
     hardness = (residual - HARD_RESIDUAL) / (VERY_HARD_RESIDUAL - HARD_RESIDUAL)
     damping = MAX_DAMPING * float(np.clip(hardness, 0, 1))
     return AvatarLight(
-        radiance=radiance.astype(np.float32), transfer=transfer, occlusion=occlusion,
-        irradiance=irradiance.astype(np.float32), roughness=wet_roughness(capture.neutral, faces),
-        residual=residual, damping=round(damping, 3), source=source,
-    )  # fmt: skip
+        radiance=radiance.astype(np.float32),
+        transfer=transfer,
+        occlusion=occlusion,
+        irradiance=irradiance.astype(np.float32),
+        roughness=wet_roughness(capture.neutral, faces),
+        residual=residual,
+        damping=round(damping, 3),
+        source=source,
+    )
 
 
 def recorded_irradiance(
@@ -160,7 +175,8 @@ def recorded_irradiance(
 ) -> np.ndarray:
     """(V, 3): mean of direct (T, V, 3) and of skin around; each timestep counts as many times as
     cameras (T, F) see the vertex: teeth in an open mouth."""
-    total, count = np.zeros(direct.shape[1:]), np.zeros((direct.shape[1], 1))
+    total = np.zeros(direct.shape[1:])
+    count = np.zeros((direct.shape[1], 1))
     for arriving, seen in zip(direct, cameras, strict=True):
         views = np.bincount(faces.ravel(), np.repeat(seen, 3), len(arriving))
         weight = views[:, None] + UNSEEN_WEIGHT
@@ -181,10 +197,12 @@ def fit_light(
     usable = np.isfinite(color[..., 0]) & (received[..., 0] > MIN_OPEN_TRANSFER)
     if usable.sum() < 10 * COUNT:
         raise StgaError("light: too few triangles are seen in the images to estimate it")
-    color, received = color[usable], received[usable].astype(np.float64)
+    color = color[usable]
+    received = received[usable].astype(np.float64)
     face = np.broadcast_to(np.arange(faces), usable.shape)[usable]
     radiance = np.array(uniform(np.ones(3) / np.pi) if given is None else given)
-    typical, error = np.empty(3), np.empty_like(color)
+    typical = np.empty(3)
+    error = np.empty_like(color)
     for k, shown in enumerate(color.T):
         weight = np.ones_like(shown)
         for _ in range(ITERATIONS):
@@ -212,7 +230,8 @@ def wet_roughness(neutral: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(V,) float32: EYE_ROUGHNESS on eyeballs: parts that are nearly spheres of an eye's size; else
     0."""
     part = connected_parts(len(neutral), faces)
-    found, used = np.zeros(len(neutral), np.float32), np.zeros(len(neutral), bool)
+    found = np.zeros(len(neutral), np.float32)
+    used = np.zeros(len(neutral), bool)
     used[faces] = True
     for label in np.unique(part[used]):
         members = used & (part == label)

@@ -22,7 +22,8 @@ def basis(directions: np.ndarray) -> np.ndarray:
 def even_directions(count: int) -> np.ndarray:
     """(count, 3) unit vectors spread evenly over the sphere (a Fibonacci lattice)."""
     place = np.arange(count) + 0.5
-    height, turn = 1 - 2 * place / count, place * np.pi * (1 + 5**0.5)
+    height = 1 - 2 * place / count
+    turn = place * np.pi * (1 + 5**0.5)
     ring = np.sqrt(1 - height**2)
     return np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], axis=-1)
 

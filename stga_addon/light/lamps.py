@@ -15,7 +15,8 @@ from .values import KINDS, Caster, Light, Lighting
 
 MAP_SIZE = 512  # Texels a side of a light's shadow map, which just holds the head
 LIFT_M = 0.001  # Points are lifted off the surface by it, so that it does not shade itself
-BIAS_M, MAX_BIAS_M = 0.001, 0.006
+BIAS_M = 0.001
+MAX_BIAS_M = 0.006
 """A surface shades what lies deeper by BIAS_M, and on slopes by what its depth changes within the
 taps, at most MAX_BIAS_M."""
 TAP_STEP = 1.0  # Texels between the 3 × 3 places that are looked up: splats soften edges already
@@ -59,7 +60,8 @@ class HeadBounds(NamedTuple):
 def head_bounds(vertices: np.ndarray) -> HeadBounds:
     """Those of vertices (V, 3)."""
     rows = np.ascontiguousarray(vertices.T)  # numpy is slow where the last axis is short
-    low, high = rows.min(1), rows.max(1)
+    low = rows.min(1)
+    high = rows.max(1)
     center = (low + high) / 2
     radius = float(np.sqrt(((rows - center[:, None]) ** 2).sum(0).max()))
     return HeadBounds(center, float(np.linalg.norm(high - low)), radius)
@@ -68,9 +70,12 @@ def head_bounds(vertices: np.ndarray) -> HeadBounds:
 def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightView:
     """A light's view of a head: wide, and without what lies behind it, from inside the head's
     sphere."""
-    center, radius = bounds.center, bounds.radius * 1.01 + 4 * LIFT_M
+    center = bounds.center
+    radius = bounds.radius * 1.01 + 4 * LIFT_M
     if light.kind == "sun":
-        forward, distance, scale = light.direction, np.inf, size / 2 / radius
+        forward = light.direction
+        distance = np.inf
+        scale = size / 2 / radius
     else:
         forward = center - light.position
         distance = float(np.linalg.norm(forward))
@@ -80,7 +85,8 @@ def light_view(bounds: HeadBounds, light: Light, size: int = MAP_SIZE) -> LightV
     across = np.cross(forward, (0.0, 1.0, 0.0) if abs(forward[1]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
     axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
-    is_sun, texel_m = light.kind == "sun", bounds.diagonal / size
+    is_sun = light.kind == "sun"
+    texel_m = bounds.diagonal / size
     return LightView(axes, center if is_sun else light.position, scale, is_sun, size, texel_m)
 
 
@@ -88,9 +94,13 @@ class ShadowMap:
     """A light's depth map of a posed head (V, 3) meters and of other objects."""
 
     def __init__(
-        self, vertices: np.ndarray, faces: np.ndarray, light: Light, casters: Sequence[Caster] = (),
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        light: Light,
+        casters: Sequence[Caster] = (),
         size: int = MAP_SIZE,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._view = light_view(head_bounds(vertices), light, size)
         is_parallel = self._view.is_parallel
         depth = np.full((size, size), np.inf if is_parallel else 0, np.float32)
@@ -105,12 +115,16 @@ class ShadowMap:
         self.depth = depth
 
     def lit(
-        self, points: np.ndarray, bias: float = BIAS_M, step: float = TAP_STEP,
+        self,
+        points: np.ndarray,
+        bias: float = BIAS_M,
+        step: float = TAP_STEP,
         normals: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """(N,) float32, 0…1: how much light reaches points (N, 3) lifted off the surface, whose
         normals (N, 3) make `bias` larger on slopes."""
-        found, biases = np.empty(len(points), np.float32), np.full(len(points), bias, np.float32)
+        found = np.empty(len(points), np.float32)
+        biases = np.full(len(points), bias, np.float32)
         if normals is not None:
             if self._view.is_parallel:
                 cosine = normals @ -self._view.axes[:, 2].astype(np.float32)
@@ -135,7 +149,9 @@ def kernels(name: str) -> Any:
     return array_kernels
 
 
-FEW, SOME, MANY = 1, 2, 3
+FEW = 1
+SOME = 2
+MANY = 3
 """Points a side by which an area light is represented, by its size over its distance."""
 MIN_FADE = 1e-4
 
@@ -144,9 +160,12 @@ class Lamps:
     """Lights around a head posed as mesh (V, 3) meters, with what blocks them."""
 
     def __init__(
-        self, lighting: Lighting, mesh: np.ndarray, faces: np.ndarray,
+        self,
+        lighting: Lighting,
+        mesh: np.ndarray,
+        faces: np.ndarray,
         casters: Sequence[Caster] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         center = (mesh.max(0) + mesh.min(0)) / 2
         self._maps: list[ShadowMap] = []
         rows = [np.zeros((0, 16), np.float32)]
@@ -162,9 +181,13 @@ class Lamps:
         return self.shade(points, normals, np.zeros(3), np.zeros(len(points), np.float32), 0.0)[0]
 
     def shade(
-        self, points: np.ndarray, normals: np.ndarray, eye: np.ndarray, roughness: np.ndarray,
+        self,
+        points: np.ndarray,
+        normals: np.ndarray,
+        eye: np.ndarray,
+        roughness: np.ndarray,
         reflectance: float,
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Irradiance and highlight (N, 3) at points (N, 3) seen from eye (3,)."""
         found = np.zeros((len(points), 3), np.float32), np.zeros((len(points), 3), np.float32)
         if not len(self._table):
@@ -173,16 +196,22 @@ class Lamps:
         for row, shadow in zip(lit, self._maps, strict=False):
             row[:] = shadow.lit(points, normals=normals)
         kernels("shade").add_lights(
-            np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32),
-            np.asarray(eye, np.float32), np.asarray(roughness, np.float32),
-            np.full(len(points), reflectance, np.float32), self._table, lit, *found,
-        )  # fmt: skip
+            np.ascontiguousarray(points, np.float32),
+            np.ascontiguousarray(normals, np.float32),
+            np.asarray(eye, np.float32),
+            np.asarray(roughness, np.float32),
+            np.full(len(points), reflectance, np.float32),
+            self._table,
+            lit,
+            *found,
+        )
         return found
 
 
 def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
     """(points, 16) float32: a light as rows of `raster.cpu.shade`, for a head at `center` (3,)."""
-    places, width = light.position[None], light.radius
+    places = light.position[None]
+    width = light.radius
     if light.kind == "sun":
         width = float(np.tan(light.angle / 2))
     elif light.kind == "area":
@@ -195,7 +224,8 @@ def light_rows(light: Light, center: np.ndarray, shadow_map: int) -> np.ndarray:
             x, y = x * np.sqrt(1 - 2 * y * y), y * np.sqrt(1 - 2 * x * x)
         across = np.cross(light.direction, light.tangent)
         offset = x[:, None] * light.size[0] * light.tangent + y[:, None] * light.size[1] * across
-        places, width = light.position + offset, float(np.mean(light.size)) / 2 / side
+        places = light.position + offset
+        width = float(np.mean(light.size)) / 2 / side
     kind = KINDS.index(light.kind)
     intensity = (1.0, 1 / (4 * np.pi), 1 / (4 * np.pi), 1 / np.pi)[kind]
     edge = np.cos(light.cone / 2)

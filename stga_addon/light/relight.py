@@ -19,7 +19,8 @@ from .surface import Bounce, Lashes, at_splats, find_lashes, row_dot, surface_po
 from .values import SKIN_ROUGHNESS, Caster, Lighting
 
 UNLIKE_LIGHT = 0.2  # Difference of two lights from which on nothing is kept, as a share
-ALIKE_AT_SPLAT, UNLIKE_AT_SPLAT = 0.25, 0.75
+ALIKE_AT_SPLAT = 0.25
+UNLIKE_AT_SPLAT = 0.75
 """Difference between what arrives at a splat, now and in the capture, up to which all is kept and
 from which on nothing: other objects' shadows."""
 RIDGE = 1e-6  # For meshes without light in some harmonics
@@ -69,7 +70,9 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
 MIN_IRRADIANCE = 0.15  # Least irradiance that color is divided by, as a share of its mean: noise
-HIGHLIGHT_SHARE, WET_HIGHLIGHT_SHARE, MIN_DIFFUSE_SHARE = 0.034, 0.14, 0.1
+HIGHLIGHT_SHARE = 0.034
+WET_HIGHLIGHT_SHARE = 0.14
+MIN_DIFFUSE_SHARE = 0.1
 """Part of what arrived in the capture that came back as highlights, from skin and from wet eyes; it
 is taken from recorded colors, of which at least MIN_DIFFUSE_SHARE remains."""
 VIEW_MEANS = (1.0, 0.65, 0.195, -0.089375)
@@ -85,7 +88,8 @@ class Relighter:
         if avatar.light is None:
             problem = "the avatar does not know the light of its capture"
             raise StgaError(f"{problem}; `stga relight RUN` estimates it")
-        self.avatar, self.light = avatar, avatar.light
+        self.avatar = avatar
+        self.light = avatar.light
         self.face, self.weights = surface_points(avatar)
         self.corners = np.ascontiguousarray(avatar.faces[self.face])
 
@@ -189,14 +193,16 @@ class Relighter:
     ) -> np.ndarray:
         vertex_normal = vertex_normals(mesh, self.avatar.faces)
         distant, likeness = self.distant_in_head(mesh, lighting)
-        world, casters = distant[:, :3], (*casters, *self.lash_casters(mesh, lighting))
+        world = distant[:, :3]
+        casters = (*casters, *self.lash_casters(mesh, lighting))
         lamps = Lamps(lighting, mesh, self.avatar.faces, casters)
         at_vertices = np.maximum(self.light.transfer @ world, 0)
         at_vertices += lamps.irradiance(mesh + LIFT_M * vertex_normal, vertex_normal)
         # All at once, because the places of the vertices in memory are what takes time.
         bounced = self.bounce.light(at_vertices)
         at_splats = self._at_splats(np.concatenate([mesh, vertex_normal, bounced], axis=1))
-        points, normals = np.ascontiguousarray(at_splats[:, :3]), _unit(at_splats[:, 3:6])
+        points = np.ascontiguousarray(at_splats[:, :3])
+        normals = _unit(at_splats[:, 3:6])
         skin = np.float32(max(lighting.roughness, 0.05))
         roughness = np.where(self.roughness > 0, self.roughness, skin)
         lifted = points + LIFT_M * normals
@@ -207,8 +213,10 @@ class Relighter:
             cosine = np.maximum(row_dot(normals, view), np.float32(0.02))
             glossy = (GLOSSY[:, None] * lighting.world).astype(np.float32)
             seen = np.maximum(basis(2 * cosine[:, None] * normals - view) @ glossy, 0)
-            x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
-            z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
+            x = 1 - roughness
+            y = 0.0425 - 0.0275 * roughness
+            z = 1.04 - 0.572 * roughness
+            w = 0.022 * roughness - 0.04
             part = np.minimum(x * x, np.exp2(np.float32(-9.28) * cosine)) * x + y
             reflected = REFLECTANCE * (z - 1.04 * part) + 1.04 * part + w
             highlight += np.asarray(seen * (reflected * self.occlusion)[:, None], np.float32)
@@ -224,7 +232,8 @@ class Relighter:
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
         linear = srgb_to_linear(np.maximum(color, 0))
-        wet, skin = np.float32(WET_HIGHLIGHT_SHARE), np.float32(HIGHLIGHT_SHARE)
+        wet = np.float32(WET_HIGHLIGHT_SHARE)
+        skin = np.float32(HIGHLIGHT_SHARE)
         highlight = np.where(self.roughness > 0, wet, skin)[:, None] * self.irradiance / np.pi
         diffuse = np.maximum(linear - highlight, MIN_DIFFUSE_SHARE * linear)
         albedo = np.pi * diffuse / self.irradiance

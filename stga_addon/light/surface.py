@@ -14,7 +14,10 @@ from .lamps import ShadowMap
 from .values import Caster, Light
 
 DIRECTIONS = 192
-MAP_SIZE, BIAS_M, LIFT_M = 256, 0.0015, 0.002  # As in `lamps`, for maps of half the size
+# As in `lamps`, for maps of half the size
+MAP_SIZE = 256
+BIAS_M = 0.0015
+LIFT_M = 0.002
 
 
 def transfer_of(
@@ -25,7 +28,8 @@ def transfer_of(
     Snyder 2002); visibility of a direction is one depth map."""
     vertices = np.asarray(vertices, np.float64)
     normals = vertex_normals(vertices, faces)
-    points, sky = vertices + LIFT_M * normals, even_directions(directions)
+    points = vertices + LIFT_M * normals
+    sky = even_directions(directions)
     harmonics = basis(sky) * (4 * np.pi / directions)
     transfer = np.zeros((len(vertices), harmonics.shape[1]))
     open_sky, whole_sky = np.zeros((2, len(vertices)))
@@ -88,30 +92,43 @@ def surface_points(avatar: Avatar) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(key[order][1:] == key[order][:-1])
     found = np.full(len(key), -1)
-    found[order[same]], found[order[same + 1]] = order[same + 1] // 3, order[same] // 3
-    corners, beyond = avatar.neutral[avatar.faces].astype(np.float64), found.reshape(-1, 3)
+    found[order[same]] = order[same + 1] // 3
+    found[order[same + 1]] = order[same] // 3
+    corners = avatar.neutral[avatar.faces].astype(np.float64)
+    beyond = found.reshape(-1, 3)
     inside, weights, distance = _nearest(points, corners[face])
-    found, walking, at = face.copy(), np.arange(len(face)), face
+    found = face.copy()
+    walking = np.arange(len(face))
+    at = face
     for _ in range(MAX_STEPS):
         edge = inside.argmin(1)
         following = np.where(inside.min(1) < 0, beyond[at, edge], -1)
         goes = following >= 0
-        walking, at = walking[goes], following[goes]
+        walking = walking[goes]
+        at = following[goes]
         inside, there, away = _nearest(points[walking], corners[at])
         nearer = away < distance[walking]
         rows = walking[nearer]
-        found[rows], weights[rows], distance[rows] = at[nearer], there[nearer], away[nearer]
+        found[rows] = at[nearer]
+        weights[rows] = there[nearer]
+        distance[rows] = away[nearer]
     return found, weights.astype(np.float32)
 
 
 def _nearest(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Barycentric coordinates (N, 3) in triangles' planes, clamped, and squared distance (N,)."""
-    a, first, second = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    a = corners[:, 0]
+    first = corners[:, 1] - corners[:, 0]
+    second = corners[:, 2] - corners[:, 0]
     offset = points - a
-    uu, uv, vv = row_dot(first, first), row_dot(first, second), row_dot(second, second)
-    pu, pv = row_dot(offset, first), row_dot(offset, second)
+    uu = row_dot(first, first)
+    uv = row_dot(first, second)
+    vv = row_dot(second, second)
+    pu = row_dot(offset, first)
+    pv = row_dot(offset, second)
     area = np.maximum(uu * vv - uv * uv, 1e-30)
-    u, v = (vv * pu - uv * pv) / area, (uu * pv - uv * pu) / area
+    u = (vv * pu - uv * pv) / area
+    v = (uu * pv - uv * pu) / area
     inside = np.stack([1 - u - v, u, v], axis=-1)
     weights = np.clip(inside, 0, 1)
     weights /= weights.sum(1, keepdims=True)
@@ -137,7 +154,8 @@ def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.
 REACH_M = 0.025  # From the middle of an eyeball
 MIN_HEIGHT_M = 0.002
 """Above the mesh: shadow maps have a bias, and splats of skin lie within 1.5 mm."""
-MIN_OPACITY, MAX_ALBEDO = 0.3, 0.15
+MIN_OPACITY = 0.3
+MAX_ALBEDO = 0.15
 EXTENT = 2.0  # A lash's half length in standard deviations of the splat: gaps close
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
 
@@ -152,7 +170,8 @@ class Lashes:
 
     def caster(self, mesh: np.ndarray) -> Caster:
         """The cards of a head posed as mesh (V, 3), as what throws shadows."""
-        avatar, used = self.avatar, self.avatar.faces[self.face]
+        avatar = self.avatar
+        used = self.avatar.faces[self.face]
         frames = face_frames(mesh, used, avatar.neutral, avatar.convention)
         corners = self.corners.reshape(-1, 3)
         vertices = points_to_world(corners, frames, np.repeat(np.arange(len(self.face)), 4))
@@ -161,13 +180,17 @@ class Lashes:
 
 
 def find_lashes(
-    avatar: Avatar, corners: np.ndarray, weights: np.ndarray, roughness: np.ndarray,
+    avatar: Avatar,
+    corners: np.ndarray,
+    weights: np.ndarray,
+    roughness: np.ndarray,
     albedo: np.ndarray,
-) -> Lashes:  # fmt: skip
+) -> Lashes:
     """The lashes of an avatar with light; corners, weights (N, 3) of `surface_points`, roughness
     (N,) and albedo (N, 3) of the splats."""
     assert avatar.light is not None
-    splats, neutral = avatar.splats, avatar.neutral.astype(np.float64)
+    splats = avatar.splats
+    neutral = avatar.neutral.astype(np.float64)
     frames = face_frames(neutral, avatar.faces, neutral, avatar.convention)
     dark = (albedo.mean(1) < MAX_ALBEDO) & (roughness == 0) & (splats.opacities() > MIN_OPACITY)
     found = np.flatnonzero(dark)
@@ -178,7 +201,8 @@ def find_lashes(
     for label in np.unique(part[wet]):
         middle = neutral[wet & (part == label)].mean(0)
         near |= np.linalg.norm(points - middle, axis=1) < REACH_M
-    found, points = found[near], points[near]
+    found = found[near]
+    points = points[near]
     normal = at_splats(vertex_normals(neutral, avatar.faces), corners[found], weights[found])
     above = points - at_splats(neutral, corners[found], weights[found])
     height = (above * normal).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
@@ -187,7 +211,8 @@ def find_lashes(
     scale = np.exp(rows.log_scale.astype(np.float64))
     longest = np.argsort(-scale, axis=1, kind="stable")[:, :2]
     axes = np.swapaxes(to_matrices(rows.rotation), 1, 2)
-    splat, lengths = np.arange(len(found)), EXTENT * np.take_along_axis(scale, longest, 1)
+    splat = np.arange(len(found))
+    lengths = EXTENT * np.take_along_axis(scale, longest, 1)
     first, second = (lengths[:, k, None] * axes[splat, longest[:, k]] for k in range(2))
     offsets = np.stack([first, second, -first, -second], axis=1)
     return Lashes(avatar, splats.face[found], np.asarray(rows.xyz[:, None] + offsets, np.float32))

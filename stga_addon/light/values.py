@@ -64,10 +64,13 @@ class Light:
         lengths and leaves the color, as in a scene that is scaled."""
         scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
         return replace(
-            self, position=matrix[:3, :3] @ self.position + matrix[:3, 3],
-            direction=matrix[:3, :3] @ self.direction, tangent=matrix[:3, :3] @ self.tangent,
-            radius=self.radius * scale, size=(self.size[0] * scale, self.size[1] * scale),
-        )  # fmt: skip
+            self,
+            position=matrix[:3, :3] @ self.position + matrix[:3, 3],
+            direction=matrix[:3, :3] @ self.direction,
+            tangent=matrix[:3, :3] @ self.tangent,
+            radius=self.radius * scale,
+            size=(self.size[0] * scale, self.size[1] * scale),
+        )
 
 
 @dataclass(frozen=True)

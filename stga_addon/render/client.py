@@ -46,7 +46,8 @@ class RenderClient:
     def __init__(
         self, find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto"
     ) -> None:
-        self._find_python, self._find_device = find_python, find_device
+        self._find_python = find_python
+        self._find_device = find_device
         self._lock = threading.Lock()
         self._composer = Composer()
         self._server: tuple[str, subprocess.Popen[bytes]] | None = None
@@ -71,7 +72,9 @@ class RenderClient:
 
     def close(self) -> None:
         """End the server, if one is running; the next image starts another."""
-        running, self._server, self._sent = self._server, None, None
+        running = self._server
+        self._server = None
+        self._sent = None
         if running is not None:
             _, server = running
             server.kill()
@@ -109,7 +112,8 @@ class RenderClient:
             raise StgaError(
                 f"{python}: the render server exited unexpectedly; that Python needs numba"
             ) from error
-        self._sent, self.failure = layers, str(reply.get("failure", ""))
+        self._sent = layers
+        self.failure = str(reply.get("failure", ""))
         if "error" in reply:
             reason = f"could not render the image ({reply['error']})"
             raise StgaError(f"{python}: the render server {reason}")
@@ -142,7 +146,8 @@ def receive(stream: BinaryIO) -> dict[str, np.ndarray]:
             size -= len(parts[-1])
         return b"".join(parts)
 
-    mark, size = read(len(MARK)), int.from_bytes(read(8), "little")
+    mark = read(len(MARK))
+    size = int.from_bytes(read(8), "little")
     if mark != MARK:
         raise ValueError(f"a message begins with {MARK!r}, got {mark!r}")
     with np.load(io.BytesIO(read(size)), allow_pickle=False) as arrays:

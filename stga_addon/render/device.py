@@ -64,7 +64,8 @@ def adapter_names(software: bool = True) -> list[str]:
 
 def adapter_name(device: str) -> str:
     """The adapter's name for "gpu" or "gpu:NAME". Raises StgaError unless there is just one."""
-    names, part = adapter_names(), device.removeprefix(GPU)
+    names = adapter_names()
+    part = device.removeprefix(GPU)
     if device == "gpu" or part in names:
         return names[0] if device == "gpu" else part
     found = [name for name in names if part.lower() in name.lower()]
@@ -110,7 +111,8 @@ def _trial(adapter: str) -> "Trial":
 def _comparison(trial: "Trial") -> str:
     """How fast a device is compared with the CPU, and the time of an image on each."""
     times = f"{1e3 * trial.device_s:.1f} and {1e3 * trial.cpu_s:.1f} ms an image"
-    faster, slower = trial.cpu_s / trial.device_s, trial.device_s / trial.cpu_s
+    faster = trial.cpu_s / trial.device_s
+    slower = trial.device_s / trial.cpu_s
     share = f"{faster:.1f} times as fast as" if faster > 1 else f"{slower:.1f} times slower than"
     return f"{share} the CPU in a trial ({times})"
 
@@ -128,7 +130,9 @@ class Composer:
     """
 
     def __init__(self, requested: str = "auto") -> None:
-        self.requested, self.device, self.failure = requested, "", ""
+        self.requested = requested
+        self.device = ""
+        self.failure = ""
 
     def choose(self) -> str:
         """The device of the next image. Raises StgaError where one asked for by name fails."""
@@ -150,7 +154,8 @@ class Composer:
                     raise
                 cause = f"{self.device}: {first_line(error)}"
                 cause = error.cause if isinstance(error, DeviceError) else cause
-                self.device, self.failure = "cpu", one_line(f"{cause}; the CPU renders instead")
+                self.device = "cpu"
+                self.failure = one_line(f"{cause}; the CPU renders instead")
                 logging.getLogger(__name__).warning(self.failure)
         from ..raster.cpu import compose as cpu
 

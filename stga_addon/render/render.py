@@ -32,10 +32,14 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 def render(
-    splats: Splats, camera: Camera, background: tuple[float, float, float] = WHITE,
-    frames: FaceFrames = WORLD, antialiased: bool = False, composer: Composer | None = None,
+    splats: Splats,
+    camera: Camera,
+    background: tuple[float, float, float] = WHITE,
+    frames: FaceFrames = WORLD,
+    antialiased: bool = False,
+    composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
     splats: raw values as `Splats` documents them (opacity as a logit, scale as a logarithm, SH
@@ -56,27 +60,38 @@ def render(
     values = (np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
     parameters = Parameters(*values)
     output = render_forward(
-        parameters, splats.face, frames_in_camera(frames, camera), splats.sh_degree,
-        np.array(background, np.float32), antialiased=antialiased,
-    )  # fmt: skip
+        parameters,
+        splats.face,
+        frames_in_camera(frames, camera),
+        splats.sh_degree,
+        np.array(background, np.float32),
+        antialiased=antialiased,
+    )
     return np.clip(output.image, 0, 1)
 
 
 def render_avatar(
-    avatar: Avatar, mesh: np.ndarray, camera: Camera,
-    background: tuple[float, float, float] = WHITE, composer: Composer | None = None,
+    avatar: Avatar,
+    mesh: np.ndarray,
+    camera: Camera,
+    background: tuple[float, float, float] = WHITE,
+    composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """`render` of an avatar that follows a mesh (V, 3) in world meters."""
     pose = avatar.frames(mesh), avatar.antialiased
     return render(avatar.splats, camera, background, *pose, composer, behind)
 
 
 def render_colors(
-    avatar: Avatar, mesh: np.ndarray, camera: Camera, colors: np.ndarray,
-    background: tuple[float, float, float] = WHITE, composer: Composer | None = None,
+    avatar: Avatar,
+    mesh: np.ndarray,
+    camera: Camera,
+    colors: np.ndarray,
+    background: tuple[float, float, float] = WHITE,
+    composer: Composer | None = None,
     behind: Splats | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """`render_avatar` with sRGB colors (N, 3), as `light.relight` finds them, not its own."""
     sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
     pose = replace(avatar.frames(mesh), color=NO_COLUMNS), avatar.antialiased

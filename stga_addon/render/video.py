@@ -18,11 +18,13 @@ from ..raster.posed_splats import ComposedImage, PosedSplats
 from .client import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
 from .device import Composer
 
-CODEC, PIXEL_FORMAT = "libx264", "yuv420p"
+CODEC = "libx264"
+PIXEL_FORMAT = "yuv420p"
 """H.264 with halved color resolution: what browsers, phones and editors play."""
 QUALITY = {"crf": "16", "preset": "medium"}
 """Constant rate factor of x264: 18 is called visually lossless, lower is better."""
-BT709, LIMITED_RANGE = 1, 1
+BT709 = 1
+LIMITED_RANGE = 1
 """Of FFmpeg's AVCOL_* enumerations: what players assume of untagged HD video."""
 IMAGE_NAME = re.compile(r"\d{4,}\.png", re.IGNORECASE)
 """Name of an image of a sequence: 0012.png."""
@@ -41,7 +43,8 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     check_rate(path, fps)
     import av
 
-    rate, is_empty = Fraction(fps).limit_denominator(1001), True
+    rate = Fraction(fps).limit_denominator(1001)
+    is_empty = True
     with replacing(path) as partial:
         try:
             with av.open(
@@ -59,7 +62,9 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
                     pixels = np.ascontiguousarray(np.pad(image, odd, mode="edge"))
                     frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
                     if is_empty:
-                        stream.width, stream.height, is_empty = frame.width, frame.height, False
+                        stream.width = frame.width
+                        stream.height = frame.height
+                        is_empty = False
                     colors = {"dst_colorspace": BT709, "dst_color_range": LIMITED_RANGE}
                     container.mux(stream.encode(frame.reformat(format=PIXEL_FORMAT, **colors)))
 
@@ -83,7 +88,8 @@ def sequence_writer(folder: Path) -> Iterator[WriteImage]:
     """
     from PIL import Image
 
-    files, number = NumberedFiles(folder, IMAGE_NAME), count(1)
+    files = NumberedFiles(folder, IMAGE_NAME)
+    number = count(1)
 
     def write(image: np.ndarray) -> None:
         path = folder / f"{next(number):04d}.png"
@@ -150,7 +156,8 @@ def finished(
     image: ComposedImage, background: tuple[float, float, float] | None, opaque: bool
 ) -> np.ndarray:
     """(H, W, 3) uint8 sRGB over the background; if that is None, straight alpha or `opaque`."""
-    color, alpha = image.rgb.transpose(1, 2, 0), image.alpha[..., None]
+    color = image.rgb.transpose(1, 2, 0)
+    alpha = image.alpha[..., None]
     if background is None and not opaque:
         straight = color / np.maximum(alpha, np.finfo(np.float32).tiny)
         pixels = np.concatenate([straight, alpha], axis=2)

@@ -72,7 +72,8 @@ def write_curves(
 ) -> None:
     """Add f-curves with all their keyframes to the action of `owner`. frames (K,): ascending;
     values: (K,) of a scalar, (K, C) of an array's elements."""
-    curves, values = action_curves(owner), np.asarray(values)
+    curves = action_curves(owner)
+    values = np.asarray(values)
     mode = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items[interpolation].value
     for index, column in enumerate(values.reshape(len(values), -1).T):
         points = curves.new(data_path, index=index).keyframe_points

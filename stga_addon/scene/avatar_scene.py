@@ -29,8 +29,10 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
     None; not those that look through a camera. The dashed lines to parents are hidden."""
     matrix = head.matrix_world
     vertices = evaluated_vertices(head)
-    low, high = matrix @ Vector(vertices.min(0)), matrix @ Vector(vertices.max(0))
-    center, radius = (low + high) / 2, (high - low).length / 2
+    low = matrix @ Vector(vertices.min(0))
+    high = matrix @ Vector(vertices.max(0))
+    center = (low + high) / 2
+    radius = (high - low).length / 2
     for area in _viewports(screens):
         space = area.spaces.active
         space.overlay.show_relationship_lines = False
@@ -40,7 +42,8 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_perspective = "PERSP"
         # Without a turn, a camera looks along -z with +y up: at the front of FLAME's heads.
         region.view_rotation = (camera or head).matrix_world.to_quaternion()
-        region.view_location, region.view_distance = center, DISTANCE * radius
+        region.view_location = center
+        region.view_distance = DISTANCE * radius
 
 
 def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:
@@ -77,7 +80,8 @@ def set_up_head(capture: Capture) -> Any:
 def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     """Show the avatar in place of the mesh, with every viewport on it and a white world; bones and
     cameras are hidden. Returns the splats. link: the avatar's file, relative to the .blend file."""
-    shown, scene = show_avatar(avatar, head), bpy.context.scene
+    shown = show_avatar(avatar, head)
+    scene = bpy.context.scene
     shown[tags.AVATAR] = link
     hide_object(head, scene)
     go_to_frame(head[tags.TIMESTEPS][0])

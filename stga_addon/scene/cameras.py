@@ -30,9 +30,12 @@ def image_size(render: Any) -> tuple[int, int]:
 
 
 def render_camera(
-    camera: Any, depsgraph: Any, width: int, height: int,
+    camera: Any,
+    depsgraph: Any,
+    width: int,
+    height: int,
     border: tuple[int, int, int, int] | None = None,
-) -> Camera:  # fmt: skip
+) -> Camera:
     """The evaluated camera object for an image of width × height pixels. border: x, y, width,
     height in pixels of the render region, from the bottom left. Raises StgaError unless it is
     perspective."""
@@ -48,7 +51,8 @@ def render_camera(
     pose = np.array(camera.matrix_world.normalized(), np.float64)
     whole = camera_of(pose, projection, width, height)
     x, y, columns, rows = border or (0, 0, width, height)
-    cx, cy = whole.cx - x, whole.cy - (height - y - rows)
+    cx = whole.cx - x
+    cy = whole.cy - (height - y - rows)
     return replace(whole, width=columns, height=rows, cx=cx, cy=cy)
 
 
@@ -57,9 +61,11 @@ def viewport_camera(region: Any, width: int, height: int) -> Camera:
     pose = np.array(region.view_matrix.inverted(), np.float64)
     projection = np.array(region.window_matrix, np.float64)
     if not region.is_perspective:  # nearly the same in perspective from far behind
-        flat, distance = projection, ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
+        flat = projection
+        distance = ORTHOGRAPHIC_DISTANCE * 2 / projection[0, 0]
         projection = np.zeros((4, 4))
-        projection[0, 0], projection[1, 1] = flat[0, 0] * distance, flat[1, 1] * distance
+        projection[0, 0] = flat[0, 0] * distance
+        projection[1, 1] = flat[1, 1] * distance
         projection[:2, 2] = -flat[:2, 3]
         pose[:3, 3] += distance * pose[:3, 2]
     return camera_of(pose, projection, width, height)
@@ -94,10 +100,12 @@ def import_cameras(capture: Capture, root: Any, warn: Warn = log_warning) -> lis
         by_index.setdefault(view.camera_index, {}).setdefault(view.timestep, view)
     for index, by_timestep in sorted(by_index.items()):
         views = [by_timestep[timestep] for timestep in sorted(by_timestep)]
-        first, title = views[0].camera, f"{root.name} camera {index:02d}"
+        first = views[0].camera
+        title = f"{root.name} camera {index:02d}"
         data = bpy.data.cameras.new(title)
         set_intrinsics(data, first)
-        data.clip_start, data.display_size = CLIP_START, DISPLAY_SIZE
+        data.clip_start = CLIP_START
+        data.display_size = DISPLAY_SIZE
         camera = place(root, tags.CAMERA, title, data, old.pop(index, None))
         camera[tags.CAMERA_INDEX] = index
         camera[tags.IMAGE_SIZE] = [first.width, first.height]
@@ -146,10 +154,14 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
     aspect = camera[tags.PIXEL_ASPECT]
     scene.camera = camera
     render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, 1.0 / aspect), max(1.0, aspect)
+    render.resolution_x = width
+    render.resolution_y = height
+    render.resolution_percentage = 100
+    render.pixel_aspect_x = max(1.0, 1.0 / aspect)
+    render.pixel_aspect_y = max(1.0, aspect)
     if capture.timesteps:
-        scene.frame_start, scene.frame_end = capture.timesteps[0], capture.timesteps[-1]
+        scene.frame_start = capture.timesteps[0]
+        scene.frame_end = capture.timesteps[-1]
     if capture.fps is not None:
         set_frames_per_second(scene, capture.fps)
     scene.view_settings.view_transform = "Standard"
@@ -215,7 +227,8 @@ def scene_camera(depsgraph: Any) -> Camera:
 def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) -> list[Camera]:
     """`count` cameras that start as the scene's and orbit a head or splats. angle: radians; 0: the
     sides that the cameras of the capture saw, a full turn where there are none."""
-    start, matrix = scene_camera(depsgraph), np.array(subject.matrix_world, np.float64)
+    start = scene_camera(depsgraph)
+    matrix = np.array(subject.matrix_world, np.float64)
     if subject.get(tags.KIND) == tags.SPLATS:  # in world space, some of them far away
         middle = np.median(arrays.mesh_vertices(subject.data), axis=0)
     else:

@@ -66,7 +66,9 @@ class SceneLayer:
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
         """The splats as the settings show them; eye (3,): camera in the scene, where relit."""
-        splats, frames, settings = self.splats, self.frames, self.settings
+        splats = self.splats
+        frames = self.frames
+        settings = self.settings
         if self.relit is not None:
             assert eye is not None
             splats = self.relit.splats(self.eye_in_avatar(eye))
@@ -76,8 +78,10 @@ class SceneLayer:
         if self.frozen is not None:
             frozen = self.frozen[splats.face]
             if settings.show_selection:
-                sh, gray = splats.sh.copy(), (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
-                sh[frozen], sh[frozen, 0] = 0, gray
+                sh = splats.sh.copy()
+                gray = (np.array(FROZEN_COLOR_SRGB) - 0.5) / SH_C0
+                sh[frozen] = 0
+                sh[frozen, 0] = gray
                 splats = replace(splats, sh=sh)
                 color = np.where(self.frozen[:, None], np.float32(0), frames.color)
                 frames = replace(frames, color=color)

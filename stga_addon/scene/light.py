@@ -45,38 +45,57 @@ class LightingSettings(bpy.types.PropertyGroup):  # type: ignore[misc]
         update=_mode_changed,
     )
     mix: bpy.props.FloatProperty(
-        name="Mix", description="Share of the scene's light",
-        default=0.5, min=0.0, max=1.0, subtype="FACTOR",
-    )  # fmt: skip
+        name="Mix",
+        description="Share of the scene's light",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+    )
     exposure: bpy.props.FloatProperty(
-        name="Exposure", soft_min=-4.0, soft_max=4.0,
+        name="Exposure",
+        soft_min=-4.0,
+        soft_max=4.0,
         description="Stops by which relit avatars are brighter: the absolute level of a capture's "
         "light is not known",
-    )  # fmt: skip
+    )
     white: bpy.props.FloatVectorProperty(
-        name="White", subtype="COLOR", size=3, default=(1.0, 1.0, 1.0), min=0.0, max=1.0,
+        name="White",
+        subtype="COLOR",
+        size=3,
+        default=(1.0, 1.0, 1.0),
+        min=0.0,
+        max=1.0,
         description="What should be white or gray on the avatar; its tint is taken away. Pick it "
         "with the eyedropper from the avatar as recorded",
-    )  # fmt: skip
+    )
     roughness: bpy.props.FloatProperty(
-        name="Roughness", description="Of highlights on skin",
-        default=SKIN_ROUGHNESS, min=0.05, max=1.0,
-    )  # fmt: skip
+        name="Roughness",
+        description="Of highlights on skin",
+        default=SKIN_ROUGHNESS,
+        min=0.05,
+        max=1.0,
+    )
     specular: bpy.props.FloatProperty(
-        name="Highlights", description="Factor of highlights; 0: none",
-        default=1.0, min=0.0, soft_max=2.0,
-    )  # fmt: skip
+        name="Highlights",
+        description="Factor of highlights; 0: none",
+        default=1.0,
+        min=0.0,
+        soft_max=2.0,
+    )
     shadows: bpy.props.BoolProperty(
-        name="Shadows", description="Lights are blocked by the head and by other objects",
+        name="Shadows",
+        description="Lights are blocked by the head and by other objects",
         default=True,
-    )  # fmt: skip
+    )
     world: bpy.props.BoolProperty(
         name="World", description="The scene's world lights avatars, too", default=True
     )
     lights: bpy.props.PointerProperty(
-        name="Lights", type=bpy.types.Collection,
+        name="Lights",
+        type=bpy.types.Collection,
         description="Only the lights of this collection light avatars; empty: all",
-    )  # fmt: skip
+    )
 
 
 def lighting_settings(scene: Any) -> Any:
@@ -108,7 +127,8 @@ def light_of(light: Any, matrix: Any) -> Light | None:
     axes = to_world[:3, :3] / np.maximum(scale, 1e-12)
     own: dict[str, Any] = {}
     if light.type == "SUN":
-        own["angle"], area = light.angle, np.pi * np.tan(light.angle / 2) ** 2
+        own["angle"] = light.angle
+        area = np.pi * np.tan(light.angle / 2) ** 2
     elif light.type == "AREA":
         height = light.size_y if light.shape in ("RECTANGLE", "ELLIPSE") else light.size
         is_round = light.shape in ("DISK", "ELLIPSE")
@@ -116,10 +136,12 @@ def light_of(light: Any, matrix: Any) -> Light | None:
         own |= {"tangent": axes[:, 0], "shape": "ellipse" if is_round else "rectangle"}
         area = width * height * (np.pi / 4 if is_round else 1.0)
     else:
-        own["radius"], area = light.shadow_soft_size, np.pi * light.shadow_soft_size**2
+        own["radius"] = light.shadow_soft_size
+        area = np.pi * light.shadow_soft_size**2
         if light.type == "SPOT":
             own |= {"cone": light.spot_size, "blend": light.spot_blend}
-    color, shader = light_strength(light, area), _surface_node(light.use_nodes and light.node_tree)
+    color = light_strength(light, area)
+    shader = _surface_node(light.use_nodes and light.node_tree)
     if shader is not None and shader.type == "EMISSION":
         emitted, strength = (shader.inputs[name] for name in ("Color", "Strength"))
         color = color * np.array(emitted.default_value[:3]) * strength.default_value
@@ -182,13 +204,15 @@ def world_light(world: Any) -> WorldLight | None:
         return WorldLight((0.0, 0.0, 0.0))
     if background.type != "BACKGROUND" or background.inputs["Strength"].is_linked:
         return None
-    strength, color = background.inputs["Strength"].default_value, background.inputs["Color"]
+    strength = background.inputs["Strength"].default_value
+    color = background.inputs["Color"]
     if not color.is_linked:
         return WorldLight(tuple(channel * strength for channel in color.default_value[:3]))
     texture = color.links[0].from_node
     if texture.type != "TEX_ENVIRONMENT" or texture.image is None:
         return None
-    links, turn = texture.inputs["Vector"].links, np.eye(3)
+    links = texture.inputs["Vector"].links
+    turn = np.eye(3)
     if links and (node := links[0].from_node).type != "TEX_COORD":
         source = node.inputs["Vector"].links if node.type == "MAPPING" else ()
         if not source or source[0].from_node.type != "TEX_COORD":
@@ -221,9 +245,15 @@ class SceneLight:
         self._placed.clear()
 
     def relit(
-        self, splat_object: Any, head: Any, avatar: Avatar, vertices: np.ndarray,
-        to_world: np.ndarray, visible: Sequence[tuple[Any, Any]], depsgraph: Any,
-    ) -> Relit | None:  # fmt: skip
+        self,
+        splat_object: Any,
+        head: Any,
+        avatar: Avatar,
+        vertices: np.ndarray,
+        to_world: np.ndarray,
+        visible: Sequence[tuple[Any, Any]],
+        depsgraph: Any,
+    ) -> Relit | None:
         """How the scene lights a head of vertices (V, 3), None where colors are as recorded; the
         same object while all is the same, `vertices` by identity. to_world (4, 4): from the
         avatar's space. visible: objects and their matrices."""
@@ -251,7 +281,8 @@ class SceneLight:
         values = [value for name, value in vars(lighting).items() if name != "lights"]
         values += [value for light in lighting.lights for value in vars(light).values()]
         same = [each.tobytes() if isinstance(each, np.ndarray) else each for each in values]
-        key, place = (*same, id(relighter), id(vertices), id(casters)), (uid, to_world.tobytes())
+        key = (*same, id(relighter), id(vertices), id(casters))
+        place = (uid, to_world.tobytes())
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
@@ -260,9 +291,13 @@ class SceneLight:
         return known[1]
 
     def _lighting(
-        self, settings: Any, receivers: tuple[Any, ...], to_world: np.ndarray,
-        visible: Sequence[tuple[Any, Any]], depsgraph: Any,
-    ) -> Lighting:  # fmt: skip
+        self,
+        settings: Any,
+        receivers: tuple[Any, ...],
+        to_world: np.ndarray,
+        visible: Sequence[tuple[Any, Any]],
+        depsgraph: Any,
+    ) -> Lighting:
         """The light for objects `receivers`, in the space that `to_world` takes to the world."""
         chosen = lighting_settings(depsgraph.scene).lights
         lights = []

@@ -54,7 +54,9 @@ def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
 
 def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
     """The layer collections of `collection_of`, which may be linked in several places."""
-    collection, waiting, found = collection_of(root, kind), [view_layer.layer_collection], []
+    collection = collection_of(root, kind)
+    waiting = [view_layer.layer_collection]
+    found = []
     while collection is not None and waiting:
         layer = waiting.pop()
         waiting += layer.children
@@ -68,7 +70,8 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
     modifiers, parents and constraints that refer to it; its old data, keyframes and drivers go."""
     obj = existing
     if obj is None:
-        obj, collection = bpy.data.objects.new(name, data), collection_of(root, kind)
+        obj = bpy.data.objects.new(name, data)
+        collection = collection_of(root, kind)
         if collection is None:
             collection = bpy.data.collections.new(f"{root.name} {COLLECTIONS[kind]}")
             collection[tags.KIND] = kind
@@ -77,7 +80,8 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         obj.parent = root
     else:
         leave_edit_mode()
-        old_data, old_action = obj.data, _action(obj)
+        old_data = obj.data
+        old_action = _action(obj)
         obj.animation_data_clear()
         obj.data = data
         _purge([old_data], [old_action])
@@ -106,7 +110,8 @@ def leave_edit_mode() -> None:
 def remove(objects: Iterable[Any]) -> None:
     """Delete objects with their data and actions."""
     for obj in list(objects):
-        data, action = obj.data, _action(obj)
+        data = obj.data
+        action = _action(obj)
         bpy.data.objects.remove(obj)
         _purge([data], [action])
 
@@ -170,7 +175,8 @@ def frames_per_second(scene: Any) -> float:
 def set_frames_per_second(scene: Any, rate: float) -> None:
     """Let the scene play at the rate, which Blender holds as an integer and a divisor."""
     whole = max(1, round(rate))
-    scene.render.fps, scene.render.fps_base = whole, whole / rate
+    scene.render.fps = whole
+    scene.render.fps_base = whole / rate
 
 
 def go_to_frame(frame: int) -> None:
@@ -188,8 +194,11 @@ def show_progress(share: float) -> None:
 
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
     """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
-    scene, manager, numbers = bpy.context.scene, bpy.context.window_manager, list(numbers)
-    frame, subframe = scene.frame_current, scene.frame_subframe
+    scene = bpy.context.scene
+    manager = bpy.context.window_manager
+    numbers = list(numbers)
+    frame = scene.frame_current
+    subframe = scene.frame_subframe
     manager.progress_begin(0, 1)
     try:
         for index, number in enumerate(numbers):

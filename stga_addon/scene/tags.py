@@ -26,7 +26,11 @@ RUN = "stga_run"  # on splats that preview or show a training run: the run's fol
 WORLD = "stga_world"  # on splats of a run's world: their file
 
 # Kinds of object.
-ROOT, HEAD, RIG, CAMERA, SPLATS = "root", "head", "rig", "camera", "splats"
+ROOT = "root"
+HEAD = "head"
+RIG = "rig"
+CAMERA = "camera"
+SPLATS = "splats"
 
 # Boolean face attributes of the head mesh, one per region.
 REGION_PREFIX = "stga_region_"

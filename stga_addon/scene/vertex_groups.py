@@ -118,7 +118,8 @@ def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
         return []
     members = [vertex.groups for vertex in head.data.vertices]
     counts = np.array([len(each) for each in members], np.int64)
-    indices, weights = np.empty(counts.sum(), np.int32), np.empty(counts.sum(), np.float32)
+    indices = np.empty(counts.sum(), np.int32)
+    weights = np.empty(counts.sum(), np.float32)
     ends = np.cumsum(counts)
     for each, begin, end in zip(members, (ends - counts).tolist(), ends.tolist(), strict=True):
         if begin < end:
@@ -126,7 +127,8 @@ def _read_faces(head: Any, groups: list[int]) -> list[np.ndarray]:
             each.foreach_get("weight", weights[begin:end])
     row_of = np.full(len(head.vertex_groups), -1)
     row_of[groups] = np.arange(len(groups))
-    rows, vertices = row_of[indices], np.repeat(np.arange(len(members)), counts)
+    rows = row_of[indices]
+    vertices = np.repeat(np.arange(len(members)), counts)
     selected = (rows >= 0) & (weights >= SELECTED_WEIGHT)
     in_group = np.zeros((len(groups), len(members)), bool)
     in_group[rows[selected], vertices[selected]] = True
@@ -139,11 +141,9 @@ HEAT = "stga_heat"  # on face corners: one of these as a color, relative to the 
 MODIFIER = "STGA Heat Map"
 # Linear RGB from never to most often selected.
 STOPS = (0.0, 1e-9, 0.25, 0.5, 0.75, 1.0)
-RED, GREEN, BLUE = (
-    (0.1, 0.02, 0.05, 0.15, 0.95, 0.9),
-    (0.1, 0.03, 0.35, 0.6, 0.6, 0.05),
-    (0.1, 0.3, 0.6, 0.1, 0.02, 0.01),
-)
+RED = (0.1, 0.02, 0.05, 0.15, 0.95, 0.9)
+GREEN = (0.1, 0.03, 0.35, 0.6, 0.6, 0.05)
+BLUE = (0.1, 0.3, 0.6, 0.1, 0.02, 0.01)
 
 
 def show_heat_map(

@@ -18,12 +18,17 @@ NOISE_LEVELS = 6.0
 """Standard deviation, of 255, of a pixel from the texture on skin that is followed exactly."""
 LIGHT_PRIOR = 0.02
 """Weight of the camera's usual lighting in a view's, as a share of the points' information."""
-LIGHT_ITERATIONS, TEXTURE_ITERATIONS, MEAN_ITERATIONS = 2, 4, 3
-ALBEDO_SCALE, TEXTURE_SCALE = 6 * NOISE_LEVELS, 4 * NOISE_LEVELS
-LIGHT_SCALE, MEAN_SCALE = 2 * NOISE_LEVELS, 3 * NOISE_LEVELS
+LIGHT_ITERATIONS = 2
+TEXTURE_ITERATIONS = 4
+MEAN_ITERATIONS = 3
+ALBEDO_SCALE = 6 * NOISE_LEVELS
+TEXTURE_SCALE = 4 * NOISE_LEVELS
+LIGHT_SCALE = 2 * NOISE_LEVELS
+MEAN_SCALE = 3 * NOISE_LEVELS
 """Differences, in levels, beyond which pixels are outliers: against skin of one color, the texture
 as it is found, the texture, and the mean."""
-MIN_SHADING, MAX_SHADING = 0.2, 4.0
+MIN_SHADING = 0.2
+MAX_SHADING = 4.0
 OWN_VIEW_PRIOR = 6.0
 """Observations of all cameras beside a camera's own: skin shines differently to each side."""
 MAX_DEVIATION_LEVELS = 60.0
@@ -31,10 +36,13 @@ MAX_SAMPLES = 1 << 14  # Of an image at a time: OpenCV takes less than 2^15
 POINT_SHARE = 0.25  # Weight of a point in a view: neighboring points share pixels
 OUTLIER_SQUARED = 4.0, 4.0, 16.0, 16.0
 """By level: squared difference in NOISE_LEVELS at which a point is explained by half."""
-FLOW_LEVEL, FLOW_POINTS, FLOW_ITERATIONS = 1, 2, 4
+FLOW_LEVEL = 1
+FLOW_POINTS = 2
+FLOW_ITERATIONS = 4
 """Pyramid level of the images of optical flow, level of the points that it moves, and Gauss–Newton
 steps."""
-FLOW_SHARE, FLOW_SCALE_PX = 0.3, 2.0
+FLOW_SHARE = 0.3
+FLOW_SCALE_PX = 2.0
 """Weight of a point's flow of 1 pixel, and the distance in pixels beyond which it is an outlier."""
 MIN_FLOW_SIDE_PX = 32  # Smaller images are too small for the patches of DIS
 MIN_OBSERVATIONS = 1.0  # Sum of its views' weights, below which a point's texture is not known
@@ -134,7 +142,8 @@ def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(N, 2, 3): derivatives of the pixels of points (N, 3) by their positions."""
-    turn, at = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    turn = camera.world_to_camera[:3, :3]
+    at = camera.world_to_camera[:3, 3]
     x, y, z = (points @ turn.T + at).T
     z = np.maximum(z, 1e-6)
     of_x = (camera.fl_x / z)[:, None] * (turn[0] - (x / z)[:, None] * turn[2])
@@ -151,7 +160,8 @@ def flow_targets(at: np.ndarray, before: Views, now: Views) -> Any:
     flow = opencv.DISOpticalFlow_create(opencv.DISOPTICAL_FLOW_PRESET_FAST)
     first = {view.key: view.levels[FLOW_LEVEL] for view in before}
     for view in now:
-        level, old = view.levels[FLOW_LEVEL], first.get(view.key)
+        level = view.levels[FLOW_LEVEL]
+        old = first.get(view.key)
         shape = level.channels.shape
         if old is not None and old.channels.shape == shape and min(shape[:2]) >= MIN_FLOW_SIDE_PX:
             pixels, _ = old.camera.project(at)
@@ -189,7 +199,9 @@ def fitted_light(
 
     basis (N, 9), weight (N,); usual (9,): the prior. Robust beyond `scale` levels.
     """
-    design, target, light = basis * texture[:, :1], values[:, 0], usual
+    design = basis * texture[:, :1]
+    target = values[:, 0]
+    light = usual
     prior = LIGHT_PRIOR * float((weight * texture[:, 0] ** 2).sum() + 1) * np.eye(len(usual))
     for _ in range(LIGHT_ITERATIONS):
         weighted = design * (weight * robust(target - design @ light, scale))[:, None]
@@ -244,7 +256,8 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     first = _robust_mean([own.values[0] for own in samples], weight)
     luma = np.tile(np.median(first[known if known.any() else ...], axis=0), (len(first), 1))
     lights = {own.camera: np.eye(own.basis.shape[1])[0] for own in samples}
-    lit, values = [own.values for own in samples], [luma]
+    lit = [own.values for own in samples]
+    values = [luma]
     for number in range(TEXTURE_ITERATIONS):
         scale = TEXTURE_SCALE if number else ALBEDO_SCALE
         found = [
@@ -265,7 +278,8 @@ def average_texture(samples: Sequence[Sample]) -> Texture:
     by_camera: dict[bytes, list[np.ndarray]] = {}
     for name in lights:  # what one camera sees, drawn to what all do
         rows = [row for row, own in enumerate(samples) if own.camera == name]
-        share, by_camera[name] = weight[rows].sum(0)[:, None], []
+        share = weight[rows].sum(0)[:, None]
+        by_camera[name] = []
         for level, every in enumerate(values):
             mean = _robust_mean([lit[row][level] for row in rows], weight[rows], every)
             mean = (share * mean + OWN_VIEW_PRIOR * every) / (share + OWN_VIEW_PRIOR)
@@ -278,7 +292,8 @@ def _robust_mean(
 ) -> np.ndarray:
     """(N, 3) of M values (N, 3) with weights (M, N), from the weighted median on; outliers by
     detail and redness."""
-    stacked, mean = np.stack(values), start
+    stacked = np.stack(values)
+    mean = start
     if mean is None:
         order = np.argsort(stacked, axis=0)
         ordered = np.take_along_axis(stacked, order, axis=0)
@@ -288,6 +303,7 @@ def _robust_mean(
         mean = np.take_along_axis(ordered, middle[None], axis=0)[0]
     for _ in range(MEAN_ITERATIONS):
         used = weight * robust(np.abs(stacked - mean)[..., 1:].max(2), MEAN_SCALE)
-        total, mass = (used[..., None] * stacked).sum(0), used.sum(0)[:, None]
+        total = (used[..., None] * stacked).sum(0)
+        mass = used.sum(0)[:, None]
         mean = np.where(mass > 1e-6, total / np.maximum(mass, 1e-6), mean)
     return np.asarray(mean)

@@ -101,7 +101,8 @@ def corrected(
     shares = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
     # for translation.
-    blocks, posed = [], PosedPoints(model, points)
+    blocks = []
+    posed = PosedPoints(model, points)
     for row, share in zip(near, shares, strict=True):
         _, jacobian = posed.linearized(solved[row, :-RIGID_SIZE], solved[row, -RIGID_SIZE:])
         flat = jacobian.reshape(-1, size) / LANDMARK_SIGMA_M
@@ -127,7 +128,8 @@ def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:
     """Timesteps and parameters (T, E + 18) as they were tracked: those of the file that the first
     correction writes, or of the capture where there is none. Raises StgaError where the file is not
     of the capture's timesteps."""
-    path, timesteps = out / SOLVED_FILE, list(sequence.timesteps)
+    path = out / SOLVED_FILE
+    timesteps = list(sequence.timesteps)
     if not os.path.lexists(path):
         return timesteps, np.stack([sequence.frame(timestep).parameters for timestep in timesteps])
     arrays = read_npz(path)

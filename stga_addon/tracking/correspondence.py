@@ -24,16 +24,19 @@ AMBIENT = 0.38
 VIEWS_DEG = (0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (0, 20), (0, -20), (-30, 15), (30, 15)
 """Azimuth and elevation of the pictures."""
 PICTURE_SIZE = 512
-PICTURE_DISTANCE, PICTURE_FOCAL = 3.5, 3.0
+PICTURE_DISTANCE = 3.5
+PICTURE_FOCAL = 3.0
 """In extents of the head, and in image widths: the head fills most of the picture, with little
 perspective."""
 MIN_PICTURES = 3
-OPEN_JAW_WEIGHT, OPEN_JAW_RAD = 0.4, 0.2
+OPEN_JAW_WEIGHT = 0.4
+OPEN_JAW_RAD = 0.2
 """Of ARKit's jawOpen, or of the jaw joint, by which lips part: on a closed mouth, the lower lip's
 inner landmarks are as near to the upper lip."""
 BLINKS = "eyeBlinkLeft", "eyeBlinkRight"
 EYE_JOINTS = JOINTS.index("left_eye"), JOINTS.index("right_eye")
-SCLERA_RGB, IRIS_RGB = (0.95, 0.93, 0.9), (0.15, 0.09, 0.05)
+SCLERA_RGB = (0.95, 0.93, 0.9)
+IRIS_RGB = (0.15, 0.09, 0.05)
 IRIS_RADIUS = 0.4  # Share of the eyeball's radius
 MAX_SURFACE_DISTANCE = 0.02
 """Share of the head's extent: a landmark farther from the surface than this (6 mm) is not used."""
@@ -48,7 +51,8 @@ def shaded_image(
     """The mesh in soft light on gray: (H, W, 3) uint8. colors (V, 3), 0 to 1; None: skin's."""
     triangle, weights = rasterize(vertices, faces, camera)
     seen = triangle >= 0
-    corners, inside = faces[triangle[seen]], weights[seen][..., None]
+    corners = faces[triangle[seen]]
+    inside = weights[seen][..., None]
     axes = camera.world_to_camera[:3, :3]
     normal = (vertex_normals(vertices, faces)[corners] * inside).sum(1) @ axes.T * [1, -1, -1]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
@@ -72,7 +76,8 @@ def calibrate(
     opened and the eyes closed too. The model looks along +z with y up; `name` is what errors call
     it. Raises StgaError where the detector does not see a face.
     """
-    neutral, faces = model.v_template, model.faces
+    neutral = model.v_template
+    faces = model.faces
     colors = _colors(model)
     located, count = _located(neutral, faces, colors, detector)
     if located is None:
@@ -82,7 +87,8 @@ def calibrate(
         )
     seen = [(neutral, located.position)]
     # with the mouth open, and with the eyes closed, as far as shapes or a joint are known for that
-    frame, names = neutral_frame(model), np.array(model.expression_names)
+    frame = neutral_frame(model)
+    names = np.array(model.expression_names)
     weights = [OPEN_JAW_WEIGHT * (names == "jawOpen"), np.isin(names, BLINKS)]
     frames = [replace(frame, expr=1.0 * own) for own in weights if len(names) and own.any()]
     if not len(names) and model.weights[:, JOINTS.index("jaw")].any():
@@ -140,11 +146,14 @@ def _located(
 
 def picture_cameras(vertices: np.ndarray) -> list[Camera]:
     """Cameras in front of a head (V, 3), in VIEWS_DEG."""
-    low, high = vertices.min(0), vertices.max(0)
-    center, distance = (low + high) / 2, PICTURE_DISTANCE * float((high - low).max())
+    low = vertices.min(0)
+    high = vertices.max(0)
+    center = (low + high) / 2
+    distance = PICTURE_DISTANCE * float((high - low).max())
     cameras = []
     for azimuth, elevation in VIEWS_DEG:
-        turn, rise = math.radians(azimuth), math.radians(elevation)
+        turn = math.radians(azimuth)
+        rise = math.radians(elevation)
         across = math.cos(rise)
         direction = np.array([math.sin(turn) * across, math.sin(rise), math.cos(turn) * across])
         focal = PICTURE_FOCAL * PICTURE_SIZE
@@ -179,7 +188,9 @@ def _with_pupils(
 ) -> tuple[SurfacePoints, list[int]]:
     """The places with the centers of the irises on the foremost points of the eyeballs, where the
     model has any."""
-    face, barycentric, moved = places.face.copy(), places.barycentric.copy(), []
+    face = places.face.copy()
+    barycentric = places.barycentric.copy()
+    moved = []
     for joint in EYE_JOINTS:
         eyeball = np.flatnonzero((model.weights[model.faces, joint] > EYEBALL_WEIGHT).all(1))
         if not len(eyeball):
@@ -189,6 +200,7 @@ def _with_pupils(
         center = np.array([*corners.mean((0, 1))[:2], foremost[2]])
         pupil = min(IRIS_CENTERS, key=lambda number: abs(located[number, 0] - center[0]))
         on, _ = nearest_points(model.v_template, model.faces[eyeball], center[None])
-        face[pupil], barycentric[pupil] = eyeball[on.face[0]], on.barycentric[0]
+        face[pupil] = eyeball[on.face[0]]
+        barycentric[pupil] = on.barycentric[0]
         moved.append(pupil)
     return SurfacePoints(face, barycentric), moved

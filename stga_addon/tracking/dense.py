@@ -31,12 +31,15 @@ from .solve import Observation, acceleration_precision, normal_equations, prior_
 
 MIN_TIMESTEPS = 6  # Below it, an averaged texture is no evidence of how timesteps differ
 SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
-TEXTURE_TIMESTEPS, MAX_CAMERAS = 32, 8
+TEXTURE_TIMESTEPS = 32
+MAX_CAMERAS = 8
 """Timesteps, spread over the take, of the texture; cameras, spread over the rig, whose images are
 compared."""
-TEXTURE_PART_TIMESTEPS, PART_TIMESTEPS = 12, 24
+TEXTURE_PART_TIMESTEPS = 12
+PART_TIMESTEPS = 24
 """At most, of the parts in which a texture's timesteps, and then the whole take, are worked on."""
-LANDMARK_SHARE, INNER_SHARE = 0.01, 0.3
+LANDMARK_SHARE = 0.01
+INNER_SHARE = 0.3
 """Weight of landmarks beside the images; of those on eyeballs and lids, where no texture shows
 reflections, nor which of the two is seen."""
 REGION_SCALE_M = 0.004
@@ -45,17 +48,21 @@ a quarter."""
 DISAGREEMENT_M = 0.0015
 """The same, of the distance beyond that at most timesteps, for landmarks of which a fit begins
 again."""
-START_STEPS, START_LEVEL = ((3, 2), (2, 2)), 2
+START_STEPS = ((3, 2), (2, 2))
+START_LEVEL = 2
 """Levels of the pyramid and Gauss–Newton steps in each, for every start; and the level in which
 starts are compared."""
-FINE_STEPS, EVIDENCE_LEVEL = ((2, 3), (1, 16), (0, 3)), 1
+FINE_STEPS = ((2, 3), (1, 16), (0, 3))
+EVIDENCE_LEVEL = 1
 """The same for the best start; and the level in which points that were not fitted tell whether it
 is better."""
-LAST_STEPS, LAST_ROUNDS = ((1, 12), (0, 4)), 2
+LAST_STEPS = ((1, 12), (0, 4))
+LAST_ROUNDS = 2
 """The same for its result where other points are visible than at the start, as in a mouth that
 opens."""
 OPENINGS_M = 0.008, 0.016  # By which the chin is moved for further starts
-USUAL_QUANTILE, USUAL_FACTOR = 0.2, 1.5
+USUAL_QUANTILE = 0.2
+USUAL_FACTOR = 1.5
 """Other starts are tried where the first leaves a region of the face worse explained, by this
 factor, than it is at this share of the texture's timesteps."""
 DAMPING = 1e-3
@@ -65,7 +72,9 @@ SETTLED_GAIN = 0.01
 """By which a region's misfit has to fall for a settled timestep to be changed: below it, the
 surface that several cameras see is the better evidence."""
 KEPT_STIFFNESS = 100.0  # Of a timestep that keeps what it had; in the stiffness over time
-MAX_GROWTH, SMALL_MISS_M, MIN_REGION_GAIN = 1.5, 0.001, 0.1
+MAX_GROWTH = 1.5
+SMALL_MISS_M = 0.001
+MIN_REGION_GAIN = 0.1
 """Of the landmarks' distance in a region whose misfit falls by less than MIN_REGION_GAIN of it:
 beyond, landmarks are the better evidence there. A forehead in wrinkles looks a little more like
 lowered brows than like raised ones."""
@@ -130,7 +139,8 @@ def fit_dense(
     if len(timesteps) < MIN_TIMESTEPS:
         return None
     chosen = evenly_spread(timesteps, TEXTURE_TIMESTEPS)
-    head, total = DenseHead(fit.head, take), 2 * len(chosen) + len(timesteps)
+    head = DenseHead(fit.head, take)
+    total = 2 * len(chosen) + len(timesteps)
 
     def in_parts(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
@@ -161,7 +171,8 @@ def _sampled_part(
     fit: HeadFit, take: RecordedTake, weights: np.ndarray, step: Step
 ) -> list[Sample]:
     """What the views of a part's timesteps show; weights (T, N) of the points at each."""
-    solver, found = _Solver(fit, take), []
+    solver = _Solver(fit, take)
+    found = []
     for timestep, weight in zip(sorted(take.landmarks), weights, strict=True):
         shot = solver.shot(timestep)
         visible = solver.head.visibility(shot.start, shot.views)
@@ -173,7 +184,8 @@ def _sampled_part(
 def _started_part(fit: HeadFit, take: RecordedTake, texture: Texture, step: Step) -> np.ndarray:
     """(T, R) how badly the regions are explained in coarse images from where the fit is, at the
     timesteps of a part."""
-    solver, found = _Solver(fit, take, texture), []
+    solver = _Solver(fit, take, texture)
+    found = []
     for timestep in sorted(take.landmarks):
         shot = solver.shot(timestep)
         visible = solver.head.visibility(shot.start, shot.views)
@@ -195,7 +207,8 @@ def _solved_part(
         solved.append(solver.solve(shot, before, usual))
         before = shot, solved[-1]
         step()
-    names, order = ("values", "matrix", "right", "misfit", "missed", "better"), -1 if settled else 1
+    names = ("values", "matrix", "right", "misfit", "missed", "better")
+    order = -1 if settled else 1
     return {name: np.stack([getattr(own, name) for own in solved[::order]]) for name in names}
 
 
@@ -206,15 +219,20 @@ class _Solver:
         self, fit: HeadFit, take: RecordedTake, texture: Texture = NO_TEXTURE, min_gain: float = 0.0
     ) -> None:
         self.head = DenseHead(fit.head, take, texture)
-        self._fit, self._take, self._min_gain = fit, take, min_gain
+        self._fit = fit
+        self._take = take
+        self._min_gain = min_gain
         self._visibility = LandmarkVisibility(fit.head, take.places)
 
     def shot(self, timestep: int) -> _Shot:
         """Read a timestep."""
-        parameters, world = self._fit.parameters[timestep], self._fit.to_capture
-        center, views = self.head.positions(parameters).mean(0), []
+        parameters = self._fit.parameters[timestep]
+        world = self._fit.to_capture
+        center = self.head.positions(parameters).mean(0)
+        views = []
         for recording, image in self._take.images(timestep, MAX_CAMERAS):
-            camera, key = world.camera(recording), recording.world_to_camera.tobytes()
+            camera = world.camera(recording)
+            key = recording.world_to_camera.tobytes()
             views.append(PyramidView(key, camera, pyramid(camera, image, center)))
         seen = self._visibility.weighted(self._take.landmarks[timestep], parameters, world)
         landmarks = landmarks_in_capture(seen, self._take, self._fit)
@@ -236,7 +254,8 @@ class _Solver:
             for other in others:
                 values, found = self.started(shot, other, visible)
                 if found.all < error.all:
-                    best, error = values, found
+                    best = values
+                    error = found
         best, visible = self._refined(shot, best)
         while (astray := self._astray(shot, best, visible) & ~shot.by_landmarks).any():
             shot = replace(shot, by_landmarks=shot.by_landmarks | astray)
@@ -251,7 +270,8 @@ class _Solver:
             best = shot.start
             matrix = np.diag(KEPT_STIFFNESS * acceleration_precision(self.head.head.model))
             right = -prior_terms(self.head.head, best)[1]  # which the prior does not move
-        missed, misfit = self._missed(shot.landmarks, best), self._evidence(shot, best, visible)
+        missed = self._missed(shot.landmarks, best)
+        misfit = self._evidence(shot, best, visible)
         return _Solved(best, visible, matrix, right, misfit.regions, missed, better)
 
     def _evidence(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> Misfit:
@@ -261,7 +281,8 @@ class _Solver:
     def _astray(self, shot: _Shot, values: np.ndarray, visible: np.ndarray) -> np.ndarray:
         """(R,) bool: regions whose landmarks are missed by much more, though they are not explained
         clearly better; and those of the upper face that went farther from them than it moves."""
-        both, astray = (shot.start, values), np.zeros(len(REGIONS), bool)
+        both = (shot.start, values)
+        astray = np.zeros(len(REGIONS), bool)
         old, new = (self._evidence(shot, own, visible).regions for own in both)
         missed = [self._missed(shot.landmarks, own) for own in both]
         for region in range(len(REGIONS)):
@@ -277,7 +298,8 @@ class _Solver:
         visible = self.head.visibility(values, shot.views)
         values = self._descended(shot, values, visible, FINE_STEPS)
         for _ in range(LAST_ROUNDS):
-            assumed, visible = visible, self.head.visibility(values, shot.views)
+            assumed = visible
+            visible = self.head.visibility(values, shot.views)
             if np.array_equal(assumed, visible):
                 break
             values = self._descended(shot, values, visible, LAST_STEPS)
@@ -318,7 +340,8 @@ class _Solver:
         # a level weighs the same with fewer points
         share = len(self.head.rows[0]) / len(jacobian)
         flat = jacobian.reshape(-1, len(values))
-        missed, weight = self._missed(shot.landmarks, values), shot.landmarks.weight.copy()
+        missed = self._missed(shot.landmarks, values)
+        weight = shot.landmarks.weight.copy()
         for region in np.flatnonzero(~shot.by_landmarks):
             own = self.head.landmark_region == region
             if (own & (weight > 0)).any():  # far from the head, they count less
@@ -352,10 +375,8 @@ def _agreeing(
     beyond = np.maximum(by_region - np.median(by_region, axis=0), 0) * better[:, None]
     moved = {}
     for timestep, far in zip(sorted(take.landmarks), beyond, strict=True):
-        own, at = (
-            take.landmarks[timestep],
-            head.landmarks.positions(*split(fit.parameters[timestep])),
-        )
+        own = take.landmarks[timestep]
+        at = head.landmarks.positions(*split(fit.parameters[timestep]))
         weight = robust(far, DISAGREEMENT_M)[head.landmark_region][:, None]
         seen = np.stack([fit.to_capture.camera(camera).project(at)[0] for camera in own.cameras])
         moved[timestep] = replace(own, points=weight * own.points + (1 - weight) * seen)

@@ -40,10 +40,12 @@ CHIN_DIRECTION = np.array([0.0, -1.0, -0.4])  # In which an opening jaw moves it
 OPENING_SIGMA_M = 0.002
 MIN_COSINE = 0.25  # Of the angle between normal and camera, below which a point is not compared
 VISIBILITY_SIDE_PX = 110  # Size of the depth image that hidden points are found in
-DIRECTIONS, OPENING_STEP_M = 8, 0.008
+DIRECTIONS = 8
+OPENING_STEP_M = 0.008
 """Steps of a direction's coordinates, and of the chin's height, within which a head hides the same
 of itself."""
-REST_QUANTILE, REST_SCALE_M = 0.2, 0.002
+REST_QUANTILE = 0.2
+REST_SCALE_M = 0.002
 """A region is at rest when it moves as little as at this share of the timesteps, within that
 distance."""
 HELD_OUT_LEVEL = len(appearance.LEVELS_M)
@@ -69,10 +71,15 @@ class DenseHead:
         """texture: of the points, which `photo_term` and `misfit` compare with images."""
         from scipy.spatial import cKDTree
 
-        self.head, self._texture, model = head, texture, head.model
-        places, reliable = take.places, take.reliable
-        template, faces = model.v_template, model.faces
-        self.landmarks, at = PosedPoints(model, places), places.on(template, faces)
+        self.head = head
+        self._texture = texture
+        model = head.model
+        places = take.places
+        reliable = take.reliable
+        template = model.v_template
+        faces = model.faces
+        self.landmarks = PosedPoints(model, places)
+        at = places.on(template, faces)
         skin = large_parts(model)[places.face]
         eyeballs = model.weights[:, [JOINTS.index(f"{side}_eye") for side in ("left", "right")]]
         balls = template[(eyeballs > EYEBALL_WEIGHT).any(1)]
@@ -85,11 +92,13 @@ class DenseHead:
         distance, _ = cKDTree(at[used]).query(points.on(template, faces))
         self.points = points[distance < FACE_RADIUS_M] + places[used]
         held = np.arange(len(self.points)) % HELD_OUT == 0
-        fitted, others = np.flatnonzero(~held), np.flatnonzero(held)
+        fitted = np.flatnonzero(~held)
+        others = np.flatnonzero(held)
         self.rows = [*(fitted[::step] for step in STEPS), others, np.arange(len(self.points))]
         self._posed = [PosedPoints(model, self.points[rows]) for rows in self.rows]
         height = at[:, 1]
-        low, high = height[reliable].min(), height[reliable].max()
+        low = height[reliable].min()
+        high = height[reliable].max()
         edges = low + (high - low) * np.array(REGION_EDGES)
         self.landmark_region = np.digitize(height, edges)
         self.region = np.digitize(self.points.on(template, faces)[:, 1], edges)
@@ -117,9 +126,11 @@ class DenseHead:
     def visibility(self, values: np.ndarray, views: Views) -> np.ndarray:
         """(C, N) squared cosine at which each camera sees each point, 0 where the head hides it;
         kept by direction and by how far the mouth is open."""
-        at, turn = self.positions(values), head_rotation(values)
+        at = self.positions(values)
+        turn = head_rotation(values)
         opening = round(self.opening(values) / OPENING_STEP_M)
-        seen, faces = [], self.head.model.faces
+        seen = []
+        faces = self.head.model.faces
         for camera in (view.camera for view in views):
             key = opening, *rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
             if key not in self._visible:
@@ -157,7 +168,8 @@ class DenseHead:
         regions, of_region = np.unique(self.region, return_inverse=True)
         for values in take:
             still = values.copy()
-            still[:-RIGID_SIZE], still[-RIGID_SIZE + 3 : -3] = 0, 0
+            still[:-RIGID_SIZE] = 0
+            still[-RIGID_SIZE + 3 : -3] = 0
             distance = ((self.positions(values) - self.positions(still)) ** 2).sum(1)
             by_region = (distance[self.region == region] for region in regions)
             moved.append([np.sqrt(own.mean()) for own in by_region])
@@ -166,7 +178,9 @@ class DenseHead:
 
     def samples(self, views: Views, values: np.ndarray, weight: np.ndarray) -> list[Sample]:
         """What the views show of the points; weight (C, N)."""
-        at, basis, found = self.positions(values), self.light_basis(values), []
+        at = self.positions(values)
+        basis = self.light_basis(values)
+        found = []
         for view, own in zip(views, weight, strict=True):
             projected = [level.camera.project(at) for level in view.levels]
             levels = [
@@ -182,8 +196,10 @@ class DenseHead:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Gauss–Newton terms of a level's points by their positions: H (M, 3, 3) and b (M, 3)."""
         at = self.positions(values, level)
-        matrix, right = np.zeros((len(at), 3, 3)), np.zeros((len(at), 3))
-        basis, rows = self.light_basis(values, level), self.rows[level]
+        matrix = np.zeros((len(at), 3, 3))
+        right = np.zeros((len(at), 3))
+        basis = self.light_basis(values, level)
+        rows = self.rows[level]
         for view, seen in zip(views, visible, strict=True):
             own = view.levels[level]
             pixels, depth = own.camera.project(at)
@@ -204,7 +220,8 @@ class DenseHead:
             sums = ((one * other) @ appearance.CHANNEL_WEIGHTS for one, other in pairs)
             xx, xy, yy, x, y = ((used * own)[:, None] for own in sums)
             of_x, of_y = appearance.projection_derivative(own.camera, at[near]).swapaxes(0, 1)
-            along_x, along_y = xx * of_x + xy * of_y, xy * of_x + yy * of_y
+            along_x = xx * of_x + xy * of_y
+            along_y = xy * of_x + yy * of_y
             matrix[near] += of_x[:, :, None] * along_x[:, None]
             matrix[near] += of_y[:, :, None] * along_y[:, None]
             right[near] -= x * of_x + y * of_y
@@ -214,11 +231,14 @@ class DenseHead:
         self, views: Views, visible: np.ndarray, values: np.ndarray, points: int, level: int
     ) -> Misfit:
         """How badly a level's images are explained at the points of a level."""
-        at, basis = self.positions(values, points), self.light_basis(values, points)
+        at = self.positions(values, points)
+        basis = self.light_basis(values, points)
         rows = self.rows[points]
-        total, weights = np.zeros(len(REGIONS)), np.zeros(len(REGIONS))
+        total = np.zeros(len(REGIONS))
+        weights = np.zeros(len(REGIONS))
         for view, seen in zip(views, visible, strict=True):
-            weight, own = seen[rows] * self._texture.trust[rows], view.levels[level]
+            weight = seen[rows] * self._texture.trust[rows]
+            own = view.levels[level]
             pixels, depth = own.camera.project(at)
             shown = appearance.inside(own.camera, pixels, depth)
             (found,) = appearance.sampled([own.channels], pixels)
@@ -238,7 +258,8 @@ class DenseHead:
         are `before`, visible (C, N) and values."""
         start = self.positions(values, appearance.FLOW_POINTS)
         targets = list(appearance.flow_targets(start, before, now))
-        rows, moved = self.rows[appearance.FLOW_POINTS], values
+        rows = self.rows[appearance.FLOW_POINTS]
+        moved = values
         weights = {view.key: own[rows] for view, own in zip(before, visible, strict=True)}
         for _ in range(appearance.FLOW_ITERATIONS):
             at, jacobian = self.linearized(moved, appearance.FLOW_POINTS)

@@ -17,17 +17,21 @@ import numpy as np
 from ..errors import StgaError
 
 FOLDER = Path(__file__).with_name("networks")
-FACE_FILE, PERSON_FILE = FOLDER / "face_landmarker.task", FOLDER / "selfie_segmentation.tflite"
+FACE_FILE = FOLDER / "face_landmarker.task"
+PERSON_FILE = FOLDER / "selfie_segmentation.tflite"
 MIN_DETECTION_SCORE = 0.3  # MediaPipe's default, 0.5, misses near-profile views
 MIN_PRESENCE = 0.5  # Of a face in the crop, as the landmarks' network sees it
 MAX_FACES = 2  # Faces that are looked for: a second one in a frame is reported
 MAX_BOX_OVERLAP = 0.5  # Intersection over union beyond which two detected boxes are of one face
 CROP_SCALE = 1.5  # Side of the landmarks' crop, in sides of the detected box
-DETECTOR_SIZE_PX, CROP_SIZE_PX, PERSON_SIZE_PX = 128, 256, 256
+DETECTOR_SIZE_PX = 128
+CROP_SIZE_PX = 256
+PERSON_SIZE_PX = 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
 IRIS_CENTERS = (468, 473)
-FIRST_IRIS_POINT, MESH_POINTS = 468, 478
+FIRST_IRIS_POINT = 468
+MESH_POINTS = 478
 """Landmarks: 468 of the skin, and five an iris of which the first is its center."""
 SCORE_POINTS = np.array([
     0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63, 65, 66,
@@ -75,7 +79,8 @@ class _Crop:
 
     def matrix(self, size: int) -> np.ndarray:
         """(2, 3) from pixels of the crop, resampled to `size`, to the image's."""
-        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        cos = np.cos(self.angle)
+        sin = np.sin(self.angle)
         turn = self.side / size * np.array([[cos, -sin], [sin, cos]])
         return np.column_stack([turn, self.center - turn @ [size / 2, size / 2]])
 
@@ -107,14 +112,18 @@ class FaceNetworks:
         import cv2
         from scipy.special import expit
 
-        found, (height, width) = [], image.shape[:2]
+        found = []
+        (height, width) = image.shape[:2]
         whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
-        matrix, scale = whole.matrix(DETECTOR_SIZE_PX), whole.side / DETECTOR_SIZE_PX
+        matrix = whole.matrix(DETECTOR_SIZE_PX)
+        scale = whole.side / DETECTOR_SIZE_PX
         small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
         self._faces.setInput(cv2.dnn.blobFromImage(small, 2 / 255, mean=(127.5,) * 3))  # −1 to 1
         boxes, scores = self._faces.forward(["regressors", "classificators"])
         for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores))[:most]:
-            center, side, (right_eye, left_eye) = box[:2], box[2:4].max(), box[4:8].reshape(2, 2)
+            center = box[:2]
+            side = box[2:4].max()
+            (right_eye, left_eye) = box[4:8].reshape(2, 2)
             angle = float(np.arctan2(*(left_eye - right_eye)[::-1]))
             center = center @ matrix[:, :2].T + matrix[:, 2]
             crop = _Crop(center, CROP_SCALE * scale * side, angle)
@@ -199,14 +208,16 @@ def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
     """
     from scipy.special import expit
 
-    share, boxes = expit(scores.astype(np.float64)), boxes.copy()
+    share = expit(scores.astype(np.float64))
+    boxes = boxes.copy()
     boxes[:, :2] += _anchors()
     boxes[:, 4:] += np.tile(_anchors(), 6)
     left = np.argsort(-share, kind="stable")
     left = left[share[left] >= MIN_DETECTION_SCORE]
     faces = []
     while len(left):
-        low, high = boxes[left, :2] - boxes[left, 2:4] / 2, boxes[left, :2] + boxes[left, 2:4] / 2
+        low = boxes[left, :2] - boxes[left, 2:4] / 2
+        high = boxes[left, :2] + boxes[left, 2:4] / 2
         common = np.maximum(np.minimum(high, high[0]) - np.maximum(low, low[0]), 0).prod(axis=1)
         area = boxes[left, 2:4].prod(axis=1)
         same = common / np.maximum(area + area[0] - common, 1e-9) > MAX_BOX_OVERLAP

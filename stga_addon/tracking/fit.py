@@ -86,7 +86,8 @@ def triangulate(
     offsets = np.einsum("cnij,cj->cni", across, origins)
     guess = origins.mean(0) + (directions * confidence[..., None]).sum(0)
     weights = confidence.astype(np.float64)
-    position, distance = guess, np.zeros(confidence.shape)
+    position = guess
+    distance = np.zeros(confidence.shape)
     for _ in range(ITERATIONS):
         total = weights.sum(0)
         share = weights / np.where(total > 0, total, 1.0)
@@ -193,7 +194,9 @@ def excerpt(
 def in_cameras_world(fit: HeadFit) -> HeadFit:
     """The same fit with the cameras where they are: only the scale of their world changes, about
     its origin."""
-    model, world, moved = fit.head.model, fit.to_capture, {}
+    model = fit.head.model
+    world = fit.to_capture
+    moved = {}
     for timestep, parameters in fit.parameters.items():
         expression, rigid = split(parameters.copy())
         root = model.j_regressor[0] @ (model.v_template + model.shapedirs @ expression)
@@ -232,7 +235,9 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     the surface. Where the world of the cameras is metric, the size of the head is the person's.
     step: follows each of ROUNDS.
     """
-    places, reliable, take = recorded.places, recorded.reliable, recorded.landmarks
+    places = recorded.places
+    reliable = recorded.reliable
+    take = recorded.landmarks
     timesteps = sorted(take)
     several = [t for t in timesteps if len(take[t].cameras) > 1]
     spread = evenly_spread(several or timesteps, IDENTITY_TIMESTEPS)
@@ -241,8 +246,11 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
     u, _, vt = np.linalg.svd(np.sum([one.rotation for one in aligned], axis=0))
     centers = [-one.rotation.T @ one.translation / one.scale for one in aligned]
     world = Similarity(size, u @ vt, -size * u @ vt @ np.median(centers, axis=0))
-    seen, subject, shape = dict(take), head, np.zeros(head.model.n_identity)
-    solved, ordered = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE)), True
+    seen = dict(take)
+    subject = head
+    shape = np.zeros(head.model.n_identity)
+    solved = np.zeros((len(timesteps), head.model.n_expression + RIGID_SIZE))
+    ordered = True
     parameters: dict[int, np.ndarray] = {}
     for number in range(ROUNDS):
         at = places.on(subject.model.v_template, subject.model.faces)
@@ -253,7 +261,8 @@ def fit_head(head: HeadModel, recorded: RecordedTake, step: Step = lambda: None)
         sized = recorded.metric or not several
         identity = solve_identity(head, places, observed, starts, sized)
         world = scaled_down(world, identity.scale)
-        shape, subject = identity.shape, person(head, identity.shape)
+        shape = identity.shape
+        subject = person(head, identity.shape)
         at = places.on(subject.model.v_template, subject.model.faces)
         take_observed = [observed_landmarks(found[t], world, reliable) for t in timesteps]
         if not number:
@@ -289,7 +298,8 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
     system = np.column_stack([points - center, np.ones(len(points))])
     solve = np.linalg.pinv(system, len(system) * np.finfo(np.float64).eps)
     stretch = np.ones(len(points))
-    rotation, place = np.eye(3), np.zeros(3)
+    rotation = np.eye(3)
+    place = np.zeros(3)
     for _ in range(POSIT_ITERATIONS):
         rows = (solve @ (seen * stretch[:, None])).T  # (2, 4)
         size = float(np.sqrt(np.linalg.norm(rows[0, :3]) * np.linalg.norm(rows[1, :3])))
@@ -309,7 +319,8 @@ def triangulated(
     single camera's are."""
     if len(landmarks.cameras) > 1:
         return triangulate(landmarks.cameras, landmarks.points, landmarks.confidence * reliable)
-    camera, pixels = landmarks.cameras[0], landmarks.points[0]
+    camera = landmarks.cameras[0]
+    pixels = landmarks.points[0]
     seen = landmarks.confidence[0] * reliable > 0
     origin, directions = rays(camera, pixels)
     guess = np.tile(origin, (len(head), 1))
@@ -386,6 +397,7 @@ class LandmarkVisibility:
         normals and cameras at `eyes` (C, 3), in the head's world; 0 where the surface faces
         away."""
         at = self._points.positions(*split(parameters))
-        normals, towards = self._normals @ head_rotation(parameters).T, eyes[:, None] - at
+        normals = self._normals @ head_rotation(parameters).T
+        towards = eyes[:, None] - at
         length = np.linalg.norm(towards, axis=2) * np.maximum(np.linalg.norm(normals, axis=1), 1e-9)
         return at, np.clip((normals * towards).sum(2) / length, 0, 1) ** 2

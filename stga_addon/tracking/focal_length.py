@@ -15,18 +15,24 @@ from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity
 
-CANDIDATES, TIMESTEPS, LANDMARKS = 64, 12, 80
+CANDIDATES = 64
+TIMESTEPS = 12
+LANDMARKS = 80
 """Timesteps of which the most differently turned are chosen, and how many; landmarks used."""
 MIN_TURN_DEG = (
     20.0  # Between two timesteps; below it, what is near cannot be told from what is large
 )
 USUAL_SIGMA = 0.35  # Standard deviation of the inverse focal length about that of a phone, relative
-NEAREST, FARTHEST = 2.0, 0.2
+NEAREST = 2.0
+FARTHEST = 0.2
 """Largest and smallest inverse, relative to that of a phone: 104° and 15° over the diagonal."""
-OWN_SIGMA_M, NOISE_SIGMA_M = LANDMARK_SIGMA_M, 0.0006
+OWN_SIGMA_M = LANDMARK_SIGMA_M
+NOISE_SIGMA_M = 0.0006
 """Standard deviations of what a landmark misses the head by in all timesteps alike, which says
 nothing of focal lengths, and beyond that in one of them."""
-SOLVES, ROUNDS, CONVERGED = 6, 2, 0.01
+SOLVES = 6
+ROUNDS = 2
+CONVERGED = 0.01
 """Inverse focal lengths that are tried; fits of the head for each, as its depth is that of the fit
 before; and the relative change after which no more are tried."""
 MAX_SCALE_DIFFERENCE = 0.043  # Of a camera from the median of all; 5 % of focal length show
@@ -38,7 +44,8 @@ MIN_CAMERAS = 4
 MIN_VISIBILITY = 0.1
 """Squared cosine of the angle between a landmark's surface and a camera that may use it."""
 MAX_COMPARED_TIMESTEPS = 40
-SCALE_ITERATIONS, OUTLIER_SCALE = 8, 1.5
+SCALE_ITERATIONS = 8
+OUTLIER_SCALE = 1.5
 HERE = Similarity(
     1.0, np.eye(3), np.zeros(3)
 )  # The camera's own world, in meters, in which the head is fitted
@@ -83,10 +90,12 @@ def solved_focal(head: HeadModel, take: RecordedTake) -> float | None:
 
 def _with_own_places(head: HeadModel, places: SurfacePoints) -> tuple[HeadModel, SurfacePoints]:
     """The head at its landmarks alone, and an identity that moves each by OWN_SIGMA_M."""
-    model, count = head.model, len(places)
+    model = head.model
+    count = len(places)
     corners = model.faces[places.face].ravel()
     own = OWN_SIGMA_M * np.eye(3 * count).reshape(count, 1, 3, 3 * count).repeat(3, axis=1)
-    template, known = model.v_template[corners], model.n_identity
+    template = model.v_template[corners]
+    known = model.n_identity
     dirs = np.split(model.shapedirs[corners], [known], axis=2)
     small = replace(
         model,
@@ -124,7 +133,8 @@ def _observed(
     head: HeadModel, places: SurfacePoints, views: Sequence[TimestepLandmarks]
 ) -> tuple[list[Observation], np.ndarray]:
     """Landmarks in the camera's world at the head's depth, and poses (T, 18) that lead there."""
-    neutral, used = places.on(head.model.v_template, head.model.faces), np.ones(len(places), bool)
+    neutral = places.on(head.model.v_template, head.model.faces)
+    used = np.ones(len(places), bool)
     points = (head_fit.triangulated(view, used, neutral, 1.0) for view in views)
     found = [head_fit.observed_landmarks(own, HERE, used) for own in points]
     return found, np.stack([head_fit.rigid_start(neutral, own) for own in found])
@@ -141,19 +151,23 @@ def _slope(
     camera = views[0].cameras[0]
     trial = replace(camera, fl_x=camera.fl_x / inverse, fl_y=camera.fl_y / inverse)
     views = [replace(view, cameras=(trial,)) for view in views]
-    subject, frames = person(head, np.zeros(head.model.n_identity)), np.zeros(0)
+    subject = person(head, np.zeros(head.model.n_identity))
+    frames = np.zeros(0)
     observed: list[Observation] = []
     for _ in range(ROUNDS):
         seen, starts = _observed(subject, places, views)
         frames = frames if len(frames) else np.pad(starts, ((0, 0), (head.model.n_expression, 0)))
         visibility = head_fit.LandmarkVisibility(subject, places)
-        observed, factor = [], LANDMARK_SIGMA_M / NOISE_SIGMA_M
+        observed = []
+        factor = LANDMARK_SIGMA_M / NOISE_SIGMA_M
         for view, own, values in zip(views, seen, frames, strict=True):
             weight = own.weight * visibility.weighted(view, values, HERE).confidence[0]
             observed.append(replace(own, root=own.root * factor, weight=weight))
         identity = solve_identity(head, places, observed, starts, metric=True)
-        subject, frames = person(head, identity.shape), identity.frames
-    points, total = PosedPoints(subject.model, places), 0.0
+        subject = person(head, identity.shape)
+        frames = identity.frames
+    points = PosedPoints(subject.model, places)
+    total = 0.0
     rotation = camera.world_to_camera[:3, :3]
     for view, own, values in zip(views, observed, frames, strict=True):
         at = points.positions(*split(values))
@@ -170,11 +184,13 @@ def _slope(
 def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
     """One sentence for each camera whose landmarks are of another size than the fitted head is
     there: the sign of a wrong focal length. Faces seen from the side do not count."""
-    visibility, used = head_fit.LandmarkVisibility(fit.head, take.places), take.reliable
+    visibility = head_fit.LandmarkVisibility(fit.head, take.places)
+    used = take.reliable
     timesteps = sorted(fit.parameters)[:: 1 + len(fit.parameters) // MAX_COMPARED_TIMESTEPS]
     scales: dict[str, dict[int, float]] = {}
     for timestep in timesteps:
-        parameters, seen = fit.parameters[timestep], take.landmarks[timestep]
+        parameters = fit.parameters[timestep]
+        seen = take.landmarks[timestep]
         cameras = [fit.to_capture.camera(camera) for camera in seen.cameras]
         eyes = np.stack([camera.position for camera in cameras])
         at, squared = visibility.seen(parameters, eyes)
@@ -205,7 +221,8 @@ def scale_warnings(fit: HeadFit, take: RecordedTake) -> tuple[str, ...]:
 
 def _scale(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> float:
     """The scale from points (N, 2) to others, after the mean shift; outliers count little."""
-    scale, used = 1.0, weights
+    scale = 1.0
+    used = weights
     for _ in range(SCALE_ITERATIONS):
         a = source - (used[:, None] * source).sum(0) / used.sum()
         b = target - (used[:, None] * target).sum(0) / used.sum()

@@ -11,8 +11,11 @@ from ..errors import StgaError
 from ..files import read_json, read_npz, write_npz
 from ..schema import from_json, setting
 
-REPORT_FILE, SHEET_FILE, MATTES_FILE = "tracking.json", "contact_sheet.png", "mattes.json"
-LANDMARKS_FOLDER, PLACES_FILE = "landmarks", "head_model.npz"
+REPORT_FILE = "tracking.json"
+SHEET_FILE = "contact_sheet.png"
+MATTES_FILE = "mattes.json"
+LANDMARKS_FOLDER = "landmarks"
+PLACES_FILE = "head_model.npz"
 KEPT_FOLDER = "unfinished"
 """Of results of parts, with which an interrupted tracking goes on; removed at its end."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
@@ -137,7 +140,8 @@ def read_torso_points(capture: Path) -> TorsoPoints | None:
     if not path.is_file():
         return None
     arrays = read_npz(path)
-    timestep, at = arrays.get("timestep", np.zeros(0)), arrays.get("points", np.zeros(0))
+    timestep = arrays.get("timestep", np.zeros(0))
+    at = arrays.get("points", np.zeros(0))
     if timestep.shape != () or timestep.dtype.kind not in "iu":
         raise StgaError(f"{path}: timestep: expected a whole number")
     if at.ndim != 2 or at.shape[1] != 3 or at.dtype.kind != "f" or not np.isfinite(at).all():

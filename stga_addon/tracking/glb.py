@@ -15,7 +15,8 @@ from ..flame.quaternions import to_matrices
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES = 4
-MIN_NUMBERS_ALLOWANCE, MAX_NUMBERS_PER_BYTE = 1 << 20, 8
+MIN_NUMBERS_ALLOWANCE = 1 << 20
+MAX_NUMBERS_PER_BYTE = 8
 """Numbers that the joined mesh may hold: any file's, and more for each byte. Accessors without data
 promise as many zeros as they like, and nodes repeat meshes; sparse morph targets of a real head
 reach 4 a byte."""
@@ -71,7 +72,10 @@ def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
     """The triangle primitives of the scene's meshes. Raises StgaError where these hold more numbers
     than a file of this size may."""
     allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
-    vertices, corners, accessors, names = 0, 0, document["accessors"], set[str]()
+    vertices = 0
+    corners = 0
+    accessors = document["accessors"]
+    names = set[str]()
     placed: list[Placed] = []
     for node, matrix in _mesh_nodes(document):
         mesh = document["meshes"][node["mesh"]]
@@ -98,13 +102,15 @@ def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
 
 def _mesh_nodes(document: Json) -> Iterator[tuple[Json, np.ndarray]]:
     """Nodes of the scene that have a mesh, and their transforms (4, 4)."""
-    nodes, scene = document.get("nodes", []), document["scenes"][document.get("scene", 0)]
+    nodes = document.get("nodes", [])
+    scene = document["scenes"][document.get("scene", 0)]
     waiting = [(int(row), np.eye(4)) for row in scene.get("nodes", ())]
     for _ in range(len(nodes)):  # each node has one parent: more would be a loop
         if not waiting:
             return
         row, above = waiting.pop()
-        node, own = nodes[row], np.eye(4)
+        node = nodes[row]
+        own = np.eye(4)
         if "matrix" in node:
             own = np.array(node["matrix"], float).reshape(4, 4).T
         else:
@@ -133,8 +139,10 @@ def _part(
         corners = values.astype(np.int64)
     if corners.min(initial=0) < 0 or corners.max(initial=0) >= count:
         raise ValueError("a primitive's indices do not fit its vertices")
-    turn, faces = matrix[:3, :3], corners[: len(corners) // 3 * 3].reshape(-1, 3)
-    names, moved = tuple(name for name, _ in morphs), np.einsum("ab,vbk->vak", turn, targets)
+    turn = matrix[:3, :3]
+    faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    names = tuple(name for name, _ in morphs)
+    moved = np.einsum("ab,vbk->vak", turn, targets)
     return MorphMesh(positions @ turn.T + matrix[:3, 3], faces, names, moved)
 
 
@@ -153,12 +161,14 @@ def _accessor(
     count = _count(accessor)
     if WIDTHS[accessor["type"]] != width or count != (expected or count):
         raise ValueError("an accessor is of another type or length than its use")
-    component, values = accessor["componentType"], np.zeros((count, width))
+    component = accessor["componentType"]
+    values = np.zeros((count, width))
     if "bufferView" in accessor:
         values = _view(document, data, accessor, component, (count, width))
     sparse = accessor.get("sparse")
     if sparse:
-        changed, indices = _count(sparse), sparse["indices"]
+        changed = _count(sparse)
+        indices = sparse["indices"]
         rows = _view(document, data, indices, indices["componentType"], (changed, 1))[:, 0]
         found = _view(document, data, sparse["values"], component, (changed, width))
         values[rows.astype(np.int64)] = found
@@ -171,7 +181,8 @@ def _view(
     document: Json, data: bytes, source: Json, component: int, shape: tuple[int, int]
 ) -> np.ndarray:
     """A buffer view's values, as float64 copies of this shape."""
-    view, dtype = document["bufferViews"][source["bufferView"]], np.dtype(COMPONENTS[component])
+    view = document["bufferViews"][source["bufferView"]]
+    dtype = np.dtype(COMPONENTS[component])
     if view.get("buffer", 0) != 0:
         raise ValueError("expected one buffer")
     start = int(view.get("byteOffset", 0)) + int(source.get("byteOffset", 0))

@@ -17,7 +17,8 @@ from .glb import read_glb
 IDENTITY_PREFIX = "identity"
 """Begins the names of shapes that make another person; all others are expressions."""
 LINEAR_KEYS = ("mean", "faces")
-MIN_EXTENT_M, MAX_EXTENT_M = 0.1, 2.0
+MIN_EXTENT_M = 0.1
+MAX_EXTENT_M = 2.0
 """Extent of a head model along its longest axis; outside of it, the file is in other units."""
 MAX_COMPONENT_M = 100.0
 """Displacement of a vertex by a component at coefficient 1; scales of components differ from model
@@ -56,7 +57,8 @@ def read_head_model(path: Path | None) -> HeadModel:
     """
     if path is None:
         return HeadModel(flame_model(None), "flame")
-    suffix, arrays = path.suffix.lower(), dict[str, np.ndarray]()
+    suffix = path.suffix.lower()
+    arrays = dict[str, np.ndarray]()
     if suffix == ".glb":
         mesh = read_glb(path)
         arrays = shape_arrays(mesh.positions, mesh.faces, mesh.names, mesh.targets)
@@ -135,10 +137,12 @@ def checked(path: Path, head: HeadModel) -> HeadModel:
     that none has."""
     model = head.model
     if head.layout == "flame":
-        template, shapes = "v_template", {"shapedirs": model.shapedirs, "posedirs": model.posedirs}
+        template = "v_template"
+        shapes = {"shapedirs": model.shapedirs, "posedirs": model.posedirs}
     else:
         identity, expression = np.split(model.shapedirs, [model.n_identity], axis=2)
-        template, shapes = "mean", {"identity": identity, "expression": expression}
+        template = "mean"
+        shapes = {"identity": identity, "expression": expression}
     bounds = {
         template: (model.v_template, MAX_COORDINATE_M),
         **{name: (array, MAX_COMPONENT_M) for name, array in shapes.items()},
@@ -168,7 +172,8 @@ def floats(
     the expected shape (None: any size), or is of no dtype of these kinds, which are `numbers`."""
     if key not in arrays:
         raise StgaError(f"{path}: has no {key}")
-    array, sizes = arrays[key], zip(expected, arrays[key].shape, strict=False)
+    array = arrays[key]
+    sizes = zip(expected, arrays[key].shape, strict=False)
     if array.ndim != len(expected) or any(want not in (None, size) for want, size in sizes):
         wanted = ", ".join("any" if size is None else str(size) for size in expected)
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")

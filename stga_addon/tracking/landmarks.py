@@ -18,8 +18,10 @@ from .footage.model import Footage, FootageCamera
 from .head_model import floats
 from .posed_points import SurfacePoints
 
-MIN_BARYCENTRIC, MAX_SUM_ERROR = -1e-3, 1e-3
-MAX_PIXELS, MAX_CONFIDENCE = 1e5, 1e6
+MIN_BARYCENTRIC = -1e-3
+MAX_SUM_ERROR = 1e-3
+MAX_PIXELS = 1e5
+MAX_CONFIDENCE = 1e6
 """Bounds of landmarks, three times as far as the largest image reaches, and of their confidence:
 some detectors write scores in place of shares."""
 MAX_TWO_FACES_SHARE = 0.34
@@ -158,7 +160,8 @@ def read_places(path: Path, triangles: int) -> tuple[SurfacePoints, np.ndarray]:
     arrays = read_npz(path)
     if "face" not in arrays:
         raise StgaError(f"{path}: has no face")
-    face, expected = arrays["face"], f"triangles from 0 to {triangles - 1}, or -1, of shape (any,)"
+    face = arrays["face"]
+    expected = f"triangles from 0 to {triangles - 1}, or -1, of shape (any,)"
     is_row = face.ndim == 1 and face.dtype.kind in "iu"
     if not is_row or not ((face >= -1) & (face < triangles)).all():
         raise StgaError(f"{path}: face: expected {expected}")

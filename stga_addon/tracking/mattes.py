@@ -27,7 +27,10 @@ from .landmarks import Report
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
 """Median over the tracked head, below which the network does not see the person there."""
-LIKELY, SURE, UNLIKELY = 0.5, 0.9, 0.1  # Probabilities of a person
+# Probabilities of a person
+LIKELY = 0.5
+SURE = 0.9
+UNLIKELY = 0.1
 MAX_CUT_SIDE_PX = 400
 """Of the images that GrabCut works on, whose time grows with the pixels; the band's is full."""
 CUT_ITERATIONS = 2
@@ -44,7 +47,8 @@ MIN_NEIGHBORHOOD_PX = 2.0
 REACH_SHARE = 1.0  # From the head, of its size, that hair reaches; clothes reach farther, below
 SIMILAR_COLORS_LEVELS = 30.0
 """Difference of both sides' colors at which half of the coverage is a smooth edge's."""
-PLATE_NOISE_LEVELS, PLATE_SURE_LEVELS = 10.0, 40.0
+PLATE_NOISE_LEVELS = 10.0
+PLATE_SURE_LEVELS = 40.0
 """Differences from a clean plate, of 255, that noise makes, and that only a person does."""
 MAX_HOLE_SHARE = 0.01
 """Area of a hole in the person, of the head's, that is filled: highlights, patterned cloth."""
@@ -67,10 +71,13 @@ def with_mattes(
     capture's masks and, where an interrupted call with the same `source` wrote them, read from
     there. A camera's clean plate tells the person from the backdrop, else the network.
     """
-    path, total, done = out / MATTES_FILE, len(list(footage.views())), 0
+    path = out / MATTES_FILE
+    total = len(list(footage.views()))
+    done = 0
     continues = path.exists() and read_json(path) == source
     write_json(path, source)
-    unseen, cameras = list[str](), []
+    unseen = list[str]()
+    cameras = []
 
     def count(steps: int) -> None:
         report("Mattes", done + steps, total)
@@ -99,10 +106,13 @@ def _write_mattes(
     camera: FootageCamera, files: dict[int, Path], head_pixels: HeadPixels, step: Step
 ) -> dict[int, bool]:
     """Write the mattes of timesteps without a mask; by those, whether a person was recognized."""
-    plate, network, recognized = camera.clean_plate(), PersonNetwork(), {}
+    plate = camera.clean_plate()
+    network = PersonNetwork()
+    recognized = {}
     for timestep, file in files.items():
         if camera.mask(timestep) is None:
-            image, head = camera.image(timestep), head_pixels(timestep, camera)
+            image = camera.image(timestep)
+            head = head_pixels(timestep, camera)
             is_person = network.probability(image) if plate is None else by_plate(image, plate)
             seen = float(np.median(is_person[head])) if head.any() else 1.0
             recognized[timestep] = seen >= MIN_HEAD_PROBABILITY
@@ -120,7 +130,8 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     """
     import cv2
 
-    size, whole = np.sqrt(max(head.sum(), 1.0)), image.shape[1::-1]
+    size = np.sqrt(max(head.sum(), 1.0))
+    whole = image.shape[1::-1]
     scale = min(1.0, MAX_CUT_SIDE_PX / max(whole))
     small = tuple(max(1, round(scale * side)) for side in whole)
     seeds = [image, probability, head.astype(np.float32)]
@@ -129,7 +140,8 @@ def find_matte(image: np.ndarray, probability: np.ndarray, head: np.ndarray) -> 
     person = cv2.resize(cut, whole, interpolation=cv2.INTER_LINEAR) > 0.5
     # coverage in a band along the person's outline
     band = max(1.0, BAND_SHARE * size)
-    inside, outside = _shrunk(cv2, person, band), ~_grown(cv2, person, band)
+    inside = _shrunk(cv2, person, band)
+    outside = ~_grown(cv2, person, band)
     unknown = ~inside & ~outside
     if not (unknown.any() and inside.any() and outside.any()):
         return np.where(person, 255, 0).astype(np.uint8)
@@ -167,10 +179,12 @@ def _cut(
     surely = core | _shrunk(cv2, probability > SURE, margin)
     possibly = _grown(cv2, (probability > UNLIKELY) | head, 2 * margin) & reach
     marks = np.where(probability > LIKELY, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    marks[~possibly], marks[surely] = cv2.GC_BGD, cv2.GC_FGD
+    marks[~possibly] = cv2.GC_BGD
+    marks[surely] = cv2.GC_FGD
     if 0 < np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).mean() < 1:  # it learns the colors of both
         cv2.setRNGSeed(0)  # of the clusters that the color models begin with
-        models, colors = (np.zeros((1, 65)), np.zeros((1, 65))), image[..., ::-1].copy()
+        models = (np.zeros((1, 65)), np.zeros((1, 65)))
+        colors = image[..., ::-1].copy()
         cv2.grabCut(colors, marks, None, *models, CUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
     found = np.isin(marks, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
     found = (cv2.medianBlur(found, 3) > 0).astype(np.uint8)
@@ -192,7 +206,8 @@ def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) ->
     weight = known.astype(np.float32)
     weighted = cv2.resize(image * weight[..., None], small, interpolation=cv2.INTER_AREA)
     weight = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)
-    total, norm = np.zeros_like(weighted), np.full_like(weight, 1e-9)
+    total = np.zeros_like(weighted)
+    norm = np.full_like(weight, 1e-9)
     for share, importance in zip(NEIGHBORHOOD_SHARES, (1.0, FAR_WEIGHT), strict=True):
         sigma = max(0.7, scale * share * size)
         total += importance * cv2.GaussianBlur(weighted, (0, 0), sigma)

@@ -21,17 +21,28 @@ from .footage.model import Footage
 from .head_model import HeadModel
 
 SIZE = 256  # Width and height of a picture in pixels: Blender's icons are square
-FIRST_CAMERAS, SHOWN_FRAMES = 3, 4
+FIRST_CAMERAS = 3
+SHOWN_FRAMES = 4
 """Most cameras of the first frame's fit; most frames of a picture, two in each direction."""
-COLUMNS, ROWS = 4, 5  # Of the contact sheet
+# Of the contact sheet
+COLUMNS = 4
+ROWS = 5
 PICTURE = 200, 250  # Width and height in pixels of a view; beside it stands the same with the mesh
-GAP, CAPTION, MARGIN = 8, 18, 12
+GAP = 8
+CAPTION = 18
+MARGIN = 12
 TILE_SIZE = 2 * PICTURE[0], PICTURE[1] + CAPTION
-NAME_WIDTH, CELL_HEIGHT, MAX_CHART_ROWS = 130, 12, 48
+NAME_WIDTH = 130
+CELL_HEIGHT = 12
+MAX_CHART_ROWS = 48
 HEAD_MARGIN = 0.08  # Of the head's box in the image, on every side
 MESH_OPACITY = 0.6
-MATTE_COLOR, MATTE_OPACITY = (0, 150, 60), 0.75  # Drawn over what lies outside a view's matte
-BACKGROUND, TEXT, NO_FACE = (24, 26, 30), (225, 228, 232), (70, 74, 80)
+# Drawn over what lies outside a view's matte
+MATTE_COLOR = (0, 150, 60)
+MATTE_OPACITY = 0.75
+BACKGROUND = (24, 26, 30)
+TEXT = (225, 228, 232)
+NO_FACE = (70, 74, 80)
 ERROR_COLORS = np.array([(38, 130, 110), (240, 200, 70), (215, 50, 45)], float)
 """Of no error, half of the color scale and its end."""
 COLOR_SCALE_END = 3.0  # In medians of all errors
@@ -70,7 +81,8 @@ def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
     """The head on a few of the frames that it was fitted to; black beyond an image."""
     timesteps = evenly_spread(sorted(fit.parameters), SHOWN_FRAMES)
     columns = 2 if len(timesteps) == SHOWN_FRAMES else 1
-    side, faces = SIZE // columns, fit.head.model.faces
+    side = SIZE // columns
+    faces = fit.head.model.faces
     picture = np.zeros((SIZE, SIZE, 3), np.uint8)
     for number, timestep in enumerate(timesteps[: columns**2]):
         source = next(camera for camera in footage.cameras if timestep in camera.timesteps)
@@ -78,13 +90,15 @@ def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
         vertices = posed_mesh(fit, fit.parameters[timestep])
         left, top, right, bottom = _head_box(camera, vertices)
         size = max(right - left, bottom - top)
-        left, top = (left + right - size) // 2, (top + bottom - size) // 2
+        left = (left + right - size) // 2
+        top = (top + bottom - size) // 2
         cut = _cropped(camera, left, top, size, size, side / size)
         image = Image.fromarray(source.image(timestep))
         cropped = image.crop((left, top, left + size, top + size))
         small = cropped.resize((cut.width, cut.height), Image.Resampling.BILINEAR)
         drawn = with_mesh(np.asarray(small), vertices, faces, cut)
-        row, column = side * (number // columns), side * (number % columns)
+        row = side * (number // columns)
+        column = side * (number % columns)
         square = np.asarray(Image.fromarray(drawn).resize((side, side)))
         picture[row : row + side, column : column + side] = square
     return picture
@@ -119,7 +133,8 @@ def write_contact_sheet(
 
     chart = _chart([(errors, median), (misfit, usual)], footage.timesteps)
     shown = sorted(every, key=rank, reverse=True)[: COLUMNS * ROWS]
-    (width, height), top = TILE_SIZE, MARGIN + CAPTION + chart.height + MARGIN
+    (width, height) = TILE_SIZE
+    top = MARGIN + CAPTION + chart.height + MARGIN
     lines = -(-len(shown) // COLUMNS)
     size = 2 * MARGIN + COLUMNS * (width + GAP) - GAP, top + lines * (height + GAP) + MARGIN
     sheet = Image.new("RGB", size, BACKGROUND)
@@ -128,7 +143,8 @@ def write_contact_sheet(
     sheet.paste(chart, (MARGIN, MARGIN + CAPTION))
     by_name = {camera.name: camera for camera in footage.cameras}
     for number, (name, t) in enumerate(shown):
-        image, mask = by_name[name].image(t), by_name[name].mask(t)
+        image = by_name[name].image(t)
+        mask = by_name[name].mask(t)
         if mask is not None:
             opacity = MATTE_OPACITY * (1 - mask[..., None].astype(np.float32) / 255)
             image = (image + opacity * (np.array(MATTE_COLOR) - image) + 0.5).astype(np.uint8)
@@ -184,7 +200,8 @@ def _tile(
 
 def _cropped(camera: Camera, left: int, top: int, width: int, height: int, scale: float) -> Camera:
     """The camera of a part of its image, scaled."""
-    cx, cy = camera.cx - left, camera.cy - top
+    cx = camera.cx - left
+    cy = camera.cy - top
     return replace(camera, width=width, height=height, cx=cx, cy=cy).scaled(scale)
 
 
@@ -194,7 +211,8 @@ def _head_box(camera: Camera, vertices: np.ndarray) -> tuple[int, int, int, int]
     whole = 0, 0, camera.width, camera.height
     if not (depth > 0).all():
         return whole
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    low = pixels.min(axis=0)
+    high = pixels.max(axis=0)
     margin = HEAD_MARGIN * (high - low)
     left, top = np.floor(np.maximum(low - margin, 0)).astype(int).tolist()
     right, bottom = np.ceil(np.minimum(high + margin, whole[2:])).astype(int).tolist()

@@ -65,8 +65,10 @@ class PosedPoints:
     def __init__(self, model: FlameModel, points: SurfacePoints) -> None:
         rows = model.faces[points.face].ravel()
         self.barycentric = points.barycentric
-        self.template, self.dirs = model.v_template[rows], model.shapedirs[rows]
-        self.weights, self.parents = model.weights[rows], model.parents.tolist()
+        self.template = model.v_template[rows]
+        self.dirs = model.shapedirs[rows]
+        self.weights = model.weights[rows]
+        self.parents = model.parents.tolist()
         self.posedirs = model.posedirs[rows] if model.posedirs.any() else None
         self.joints = model.j_regressor @ model.v_template
         self.joint_dirs = np.tensordot(model.j_regressor, model.shapedirs, 1)
@@ -92,9 +94,11 @@ class PosedPoints:
         self, coefficients: np.ndarray, rigid: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions (N, 3) and their derivatives (N, 3, K + 18)."""
-        posed, count = self._posed(coefficients, rigid), len(self.barycentric)
+        posed = self._posed(coefficients, rigid)
+        count = len(self.barycentric)
         turns = np.stack([left_jacobian(angles) for angles in posed.angles])
-        first, share = self.dirs.shape[2], self._corner_weights.sum(2)
+        first = self.dirs.shape[2]
+        share = self._corner_weights.sum(2)
         found = np.empty((count, 3, first + RIGID_SIZE))
         by_pose = found[..., first:-TRANSLATION_SIZE]
         # Blending and skinning are one product of (N, 3, 9) and (N, 9, K).

@@ -32,7 +32,8 @@ OUTLINE_RADIUS_M = 0.01
 """Distance from the landmarks beyond which outlines are those of hair, ears and clothes."""
 MAX_COSINE = 0.25  # Of the angle between normal and camera: those within 15° of the outline move it
 RIM_COSINE = 0.5  # The same of a triangle: those farther from the outline are not drawn
-PICTURE_SIDE, MAX_ENLARGEMENT = 600, 2
+PICTURE_SIDE = 600
+MAX_ENLARGEMENT = 2
 """The mesh's own mask is drawn with about so many pixels, since it has no soft edge."""
 SAMPLES_PER_PIXEL = 4
 MAX_REACH_PX = 40.0
@@ -90,7 +91,8 @@ def in_sight(
     small = camera.scaled(min(1.0, DEPTH_IMAGE_SIDE / max(camera.width, camera.height)))
     triangle, inside = rasterize(vertices, faces, small)
     covered = triangle >= 0
-    closeness, corners = np.zeros(triangle.shape), faces[triangle[covered]]
+    closeness = np.zeros(triangle.shape)
+    corners = faces[triangle[covered]]
     closeness[covered] = (inside[covered] / small.project(vertices)[1][corners]).sum(1)
     flat, depth = small.project(points)
     x, y = np.clip(np.nan_to_num(flat), -1, [small.width, small.height]).astype(np.int64).T
@@ -138,7 +140,8 @@ def surface_offsets(
             own[rows] += weight**2 * (patch**2).sum(2)
     pairs = np.maximum(usable.sum(0) ** 2 - (usable**2).sum(0), 1e-6)
     # the mean of all pairs of patches, weighted by the cosines of both cameras
-    correlation, rows = ((total**2).sum(2) - own) / pairs[:, None], np.arange(len(points))
+    correlation = ((total**2).sum(2) - own) / pairs[:, None]
+    rows = np.arange(len(points))
     best = correlation.argmax(1)
     middle = np.clip(best, 1, len(offsets) - 2)
     before, at, after = (correlation[rows, middle + shift] for shift in (-1, 0, 1))
@@ -184,7 +187,8 @@ class SeenSurface:
 
 def surface_points(head: HeadModel, count: int) -> SurfacePoints:
     """Centers of about `count` triangles, spread evenly over the area of the large parts."""
-    vertices, faces = head.model.v_template, head.model.faces
+    vertices = head.model.v_template
+    faces = head.model.faces
     large = large_parts(head.model)
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.cumsum(np.where(large, np.linalg.norm(np.cross(b - a, c - a), axis=1), 0.0))
@@ -194,7 +198,8 @@ def surface_points(head: HeadModel, count: int) -> SurfacePoints:
 
 def large_parts(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles of connected parts larger than eyeballs and teeth."""
-    vertices, faces = model.v_template, model.faces
+    vertices = model.v_template
+    faces = model.faces
     numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
     extent = [np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))]
     large = np.array(extent) > MIN_PART_SHARE * np.ptp(vertices, axis=0).max()
@@ -216,9 +221,12 @@ def seen_surface(
     already.
     """
     vertices, at, normals = _posed(fit, timestep, sought.points)
-    near, sweep = sought.near, sought.sweep
-    faces, turn = fit.head.model.faces, head_rotation(fit.parameters[timestep])
-    cosines, views = [], []
+    near = sought.near
+    sweep = sought.sweep
+    faces = fit.head.model.faces
+    turn = head_rotation(fit.parameters[timestep])
+    cosines = []
+    views = []
     for recording, image in images:
         camera = fit.to_capture.camera(recording)
         views.append(gray_view(camera, image, at.mean(0), sweep.spacing))
@@ -248,15 +256,18 @@ def _posed(
     fit: HeadFit, timestep: int, points: SurfacePoints
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3) at a timestep; of the points positions and unit normals (N, 3)."""
-    vertices, faces = posed_mesh(fit, fit.parameters[timestep]), fit.head.model.faces
+    vertices = posed_mesh(fit, fit.parameters[timestep])
+    faces = fit.head.model.faces
     normals = unit(points.on(vertex_normals(vertices, faces), faces))
     return vertices, points.on(vertices, faces), normals
 
 
 def outlines_agree(fit: HeadFit, take: RecordedTake, sought: SurfaceSearch) -> bool:
     """Whether masks, if any, end where the surface in the images does."""
-    distances, faces = [np.zeros(0)], fit.head.model.faces
-    chosen, reach = sought.points[sought.near], sought.sweep.reach
+    distances = [np.zeros(0)]
+    faces = fit.head.model.faces
+    chosen = sought.points[sought.near]
+    reach = sought.sweep.reach
     for timestep in fit.parameters:
         vertices, at, normals = _posed(fit, timestep, chosen)
         for recording, mask in take.masks(timestep):
@@ -271,16 +282,22 @@ def near_landmarks(head: HeadModel, points: SurfacePoints, take: RecordedTake) -
     """(N,) bool: points within OUTLINE_RADIUS_M of a reliable landmark."""
     from scipy.spatial import cKDTree
 
-    template, faces = head.model.v_template, head.model.faces
+    template = head.model.v_template
+    faces = head.model.faces
     landmarks = take.places.on(template, faces)[take.reliable]
     distance, _ = cKDTree(landmarks).query(points.on(template, faces))
     return np.asarray(distance < OUTLINE_RADIUS_M)
 
 
 def outline_offsets(
-    camera: Camera, mask: np.ndarray, vertices: np.ndarray, faces: np.ndarray, points: np.ndarray,
-    normals: np.ndarray, reach: float,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    camera: Camera,
+    mask: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    reach: float,
+) -> tuple[np.ndarray, np.ndarray]:
     """Meters (N,) by which points would have to move along their normals for the mesh to fill the
     mask; and (N,) bool for which points this is known: those near the outline of the mesh, with one
     edge of the mask near them.
@@ -291,7 +308,8 @@ def outline_offsets(
     """
     from scipy.spatial import cKDTree
 
-    found, known = np.zeros(len(points)), np.zeros(len(points), bool)
+    found = np.zeros(len(points))
+    known = np.zeros(len(points), bool)
     rows = np.flatnonzero(np.abs(facing(camera, points, normals)) < MAX_COSINE)
     begin, depth = camera.project(points[rows])
     end, _ = camera.project(points[rows] + 1e-3 * normals[rows])
@@ -300,7 +318,10 @@ def outline_offsets(
     usable = (depth > 0) & (length * reach > 1)
     if not usable.any():
         return found, known
-    rows, begin, along, length = rows[usable], begin[usable], along[usable], length[usable]
+    rows = rows[usable]
+    begin = begin[usable]
+    along = along[usable]
+    length = length[usable]
     pixels = min(float(length.max()) * reach, MAX_REACH_PX)
     steps = np.linspace(-pixels, pixels, 2 * math.ceil(SAMPLES_PER_PIXEL * pixels) + 1)
     at = begin[:, None] + steps[:, None] * (along / length[:, None])[:, None]
@@ -316,7 +337,8 @@ def outline_offsets(
     rim = rim[distance < pixels + radius]
     drawn = (rasterize(vertices, rim, camera.scaled(factor))[0] >= 0).astype(np.float32)
     # the mask's edge, where there is one; the last one of the drawn mesh, which has holes
-    level, own = _sampled(mask / np.float32(255), at), _sampled(drawn, factor * at)
+    level = _sampled(mask / np.float32(255), at)
+    own = _sampled(drawn, factor * at)
     crossings = (level[:, :-1] > 0) != (level[:, 1:] > 0)
     once = (crossings.sum(1) == 1) & (level[:, 0] > 0)
     leaves = (own[:, :-1] > 0) & (own[:, 1:] <= 0)
@@ -324,7 +346,8 @@ def outline_offsets(
     move = _crossed(level, crossings.argmax(1), steps, once)
     move = (move - _crossed(own, last, steps, leaves.any(1) & (own[:, -1] <= 0))) / length
     inside = np.abs(np.nan_to_num(move, nan=np.inf)) <= reach
-    found[rows[inside]], known[rows[inside]] = move[inside], True
+    found[rows[inside]] = move[inside]
+    known[rows[inside]] = True
     return found, known
 
 
@@ -341,6 +364,7 @@ def _crossed(
 ) -> np.ndarray:
     """Step (N,) at which levels (N, S) pass zero after `last` (N,); NaN where not valid."""
     row = np.arange(len(level))
-    before, after = level[row, last], level[row, last + 1]
+    before = level[row, last]
+    after = level[row, last + 1]
     share = before / np.where(valid, before - after, 1)
     return np.where(valid, steps[last] + share * (steps[1] - steps[0]), np.nan)

@@ -29,7 +29,9 @@ LID_SHAPES = {"eyeBlink": 1.0, "eyeLookDown": 0.57}
 1."""
 TRANSLATION_SIGMA_M = 10.0
 ABSENT_SIGMA = 1e-6
-EXPRESSION_ACCELERATION, JOINT_ACCELERATION_RAD, TRANSLATION_ACCELERATION_M = 0.25, 0.015, 0.0015
+EXPRESSION_ACCELERATION = 0.25
+JOINT_ACCELERATION_RAD = 0.015
+TRANSLATION_ACCELERATION_M = 0.0015
 """Standard deviations of second differences from one timestep to the next."""
 LID_ACCELERATION = 1.0
 """The same of LID_SHAPES: a blink closes the eyes within two or three frames of a video."""
@@ -37,11 +39,13 @@ JUMP_SCALE = 3.0  # Standard deviations of a second difference beyond which it i
 MAX_ORDERED_CHANGE = 0.7
 """Mean squared change of expression and jaw from one timestep to the next, as a share of that
 between any two, up to which timesteps follow each other in time."""
-IDENTITY_ITERATIONS, TAKE_ITERATIONS = 12, 8
+IDENTITY_ITERATIONS = 12
+TAKE_ITERATIONS = 8
 CONVERGED_STEP = 1e-3
 """Largest change of a parameter (standard deviations, radians, meters) after which iterations
 stop."""
-WINDOW, OVERLAP = 192, 24
+WINDOW = 192
+OVERLAP = 24
 """Timesteps solved at once, and how many of them two windows share: memory does not grow with the
 take."""
 
@@ -84,14 +88,16 @@ def solve_identity(
     fits best. Where the world is `metric`, it is 1, and the size of the head is the person's.
     """
     model = head.model
-    known, expressions = model.n_identity, model.n_expression
+    known = model.n_identity
+    expressions = model.n_expression
     columns = np.split(model.shapedirs, [known], axis=2)
     scale_sigma = 0.0 if metric else SCALE_SIGMA
     sized = np.concatenate(
         [columns[0], scale_sigma * model.v_template[..., None], columns[1]], axis=2
     )
     points = PosedPoints(replace(model, shapedirs=sized), places)
-    shared, own = known + 1, expressions + RIGID_SIZE
+    shared = known + 1
+    own = expressions + RIGID_SIZE
     state = np.zeros(shared + own * len(observations))
     for number, start in enumerate(rigid):
         state[shared + own * (number + 1) - RIGID_SIZE : shared + own * (number + 1)] = start
@@ -152,8 +158,10 @@ def in_order(
     """
     if len(alone) < 3:
         return True
-    points, prior = PosedPoints(head.model, places), parameter_precision(head)
-    missed, variances = [], []
+    points = PosedPoints(head.model, places)
+    prior = parameter_precision(head)
+    missed = []
+    variances = []
     for values, own in zip(alone, observations, strict=True):
         away = points.positions(*split(values)) - own.position
         missed.append(np.einsum("nij,nj->ni", own.root, away) @ head_rotation(values))
@@ -222,11 +230,13 @@ def _solve_windows(
     head: HeadModel | None, terms: Terms, start: np.ndarray, stiffness: np.ndarray | None
 ) -> np.ndarray:
     """Parameters (T, P). head: whose prior they have; stiffness (P,): of second differences."""
-    solved, size = start.copy(), start.shape[1]
+    solved = start.copy()
+    size = start.shape[1]
     for first in range(0, len(start), WINDOW - OVERLAP):
         last = min(first + WINDOW, len(start))
         state = solved[first:last].copy()
-        blocks, right = np.zeros((len(state), size, size)), np.zeros_like(state)
+        blocks = np.zeros((len(state), size, size))
+        right = np.zeros_like(state)
         for _ in range(TAKE_ITERATIONS):
             for number, values in enumerate(state):
                 blocks[number], right[number] = terms(first + number, values)
@@ -304,7 +314,8 @@ def prior_terms(head: HeadModel, values: np.ndarray) -> tuple[np.ndarray, np.nda
                 for name, share in LID_SHAPES.items()
                 if name + side in head.model.expression_names
             }
-            columns, shares = list(lid), np.array(list(lid.values()))
+            columns = list(lid)
+            shares = np.array(list(lid.values()))
             beyond = np.maximum((weights[..., columns] * shares).sum(-1, keepdims=True) - 1, 0)
             precision[..., columns] += (beyond > 0) * shares * shares.sum() / WEIGHT_EXCESS_SIGMA**2
             right[..., columns] -= beyond * shares / WEIGHT_EXCESS_SIGMA**2

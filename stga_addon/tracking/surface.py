@@ -102,7 +102,8 @@ def fit_surface(
     }
     take = replace(take, landmarks=visible)
     early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
-    points, done = surface_points(head, SURFACE_POINTS), 0
+    points = surface_points(head, SURFACE_POINTS)
+    done = 0
     near = near_landmarks(head, points, take)
     by_skin, by_outline = (
         [SurfaceSearch(points, near, sweep) for sweep in sweeps]
@@ -127,7 +128,8 @@ def fit_surface(
         solved = _identity(head, start, take, by_outline, search) or solved
     else:
         take = without
-    (found, seen), done = solved, early
+    (found, seen) = solved
+    done = early
     if not dense:
         marks = take.landmarks
         observed = {t: head_fit.landmarks_in_capture(marks[t], take, found) for t in timesteps}
@@ -173,7 +175,8 @@ def _identity(
     """Identity, scale and offsets from the timesteps of the fit, in rounds of what is sought, and
     the surfaces that they were solved from; None where the images do not show enough of the
     surface."""
-    offset, seen = np.zeros_like(head.model.v_template), dict[int, SeenSurface]()
+    offset = np.zeros_like(head.model.v_template)
+    seen = dict[int, SeenSurface]()
     for number, on in enumerate(sought):
         parts = [(*head_fit.excerpt(fit, take, [t]), on) for t in fit.parameters]
         seen = dict(zip(fit.parameters, search(_seen_part, parts), strict=True))
@@ -196,7 +199,8 @@ def _identity(
         )
         seen = {t: replace(own, position=own.position / found.scale) for t, own in seen.items()}
         if number:  # what is left between the person's template and the surfaces, along its normals
-            model, missing = fit.head.model, []
+            model = fit.head.model
+            missing = []
             for t, own in seen.items():
                 at = on.points.on(posed_mesh(fit, fit.parameters[t]), model.faces)
                 missing.append(((own.position - at) * own.normal).sum(1))
@@ -223,7 +227,8 @@ def _whole_take(
     observed: the landmarks; sought: for each of TAKE_SWEEPS. What a landmark misses at the
     timesteps of `fit`, it misses in all: it is taken off.
     """
-    timesteps, model = list(observed), fit.head.model
+    timesteps = list(observed)
+    model = fit.head.model
     missed = [
         (observed[t].position - take.places.on(posed_mesh(fit, values), model.faces))
         @ head_rotation(values)
@@ -234,7 +239,8 @@ def _whole_take(
         t: replace(own, position=own.position - bias @ head_rotation(first.parameters[t]).T)
         for t, own in observed.items()
     }
-    landmarks, at = list(corrected.values()), take.places.on(model.v_template, model.faces)
+    landmarks = list(corrected.values())
+    at = take.places.on(model.v_template, model.faces)
     start = np.zeros((len(timesteps), model.n_expression + RIGID_SIZE))
     start[:, -RIGID_SIZE:] = [head_fit.rigid_start(at, own) for own in landmarks]
     start = solve_take(fit.head, take.places, landmarks, start, fit.ordered)
@@ -278,8 +284,10 @@ def _found_part(
 
 def _fitted_landmarks(fit: HeadFit, first: HeadFit, take: RecordedTake) -> dict[int, Observation]:
     """Where the head of `first` has the landmarks at every timestep, in the world of the fit."""
-    points, count = PosedPoints(first.head.model, take.places), len(take.reliable)
-    scale, found = fit.to_capture.scale / first.to_capture.scale, {}
+    points = PosedPoints(first.head.model, take.places)
+    count = len(take.reliable)
+    scale = fit.to_capture.scale / first.to_capture.scale
+    found = {}
     for t in sorted(take.landmarks):
         at = scale * points.positions(*split(first.parameters[t]))
         found[t] = Observation(at, np.tile(np.eye(3), (count, 1, 1)), np.ones(count))
@@ -332,7 +340,8 @@ def smooth_offsets(
     smooth = SMOOTHING_M**4 * laplacian.T @ diags_array(area) @ laplacian
     small = diags_array((SMOOTHING_M / OFFSET_SIGMA_M) ** 4 * np.maximum(area, 1e-9))
     prior = OFFSET_DENSITY * (smooth + small)
-    values, trust = np.zeros(count), weight / SURFACE_SIGMA_M**2
+    values = np.zeros(count)
+    trust = weight / SURFACE_SIGMA_M**2
     for _ in range(OFFSET_ITERATIONS):
         miss = (residual - at @ values) / (2 * SURFACE_SIGMA_M)
         robust = trust / (1 + miss**2) ** 2 if values.any() else trust / np.sqrt(1 + miss**2)
@@ -346,7 +355,8 @@ def _laplacian(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> Any
     the surface alone, not on its triangles; 0 at the mesh's edge. area (V,) of the vertices."""
     from scipy.sparse import coo_array, diags_array
 
-    size, corners = (len(vertices),) * 2, vertices[faces]
+    size = (len(vertices),) * 2
+    corners = vertices[faces]
     ends = corners[:, [1, 2, 0]] - corners, corners[:, [2, 0, 1]] - corners
     sine = np.linalg.norm(np.cross(*ends), axis=2)
     cotangent = (ends[0] * ends[1]).sum(2) / np.maximum(sine, 1e-20)

@@ -28,19 +28,25 @@ from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
 
-MIN_TIMESTEPS, MAX_CAMERAS = 4, 4
+MIN_TIMESTEPS = 4
+MAX_CAMERAS = 4
 """Below it, there is no motion to tell apart; cameras over the rig, whose images are compared."""
 TIE = 1e-3  # Difference in the trace of rotations that time decides
 MIN_POINTS = 200  # Of all cameras together, below which the torso is not seen
 START_LEVEL = 2  # Level of the pyramid in which starts are compared
-COARSE_STEPS, FINE_STEPS = ((3, 3), (2, 3)), ((1, 4), (0, 2))
+COARSE_STEPS = ((3, 3), (2, 3))
+FINE_STEPS = ((1, 4), (0, 2))
 """Levels and Gauss–Newton steps in each, for every start, and for the best one."""
-CHANGE_SIGMA_RAD, CHANGE_SIGMA_M = 0.1, 0.01
+CHANGE_SIGMA_RAD = 0.1
+CHANGE_SIGMA_M = 0.01
 """Standard deviations of the torso's rotation and shift from one timestep to the next."""
-MAX_STEP, CONVERGED_STEP = 0.15, 1e-4  # Radians, meters
+# Radians, meters
+MAX_STEP = 0.15
+CONVERGED_STEP = 1e-4
 COMPARED_TIMESTEPS = 24
 """Spread over the take, at which motions are compared; depths are found at some of them."""
-MIN_GAIN, MIN_OWN_GAIN = 0.1, 0.05
+MIN_GAIN = 0.1
+MIN_OWN_GAIN = 0.05
 """Share by which the misfit has to fall for the torso not to ride on the head, and to move instead
 of being still, or to be shifted as well."""
 
@@ -85,7 +91,8 @@ def follow_torso(
     takes shorter than MIN_TIMESTEPS, of models without a neck, and where little of a torso is seen.
     bends: whether cloth may; the model is drawn over it then.
     """
-    unchanged, model = dict(parameters), fit.head.model
+    unchanged = dict(parameters)
+    model = fit.head.model
     if len(parameters) < MIN_TIMESTEPS or not fit.head.joints[NECK] or not torso_faces(model).any():
         return FollowedTorso(fit, unchanged)
     # The timestep with the head's most average turn, where the torso is taken to be straight; of a
@@ -114,7 +121,8 @@ def follow_torso(
     if motion == "head":
         return FollowedTorso(fit, unchanged, motion=decided)
     name = own if motion == "own" else motion
-    points, bending = TorsoPoints(middle, deep[name].at), None
+    points = TorsoPoints(middle, deep[name].at)
+    bending = None
     if bends and name == "shifted":
         bending = found_bending(take, motions[name], points, some, walk)
     return replace(_followed(fit, take, motions[name], bending, decided), points=points)
@@ -133,7 +141,8 @@ def _followed(
         shift_mm=1000 * float(max(shifts, default=0.0)),
         bend_mm=1000 * max((float(np.linalg.norm(b, axis=1).max()) for b in bends), default=0.0),
     )
-    heads, offsets = {t: own.parameters for t, own in posed.items()}, dict[int, np.ndarray]()
+    heads = {t: own.parameters for t, own in posed.items()}
+    offsets = dict[int, np.ndarray]()
     for t, own in posed.items():
         if own.shift is not None:
             bend = 0.0 if bending is None else bending.at(t)
@@ -176,16 +185,20 @@ class _Follower:
 
     def __init__(self, take: TorsoTake, seen: torso_take.SeenPoints, shifts: bool) -> None:
         """shifts: whether the torso is rigid, and shifted as well as turned."""
-        self._take, self.seen, self._shifts = take, seen, shifts
+        self._take = take
+        self.seen = seen
+        self._shifts = shifts
         self._first = TorsoPose(head_turn(take.parameters[seen.timestep]), np.zeros(3))
         first = take.with_torso(seen.timestep, self._first, shifts)
         self._carrier = torso_take.Carrier(take, first, seen.at)
 
     def follow(self, way: Sequence[int], step: Step) -> torso_take.Rows:
         """Poses at the timesteps of a way, which begins with the one whose points are followed."""
-        poses, shot = [self._first], self._take.shot(way[0])
+        poses = [self._first]
+        shot = self._take.shot(way[0])
         for before, timestep in pairwise(way):
-            now, pose = self._take.shot(timestep), poses[-1]
+            now = self._take.shot(timestep)
+            pose = poses[-1]
             starts = [pose, self._by_flow(now, shot, pose)]
             if self._shifts:  # where it was in the world
                 moved = self._take.pivot(before) - self._take.pivot(timestep)
@@ -228,7 +241,8 @@ class _Follower:
         self, shot: torso_take.TorsoShot, before: torso_take.TorsoShot, pose: TorsoPose
     ) -> TorsoPose:
         """The pose to which optical flow leads from `pose`, that at the timestep before."""
-        old, found = self._posed(before.timestep, pose), pose
+        old = self._posed(before.timestep, pose)
+        found = pose
         views = list(before.views.values()), list(shot.views.values())
         flows = appearance.flow_targets(old, *views)
         targets = {key[0]: (camera, target) for key, camera, target in flows}
@@ -269,7 +283,9 @@ class _Follower:
         length; terms: weights (M, C), derivatives (M, C, 6) and residuals (M, C)."""
         precision = np.repeat([CHANGE_SIGMA_RAD**-2, CHANGE_SIGMA_M**-2], 3)
         away = np.concatenate([axis_angle(pose.turn @ usual.turn.T), pose.shift - usual.shift])
-        matrix, right, free = np.diag(precision), -precision * away, 6 if self._shifts else 3
+        matrix = np.diag(precision)
+        right = -precision * away
+        free = 6 if self._shifts else 3
         for weight, rate, residual in terms:
             matrix = matrix + np.einsum("nc,nci,ncj->ij", weight, rate, rate)
             right = right - np.einsum("nc,nci,nc->i", weight, rate, residual)

@@ -27,24 +27,31 @@ from .posed_points import head_rotation
 from .torso_take import HELD_OUT, BothWays, Motion, Rows, TorsoShot, TorsoTake
 
 BLOCK_PX = 12  # Of blocks of pixels; one in HELD_OUT is not fitted, and tells whether to bend
-ROUGHNESS_M, BEND_SIGMA_M = 0.0005, 0.02
+ROUGHNESS_M = 0.0005
+BEND_SIGMA_M = 0.02
 """Standard deviations of a vertex from the mean of its neighbors, and from the rigid torso."""
-FLOW_SIGMA_PX, FLOW_SHARE = 0.5, 0.15
+FLOW_SIGMA_PX = 0.5
+FLOW_SHARE = 0.15
 """Of optical flow, and the share of the pixels that count as independent of each other."""
-FLOW_OUTLIER_PX, CHANGE_OUTLIER_LEVELS = 4.0, 5 * NOISE_LEVELS
+FLOW_OUTLIER_PX = 4.0
+CHANGE_OUTLIER_LEVELS = 5 * NOISE_LEVELS
 """Distance, and difference of what flow matches, beyond which flow is wrong."""
 PIXEL_STEP = 3  # One of so many pixels is fitted
 MIN_GAIN = 0.05  # Share by which the misfit has to fall for the torso to bend
 STEPS = 4  # Gauss–Newton steps for each timestep
 HELD = 1e10  # Precision that holds a vertex
-DEPTH_SIGMA_M, MIN_WEIGHT = 0.02, 0.5
+DEPTH_SIGMA_M = 0.02
+MIN_WEIGHT = 0.5
 """Over which points' depths are averaged; sum of weights from which the surface is seen."""
 DIRECTIONS_RAD = np.radians(np.arange(-80, 81, 5))
 """From the base of the neck, as seen from the front: from straight down to the person's left."""
 SLOPE = 0.8  # Of the angle around the neck: shoulders slope down
-REACH_RAD, DIRECTION_SIGMA = np.radians(10), 1.0
+REACH_RAD = np.radians(10)
+DIRECTION_SIGMA = 1.0
 """Of a direction to both sides; smoothing of what is found in them, in steps."""
-MIN_POINTS, FARTHEST_SHARE, BEYOND_M = 5, 0.98, 0.015
+MIN_POINTS = 5
+FARTHEST_SHARE = 0.98
+BEYOND_M = 0.015
 """Of a direction: points from which it is seen, share that the mesh reaches, how far beyond."""
 FULL_HEIGHT = 0.5  # Height (see `TorsoSheet`) from which vertices lie on the surface alone
 
@@ -100,12 +107,15 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     from scipy.ndimage import gaussian_filter1d
 
     # how far the points reach in directions around the neck, and how surely these are seen
-    angle, distance = np.arctan2(points[:, 0], -points[:, 1]), np.linalg.norm(points[:, :2], axis=1)
-    found, seen = np.zeros(len(DIRECTIONS_RAD)), np.zeros(len(DIRECTIONS_RAD))
+    angle = np.arctan2(points[:, 0], -points[:, 1])
+    distance = np.linalg.norm(points[:, :2], axis=1)
+    found = np.zeros(len(DIRECTIONS_RAD))
+    seen = np.zeros(len(DIRECTIONS_RAD))
     for number, own in enumerate(DIRECTIONS_RAD):
         near = np.abs(angle - own) < REACH_RAD
         if near.sum() >= MIN_POINTS:
-            found[number], seen[number] = np.quantile(distance[near], FARTHEST_SHARE) + BEYOND_M, 1
+            found[number] = np.quantile(distance[near], FARTHEST_SHARE) + BEYOND_M
+            seen[number] = 1
     sure = gaussian_filter1d(seen, DIRECTION_SIGMA, mode="constant")
     found = gaussian_filter1d(found, DIRECTION_SIGMA, mode="constant") / np.maximum(sure, 1e-6)
     around = SLOPE * np.arctan2(at[:, 0], at[:, 2])
@@ -154,7 +164,8 @@ def found_bending(
     if sheet is None:
         return None
     first = motion[points.timestep]
-    turn, base = head_rotation(first.parameters), take.joints(first.parameters)[0]
+    turn = head_rotation(first.parameters)
+    base = take.joints(first.parameters)[0]
     base = base + first.parameters[-3:] + first.shift
     before = (take.rigid(first, sheet.vertices) - base) @ turn
     drape = draped(sheet, before, (points.at - base) @ turn) - before
@@ -210,12 +221,16 @@ class _Cloth:
         torso's axes; first: the timestep that the others are compared with."""
         from scipy.sparse import diags_array, eye_array, kron
 
-        self._take, self._sheet, self._motion, self._drape = take, sheet, motion, drape
+        self._take = take
+        self._sheet = sheet
+        self._motion = motion
+        self._drape = drape
         mean = diags_array(1 / sheet.laplacian.diagonal()) @ sheet.laplacian
         held = HELD * ~drape.any(1)
         own = mean.T @ mean / ROUGHNESS_M**2 + diags_array(BEND_SIGMA_M**-2 + held)
         self._precision = kron(own, eye_array(3)).tocsr()
-        shot, model = take.shot(first), take.model
+        shot = take.shot(first)
+        model = take.model
         mesh = posed_mesh(take.fit, motion[first].parameters)
         mesh[sheet.vertices] = self._positions(first, np.zeros_like(drape))
         self._references: dict[int, _Reference] = {}
@@ -236,7 +251,8 @@ class _Cloth:
         """Offsets at the timesteps of a way, which begins with the first one, where they are 0."""
         bends = [np.zeros_like(self._drape)]
         for timestep in way[1:]:
-            shot, bend = self._take.shot(timestep), bends[-1]
+            shot = self._take.shot(timestep)
+            bend = bends[-1]
             for _ in range(STEPS):
                 bend = self._moved(shot, bend)
             bends.append(bend)
@@ -245,7 +261,9 @@ class _Cloth:
 
     def misfit(self, bends: Mapping[int, np.ndarray], timesteps: Sequence[int]) -> list[float]:
         """Share, 0 to 1, of pixels that were not fitted that is not explained: rigid, and bent."""
-        total, count, rigid = np.zeros(2), 0, np.zeros_like(self._drape)
+        total = np.zeros(2)
+        count = 0
+        rigid = np.zeros_like(self._drape)
         for timestep in timesteps:
             shot = self._take.shot(timestep)
             for number in self._numbers(shot):
@@ -272,7 +290,8 @@ class _Cloth:
 
     def _positions(self, timestep: int, bend: np.ndarray) -> np.ndarray:
         """(N, 3) of the sheet's vertices."""
-        torso, drawn = self._motion[timestep], self._drape + bend
+        torso = self._motion[timestep]
+        drawn = self._drape + bend
         rigid = self._take.rigid(torso, self._sheet.vertices)
         return np.asarray(rigid + drawn @ head_rotation(torso.parameters).T)
 
@@ -299,10 +318,12 @@ class _Cloth:
         """The offsets after a Gauss–Newton step."""
         from scipy.sparse import csr_array, diags_array
 
-        matrix, right = self._precision, -(self._precision @ bend.ravel())
+        matrix = self._precision
+        right = -(self._precision @ bend.ravel())
         axes = head_rotation(self._motion[shot.timestep].parameters)
         for number in self._numbers(shot):
-            reference, now = self._references[number], self._returned(shot, number, bend)
+            reference = self._references[number]
+            now = self._returned(shot, number, bend)
             miss, weight = _missed(reference, now)
             used = np.flatnonzero(weight)[::PIXEL_STEP]
             turned = (
@@ -316,7 +337,8 @@ class _Cloth:
             rate = csr_array((rates.ravel(), places), shape=(2 * len(used), bend.size))
             precision = np.repeat(FLOW_SHARE / FLOW_SIGMA_PX**2 * weight[used], 2)
             weighted = rate.T @ diags_array(precision)
-            matrix, right = matrix + weighted @ rate, right + weighted @ miss[used].ravel()
+            matrix = matrix + weighted @ rate
+            right = right + weighted @ miss[used].ravel()
         return np.asarray(bend + _solved(matrix.tocsr(), right).reshape(-1, 3))
 
 
@@ -329,7 +351,8 @@ def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:
     order = reverse_cuthill_mckee(matrix, symmetric_mode=True)
     entries = matrix[order][:, order].tocoo()
     below = entries.row >= entries.col
-    row, column = entries.row[below], entries.col[below]
+    row = entries.row[below]
+    column = entries.col[below]
     band = np.zeros(((row - column).max() + 1, len(right)))
     band[row - column, column] = entries.data[below]
     found = np.empty_like(right)

@@ -23,19 +23,24 @@ from .footage.model import FootageCamera
 from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
 
-ROOT, NECK = JOINTS.index("root"), JOINTS.index("neck")
+ROOT = JOINTS.index("root")
+NECK = JOINTS.index("neck")
 HEAD_MARGIN = 0.03  # Share of the image's height around the head, where hair and chin may be
 PLAIN_LEVEL = 128  # Gray that stands for everything outside the mask
 OFFSET_STEPS = 6  # After which offsets, which move joints, which move vertices, are those wanted
 EVIDENCE_LEVEL = 1  # Level of the pyramid in which motions are compared
-POINT_STEP_M, MAX_POINTS = 0.005, 800
+POINT_STEP_M = 0.005
+MAX_POINTS = 800
 """Distance between points at the torso, and how many of them a camera has at most."""
-BLOCK_POINTS, HELD_OUT = 4, 3
+BLOCK_POINTS = 4
+HELD_OUT = 3
 """Side of blocks in points; one of so many is not fitted, and tells which motion is right."""
 MASK_MARGIN = 0.01  # Around the mask, whose edge is compared as well; share of the image's height
 DEPTHS_M = tuple(np.linspace(-0.12, 0.06, 19).tolist())
 """Along a ray, from the mesh's depth beside it, that are tried: a chest is before the neck."""
-DEPTH_TIMESTEPS, NEIGHBORS, UNSEEN_COST = 8, 25, 0.5
+DEPTH_TIMESTEPS = 8
+NEIGHBORS = 25
+UNSEEN_COST = 0.5
 """Timesteps at which depths are compared; points that count for each other; cost unseen."""
 ALONG_CAMERAS = appearance.CHANNEL_WEIGHTS * [0, 1, 1]
 """Weights of channels between cameras, from which surfaces are not equally bright."""
@@ -74,7 +79,8 @@ class TorsoShot:
 
     def shows(self, number: int, at: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) in the camera's image, not behind or before the head."""
-        camera, head = self.views[number].levels[EVIDENCE_LEVEL].camera, self.heads[number]
+        camera = self.views[number].levels[EVIDENCE_LEVEL].camera
+        head = self.heads[number]
         pixels, depth = camera.project(at)
         x, y = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         return np.asarray(inside(camera, pixels, depth) & ~head[y, x])
@@ -87,7 +93,8 @@ class TorsoTake:
     def __init__(
         self, fit: HeadFit, parameters: Mapping[int, np.ndarray], cameras: Sequence[FootageCamera]
     ) -> None:
-        self.model, self.parameters = fit.head.model, parameters
+        self.model = fit.head.model
+        self.parameters = parameters
         self.cameras, self.torso, self.fit = cameras, torso_faces(self.model), fit
         regressor = self.model.j_regressor[[ROOT, NECK]]
         self._joints = regressor @ self.model.v_template
@@ -108,7 +115,8 @@ class TorsoTake:
     def rigid(self, torso: PosedTorso, vertices: np.ndarray) -> np.ndarray:
         """(N, 3) where a torso that is shifted carries some vertices (N,)."""
         assert torso.shift is not None
-        expr, (root, _) = torso.parameters[:-RIGID_SIZE], self.joints(torso.parameters)
+        expr = torso.parameters[:-RIGID_SIZE]
+        (root, _) = self.joints(torso.parameters)
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
         turned = (rest - root) @ head_rotation(torso.parameters).T
         return np.asarray(turned + root + torso.parameters[-3:] + torso.shift)
@@ -119,7 +127,8 @@ class TorsoTake:
         """Parameters (E + 18,) and vertex offsets (V, 3) by which a torso is rigid and shifted, and
         bent by `bend` (V, 3) meters in its own axes. Offsets move FLAME's joints as well; the
         translation undoes that for the head."""
-        model, parameters = self.model, torso.parameters.copy()
+        model = self.model
+        parameters = torso.parameters.copy()
         offset = np.zeros_like(model.v_template)
         share = np.minimum(model.weights[:, ROOT] / MIN_TORSO_WEIGHT, 1)
         moved = np.flatnonzero(share)
@@ -151,17 +160,21 @@ class TorsoTake:
     def shot(self, timestep: int) -> TorsoShot:
         """Read a timestep; images are of constant size, as optical flow needs them."""
         mesh = posed_mesh(self.fit, self.parameters[timestep])
-        views, masks, heads = {}, {}, {}
+        views = {}
+        masks = {}
+        heads = {}
         for number, source in enumerate(self.cameras):
             mask = source.mask(timestep) if timestep in source.timesteps else None
             if mask is not None:
-                image, edge = source.image(timestep).copy(), (mask > 0) & (mask < 255)
+                image = source.image(timestep).copy()
+                edge = (mask > 0) & (mask < 255)
                 share = mask[edge][:, None].astype(np.float32) / 255
                 image[edge] = image[edge] * share + PLAIN_LEVEL * (1 - share) + 0.5
                 image[mask == 0] = PLAIN_LEVEL
                 camera = self.fit.to_capture.camera(source.camera)
                 levels = appearance.pyramid(camera, image, self._center)
-                views[number], masks[number] = PyramidView(bytes([number]), camera, levels), mask
+                views[number] = PyramidView(bytes([number]), camera, levels)
+                masks[number] = mask
                 heads[number] = self.head_pixels(mesh, levels[EVIDENCE_LEVEL].camera)
         return TorsoShot(timestep, views, masks, heads)
 
@@ -174,7 +187,10 @@ class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
     def __init__(self, helpers: Helpers, report: Report, total: int) -> None:
-        self._helpers, self._report, self._done, self._total = helpers, report, 0, total
+        self._helpers = helpers
+        self._report = report
+        self._done = 0
+        self._total = total
 
     def along(
         self, follow: Callable[..., Rows], who: Sequence[Any], first: int, timesteps: Iterable[int]
@@ -182,7 +198,8 @@ class BothWays:
         """For each of `who`, by timestep, rows of the arrays that follow(who, way, step) gives."""
         later = [first, *sorted(t for t in timesteps if t > first)]
         earlier = [first, *sorted((t for t in timesteps if t < first), reverse=True)]
-        every, done = [(own, way) for own in who for way in (later, earlier)], self._done
+        every = [(own, way) for own in who for way in (later, earlier)]
+        done = self._done
 
         def count(number: int) -> None:
             self._report("Torso", done + number, self._total)
@@ -251,7 +268,8 @@ class SeenPoints:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Share (N,) from 0 to 1 of each point, moved to `at` (N, 3), that the images do not
         explain, and (N,) bool whether it is seen."""
-        share, seen = np.zeros(len(at)), np.zeros(len(at), bool)
+        share = np.zeros(len(at))
+        seen = np.zeros(len(at), bool)
         for number, rows in self.rows.items():
             if number in shot.views:
                 residual = self.residual(shot, number, rows, at[rows], level)
@@ -272,12 +290,16 @@ def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:
     """What cameras see below the head: points on pixels' rays, as deep as the mesh beside."""
     from scipy.spatial import cKDTree
 
-    shot, mesh = take.shot(timestep), posed_mesh(take.fit, take.parameters[timestep])
-    none, dark = np.zeros((0, 3)), np.zeros((0, 3), np.float32)
+    shot = take.shot(timestep)
+    mesh = posed_mesh(take.fit, take.parameters[timestep])
+    none = np.zeros((0, 3))
+    dark = np.zeros((0, 3), np.float32)
     found = [(none, none, np.zeros(0, bool), *(dark for _ in appearance.OUTLIER_SQUARED))]
-    rows_of, count = {}, 0
+    rows_of = {}
+    count = 0
     for number, view in shot.views.items():
-        camera, mask = view.camera, shot.masks[number]
+        camera = view.camera
+        mask = shot.masks[number]
         pixels, depth = camera.project(mesh[take.model.faces].mean(1))
         step = max(1.0, POINT_STEP_M * camera.fl_x / float(np.median(depth)))
         rows, columns = np.indices((int(camera.height / step), int(camera.width / step)))
@@ -311,17 +333,21 @@ class Carrier:
         used, self._face = np.unique(candidates[cKDTree(centers).query(at)[1]], return_inverse=True)
         corners = SurfacePoints(np.repeat(used, 3), np.tile(np.eye(3), (len(used), 1)))
         self._corners = PosedPoints(take.model, corners)
-        self._take, self._vertices = take, take.model.faces[used].ravel()
+        self._take = take
+        self._vertices = take.model.faces[used].ravel()
         self._neutral = take.model.v_template[self._vertices]
         self._triangles = np.arange(3 * len(used)).reshape(-1, 3)
         self._first = self._frames(first)
 
     def carried(self, torso: PosedTorso) -> Callable[[np.ndarray], np.ndarray]:
         """What brings points (N, 3) from where they are at first to where this torso has them."""
-        before, after, face = self._first, self._frames(torso), self._face
+        before = self._first
+        after = self._frames(torso)
+        face = self._face
         size = (after.scale / before.scale)[:, None, None]
         turn = (size * after.rotation @ before.rotation.swapaxes(1, 2))[face]
-        start, end = before.origin[face], after.origin[face]
+        start = before.origin[face]
+        end = after.origin[face]
         return lambda at: np.einsum("nij,nj->ni", turn, at - start) + end
 
     def _frames(self, torso: PosedTorso) -> FaceFrames:
@@ -340,16 +366,20 @@ def compared(
     timesteps: Sequence[int],
 ) -> dict[str, float]:
     """Motion -> mean misfit of held-out points, where all motions leave them in sight."""
-    start, total, count = seen["head"].timestep, np.zeros(len(motions)), 0
+    start = seen["head"].timestep
+    total = np.zeros(len(motions))
+    count = 0
     carriers = {name: Carrier(take, own[start], seen[name].at) for name, own in motions.items()}
     for timestep in (t for t in timesteps if t != start):
-        shot, found = take.shot(timestep), []
+        shot = take.shot(timestep)
+        found = []
         for name, own in motions.items():
             at = carriers[name].carried(own[timestep])(seen[name].at)
             found.append(seen[name].unexplained(shot, at, EVIDENCE_LEVEL))
         shares, shown = map(np.stack, zip(*found, strict=True))
         use = shown.all(0) & ~seen["head"].fitted
-        count, total = count + int(use.sum()), total + shares[:, use].sum(1)
+        count = count + int(use.sum())
+        total = total + shares[:, use].sum(1)
     return dict(zip(motions, (total / max(count, 1)).tolist(), strict=True))
 
 
@@ -359,7 +389,8 @@ def at_depth(
     """Motion -> the points at the depths along their rays at which other cameras, and other
     timesteps of the motion, look like them; "stereo": of other cameras alone."""
     candidates = [seen.at + depth * seen.ray for depth in DEPTHS_M]
-    shot, stereo = take.shot(seen.timestep), np.zeros((len(DEPTHS_M), len(seen.at)))
+    shot = take.shot(seen.timestep)
+    stereo = np.zeros((len(DEPTHS_M), len(seen.at)))
     for number, rows in seen.rows.items():
         for other in shot.views.keys() - {number}:
             for cost, at in zip(stereo, candidates, strict=True):

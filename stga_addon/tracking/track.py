@@ -48,14 +48,16 @@ from .surface import fit_surface
 from .torso import follow_torso
 from .write_capture import write_capture
 
-OUTLIER_FACTOR, MIN_OUTLIER_SHARE = 4.0, 0.03
+OUTLIER_FACTOR = 4.0
+MIN_OUTLIER_SHARE = 0.03
 """A camera is at fault whose landmarks miss the fitted head by this many times those of the others,
 and by this share of the face's size."""
 MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
-BIAS_ROUNDS, BIAS_TIMESTEPS = 3, 12
+BIAS_ROUNDS = 3
+BIAS_TIMESTEPS = 12
 """Rounds in which the networks' bias is measured, each on heads fitted without that of the round
 before, and timesteps at which the avatar is drawn for that."""
 LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
@@ -151,10 +153,12 @@ def track(
         if footage.focal == "usual":  # of one camera
             report("Focal length", 0, 1)
             (camera,) = footage.cameras
-            pixels, told_by = solved_focal(head, take), "solved"
+            pixels = solved_focal(head, take)
+            told_by = "solved"
             if pixels is None and person is not None and person.camera is not None:
                 sides = [max(own.width, own.height) for own in (camera.camera, person.camera)]
-                pixels, told_by = person.camera.fl_x * sides[0] / sides[1], "avatar"
+                pixels = person.camera.fl_x * sides[0] / sides[1]
+                told_by = "avatar"
             if pixels is not None:
                 moved = replace(camera, camera=replace(camera.camera, fl_x=pixels, fl_y=pixels))
                 footage = replace(footage, cameras=(moved,), focal=told_by)
@@ -182,7 +186,8 @@ def track(
         take = replace(take, images=images, masks=masks)
         fit, misfits = by_images(head, fit, take, helpers, report, person is not None)
         if person is not None:
-            shape, offset = person.fit.shape, person.fit.static_offset
+            shape = person.fit.shape
+            offset = person.fit.static_offset
             fit = replace(fit, shape=shape, static_offset=offset)
         fit = head_fit.in_cameras_world(fit) if keep else fit
         errors = reprojection_errors(fit, take, footage)
@@ -250,11 +255,18 @@ def end_tracking(out: Path) -> None:
 
 
 def _detected(
-    head: HeadModel, head_file: Path | None, footage: Footage, source: dict[str, Any], out: Path,
-    helpers: Helpers, report: Report, show: Show,
-) -> tuple[RecordedTake, dict[str, CameraLandmarks]]:  # fmt: skip
+    head: HeadModel,
+    head_file: Path | None,
+    footage: Footage,
+    source: dict[str, Any],
+    out: Path,
+    helpers: Helpers,
+    report: Report,
+    show: Show,
+) -> tuple[RecordedTake, dict[str, CameraLandmarks]]:
     """A take without landmarks yet, and where the networks find them, kept in `out`."""
-    is_new, detector = not out.exists(), FaceNetworks()
+    is_new = not out.exists()
+    detector = FaceNetworks()
     report("Head model", 0, 1)
     places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
     _begin(out, source)
@@ -277,7 +289,8 @@ def _head_pixels(
     fit: HeadFit, parameters: Mapping[int, np.ndarray], timestep: int, camera: FootageCamera
 ) -> np.ndarray:
     """The pixels of the tracked head in a camera's frame; see `mattes.HeadPixels`."""
-    mesh, faces = posed_mesh(fit, parameters[timestep]), fit.head.model.faces
+    mesh = posed_mesh(fit, parameters[timestep])
+    faces = fit.head.model.faces
     return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
 
 
@@ -290,7 +303,8 @@ def _without_bias(
     From an unusual direction they are off by the same in pictures of the person, whatever the
     light.
     """
-    networks, corrected = FaceNetworks(), take
+    networks = FaceNetworks()
+    corrected = take
     some = evenly_spread(sorted(take.landmarks), BIAS_TIMESTEPS)
     for _ in range(BIAS_ROUNDS):
         part = replace(corrected, landmarks={t: corrected.landmarks[t] for t in some})
@@ -299,7 +313,8 @@ def _without_bias(
         points = PosedPoints(fit.head.model, take.places)
         shares: dict[str, list[np.ndarray]] = {}
         for timestep, values in fit.parameters.items():
-            own, mesh = take.landmarks[timestep], posed_mesh(fit, values)
+            own = take.landmarks[timestep]
+            mesh = posed_mesh(fit, values)
             head = points.positions(*split(values))
             cameras = map(fit.to_capture.camera, own.cameras)
             for name, camera in zip(own.names, cameras, strict=True):
@@ -359,7 +374,8 @@ def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> E
     points = PosedPoints(fit.head.model, take.places)
     errors: Errors = {camera.name: {} for camera in footage.cameras}
     for timestep, parameters in fit.parameters.items():
-        head, own = points.positions(*split(parameters)), take.landmarks[timestep]
+        head = points.positions(*split(parameters))
+        own = take.landmarks[timestep]
         seen = zip(own.names, own.cameras, own.points, own.confidence, strict=True)
         for name, camera, pixels, confidence in seen:
             use = take.reliable & (confidence > 0)
@@ -507,7 +523,8 @@ def _warnings(
     blind = [name for name, own in found.items() if not own.confidence.any()]
     listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
     share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
-    single, scale = len(footage.cameras) == 1, f"{fit.to_capture.scale:.4g}"
+    single = len(footage.cameras) == 1
+    scale = f"{fit.to_capture.scale:.4g}"
     own = {
         f"no face at {share}, interpolated: {listed}": bool(missing),
         f"no face in any frame of: {', '.join(blind)}": bool(blind),

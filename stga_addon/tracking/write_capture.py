@@ -32,15 +32,18 @@ def write_capture(
     to the middle is held out as `val`; timesteps at which no camera saw a face, as behind a hand,
     are `test`. Raises StgaError where `out` cannot be written.
     """
-    fit, parameters = torso.fit, torso.parameters
+    fit = torso.fit
+    parameters = torso.parameters
     views = list(footage.views())
     index = {camera.name: number for number, camera in enumerate(footage.cameras)}
     splits: dict[str, list[dict[str, Any]]] = {"train": [], "val": [], "test": []}
-    centers, held_out = np.array([own.camera.position for own in footage.cameras]), None
+    centers = np.array([own.camera.position for own in footage.cameras])
+    held_out = None
     if len(centers) >= MIN_CAMERAS_TO_HOLD_OUT:
         nearest = np.linalg.norm(centers - centers.mean(0), axis=1).argmin()
         held_out = footage.cameras[int(nearest)].name
-    flame, model = fit.head.layout == "flame", fit.head.model
+    flame = fit.head.layout == "flame"
+    model = fit.head.model
     for number, (timestep, source) in enumerate(views):
         camera = fit.to_capture.camera(source.camera)
         entry = _entry(out, timestep, source, index[source.name], camera)
@@ -54,7 +57,8 @@ def write_capture(
     top: dict[str, Any] = {} if flame else {"canonical_mesh_path": "meshes/neutral.obj"}
     if footage.fps is not None:
         top["fps"] = footage.fps
-    neutral, own = np.zeros_like(next(iter(parameters.values()))), fit.static_offset
+    neutral = np.zeros_like(next(iter(parameters.values())))
+    own = fit.static_offset
     person = {} if own is None else {"static_offset": own.astype(np.float32)}
     person["shape"] = fit.shape.astype(np.float32)
     for number, (timestep, values) in enumerate(parameters.items()):

@@ -39,49 +39,104 @@ _SHAPES = "shape keys and drivers in Blender"
 _STRAIN = "and the strain of every frame"
 _LIMITS = {"scale_limit": 1.5, "stray_limit": 0.5, "stray_reset_interval": 20, "adam_epsilon": 0.03}
 _EFFECTS = (
-    Effect("view-color", "Moving highlights", "slower",
-           "3, 8 or 15 coefficients more a splat and channel",
-           off={"sh_degree": 0, "sh_steps": ()}),
+    Effect(
+        "view-color",
+        "Moving highlights",
+        "slower",
+        "3, 8 or 15 coefficients more a splat and channel",
+        off={"sh_degree": 0, "sh_steps": ()},
+    ),
     Effect("exposure", "Even brightness", "free", "a pass over each image when it is read"),
     Effect("antialiasing", "Sharp from afar", "free", "a root a splat", "antialiased"),
-    Effect("background", "Clean outline", "slower",
-           "a pass over the image in every iteration, and one when it is read where the backdrop "
-           "is not of one color",
-           "random_background", on={"backdrop": "plain"}, off={"backdrop": "plain"}),
-    Effect("hull-points", "Hair beyond face", "larger", "a splat for every 4 mm beside the mesh",
-           "hull_points"),
-    Effect("depth-limits", "No stray splats", "free",
-           "none: splats are smaller and nearer to their triangles", on=_LIMITS),
-    Effect("density", "Finer detail", "slower",
-           "up to a quarter more splats, more in the preset final", off={"density_interval": 0}),
-    Effect("selection", "Moving parts only", "free",
-           "none: local iterations are cheaper than global ones",
-           on={"strategy": "selective"}, off={"strategy": "global"}),
-    Effect("strain-color", "Color of wrinkles", "slower",
-           f"9 coefficients a triangle, {_STRAIN}", offsets=("strain_color",), added_later=True),
-    Effect("normal-color", "Shade of turned skin", "slower",
-           "9 coefficients a triangle, and the normals of every frame",
-           offsets=("normal_color",), added_later=True),
-    Effect("strain-position", "Shape of wrinkles", "slower",
-           f"12 coefficients a triangle, {_STRAIN}",
-           offsets=("strain_position", "strain_scale"), added_later=True),
-    Effect(RELIGHT, "Other lighting", "slower",
-           "seconds after training, and 30 bytes a vertex in the avatar file"),
-    Effect(WORLD, "Room behind", "slower",
-           "seconds to a minute after training, and a file of its own"),
+    Effect(
+        "background",
+        "Clean outline",
+        "slower",
+        "a pass over the image in every iteration, and one when it is read where the backdrop "
+        "is not of one color",
+        "random_background",
+        on={"backdrop": "plain"},
+        off={"backdrop": "plain"},
+    ),
+    Effect(
+        "hull-points",
+        "Hair beyond face",
+        "larger",
+        "a splat for every 4 mm beside the mesh",
+        "hull_points",
+    ),
+    Effect(
+        "depth-limits",
+        "No stray splats",
+        "free",
+        "none: splats are smaller and nearer to their triangles",
+        on=_LIMITS,
+    ),
+    Effect(
+        "density",
+        "Finer detail",
+        "slower",
+        "up to a quarter more splats, more in the preset final",
+        off={"density_interval": 0},
+    ),
+    Effect(
+        "selection",
+        "Moving parts only",
+        "free",
+        "none: local iterations are cheaper than global ones",
+        on={"strategy": "selective"},
+        off={"strategy": "global"},
+    ),
+    Effect(
+        "strain-color",
+        "Color of wrinkles",
+        "slower",
+        f"9 coefficients a triangle, {_STRAIN}",
+        offsets=("strain_color",),
+        added_later=True,
+    ),
+    Effect(
+        "normal-color",
+        "Shade of turned skin",
+        "slower",
+        "9 coefficients a triangle, and the normals of every frame",
+        offsets=("normal_color",),
+        added_later=True,
+    ),
+    Effect(
+        "strain-position",
+        "Shape of wrinkles",
+        "slower",
+        f"12 coefficients a triangle, {_STRAIN}",
+        offsets=("strain_position", "strain_scale"),
+        added_later=True,
+    ),
+    Effect(
+        RELIGHT,
+        "Other lighting",
+        "slower",
+        "seconds after training, and 30 bytes a vertex in the avatar file",
+    ),
+    Effect(
+        WORLD, "Room behind", "slower", "seconds to a minute after training, and a file of its own"
+    ),
     Effect("teeth", "Teeth", "free", "splats on 168 triangles", "teeth"),
-    Effect("torso", "Shoulders", "free", "none: splats below the neck follow other triangles",
-           "torso"),
+    Effect(
+        "torso", "Shoulders", "free", "none: splats below the neck follow other triangles", "torso"
+    ),
     Effect("neck", "Turning neck", "free", f"9 {_SHAPES}"),
     Effect("jaw", "Turning jaw", "free", f"9 {_SHAPES}"),
     Effect("eyes", "Turning eyes", "free", f"18 {_SHAPES}"),
-    Effect("dynamic-offsets", "Recorded details", "larger",
-           "a mesh a frame beside the parameters"),
-    Effect("tracking", "Better tracking", "slower",
-           "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
-           "head's motion",
-           "tracking"),
-)  # fmt: skip
+    Effect("dynamic-offsets", "Recorded details", "larger", "a mesh a frame beside the parameters"),
+    Effect(
+        "tracking",
+        "Better tracking",
+        "slower",
+        "a fifth of the time, or up to a second a timestep and view; tracking.npz is then the "
+        "head's motion",
+        "tracking",
+    ),
+)
 EFFECTS = {effect.name: effect for effect in _EFFECTS}
 """By name, in display order."""
 CHOICES = ("auto", "on", "off")
@@ -98,7 +153,8 @@ class EffectDecision:
     cost: str = setting()
 
     def __str__(self) -> str:
-        asked, cost = "" if self.choice == "auto" else ", as asked", f" [{self.cost}]"
+        asked = "" if self.choice == "auto" else ", as asked"
+        cost = f" [{self.cost}]"
         return f"{'on' if self.on else 'off'}{asked}: {self.reason}{cost if self.on else ''}"
 
 

@@ -76,10 +76,12 @@ def seconds_per_iteration(
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
     # shares of the run at which splats are split: by its own count, this one hardly ever would
-    (start, end), interval = settings.density_span, settings.density_interval
+    (start, end) = settings.density_span
+    interval = settings.density_interval
     turns = [n / iterations for n in range(interval, iterations, interval)] if interval else []
     turns = [share for share in turns if start <= share < end]
-    left, split_s = deque(turns), list[float]()
+    left = deque(turns)
+    split_s = list[float]()
     trainer.settings = replace(settings, density_interval=0)
     trained = capture.views["train"]
     order = view_order(trained, settings.views_per_visit, settings.seed)
@@ -100,7 +102,8 @@ def seconds_per_iteration(
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
         view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
         while left and left[0] <= progress:
-            trainer.settings, begin = replace(settings, density_interval=1), perf_counter()
+            trainer.settings = replace(settings, density_interval=1)
+            begin = perf_counter()
             trainer.step(view, image, left.popleft(), mask, mesh)
             split_s.append(perf_counter() - begin)
             trainer.settings = replace(settings, density_interval=0)

@@ -8,7 +8,8 @@ import numpy as np
 from ..capture.model import View
 from .settings import Rates, TrainingSettings
 
-COARSE_SCALE, MIN_COARSE_SIDE_PX = 0.5, 200
+COARSE_SCALE = 0.5
+MIN_COARSE_SIDE_PX = 200
 """Size of the images during `TrainingSettings.coarse_share`, as a share of the size trained at
 afterwards; not where their shorter side would be less than MIN_COARSE_SIDE_PX: splats are what
 takes time there, and half of so few pixels show too little."""
@@ -26,7 +27,8 @@ def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0)
         frames.setdefault(view.timestep, []).append(view)
     skip = start % len(views)
     for epoch in count(start // len(views)):
-        rng, visits = np.random.default_rng([seed, epoch]), []
+        rng = np.random.default_rng([seed, epoch])
+        visits = []
         for frame in frames.values():
             shuffled = [frame[n] for n in rng.permutation(len(frame))]
             size = per_visit or len(shuffled)

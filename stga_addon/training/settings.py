@@ -143,16 +143,24 @@ class TrainingSettings:
 
     strategy: str = option(
         "which splats an iteration trains (default global; selective with --schedule paper)",
-        "global", choices=(*STRATEGIES, *CONTINUATIONS), offered=STRATEGIES,
-    )  # fmt: skip
+        "global",
+        choices=(*STRATEGIES, *CONTINUATIONS),
+        offered=STRATEGIES,
+    )
     schedule: str = option(
-        "paper: the settings of the STGA paper (default: what measured best)", "default",
+        "paper: the settings of the STGA paper (default: what measured best)",
+        "default",
         choices=("default", "paper"),
-    )  # fmt: skip
+    )
     seconds: float | None = option(
-        "training time such as 90s, 10m (default 2m)", None, above=0,
-        flag="--budget", metavar="TIME", parse=duration, group="budget",
-    )  # fmt: skip
+        "training time such as 90s, 10m (default 2m)",
+        None,
+        above=0,
+        flag="--budget",
+        metavar="TIME",
+        parse=duration,
+        group="budget",
+    )
     iterations: int | None = option(
         "number of iterations instead of a time", None, 1, MAX_COUNT, group="budget"
     )
@@ -197,9 +205,10 @@ class TrainingSettings:
     )
     stop_when_flat: bool = option("stop when more time no longer helps", False)
     preset: str | None = option(
-        "quality, and with it training time; `stga presets` shows the times", None,
+        "quality, and with it training time; `stga presets` shows the times",
+        None,
         choices={name: preset.purpose for name, preset in PRESETS.items()},
-    )  # fmt: skip
+    )
     driven_offsets: tuple[str, ...] = ()
     antialiased: bool = False
     teeth: bool = True
@@ -208,8 +217,12 @@ class TrainingSettings:
     tracking: bool = False
     effects: Mapping[str, str] | None = option(
         "switch an effect on or off instead of deciding from the capture (docs/effects.md); may be "
-        "repeated", None, flag="--effect", metavar="NAME=on|off", parse=parse_choice,
-    )  # fmt: skip
+        "repeated",
+        None,
+        flag="--effect",
+        metavar="NAME=on|off",
+        parse=parse_choice,
+    )
 
     @property
     def follows_strain(self) -> bool:

@@ -28,20 +28,25 @@ MATTE_MARGIN_SHARE = 0.008
 """Around the person, where a matte is uncertain; share of the image's height."""
 PERSON = 256
 """Above every level of a pixel: sorts behind them."""
-RADII, NEAREST_RADIUS, FARTHEST_RADIUS = 24, 0.3, 12.0
+RADII = 24
+NEAREST_RADIUS = 0.3
+FARTHEST_RADIUS = 12.0
 """Shells that are tried, smallest and largest in distances of the cameras from the person."""
 DEFAULT_RADIUS = 3.0
 """Where the plates do not tell, because a wall is of one color or a single camera sees it."""
 SAMPLED_POINTS = 4000
 """Pixels of each plate by which shells are compared."""
-MIN_SHARED, MIN_LIKENESS = 0.1, 0.3
+MIN_SHARED = 0.1
+MIN_LIKENESS = 0.3
 """A shell tells how far away the world is where at least this share of the sampled pixels lies in
 another plate as well, and what both show there correlates at least so much."""
 DETAIL_SHARES = 0.003, 0.03
 """Filters between which lie the details that plates are compared by; of the image's height."""
-LARGEST_BLOCK, SMALLEST_BLOCK = 16, 2
+LARGEST_BLOCK = 16
+SMALLEST_BLOCK = 2
 """Pixels."""
-FLAT_LEVELS, MAX_FIRST_SPLATS = 1.5, 60_000
+FLAT_LEVELS = 1.5
+MAX_FIRST_SPLATS = 60_000
 """A block whose colors deviate less from their mean (standard deviation, of 255) is one splat; by
 more, twice as much and so on, where there would be too many."""
 SAME_LEVELS = 8.0
@@ -51,7 +56,8 @@ BLOCK_WIDTH = 0.8
 THICKNESS_SHARE = 0.2
 START_OPACITY = 5.0
 """A logit."""
-MIN_STEPS, STEPS_PER_CAMERA = 200, 25
+MIN_STEPS = 200
+STEPS_PER_CAMERA = 25
 RATES = Rates(
     xyz=1e-6, rotation=1e-3, log_scale=0.01, opacity=0.02, sh=0.02, sh_rest=0.004, end=0.1
 )
@@ -83,7 +89,8 @@ def clean_plates(capture: Capture, correct: Correction | None = None) -> list[Cl
             by_camera.setdefault(view.camera_index, []).append(view)
     plates = []
     for _, views in sorted(by_camera.items()):
-        camera, stack = views[0].camera, []
+        camera = views[0].camera
+        stack = []
         scale = min(1.0, (MAX_PLATE_PIXELS / (camera.width * camera.height)) ** 0.5)
         for full_size in evenly_spread(views, MAX_PLATE_VIEWS):
             view, image, mask = read_view(full_size, scale)
@@ -109,7 +116,8 @@ def filled(image: np.ndarray, seen: np.ndarray) -> np.ndarray:
         return image
     height, width = seen.shape
     weighted = np.zeros((height + height % 2, width + width % 2, 4), np.float32)
-    weighted[:height, :width, :3], weighted[:height, :width, 3] = image * seen[..., None], seen
+    weighted[:height, :width, :3] = image * seen[..., None]
+    weighted[:height, :width, 3] = seen
     half = weighted.reshape(len(weighted) // 2, 2, -1, 2, 4).mean(axis=(1, 3))
     known = half[..., 3] > 0
     smaller = filled(half[..., :3] / np.maximum(half[..., 3:], 1e-6), known)
@@ -131,9 +139,11 @@ def world_of(capture: Capture, settings: TrainingSettings, report: Report) -> Sp
 
 def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report = ignore) -> Splats:
     """In world space, meters, that show plates from their cameras; center: (3,) of the person."""
-    start, steps = first_splats(plates, center), max(MIN_STEPS, STEPS_PER_CAMERA * len(plates))
+    start = first_splats(plates, center)
+    steps = max(MIN_STEPS, STEPS_PER_CAMERA * len(plates))
     # a capture of one timestep, whose views are the plates' and whose mesh is one triangle
-    mesh, faces = center + TRIANGLE, np.arange(3, dtype=np.int32)[None]
+    mesh = center + TRIANGLE
+    faces = np.arange(3, dtype=np.int32)[None]
     cameras = enumerate(plate.camera for plate in plates)
     views = tuple(View(0, n, camera, f"plate {n}", Path()) for n, camera in cameras)
     capture = Capture(
@@ -141,17 +151,28 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     )
     mean = np.mean([plate.image.mean((0, 1)) for plate in plates], axis=0)
     settings = TrainingSettings(
-        iterations=steps, rates=RATES, ema_share=0.1, sh_degree=SH_DEGREE, sh_steps=(0.3,),
-        hull_points=False, density_interval=0, stray_reset_interval=0, unseen_opacity_weight=0.0,
-        unbound_scale_limit=1e3, background=tuple(mean.tolist()), random_background=False,
-    )  # fmt: skip
-    frames, face = face_frames(mesh, faces, mesh), np.zeros(len(start), np.int32)
+        iterations=steps,
+        rates=RATES,
+        ema_share=0.1,
+        sh_degree=SH_DEGREE,
+        sh_steps=(0.3,),
+        hull_points=False,
+        density_interval=0,
+        stray_reset_interval=0,
+        unseen_opacity_weight=0.0,
+        unbound_scale_limit=1e3,
+        background=tuple(mean.tolist()),
+        random_background=False,
+    )
+    frames = face_frames(mesh, faces, mesh)
+    face = np.zeros(len(start), np.int32)
     trainer = Trainer(capture, settings, {}, new_state(to_local(start, frames, face)))
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
         # as in training: Numba would compile again for writable arrays
         target.setflags(write=False)
-    turns, rng = -(-steps // len(plates)), np.random.default_rng(0)
+    turns = -(-steps // len(plates))
+    rng = np.random.default_rng(0)
     order = np.concatenate([rng.permutation(len(plates)) for _ in range(turns)])[:steps]
     for number in counted(order, steps, report, "World", "Step"):
         trainer.step(views[number], targets[number], trainer.iteration / steps)
@@ -176,11 +197,14 @@ def _likeness(
     plates: Sequence[CleanPlate], details: Sequence[np.ndarray], center: np.ndarray, radius: float
 ) -> float:
     """Correlation of plates at the same points of a shell; 0 where they share too few."""
-    mine, theirs, rng = [], [], np.random.default_rng(0)
+    mine = []
+    theirs = []
+    rng = np.random.default_rng(0)
     for plate, detail in zip(plates, details, strict=True):
         rows, columns = np.nonzero(plate.seen)
         chosen = rng.choice(len(rows), min(SAMPLED_POINTS, len(rows)), replace=False)
-        rows, columns = rows[chosen], columns[chosen]
+        rows = rows[chosen]
+        columns = columns[chosen]
         points = on_shell(plate.camera, np.stack([columns, rows], 1) + 0.5, center, radius)
         for other, detail_there in zip(plates, details, strict=True):
             if other is not plate:
@@ -188,7 +212,8 @@ def _likeness(
                 inside &= other.seen[y, x]
                 mine.append(detail[rows[inside], columns[inside]].ravel())
                 theirs.append(detail_there[y[inside], x[inside]].ravel())
-    one, two = np.concatenate([np.zeros(0), *mine]), np.concatenate([np.zeros(0), *theirs])
+    one = np.concatenate([np.zeros(0), *mine])
+    two = np.concatenate([np.zeros(0), *theirs])
     if len(one) < 3 * MIN_SHARED * SAMPLED_POINTS * len(plates):
         return 0.0
     return float((one * two).sum() / max(np.sqrt((one**2).sum() * (two**2).sum()), 1e-12))
@@ -210,7 +235,8 @@ def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: flo
 def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
     """A splat in world space for each block of the plates; of many plates more than
     MAX_FIRST_SPLATS, where blocks are as large as they may be."""
-    radius, levels = shell_radius(plates, center), FLAT_LEVELS
+    radius = shell_radius(plates, center)
+    levels = FLAT_LEVELS
     while True:
         parts = []
         for number, plate in enumerate(plates):
@@ -223,17 +249,22 @@ def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:
                 alike = abs(other.image[y, x] - colors).max(axis=1) < SAME_LEVELS / 255
                 new &= ~(inside & alike)
             # flat, facing the camera
-            points, count = points[new], int(new.sum())
+            points = points[new]
+            count = int(new.sum())
             width = BLOCK_WIDTH * sides[new] * camera.project(points)[1] / camera.fl_x
             log_scale = np.log(np.stack([width, width, THICKNESS_SHARE * width], axis=1))
             turn = from_matrices(camera.world_to_camera[None, :3, :3].transpose(0, 2, 1))
             sh = np.zeros((count, (SH_DEGREE + 1) ** 2, 3), np.float32)
             sh[:, 0] = (colors[new] - 0.5) / SH_C0
             splats = Splats(
-                points.astype(np.float32), np.repeat(turn, count, axis=0).astype(np.float32),
-                log_scale.astype(np.float32), np.full(count, START_OPACITY, np.float32), sh,
-                np.zeros(count, np.int32), np.ones(count, bool),
-            )  # fmt: skip
+                points.astype(np.float32),
+                np.repeat(turn, count, axis=0).astype(np.float32),
+                log_scale.astype(np.float32),
+                np.full(count, START_OPACITY, np.float32),
+                sh,
+                np.zeros(count, np.int32),
+                np.ones(count, bool),
+            )
             parts.append(splats)
         found = joined(parts)
         if len(found) <= MAX_FIRST_SPLATS or levels >= 255:
@@ -248,15 +279,18 @@ def blocks(image: np.ndarray, levels: float) -> tuple[np.ndarray, np.ndarray, np
     height, width = image.shape[:2]
     ends = [(LARGEST_BLOCK, LARGEST_BLOCK + -side % LARGEST_BLOCK) for side in (height, width)]
     padded = np.pad(image, [*ends, (0, 0)], mode="edge")
-    found, side = [], LARGEST_BLOCK
+    found = []
+    side = LARGEST_BLOCK
     open_ = np.ones((padded.shape[0] // side, padded.shape[1] // side), bool)
     while side >= SMALLEST_BLOCK:
         squares = padded.reshape(padded.shape[0] // side, side, padded.shape[1] // side, side, 3)
-        mean, deviation = squares.mean(axis=(1, 3)), squares.std(axis=(1, 3)).max(axis=-1)
+        mean = squares.mean(axis=(1, 3))
+        deviation = squares.std(axis=(1, 3)).max(axis=-1)
         taken = open_ & ((deviation < levels / 255) | (side == SMALLEST_BLOCK))
         y, x = np.nonzero(taken)
         middles = side * (np.stack([x, y], 1) + 0.5) - LARGEST_BLOCK
         found.append((middles, np.full(len(x), side), mean[taken]))
-        open_, side = np.repeat(np.repeat(open_ & ~taken, 2, 0), 2, 1), side // 2
+        open_ = np.repeat(np.repeat(open_ & ~taken, 2, 0), 2, 1)
+        side = side // 2
     middles, sides, colors = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return middles, sides.astype(np.float32), colors

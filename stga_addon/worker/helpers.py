@@ -34,7 +34,10 @@ SINGLE = dict.fromkeys(
 )  # Environment variables of a helper
 REPORT_INTERVAL_S = 0.2
 STEPS_KEY = "steps"  # In the file of a kept result: how many steps it took
-STEP, RESULT, ERROR = "step", "result", "error"  # A helper's message is a pair of this and a value
+# A helper's message is a pair of this and a value
+STEP = "step"
+RESULT = "result"
+ERROR = "error"
 
 Step = Callable[[], None]  # Called by work after each of its steps
 
@@ -55,7 +58,8 @@ class Helpers:
     def __init__(self, limit: int | None = None, folder: Path | None = None) -> None:
         threads = os.environ.get(THREADS_VARIABLE, "")
         usual = min(int(threads) if threads.isdecimal() else processors(), MAX_HELPERS)
-        self._count, self._folder = usual if limit is None else limit, folder
+        self._count = usual if limit is None else limit
+        self._folder = folder
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> "Helpers":
@@ -74,9 +78,12 @@ class Helpers:
         self._processes = []
 
     def map(
-        self, work: Callable[..., Any], parts: Sequence[tuple], done: Callable[[int], None],
+        self,
+        work: Callable[..., Any],
+        parts: Sequence[tuple],
+        done: Callable[[int], None],
         keep: bool = False,
-    ) -> list[Any]:  # fmt: skip
+    ) -> list[Any]:
         """The results of work(*part, step) of every part, in order.
 
         work: a function of a module, which calls `step` after each of its steps; parts and results

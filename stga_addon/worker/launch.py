@@ -18,14 +18,18 @@ from .training_python import own_python
 CACHE_VARIABLE = "STGA_CACHE"
 """Environment variable that names the folder. Blender's extension sets it to one that uninstalling
 removes."""
-KERNELS, BUNDLED, BYTECODE, CHARTS = "kernels", "bundled kernels", "bytecode", "matplotlib"
+KERNELS = "kernels"
+BUNDLED = "bundled kernels"
+BYTECODE = "bytecode"
+CHARTS = "matplotlib"
 """Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with
 its own (`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
 """Held in it by the process that compiles ahead of a training (`jobs.perform`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
-NICENESS, BACKGROUND_NICENESS = 5, 15
+NICENESS = 5
+BACKGROUND_NICENESS = 15
 """Added to the nice value of a worker, so that Blender has precedence, and of what runs in the
 background, so that workers have."""
 PR_SET_PDEATHSIG = 1  # Of prctl(2)
@@ -97,9 +101,11 @@ def start_in_background(
 
 
 def start_python(
-    python: str, arguments: Sequence[str], variables: Mapping[str, str] | None = None,
+    python: str,
+    arguments: Sequence[str],
+    variables: Mapping[str, str] | None = None,
     **options: Any,
-) -> subprocess.Popen[Any]:  # fmt: skip
+) -> subprocess.Popen[Any]:
     """Start `python -m ARGUMENTS…` in `worker_environment` and `variables`; options are those of
     Popen. Raises StgaError where the interpreter cannot be started."""
     environment = {**worker_environment(os.environ, python), **(variables or {})}
@@ -118,7 +124,8 @@ def end_with_this_process() -> Callable[[], None] | None:
         return None
     import ctypes  # before the fork, after which nothing may be imported
 
-    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
 
     def ask() -> None:
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

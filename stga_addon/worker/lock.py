@@ -17,7 +17,8 @@ PROBE_TIMEOUT_S = 0.03  # The same between processes that only ask, as Blender's
 RETRY_INTERVAL_S = 0.002
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system without working locks answers: some NFS and parallel file systems."""
-BEAT_S, EXPIRY_S = 5.0, 30.0
+BEAT_S = 5.0
+EXPIRY_S = 30.0
 """Seconds between two renewals of a lease, and without one until another process takes it: from a
 holder that was killed on another machine, or stands still (a suspended machine, storage that
 hangs)."""
@@ -83,9 +84,10 @@ def _hold_lease(path: Path) -> Iterator[SoftFileLease]:
     try:
         stood_still = (None, before)
         lease.acquire(
-            timeout=2 * EXPIRY_S, poll_interval=LOOK_INTERVAL_S,
+            timeout=2 * EXPIRY_S,
+            poll_interval=LOOK_INTERVAL_S,
             cancel_check=lambda: _renewed_s(path) not in stood_still,
-        )  # fmt: skip
+        )
     except Timeout as error:
         raise BlockingIOError(f"{path} is held by another process") from error
     try:

@@ -29,12 +29,17 @@ from ..progress import Progress
 from ..schema import from_json, setting
 from .lock import hold_folder, is_locked, lock_owner
 
-STATUS_FILE, LOG_FILE, LOCK_FILE, CANCEL_FILE = "status.json", "worker.log", "worker.lock", "cancel"
-PREVIEW, PICTURE = "preview.npz", "picture.npz"
+STATUS_FILE = "status.json"
+LOG_FILE = "worker.log"
+LOCK_FILE = "worker.lock"
+CANCEL_FILE = "cancel"
+PREVIEW = "preview.npz"
+PICTURE = "picture.npz"
 STATUS_INTERVAL_S = 0.5  # Least time between two writes of status.json with the same message
 PREVIEW_INTERVAL_S = 4.0  # Seconds between two previews
 MIN_FREE_BYTES = 1 << 20  # Free space below which a disk counts as full
-LOG_TAIL_LINES, REPORT_LOG_LINES = 6, 200
+LOG_TAIL_LINES = 6
+REPORT_LOG_LINES = 200
 MAX_LOG_LINE_BYTES = 400  # Assumed length of a log line, which bounds how much of the log is read
 
 
@@ -195,7 +200,8 @@ class StatusWriter:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.cancel_requested = False
-        self._status, self._written_s = WorkerStatus(machine=platform.node()), -math.inf
+        self._status = WorkerStatus(machine=platform.node())
+        self._written_s = -math.inf
         self._began_s = self._previewed_s = time.monotonic()
 
     def report(self, progress: Progress) -> bool:

@@ -27,7 +27,8 @@ def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Spla
 
 def world_splats(xyz, rotation, log_scale, opacity, sh) -> Splats:
     """Splats of another program's numbers; opacity from 0 to 1."""
-    logit, nothing = np.log(opacity / (1 - opacity)), np.zeros(len(xyz), np.int32)
+    logit = np.log(opacity / (1 - opacity))
+    nothing = np.zeros(len(xyz), np.int32)
     values = (np.asarray(each, np.float32) for each in (xyz, rotation, log_scale, logit, sh))
     return Splats(*values, face=nothing, unbound=nothing.astype(bool))
 

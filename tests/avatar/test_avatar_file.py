@@ -22,7 +22,8 @@ def test_round_trip_is_exact(is_empty, tmp_path, avatar):
     write_avatar(tmp_path / "a.npz", avatar)
     back = read_avatar(tmp_path / "a.npz")
     for name in SPLAT_FIELDS:
-        have, want = getattr(back.splats, name), getattr(avatar.splats, name)
+        have = getattr(back.splats, name)
+        want = getattr(avatar.splats, name)
         assert have.dtype == want.dtype, name
         np.testing.assert_array_equal(have, want, err_msg=name)
     for name in ("neutral", "faces"):

@@ -120,7 +120,8 @@ def test_backward_agrees_with_differences():
         direction = rng.normal(size=vertices.shape)
         ends = (vertices + sign * step * direction for sign in (1, -1))
         after, before = (face_frames(end, faces, neutral) for end in ends)
-        away, turn = after.origin - before.origin, after.rotation - before.rotation
+        away = after.origin - before.origin
+        turn = after.rotation - before.rotation
         moved = np.einsum("fji,fj->fi", frames.rotation, away / (2 * step))
         spun = np.einsum("fji,fjk->fik", frames.rotation, turn / (2 * step))
         # of a skew-symmetric matrix

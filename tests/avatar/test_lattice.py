@@ -36,7 +36,9 @@ def test_order_4_is_the_corners_and_midpoints_of_the_four_subtriangles(conventio
         len(faces), 15, 3
     )
     for points, (a, b, c) in zip(world, neutral[faces], strict=True):
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        ab = (a + b) / 2
+        bc = (b + c) / 2
+        ca = (c + a) / 2
         corners = [a, b, c, ab, bc, ca]
         edges = [(a, ab), (ab, b), (b, bc), (bc, c), (c, ca), (ca, a), (ab, bc), (bc, ca), (ca, ab)]
         expected = (

@@ -62,7 +62,8 @@ def test_rigid_motion_far_away_does_not_strain():
 @pytest.mark.parametrize("broken", ["point", "line", "posed point", "torn"])
 def test_broken_triangles_stay_finite(broken):
     """Catches division by an area of zero, and colors that explode with a stretch of a thousand."""
-    neutral, posed = sheet(), sheet(3)
+    neutral = sheet()
+    posed = sheet(3)
     if broken == "point":
         neutral[FACES[1]] = neutral[2]
     if broken == "line":
@@ -82,7 +83,8 @@ def test_deformation_stays_within_what_was_seen():
     """Catches colors extrapolated beyond the trained expressions, a range of another triangle or
     component, one that clips what was trained, a margin counted from 0 where a mesh at rest is
     clipped to less, and one beyond what may be followed."""
-    neutral, rng = sheet(), np.random.default_rng(4)
+    neutral = sheet()
+    rng = np.random.default_rng(4)
     allowed = trained_range(len(FACES))
     posed = [neutral + rng.normal(0, 3e-4, neutral.shape) for _ in range(3)]
     posed.append(0.7 * neutral)
@@ -132,7 +134,8 @@ def test_the_range_is_in_the_file_and_in_renderings(tmp_path):
 def test_baking_keeps_the_picture():
     """Catches a world PLY that forgets the colors of a deformed frame, or counts them twice."""
     neutral = sheet()
-    avatar, posed = colored(neutral), sheet(4)
+    avatar = colored(neutral)
+    posed = sheet(4)
     pose = np.eye(4)
     pose[:3, 3] = [-0.005, -0.008, 0.1]
     camera = Camera(48, 48, 150.0, 150.0, 24.0, 24.0, pose)
@@ -174,10 +177,13 @@ def test_strain_is_averaged_over_whatever_touches():
     """Catches lists of another vertex or triangle, a weight that is not one over their length, and
     a wrong dual basis, factor or transposed map of E = ½(FᵀF − I): plain loops over a mesh with a
     boundary, an edge of three triangles, and a vertex that no triangle touches."""
-    (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
-    axes, tensors = [], []
+    (neutral, faces) = finned_sheet()
+    (posed, _) = finned_sheet(3)
+    axes = []
+    tensors = []
     for face in faces:
-        first, second = neutral[face[1]] - neutral[face[0]], neutral[face[2]] - neutral[face[0]]
+        first = neutral[face[1]] - neutral[face[0]]
+        second = neutral[face[2]] - neutral[face[0]]
         normal = np.cross(first, second)
         along, across = (v / np.linalg.norm(v) for v in (first, np.cross(normal, first)))
         axes.append((along, across))
@@ -200,7 +206,8 @@ def test_strain_is_averaged_over_whatever_touches():
 
 def test_smoothed_strain_is_averaged_over_edges():
     """Catches another weight or number of rounds, and a mesh at rest that is not zero."""
-    (neutral, faces), (posed, _) = finned_sheet(), finned_sheet(3)
+    (neutral, faces) = finned_sheet()
+    (posed, _) = finned_sheet(3)
     basis = strain_basis(neutral, faces, trained_range(len(faces)))
     deformed = deformation(basis, posed)
     average = np.zeros((len(faces), len(faces)))
@@ -220,7 +227,8 @@ def test_colors_follow_strain_and_normals(convention):
     """Catches coefficients of another triangle, signal or component, normals in the triangle's own
     axes, or of the posed mesh only, one of two colors that is lost, and the capture's light that
     stays where other light takes its place: plain loops."""
-    neutral, posed = sheet(), sheet(3)
+    neutral = sheet()
+    posed = sheet(3)
     avatar = replace(colored(neutral), convention=convention)
     basis = strain_basis(neutral, FACES)
     smoothed = smoothed_strain(basis, deformation(basis, posed))
@@ -239,7 +247,8 @@ def test_colors_follow_strain_and_normals(convention):
 def test_older_files_keep_their_colors(tmp_path):
     """Catches files of version 2, where each splat has strain colors of its own, that are refused,
     whose colors at rest change, or follow another splat or triangle."""
-    neutral, rng = sheet(), np.random.default_rng(5)
+    neutral = sheet()
+    rng = np.random.default_rng(5)
     avatar = replace(colored(neutral), driven_offsets={})
     write_avatar(tmp_path / "a.npz", avatar)
     with np.load(tmp_path / "a.npz") as arrays:
@@ -262,7 +271,8 @@ def test_older_files_keep_their_colors(tmp_path):
 def test_positions_follow_strain(convention, tmp_path):
     """Catches a shift in other axes or units than the splats', one lost in the file, and a mesh at
     rest that moves."""
-    neutral, posed = sheet(), sheet(3)
+    neutral = sheet()
+    posed = sheet(3)
     avatar = replace(following(neutral), convention=convention)
     write_avatar(tmp_path / "a.npz", avatar)
     found = read_avatar(tmp_path / "a.npz")
@@ -292,10 +302,13 @@ def test_positions_stay_near_where_the_mesh_is_torn():
     neutral = sheet()
     avatar = following(neutral)
     farthest = MAX_STRAIN * np.abs(avatar.driven_offsets["strain_position"]).sum((1, 2))
-    torn, flat, far = 1000 * sheet(2), neutral * [1, 0, 0], neutral + 100.0
+    torn = 1000 * sheet(2)
+    flat = neutral * [1, 0, 0]
+    far = neutral + 100.0
     torn[1] = torn[0]
     for posed in (torn, flat, far, np.zeros_like(neutral)):
-        plain, moved = face_frames(posed, FACES, neutral), avatar.frames(posed)
+        plain = face_frames(posed, FACES, neutral)
+        moved = avatar.frames(posed)
         away = np.linalg.norm(moved.origin - plain.origin, axis=1)
         assert np.isfinite(moved.origin).all()
         assert (away <= farthest * plain.scale + 1e-9).all()
@@ -307,18 +320,23 @@ def test_positions_stay_near_where_the_mesh_is_torn():
 @pytest.mark.parametrize("name", OFFSETS)
 def test_only_what_shows_is_kept(name, convention):
     """Catches coefficients taken for invisible by another range, signal or unit than poses have."""
-    neutral, rng = sheet(), np.random.default_rng(4)
+    neutral = sheet()
+    rng = np.random.default_rng(4)
     limits = rng.random((len(FACES), 2, 6)).astype(np.float32) * [[-2], [0.5]]
     unit = face_frames(neutral, FACES, neutral, convention).scale
-    shares, divisor = [], 10 * unit if name == "strain_position" else 1.0
+    shares = []
+    divisor = 10 * unit if name == "strain_position" else 1.0
     for exponent in np.linspace(-3, 1, 41):
         sizes = 10**exponent * rng.random(len(FACES)) / divisor
         coefficients = sizes[:, None, None] * rng.normal(0, 0.2, (len(FACES), 3, 3))
         whole = Avatar(
-            colored(neutral).splats, convention, neutral.astype(np.float32), FACES,
+            colored(neutral).splats,
+            convention,
+            neutral.astype(np.float32),
+            FACES,
             strain_range=limits.astype(np.float32),
             driven_offsets={name: coefficients.astype(np.float32)},
-        )  # fmt: skip
+        )
         pruned = whole.without_invisible_offsets
         is_kept = pruned.driven_offsets[name].any((1, 2))
         np.testing.assert_array_equal(
@@ -327,7 +345,8 @@ def test_only_what_shows_is_kept(name, convention):
         shares.append(is_kept.mean())
         for _ in range(20):
             posed = (neutral * rng.uniform(0.4, 1.5, 3)) @ Rotation.random(rng=rng).as_matrix()
-            ours, theirs = pruned.frames(posed), whole.frames(posed)
+            ours = pruned.frames(posed)
+            theirs = whole.frames(posed)
             assert abs(ours.color - theirs.color).max(initial=0) < MIN_COLOR_CHANGE
             assert abs(np.log(ours.scale / theirs.scale)).max() < MIN_SCALE_CHANGE
             plain = face_frames(posed, FACES, neutral, convention)

@@ -23,7 +23,9 @@ class SimulatedEngine(Engine):
     interval_s = 0.0
 
     def __init__(self, outcome=finished, room=1 << 30, takes_all=False):
-        self.outcome, self.room, self.takes_all = outcome, room, takes_all
+        self.outcome = outcome
+        self.room = room
+        self.takes_all = takes_all
         self.submitted: list[str] = []
         self.most = 0
         self.jobs: dict[str, Job] = {}
@@ -43,7 +45,8 @@ class SimulatedEngine(Engine):
         return dict.fromkeys(self.jobs, "simulated")
 
     def ended(self) -> Mapping[str, Ended]:
-        jobs, self.jobs = self.jobs, {}
+        jobs = self.jobs
+        self.jobs = {}
         return {name: self.end(job) for name, job in jobs.items()}
 
     def end(self, job: Job) -> Ended:

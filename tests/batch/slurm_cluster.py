@@ -72,7 +72,8 @@ class Cluster:
         key.write_bytes(os.urandom(128))
         key.chmod(0o600)
         ports = {name: _free_port() for name in ("controller", "first", "second")}
-        user, host = pwd.getpwuid(os.geteuid()).pw_name, socket.gethostname()
+        user = pwd.getpwuid(os.geteuid()).pw_name
+        host = socket.gethostname()
         text = CONFIGURATION.format(folder=self.folder, user=user, host=host, **ports)
         (self.folder / "slurm.conf").write_text(text)
         names = {

@@ -70,10 +70,20 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         blender("--background", "--python-exit-code", "1", "--python", folder / "make.py")
         names = folder / "whole/######"
         blender(
-            "--background", folder / "head.blend", "--engine", "STGA_SPLATS", "--render-output",
-                names,
-            "--render-format", "PNG", "--frame-start", 0, "--frame-end", 4, "--render-anim",
-        )  # fmt: skip
+            "--background",
+            folder / "head.blend",
+            "--engine",
+            "STGA_SPLATS",
+            "--render-output",
+            names,
+            "--render-format",
+            "PNG",
+            "--frame-start",
+            0,
+            "--frame-end",
+            4,
+            "--render-anim",
+        )
         yield folder
 
 
@@ -86,7 +96,8 @@ def pictures(folder: Path) -> dict[str, np.ndarray]:
 
 
 def check(shot: Path, engine: str) -> None:
-    whole, found = pictures(shot / "whole"), pictures(shot / engine)
+    whole = pictures(shot / "whole")
+    found = pictures(shot / engine)
     assert list(found) == list(whole) == [f"{frame:06d}.png" for frame in range(5)]
     for name, picture in whole.items():
         np.testing.assert_array_equal(found[name], picture)

@@ -60,9 +60,13 @@ def killer(jobs, kills, ended, killed, resumable):
 def test_killed_workers_resume_to_the_same_bits(tmp_path, trained_here, monkeypatch):
     """Catches a job that a kill damages, loses or changes, and one that is not tried again."""
     monkeypatch.setenv("STGA_CHECKPOINT_S", "0.3")
-    seeds, iterations = max(1, KILLS // 3), max(ITERATIONS, 80 * KILLS)
-    whole, plan = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
-    ended, killed, resumable = threading.Event(), list[str](), list[str]()
+    seeds = max(1, KILLS // 3)
+    iterations = max(ITERATIONS, 80 * KILLS)
+    whole = trained_here(seeds, iterations)
+    plan = tiny_plan(tmp_path, seeds, iterations)
+    ended = threading.Event()
+    killed = list[str]()
+    resumable = list[str]()
     thread = threading.Thread(target=killer, args=(plan.jobs, KILLS, ended, killed, resumable))
     thread.start()
     try:
@@ -99,7 +103,8 @@ def test_captures_of_the_command(tmp_path, capsys, monkeypatch):
     """Catches options that are forgotten for captures, or silently ignored for a plan."""
     monkeypatch.setattr("stga_addon.jobs.batch.engines.make_engine", lambda *_: InProcessEngine())
     tiny_plan(tmp_path)
-    capture, out = str(tmp_path / "capture"), str(tmp_path / "out")
+    capture = str(tmp_path / "capture")
+    out = str(tmp_path / "out")
     options = "--iterations 2 --device cpu --threads 1 --principal-point opencv --seed 5"
     assert main(["batch", capture, "--out", out, *options.split()]) == 0
     assert "1 of 1 jobs finished" in capsys.readouterr().out

@@ -60,7 +60,8 @@ def plan_of(base: Path, text: str = PLAN) -> Plan:
 
 def test_jobs_of_a_plan(base: Path) -> None:
     """Catches fields that do not reach a request, and a job before what it reads is there."""
-    plan, runs = plan_of(base), base / "runs"
+    plan = plan_of(base)
+    runs = base / "runs"
     jobs = {job.name: job for job in plan.jobs}
     assert [*jobs] == ["tracked", "anna", "anna-val", "smile"]
     assert jobs["tracked"].request == Track(
@@ -68,9 +69,12 @@ def test_jobs_of_a_plan(base: Path) -> None:
     )
     default = make_settings(iterations=1).selection
     settings = make_settings(
-        iterations=30, seed=7, effects={}, sh_steps=(0.5,),
+        iterations=30,
+        seed=7,
+        effects={},
+        sh_steps=(0.5,),
         selection=replace(default, threshold=0.02),
-    )  # fmt: skip
+    )
     training = jobs["anna"]
     assert training.request == Train(runs / "anna", runs / "tracked", settings)
     assert training.after == ("tracked",)
@@ -95,7 +99,8 @@ def test_names_of_captures(base: Path) -> None:
     assert {job.name: job.request.capture for job in plan.jobs} == {
         f"train-{name}": base / folder for name, folder in zip(names, folders, strict=True)
     }
-    first, settings = plan.jobs[0].request, plan.jobs[0].request.settings
+    first = plan.jobs[0].request
+    settings = plan.jobs[0].request.settings
     assert (first.run, first.device) == (base / "out/train-anna-take", "cpu")
     assert (settings.preset, settings.seconds, settings.lattice) == ("draft", None, 1)
     assert settings.effects == {}
@@ -108,41 +113,50 @@ MISTAKES = {
     'out = "r"\n': r"holds no job; expected a table \[job.NAME\]",
     'out = "r"\n[job."a/b"]\n': r"\[job.'a/b'\]: expected a name",
     'out = "r"\n[job.replaced]\n': "other than 'replaced'",
-    'out = "r"\n[job.a]\nrequest = "fly"\n':
-        r"\[job.a\]: request: expected one of train, .*got 'fly'",
+    'out = "r"\n[job.a]\nrequest = "fly"\n': r"\[job.a\]: request: expected one of train, .*got 'fly'",
     'out = "r"\n[job.a]\n': r"\[job.a\]: request: expected one of",
     'out = "r"\n' + ONE + 'capturee = "x"\n': r"\[job.one\]: capturee: is not a key",
     'out = "r"\n' + ONE + "device = 3\n": r"\[job.one\]: device: expected a text",
     'out = "r"\n' + ONE + 'device = "abacus"\n': r"\[job.one\]: device: expected auto, cpu, gpu",
     'out = "r"\n' + ONE + "flame = 3\n": r"\[job.one\]: flame: expected a path",
     'out = "r"\n' + ONE + "flame = 1979-05-27\n": r"\[job.one\]: flame: expected a path",
-    'out = "footage/anna"\n' + ONE:
-        r"\[job.one\]: capture: .*anna is the batch's own folder; choose another 'out'",
+    'out = "footage/anna"\n'
+    + ONE: r"\[job.one\]: capture: .*anna is the batch's own folder; choose another 'out'",
     'out = "r"\n' + ONE + 'flame = "none.pkl"\n': r"\[job.one\]: flame: .*none.pkl does not exist",
-    'out = "r"\n' + ONE.replace("iterations = 3", "iterations = 0"):
-        r"\[job.one\]: settings.iterations: expected",
-    'out = "r"\n' + ONE.replace("iterations = 3", "iterations = inf"):
-        r"\[job.one\]: settings.iterations",
-    'out = "r"\n' + ONE.replace("iterations = 3", "iteration = 3"):
-        r"\[job.one\]: settings: iteration: is not a key",
+    'out = "r"\n'
+    + ONE.replace(
+        "iterations = 3", "iterations = 0"
+    ): r"\[job.one\]: settings.iterations: expected",
+    'out = "r"\n'
+    + ONE.replace("iterations = 3", "iterations = inf"): r"\[job.one\]: settings.iterations",
+    'out = "r"\n'
+    + ONE.replace(
+        "iterations = 3", "iteration = 3"
+    ): r"\[job.one\]: settings: iteration: is not a key",
     'out = "r"\n' + ONE.replace("iterations = 3", ""): r"\[job.one\]: the budget must be given",
-    'out = "r"\n' + ONE.replace("{ iterations = 3 }", "3"):
-        r"\[job.one\]: settings: expected a table",
-    'out = "r"\n' + ONE + 'after = ["two"]\n':
-        r"\[job.one\]: after: 'two' is not a job of the plan",
+    'out = "r"\n'
+    + ONE.replace("{ iterations = 3 }", "3"): r"\[job.one\]: settings: expected a table",
+    'out = "r"\n'
+    + ONE
+    + 'after = ["two"]\n': r"\[job.one\]: after: 'two' is not a job of the plan",
     'out = "r"\n' + ONE + 'after = "two"\n': r"\[job.one\]: after: expected a list",
     'out = "r"\n' + ONE + 'after = ["one"]\n': "these jobs wait for each other: one → one",
-    'out = "r"\n' + "".join(f'[job.{a}]\nrequest = "evaluate"\nrun = "r/{b}"\n' for a, b in
-        ("ab", "ba")): "wait for each other",
-    'out = "r"\n' + ONE + "resources = { threads = -1 }\n":
-        r"\[job.one\]: resources: setting threads: expected",
-    'out = "r"\n' + ONE + "resources = { cpus = 1 }\n":
-        r"\[job.one\]: resources: cpus: is not a key",
-    'out = "r"\n' + ONE + "minutes = 0\n":
-        r"\[job.one\]: setting minutes: expected a number above 0",
+    'out = "r"\n'
+    + "".join(
+        f'[job.{a}]\nrequest = "evaluate"\nrun = "r/{b}"\n' for a, b in ("ab", "ba")
+    ): "wait for each other",
+    'out = "r"\n'
+    + ONE
+    + "resources = { threads = -1 }\n": r"\[job.one\]: resources: setting threads: expected",
+    'out = "r"\n'
+    + ONE
+    + "resources = { cpus = 1 }\n": r"\[job.one\]: resources: cpus: is not a key",
+    'out = "r"\n'
+    + ONE
+    + "minutes = 0\n": r"\[job.one\]: setting minutes: expected a number above 0",
     'out = "r"\n[job.a]\nrequest = "evaluate"\n': r"\[job.a\]: run: is missing",
     'out = "r': "is not valid TOML",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("text", MISTAKES, ids=lambda text: re.sub(r"\W+", "-", text)[-40:])

@@ -102,7 +102,8 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     """Catches a token that cannot be used, jobs lost or changed, and two workers on one."""
     pytest.importorskip("torch")
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'stga-addon[ray]'")
-    seeds, iterations = max(1, KILLS // 2), max(ITERATIONS, 200 * KILLS)
+    seeds = max(1, KILLS // 2)
+    iterations = max(ITERATIONS, 200 * KILLS)
     variables = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     variables["STGA_CHECKPOINT_S"] = "0.3"
     killed, states = run_script(NODES, tmp_path, KILLS, seeds, iterations, **variables)[-2:]
@@ -111,7 +112,8 @@ def test_jobs_of_killed_nodes_resume_elsewhere(tmp_path: Path, trained_here: Tra
     print(killed)
     assert int(killed.split()[0]) >= KILLS // 2
     assert int(killed.split()[3]) > 0
-    here, there = trained_here(seeds, iterations), tiny_plan(tmp_path, seeds, iterations)
+    here = trained_here(seeds, iterations)
+    there = tiny_plan(tmp_path, seeds, iterations)
     for seed in range(seeds):
         assert splats_of(there, f"train-seed{seed}") == splats_of(here, f"train-seed{seed}")
 

@@ -150,7 +150,9 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
 @pytest.mark.parametrize("takes_all", [False, True])
 def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
     """Catches times and forecasts that grow with a cluster's queue or a batch's pauses."""
-    queue_s, work_s, waited = 0.8, 0.2, []
+    queue_s = 0.8
+    work_s = 0.2
+    waited = []
 
     class Queued(SimulatedEngine):
         def running(self) -> dict[str, str]:
@@ -224,7 +226,8 @@ def test_room_on_this_machine(tmp_path: Path) -> None:
     engine = LocalEngine(cores=4, memory_gb=8.0)
 
     def job(name: str, **needs: float) -> Job:
-        found, resources = empty_jobs(tmp_path, 1).jobs[0], Resources(**{"threads": 1, **needs})
+        found = empty_jobs(tmp_path, 1).jobs[0]
+        resources = Resources(**{"threads": 1, **needs})
         return Job(name, found.request, tmp_path / name, resources=resources)
 
     assert engine.has_room(job("huge", threads=64, memory_gb=100.0))
@@ -344,7 +347,8 @@ def test_a_job_costs_the_same_in_a_large_batch(tmp_path: Path) -> None:
     """Catches time or memory that grows faster than the number of jobs, in a process of its own."""
     if not Path("/proc/self/status").exists():
         pytest.skip("peak memory of a process is read from Linux's /proc")
-    tests, few = Path(__file__).resolve().parents[1], JOBS // 8
+    tests = Path(__file__).resolve().parents[1]
+    few = JOBS // 8
     path = os.pathsep.join([str(tests.parent), str(tests)])
     environment = os.environ | {"PYTHONPATH": path, "TMPDIR": str(tmp_path)}
     command = [sys.executable, "-c", COST, str(few), str(JOBS)]

@@ -121,7 +121,9 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, programs: dict[str, 
 
 def test_what_waits_in_the_queue_is_submitted_once(tmp_path, monkeypatch):
     """Catches a batch that ends where squeue fails once, and jobs submitted again."""
-    queue, down, calls = tmp_path / "queue", tmp_path / "down", tmp_path / "calls"
+    queue = tmp_path / "queue"
+    down = tmp_path / "down"
+    calls = tmp_path / "calls"
     programs = {
         "sbatch": f'echo "$@" >>{calls}; n=$(wc -l <{calls}); '
         f'for i in 0 1 2; do echo "${{n}}_$i|PENDING|" >>{queue}; done; echo $n',

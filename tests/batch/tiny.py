@@ -23,10 +23,12 @@ ROOT = Path(__file__).resolve().parents[2]
 ITERATIONS = 400
 """Some seconds of training, so that workers and machines can be killed between checkpoints."""
 RAY_SETTINGS = {
-    "worker_niceness": "0", "health_check_initial_delay_ms": "1000", "health_check_period_ms":
-        "1000",
-    "health_check_failure_threshold": "3", "health_check_timeout_ms": "10000",
-}  # fmt: skip
+    "worker_niceness": "0",
+    "health_check_initial_delay_ms": "1000",
+    "health_check_period_ms": "1000",
+    "health_check_failure_threshold": "3",
+    "health_check_timeout_ms": "10000",
+}
 """Tasks have the priority of the tests beside them (Ray's own is 15 lower, and takes minutes then);
 a killed node is noticed after 3 s, and a node that is only slow has 10 s to answer."""
 SETTINGS = {"strategy": "selective", "hull_points": False}
@@ -78,9 +80,13 @@ def interrupt_batch(base: Path, *options: str) -> tuple[int, str]:
     )
     command = [sys.executable, "-m", "stga_addon", "batch", str(base / "plan.toml"), *options]
     started = subprocess.Popen(
-        command, cwd=ROOT, env=ray_variables(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        command,
+        cwd=ROOT,
+        env=ray_variables(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
-    )  # fmt: skip
+    )
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         status, failed = (read_status(base / f"runs/train-{name}/job") for name in ("good", "bad"))

@@ -91,7 +91,8 @@ def flame_sequence(
         )
         for timestep in timesteps
     }
-    shape, offset = rng.normal(size=model.n_identity), rng.normal(0, 0.002, (size, 3))
+    shape = rng.normal(size=model.n_identity)
+    offset = rng.normal(0, 0.002, (size, 3))
     return FlameSequence(model, shape, offset, tuple(timesteps), frames.__getitem__)
 
 

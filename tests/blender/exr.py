@@ -13,7 +13,8 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     data = path.read_bytes()
     magic, version = struct.unpack_from("<2i", data)
     assert magic == 20000630
-    headers, at = [], 8
+    headers = []
+    at = 8
     while data[at]:
         header, at = _header(data, at)
         headers.append(header)
@@ -23,7 +24,8 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     found = {}
     for header in headers:
         x0, y0, x1, y1 = struct.unpack("<4i", header["dataWindow"])
-        width, height = x1 - x0 + 1, y1 - y0 + 1
+        width = x1 - x0 + 1
+        height = y1 - y0 + 1
         names = _channels(header["channels"])
         rows = np.empty((height, len(names), width), np.float32)
         for start in struct.unpack_from(f"<{height}q", data, at):

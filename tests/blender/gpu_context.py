@@ -10,7 +10,9 @@ def run_with_gpu(work: Callable[[], None]) -> None:
     errors: list[BaseException] = []
 
     class Engine(bpy.types.RenderEngine):
-        bl_idname, bl_label, bl_use_gpu_context = "STGA_TEST_GPU", "Test", True
+        bl_idname = "STGA_TEST_GPU"
+        bl_label = "Test"
+        bl_use_gpu_context = True
 
         def render(self, depsgraph: object) -> None:
             try:

@@ -18,7 +18,8 @@ from stga_addon.avatar.file import read_avatar
 from stga_addon.scene import compat, tags
 
 if not compat.NATIVE_SPLATS:
-    compat.NATIVE_SPLATS, compat.native_splats = True, lambda tree, points: points
+    compat.NATIVE_SPLATS = True
+    compat.native_splats = lambda tree, points: points
 
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_attributes import RELIT_COLOR

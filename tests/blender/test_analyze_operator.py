@@ -23,7 +23,8 @@ def chosen(head):
 def test_effect_choices(chosen, extension, tmp_path):
     """Catches choices of another capture, that are lost, or cannot be and show nowhere."""
     row = chosen.effects.add()
-    row.name, row.choice = "jaw", "on"
+    row.name = "jaw"
+    row.choice = "on"
     with pytest.raises(RuntimeError, match=r"jaw=on: .* no parameters of FLAME"):
         bpy.ops.stga.analyze_capture()
     assert error_of(extension, Kind.ANALYSIS).startswith("jaw=on: ")
@@ -33,7 +34,8 @@ def test_effect_choices(chosen, extension, tmp_path):
     assert not chosen.effects
     assert not chosen.preset_timing
     row = chosen.effects.add()  # as an earlier analysis leaves it
-    row.name, row.choice = "strain-color", "on"
+    row.name = "strain-color"
+    row.choice = "on"
     bpy.ops.stga.analyze_capture()
     rows = {row.name: row for row in chosen.effects}
     assert len(rows) == len(chosen.effects) > 2

@@ -96,7 +96,8 @@ def test_refined_tracking_keeps_the_offsets_of_each_frame(tmp_path, place):
 
 def test_undo(scene):
     """Catches a motion that undo leaves half of: actions, bindings, frame range."""
-    actions, before = sorted(bpy.data.actions.keys()), at(1)
+    actions = sorted(bpy.data.actions.keys())
+    before = at(1)
     bpy.ops.ed.undo_push(message="before")
     bpy.ops.stga.apply_motion(filepath=str(scene.file), start=1, place="strip")
     bpy.ops.ed.undo_push(message="after")
@@ -154,7 +155,8 @@ def read_row(timestep: int) -> dict[str, np.ndarray]:
 
 def test_wrong_sources_change_nothing(scene, tmp_path):
     """Catches half a motion, and messages that do not say what is needed."""
-    actions, before = sorted(bpy.data.actions.keys()), at(1)
+    actions = sorted(bpy.data.actions.keys())
+    before = at(1)
     np.savez(tmp_path / "wide.npz", expr=np.zeros((2, 50)))
     np.savez(tmp_path / "long.npz", expr=np.zeros((3, 2)))
     meshes = write_mesh_capture(tmp_path / "meshes")

@@ -69,7 +69,8 @@ def test_sliders(scene):
     """Catches a slider other than the map's, that stops own motion or needs Python."""
     before = [at(frame) for frame in range(3)]
     assert bpy.ops.stga.add_arkit_controls() == {"FINISHED"}
-    head, model = the_head(), scene.own.model
+    head = the_head()
+    model = scene.own.model
     keys = head.data.shape_keys
     assert set(ARKIT_SHAPES) <= set(keys.key_blocks.keys())
     assert all(driver.driver.is_simple_expression for driver in keys.animation_data.drivers)
@@ -125,7 +126,8 @@ def test_curves_come_back_from_an_action(scene, tmp_path):
     plain = Performance(np.arange(7) / 30, weights, scene.turns, 30.0)
     write_performance(tmp_path / "plain.csv", plain)
     bpy.ops.stga.apply_motion(filepath=str(tmp_path / "plain.csv"), start=1)
-    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 7
+    bpy.context.scene.frame_start = 1
+    bpy.context.scene.frame_end = 7
     assert bpy.ops.stga.export_performance(filepath=str(tmp_path / "back.csv")) == {"FINISHED"}
     back = read_performance(tmp_path / "back.csv")
     assert back.fps == pytest.approx(30, rel=1e-3)

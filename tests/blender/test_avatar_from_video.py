@@ -34,14 +34,16 @@ def asked(extension, monkeypatch):
 
 def begin(requests):
     """What the worker writes first."""
-    jobs, request = import_module(type(requests[-1]).__module__), requests[-1]
+    jobs = import_module(type(requests[-1]).__module__)
+    request = requests[-1]
     request.out.mkdir(parents=True, exist_ok=True)
     jobs.write_json(request.out / jobs.INPUTS, jobs._inputs(request.track))
 
 
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
     """Catches other settings than `stga avatar VIDEO`, and a dropped video that starts nothing."""
-    out, opened = tmp_path / "out", list[bool]()
+    out = tmp_path / "out"
+    opened = list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
     monkeypatch.setattr(extension.operators.monitor, "show_panel", show_panel)
     bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3)
@@ -103,7 +105,8 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     video = tmp_path / "head.mp4"
     write_head_video(video, 6)
     bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable)
-    settings, out = bpy.context.scene.stga, tmp_path / "head avatar"
+    settings = bpy.context.scene.stga
+    out = tmp_path / "head avatar"
     assert settings.head[tags.CAPTURE] == str(out / "capture")
     assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
     assert (settings.avatar, settings.avatar_shown) == (str(out / "run/avatar.npz"), True)

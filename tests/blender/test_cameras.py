@@ -59,7 +59,8 @@ def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:
 
 def pixels_in_blender(camera_object, points: np.ndarray) -> np.ndarray:
     """(N, 2) pixels where the scene's render puts the capture's points (N, 3)."""
-    render, depsgraph = bpy.context.scene.render, bpy.context.evaluated_depsgraph_get()
+    render = bpy.context.scene.render
+    depsgraph = bpy.context.evaluated_depsgraph_get()
     size = {"x": render.resolution_x, "y": render.resolution_y}
     aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     projection = camera_object.calc_matrix_camera(depsgraph, **size, **aspect)
@@ -193,7 +194,8 @@ def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
     assert central([]) is None
 
 
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 def add_camera(name, position, **values):
@@ -211,13 +213,15 @@ def add_camera(name, position, **values):
 
 def scene_with_cameras():
     render = bpy.context.scene.render
-    render.resolution_x, render.resolution_y = 2 * WIDTH, 2 * HEIGHT
+    render.resolution_x = 2 * WIDTH
+    render.resolution_y = 2 * HEIGHT
     render.resolution_percentage = 50
     add_camera("left", (-1, -1, 0.3), lens=45, shift_x=0.1, shift_y=-0.05)
     add_camera("Camera.001", (0.2, -1.4, 0), lens=60, sensor_fit="VERTICAL", sensor_height=20)
     parent = bpy.data.objects.new("rail", None)
     bpy.context.collection.objects.link(parent)
-    parent.scale, parent.location = (2, 2, 2), (0.1, 0, 0)
+    parent.scale = (2, 2, 2)
+    parent.location = (0.1, 0, 0)
     add_camera("on rail", (0.6, -0.5, 0.1)).parent = parent
     bpy.context.view_layer.update()
 
@@ -240,12 +244,14 @@ def test_exported_cameras(tmp_path):
     for camera in footage.cameras:
         # captures are y up
         pixels, depths = camera.camera.project(points[:, [0, 2, 1]] * [1, 1, -1])
-        scene, thing = bpy.context.scene, bpy.data.objects[camera.name]
+        scene = bpy.context.scene
+        thing = bpy.data.objects[camera.name]
         seen = [world_to_camera_view(scene, thing, Vector(point)) for point in points]
         expected = [(x * WIDTH, (1 - y) * HEIGHT) for x, y, _ in seen]
         np.testing.assert_allclose(pixels, expected, atol=2e-3, err_msg=camera.name)
         np.testing.assert_allclose(depths, [z for _, _, z in seen], atol=1e-5)
-    left, path = bpy.data.objects["left"], tmp_path / "cameras.json"
+    left = bpy.data.objects["left"]
+    path = tmp_path / "cameras.json"
     left.select_set(True)
     bpy.ops.stga.export_cameras(filepath=str(path), selected_only=True)
     (frame,) = json.loads(path.read_text(encoding="utf-8"))["frames"]
@@ -258,6 +264,7 @@ def test_exported_cameras(tmp_path):
     left.scale = -1, 1, 1
     with pytest.raises(RuntimeError, match="left: is mirrored by a negative scale"):
         bpy.ops.stga.export_cameras(filepath=str(path))
-    left.scale, left.data.type = (1, 1, 1), "ORTHO"
+    left.scale = (1, 1, 1)
+    left.data.type = "ORTHO"
     with pytest.raises(RuntimeError, match="left: is not a perspective camera"):
         bpy.ops.stga.export_cameras(filepath=str(path))

@@ -102,7 +102,8 @@ def bare_python(folder: Path) -> Path:
 @pytest.mark.slow
 def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> None:
     """Catches a missing wheel, a worker that needs more, and files that uninstalling leaves."""
-    python, video = bare_python(tmp_path / "bare"), tmp_path / "head.mp4"
+    python = bare_python(tmp_path / "bare")
+    video = tmp_path / "head.mp4"
     write_head_video(video, 6)
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}

@@ -87,7 +87,8 @@ def test_mistakes_are_sentences(head, asked, run, tmp_path):
 def test_residuals_are_shown_on_the_head(head, run, extension):
     """Catches a heat map of other triangles, and unknown ones shown as bad."""
     residual = np.full(len(head.data.polygons), 0.01, np.float32)
-    residual[7], residual[9] = 0.2, np.nan
+    residual[7] = 0.2
+    residual[9] = np.nan
     extension.stga_addon.training.run.folder.write_residuals(run, residual)
     bpy.ops.stga.heat_map(of="RESIDUAL", directory=str(run))
     shown = np.array([item.value for item in head.data.attributes["stga_residual"].data])

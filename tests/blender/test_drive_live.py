@@ -34,7 +34,8 @@ def live(tmp_path: Path, extension) -> SimpleNamespace:
     jaw = np.linspace([0, 0, 0], [0.2, 0, 0], 5)
     own = import_small_head(tmp_path, expr=expr, jaw_pose=jaw)
     settings = bpy.context.scene.stga.drive
-    settings.port, settings.takes = wire.free_port(), str(tmp_path / "takes")
+    settings.port = wire.free_port()
+    settings.takes = str(tmp_path / "takes")
     recorded = read_motion(tmp_path / "own.npz", own.model)
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sessions = extension.operators.drive
@@ -84,7 +85,8 @@ def half(seed: int) -> dict[str, float]:
 def test_the_head_follows_and_comes_back(live):
     """Catches another pose than a file's, keyframes, a head left posed, and sliders added."""
     bpy.context.scene.frame_set(1)
-    before, actions = mesh(), sorted(bpy.data.actions.keys())
+    before = mesh()
+    actions = sorted(bpy.data.actions.keys())
     bpy.ops.stga.drive_live()
     for number in range(3):
         weights = half(number)
@@ -124,7 +126,8 @@ def test_a_rendered_animation_keeps_its_own_pose(live):
     bpy.ops.stga.drive_live()
     live.send(half(0), 0)
     scene = bpy.context.scene
-    scene.frame_start, scene.frame_end = 1, 3
+    scene.frame_start = 1
+    scene.frame_end = 3
     scene.render.resolution_x = scene.render.resolution_y = 4
     active_camera()
     scene.render.filepath = str(live.takes / "image_")
@@ -178,7 +181,8 @@ def test_the_trained_range(live):
     bpy.ops.stga.measure_range()
     from stga_addon.scene.rig.motion import outside_now, stored_range
 
-    head, rig = the_head(), rig_of(the_head())
+    head = the_head()
+    rig = rig_of(the_head())
     trained = stored_range(head)
     np.testing.assert_allclose(trained.middle["jaw"][0], 0.1, atol=0.01)
     assert outside_now(head, rig, trained)["jaw"] == 0
@@ -202,7 +206,8 @@ def test_another_address_needs_online_access(live):
     with pytest.raises(RuntimeError, match="online access is off"):
         bpy.ops.stga.drive_live()
     live.settings.address = "127.0.0.1"
-    live.settings.source, live.settings.phone = "facial_mocap", "192.168.0.7"
+    live.settings.source = "facial_mocap"
+    live.settings.phone = "192.168.0.7"
     with pytest.raises(RuntimeError, match="online access is off"):
         bpy.ops.stga.drive_live()
 

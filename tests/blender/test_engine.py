@@ -34,7 +34,8 @@ from .test_splat_object import (
     random_splats,
 )
 
-WIDTH, HEIGHT = 96, 64
+WIDTH = 96
+HEIGHT = 64
 TOLERANCE = 1 / 255
 
 
@@ -48,7 +49,8 @@ def _engine(empty_scene):
     engine.register(no_python)
     scene = bpy.context.scene
     scene.render.engine = engine.ENGINE
-    scene.render.resolution_x, scene.render.resolution_y = WIDTH, HEIGHT
+    scene.render.resolution_x = WIDTH
+    scene.render.resolution_y = HEIGHT
     scene.render.film_transparent = True
     scene.view_settings.view_transform = "Standard"
     scene.view_layers[0].use_pass_z = True
@@ -75,7 +77,8 @@ def camera_at(lens: float = 60.0, **data: object):
 
 def add_sun(energy: float = 1.0):
     sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
-    sun.data.energy, sun.rotation_euler = energy, (1.2, 0.0, 0.4)
+    sun.data.energy = energy
+    sun.rotation_euler = (1.2, 0.0, 0.4)
     bpy.context.scene.collection.objects.link(sun)
     return sun
 
@@ -101,7 +104,8 @@ def multilayer(settings: object) -> None:
     """Choose files that hold all passes in float."""
     if hasattr(settings, "media_type"):
         settings.media_type = "MULTI_LAYER_IMAGE"
-    settings.file_format, settings.exr_codec = "OPEN_EXR_MULTILAYER", "NONE"
+    settings.file_format = "OPEN_EXR_MULTILAYER"
+    settings.exr_codec = "NONE"
     settings.color_depth = "32"
 
 
@@ -137,7 +141,8 @@ def expected_camera(camera, shown, width: int = WIDTH, height: int = HEIGHT) -> 
     focal = data.lens / sensor * across
     world_to_eye = np.linalg.inv(np.array(camera.matrix_world, np.float64))
     view = np.diag([1.0, -1.0, -1.0, 1.0]) @ world_to_eye @ np.array(shown.matrix_world)
-    cx, cy = width / 2 - data.shift_x * across, height / 2 + data.shift_y * across
+    cx = width / 2 - data.shift_x * across
+    cy = height / 2 + data.shift_y * across
     return Camera(width, height, focal, focal, cx, cy, view)
 
 
@@ -154,7 +159,8 @@ def test_image_equals_render_avatar(make, background, tmp_path):
     """Catches another camera, color, order or pose than `stga render`'s, and parts left out."""
     avatar = make()
     shown, head = show(avatar)
-    camera, mesh = expected_camera(camera_at(), shown), evaluated_vertices(head)
+    camera = expected_camera(camera_at(), shown)
+    mesh = evaluated_vertices(head)
     expected = render_avatar(avatar, mesh, camera, (background,) * 3)
     assert np.abs(expected - background).max(0).mean() > 0.02, "nothing to compare"
     assert np.abs(displayed(render(tmp_path), background) - expected).max() < TOLERANCE
@@ -190,8 +196,10 @@ def test_light_of_the_scene(device, lighting, monkeypatch, tmp_path):
     assert unlit["A"].max() > 0.5
     for name, values in unlit.items():
         assert np.array_equal(recorded[name], values), name
-    lighting.mode, lighting.exposure = "scene", 0.5
-    camera, mesh = expected_camera(camera_object, shown), evaluated_vertices(head)
+    lighting.mode = "scene"
+    lighting.exposure = 0.5
+    camera = expected_camera(camera_object, shown)
+    mesh = evaluated_vertices(head)
     shines = np.array(shown.matrix_world.inverted() @ sun.matrix_world)[:3, :3] @ [0, 0, -1]
     light = Light("sun", np.full(3, 4.0), direction=shines, angle=sun.data.angle)
     light = Lighting(lights=(light,), exposure=0.5)
@@ -218,7 +226,8 @@ def test_camera_settings_are_applied(changes, portrait, tmp_path):
     """Catches a wrong sensor fit, shifts' sign or unit, and the percentage."""
     scene = bpy.context.scene
     width, height = (HEIGHT, WIDTH) if portrait else (WIDTH, HEIGHT)
-    scene.render.resolution_x, scene.render.resolution_y = 2 * width, 2 * height
+    scene.render.resolution_x = 2 * width
+    scene.render.resolution_y = 2 * height
     scene.render.resolution_percentage = 50
     avatar = textured(avatar_of("stga"))
     shown, head = show(avatar)
@@ -235,9 +244,14 @@ def test_render_region(crop, tmp_path):
     camera_at()
     whole = render(tmp_path)["R"]
     r = bpy.context.scene.render
-    r.use_border, r.use_crop_to_border = True, crop
-    r.border_min_x, r.border_max_x, r.border_min_y, r.border_max_y = 0.3, 0.71, 0.2, 0.77
-    rows, columns = slice(HEIGHT - int(0.77 * HEIGHT), HEIGHT - int(0.2 * HEIGHT)), slice(28, 68)
+    r.use_border = True
+    r.use_crop_to_border = crop
+    r.border_min_x = 0.3
+    r.border_max_x = 0.71
+    r.border_min_y = 0.2
+    r.border_max_y = 0.77
+    rows = slice(HEIGHT - int(0.77 * HEIGHT), HEIGHT - int(0.2 * HEIGHT))
+    columns = slice(28, 68)
     part = render(tmp_path)["R"]
     assert whole[rows, columns].max() > 0.1
     part = part if crop else part[rows, columns]
@@ -298,7 +312,8 @@ def test_display_settings_apply_to_renders(tmp_path):
     frozen = ~np.isin(avatar.faces, vertices).all(1)[avatar.splats.face]
     constant = replace(avatar.splats, sh=avatar.splats.sh[:, :1])
     larger = replace(avatar.splats, log_scale=avatar.splats.log_scale + np.float32(np.log(2)))
-    mesh, black = evaluated_vertices(head), (0.0,) * 3
+    mesh = evaluated_vertices(head)
+    black = (0.0,) * 3
     cases = {
         splat_nodes.OPACITY_THRESHOLD: (0.5, 0.0, avatar.splats.rows(~faint)),
         splat_nodes.SELECTED_ONLY: (True, False, avatar.splats.rows(~frozen)),
@@ -312,13 +327,15 @@ def test_display_settings_apply_to_renders(tmp_path):
         assert np.abs(displayed(render(tmp_path), 0.0) - expected).max() < TOLERANCE, name
         set_input(shown, name, default)
     set_input(shown, splat_nodes.SHOW_SELECTION, True)
-    gray, colored = displayed(render(tmp_path), 0.0), render_avatar(avatar, mesh, camera, black)
+    gray = displayed(render(tmp_path), 0.0)
+    colored = render_avatar(avatar, mesh, camera, black)
     assert np.ptp(gray, axis=0).mean() < np.ptp(colored, axis=0).mean()
 
 
 def test_only_visible_objects_are_rendered(tmp_path):
     """Catches hidden objects in the image, and missing collection instances."""
-    xyz, log_scale = np.zeros((50, 3), np.float32), np.full((50, 3), -4, np.float32)
+    xyz = np.zeros((50, 3), np.float32)
+    log_scale = np.full((50, 3), -4, np.float32)
     splats = replace(random_splats(1, 50), xyz=xyz, log_scale=log_scale)
     shown = show_world_splats(splats, "scan")
     active_camera((0, 0, 1))
@@ -331,7 +348,8 @@ def test_only_visible_objects_are_rendered(tmp_path):
     collection.objects.link(shown)
     assert render(tmp_path)["A"].max() == 0
     instance = bpy.data.objects.new("instance", None)
-    instance.instance_type, instance.instance_collection = "COLLECTION", collection
+    instance.instance_type = "COLLECTION"
+    instance.instance_collection = collection
     instance.location = (0.2, 0, 0)
     bpy.context.scene.collection.objects.link(instance)
     alpha = render(tmp_path)["A"]
@@ -347,7 +365,9 @@ def test_animation(tmp_path):
         shown.hide_render = hidden
         shown.keyframe_insert("hide_render", frame=frame)
     scene = bpy.context.scene
-    scene.frame_start, scene.frame_end, scene.frame_step = 1, 9, 4
+    scene.frame_start = 1
+    scene.frame_end = 9
+    scene.frame_step = 4
     multilayer(scene.render.image_settings)
     scene.render.filepath = str(tmp_path / "image_####.exr")
     bpy.ops.render.render(animation=True)
@@ -443,7 +463,8 @@ def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, m
 def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
     """Catches preferences read from a render thread, and an error that is lost."""
     monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
-    answers, callers = [StgaError("no environment"), "python"], []
+    answers = [StgaError("no environment"), "python"]
+    callers = []
 
     def find() -> str:
         callers.append(threading.current_thread())

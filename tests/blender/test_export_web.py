@@ -79,7 +79,9 @@ def test_sliders_motion_and_camera(extension, tmp_path):
         jaw.keyframe_insert("rotation_quaternion", frame=frame)
         head.data.shape_keys.key_blocks["expr_003"].value = 2 * angle
         head.data.shape_keys.key_blocks["expr_003"].keyframe_insert("value", frame=frame)
-    scene.frame_start, scene.frame_end, scene.render.fps = 1, 5, 24
+    scene.frame_start = 1
+    scene.frame_end = 5
+    scene.render.fps = 24
     header, arrays = exported(tmp_path)
     assert (header["fps"], len(arrays["pose"])) == (24, 5)
     assert_plays(header, arrays)

@@ -65,7 +65,8 @@ def test_a_world_is_hidden_until_it_is_wanted(extension, tmp_path):
 def test_the_start_up_cube_does_not_enclose_the_head(extension, tmp_path, moved):
     """Catches a first look from within the default cube, and an artist's cube hidden."""
     bpy.ops.mesh.primitive_cube_add()
-    cube, folder = bpy.context.object, str(write_mesh_capture(tmp_path / "capture"))
+    cube = bpy.context.object
+    folder = str(write_mesh_capture(tmp_path / "capture"))
     cube.location.x = float(moved)
     bpy.context.view_layer.update()
     bpy.ops.stga.import_capture(directory=folder)
@@ -104,9 +105,13 @@ def test_images_by_other_engines(extension, tmp_path):
     write_ball_avatar(tmp_path / "avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     shown = bpy.context.scene.stga.splats
-    scene, path = bpy.context.scene, tmp_path / "image.png"
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
-    scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(path)
+    scene = bpy.context.scene
+    path = tmp_path / "image.png"
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 1
+    scene.cycles.use_denoising = False
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.filepath = str(path)
     images = {}
     for mode in (AS_TRAINED, QUADS, POINTS):
         set_input(shown, DISPLAY, mode)
@@ -115,14 +120,18 @@ def test_images_by_other_engines(extension, tmp_path):
     assert images[QUADS][..., :3].max() > 50
     np.testing.assert_array_equal(images[AS_TRAINED], images[QUADS])
     assert np.abs(images[AS_TRAINED] - images[POINTS]).max() > 20
-    scene, cycles = bpy.context.scene, bpy.context.scene.cycles
+    scene = bpy.context.scene
+    cycles = bpy.context.scene.cycles
     other = bpy.data.scenes.new("other").cycles
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (64, 64)
     assert other.transparent_max_bounces < 64
-    cycles.transparent_max_bounces, cycles.min_transparent_bounces = 200, 8
+    cycles.transparent_max_bounces = 200
+    cycles.min_transparent_bounces = 8
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     assert (cycles.transparent_max_bounces, cycles.min_transparent_bounces) == (200, 64)
-    shown, scene.render.engine, cycles.transparent_max_bounces = scene.stga.splats, "CYCLES", 8
+    shown = scene.stga.splats
+    scene.render.engine = "CYCLES"
+    cycles.transparent_max_bounces = 8
     bpy.ops.stga.preview_images()
     assert (display_mode(shown), cycles.transparent_max_bounces) == (QUADS, 64)
     with pytest.raises(RuntimeError, match="displayed as trained"):

@@ -53,7 +53,8 @@ def test_poses_set_by_hand_equal_the_forward_pass(source):
     """Fails when only imported frames match: fixed joints, missing drivers, raw quaternions."""
     sequence = flame_sequence(flame_model())
     head = import_head(motion_capture(sequence, source))
-    rig, keys = rig_of(head), head.data.shape_keys
+    rig = rig_of(head)
+    keys = head.data.shape_keys
     rig.animation_data.action = keys.animation_data.action = None
     wanted = sequence_frame = flame_sequence(sequence.model, seed=5).frame(4)
     for name, axis_angle in zip(JOINTS, sequence_frame.pose, strict=True):
@@ -140,7 +141,9 @@ def test_all_components_have_sliders(source):
 def test_the_published_topology_with_teeth(source, shared_data):
     """Fails when parity is lost at FLAME's size, or identity sliders leave joints."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
-        template, identity, faces = data["v_template"], data["shapedirs"], data["faces"]
+        template = data["v_template"]
+        identity = data["shapedirs"]
+        faces = data["faces"]
     small = flame_model(vertices=len(template), components=20, identity=0)
     open_head = replace(
         small,
@@ -165,7 +168,8 @@ def test_the_published_topology_with_teeth(source, shared_data):
 
 def test_what_a_rig_cannot_hold_is_reported(source):
     """Fails when dynamic_offset is dropped or spares joints, or clamping comes without warning."""
-    sequence, said = flame_sequence(flame_model(), dynamic=True), []
+    sequence = flame_sequence(flame_model(), dynamic=True)
+    said = []
     head = import_head(motion_capture(sequence, source), warn=said.append)
     assert_parity(head, sequence)
     plain = flame_sequence(sequence.model)
@@ -184,7 +188,8 @@ def test_importing_again_replaces_the_rig(source):
     dynamic = flame_sequence(flame_model(), dynamic=True)
     first = import_head(motion_capture(dynamic, source), warn=lambda sentence: None)
     kinds = bpy.data.objects, bpy.data.armatures, bpy.data.actions, bpy.data.meshes
-    rig, counts = rig_of(first), [len(blocks) for blocks in kinds]
+    rig = rig_of(first)
+    counts = [len(blocks) for blocks in kinds]
     sequence = flame_sequence(flame_model(seed=2), seed=2)
     head = import_head(motion_capture(sequence, source))
     assert head == first
@@ -228,7 +233,8 @@ def test_the_bundled_head_has_arkits_sliders(source):
     assert_parity(head, sequence)
     sampled = sample_motion(head, sequence, sequence.timesteps)
     for number, timestep in enumerate(sequence.timesteps):
-        found, tracked = sampled.frame(number).expr, sequence.frame(timestep).expr
+        found = sampled.frame(number).expr
+        tracked = sequence.frame(timestep).expr
         np.testing.assert_allclose(found, tracked, atol=1e-5)
     key = head.data.shape_keys.key_blocks["jawOpen"]
     assert is_of_parts(key.path_from_id("value"), ["expression"])

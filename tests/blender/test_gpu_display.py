@@ -37,8 +37,11 @@ class Region:
     def __init__(self, is_perspective: bool) -> None:
         from mathutils import Matrix
 
-        near, far, f = 0.1, 10.0, 2.0
-        self.is_perspective, self.use_clip_planes = is_perspective, False
+        near = 0.1
+        far = 10.0
+        f = 2.0
+        self.is_perspective = is_perspective
+        self.use_clip_planes = False
         self.view_matrix = Matrix.Translation((0, 0, -1))
         depth = np.array([-(far + near), -2 * far * near] if is_perspective else [-2, -far - near])
         last = (0, 0, -1, 0) if is_perspective else (0, 0, 0, 1)
@@ -87,13 +90,16 @@ def test_cache_follows_new_splats_and_shapes():
     """Catches splats of an earlier training state, and frames of an earlier pose."""
     avatar = avatar_of("stga")
     head = animated_head(avatar.neutral, avatar.faces)
-    shown, cache = show_avatar(avatar, head), SplatCache()
+    shown = show_avatar(avatar, head)
+    cache = SplatCache()
 
     def layer(frame: int) -> SceneLayer:
         bpy.context.scene.frame_set(frame)
         return visible_layers(bpy.context.evaluated_depsgraph_get(), cache)[0]
 
-    first, again, later = layer(1), layer(1), layer(5)
+    first = layer(1)
+    again = layer(1)
+    later = layer(5)
     assert first.splats is again.splats is later.splats
     assert first.frames is again.frames
     assert np.abs(first.frames.origin - later.frames.origin).max() > 1e-4
@@ -166,11 +172,15 @@ def linked_collection(path: Path):
 def test_linked_heads_are_followed(library, is_instance):
     """Catches linked or instanced splats that are missing, stand still, or are elsewhere."""
     path, expected = library
-    scene, cache, linked = bpy.context.scene, SplatCache(), linked_collection(path)
+    scene = bpy.context.scene
+    cache = SplatCache()
+    linked = linked_collection(path)
     if is_instance:
         instance = bpy.data.objects.new("anna", None)
-        instance.instance_type, instance.instance_collection = "COLLECTION", linked
-        instance.location, instance.scale = (1, 2, 3), (2, 2, 2)
+        instance.instance_type = "COLLECTION"
+        instance.instance_collection = linked
+        instance.location = (1, 2, 3)
+        instance.scale = (2, 2, 2)
         scene.collection.objects.link(instance)
     else:
         scene.collection.children.link(linked)

@@ -58,11 +58,13 @@ def avatar(degree: int, *driven: str) -> Avatar:
 
 def with_driven(of: Avatar, *names: str) -> Avatar:
     """With these driven offsets, and ranges of normals that clip small turns."""
-    rng, count = np.random.default_rng(9), len(of.faces)
+    rng = np.random.default_rng(9)
+    count = len(of.faces)
     units = [5e-3 if OFFSETS[name].target == POSITION else 0.6 for name in names]
     values = [rng.normal(0, unit, (count, 3, 3)).astype(np.float32) for unit in units]
     ends = np.repeat([[-2.0, -0.06], [2.0, 0.03]], 3, axis=1).astype(np.float32)
-    limits, offsets = np.tile(ends, (count, 1, 1)), dict(zip(names, values, strict=True))
+    limits = np.tile(ends, (count, 1, 1))
+    offsets = dict(zip(names, values, strict=True))
     return replace(of, strain_range=limits, driven_offsets=offsets)
 
 
@@ -158,7 +160,8 @@ def test_picture_equals_the_rasterizers(name: str) -> None:
 @needs_gpu
 def test_clip_planes() -> None:
     """Catches splats outside a clipping region, and planes of another space."""
-    camera, of = cases()["sh 0"][1], avatar(0)
+    camera = cases()["sh 0"][1]
+    of = avatar(0)
     planes = np.array([[1.0, 0.2, 0.0, 0.0], [0.0, 1.0, 0.0, 0.02]])
     world = to_world(of.splats, of.frames(of.neutral))
     inside = (np.c_[world.xyz, np.ones(len(world))] @ planes.T >= 0).all(1)
@@ -212,7 +215,8 @@ def relit_layers(mode: str) -> list[SceneLayer]:
 @pytest.mark.parametrize("mode", ["scene", "mix", "kept"])
 def test_light_of_the_scene(mode):
     """Catches light that the GPU computes otherwise than `Relighter`, and a lit recorded layer."""
-    layers, camera = relit_layers(mode), look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
+    layers = relit_layers(mode)
+    camera = look_at((0.3, 0.2, 0.7), (0, 0, 0), 160, 200, 300)
     (image,) = drawn([(layers, View(camera))])
     expected = compose([one.posed(camera.position) for one in layers], camera)
     print(f"{psnr_db(image.rgb, expected.rgb):.1f} dB")
@@ -236,7 +240,8 @@ def check_shadow_map(atlas: np.ndarray, index: int, expected: np.ndarray) -> Non
 def test_shadow_maps() -> None:
     """Catches surfaces that hide what is nearer to a light, and depth bent over large triangles."""
     shown = relit_layers("scene")[1]
-    relit, far = shown.relit, Light("point", np.ones(3), (30, 50, 20))
+    relit = shown.relit
+    far = Light("point", np.ones(3), (30, 50, 20))
     assert relit is not None
     lighting = replace(relit.lighting, lights=(*relit.lighting.lights[:3], far))
     relit = replace(relit, lighting=lighting)

@@ -29,7 +29,8 @@ def test_each_frame_evaluates_to_its_timestep(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     name = head.name
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "head.blend"))
-    head, mesh = bpy.data.objects[name], capture.mesh
+    head = bpy.data.objects[name]
+    mesh = capture.mesh
     expected = {timestep: mesh(timestep) for timestep in capture.timesteps}
     expected |= {6: mesh(3) / 4 + mesh(7) * 3 / 4, 2.5: (mesh(2) + mesh(3)) / 2}
     for frame, vertices in (expected | {-5: mesh(2), 30: mesh(8)}).items():

@@ -57,7 +57,9 @@ def state_of_file() -> dict[str, list[str]]:
 def test_importing_again_doubles_nothing(tmp_path, model, kind):
     """Catches a second head, rig, camera, action or image, other meshes than the source's, and a
     head that cannot be worked with because there is no folder around it."""
-    folder, ops, flame = tmp_path / "source", bpy.ops.stga, str(model)
+    folder = tmp_path / "source"
+    ops = bpy.ops.stga
+    flame = str(model)
     if kind == "motion":
         source = write_motion(tmp_path / "source.npz")
         bring = partial(ops.import_motion, filepath=str(source), flame=flame)
@@ -66,7 +68,8 @@ def test_importing_again_doubles_nothing(tmp_path, model, kind):
         bring = partial(ops.import_meshes, filepath=str(source))
     else:
         (write_mesh_capture if kind == "capture" else write_flame_capture)(folder)
-        source, own = folder, {"flame": flame} if kind == "flame" else {}
+        source = folder
+        own = {"flame": flame} if kind == "flame" else {}
         bring = partial(ops.import_capture, directory=str(folder), **own)
     bring()
     once = state_of_file()
@@ -200,7 +203,8 @@ def test_a_file_stands_for_its_capture(tmp_path):
 
 def test_an_npz_is_opened_by_its_content(tmp_path):
     """Catches an avatar taken for a motion, a second head, and a traceback for others."""
-    avatar, motion = tmp_path / "a.npz", write_motion(tmp_path / "smile.npz")
+    avatar = tmp_path / "a.npz"
+    motion = write_motion(tmp_path / "smile.npz")
     write_ball_avatar(avatar)
     np.savez(tmp_path / "other.npz", values=np.zeros(3))
     (tmp_path / "noise.npz").write_bytes(b"no archive")

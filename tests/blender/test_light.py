@@ -57,7 +57,8 @@ def background(world):
 def lamp(kind: str, location: tuple[float, ...], energy: float, **properties: object):
     """A light that shines at PLACE's head."""
     light = bpy.data.lights.new(kind, kind)
-    light.energy, light.color = energy, (1.0, 0.8, 0.5)
+    light.energy = energy
+    light.color = (1.0, 0.8, 0.5)
     for name, value in properties.items():
         setattr(light, name, value)
     placed = bpy.data.objects.new(kind, light)
@@ -87,13 +88,16 @@ def baked_irradiance(shown, head) -> np.ndarray:
     """(BALL, 3) by Cycles: direct light on white, diffuse vertices."""
     shown.hide_render = True  # splats shine themselves
     scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 32, False
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 32
+    scene.cycles.use_denoising = False
     head.hide_set(False)
     head.hide_render = False
     material = bpy.data.materials.new("white")
     nodes = enable_nodes(material).nodes
     nodes.clear()
-    white, out = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeOutputMaterial")
+    white = nodes.new("ShaderNodeBsdfDiffuse")
+    out = nodes.new("ShaderNodeOutputMaterial")
     white.inputs[0].default_value = (1, 1, 1, 1)
     material.node_tree.links.new(white.outputs[0], out.inputs[0])
     head.data.materials.append(material)
@@ -120,7 +124,8 @@ LAMPS = {
 
 
 def check_irradiance(shown, head, limit: float) -> None:
-    arriving, expected = light_irradiance(relit()), baked_irradiance(shown, head)
+    arriving = light_irradiance(relit())
+    expected = baked_irradiance(shown, head)
     assert arriving.mean(0) == pytest.approx(expected.mean(0), rel=0.05)
     error = np.abs(arriving - expected).mean() / expected.mean()
     print(f"{arriving.mean() / expected.mean() - 1:.1%}, each vertex {error:.1%}")
@@ -151,13 +156,16 @@ def sky(size: tuple[int, int] = (64, 32)):
 
 
 def use_texture(world, image, kind: str | None) -> None:
-    nodes, links = world.node_tree.nodes, world.node_tree.links
+    nodes = world.node_tree.nodes
+    links = world.node_tree.links
     texture = nodes.new("ShaderNodeTexEnvironment")
     texture.image = image
     links.new(texture.outputs["Color"], nodes["Background"].inputs["Color"])
     if kind:
-        turn, source = nodes.new("ShaderNodeMapping"), nodes.new("ShaderNodeTexCoord")
-        turn.vector_type, turn.inputs["Rotation"].default_value = kind, (0.4, 0.3, 1.1)
+        turn = nodes.new("ShaderNodeMapping")
+        source = nodes.new("ShaderNodeTexCoord")
+        turn.vector_type = kind
+        turn.inputs["Rotation"].default_value = (0.4, 0.3, 1.1)
         links.new(source.outputs["Generated"], turn.inputs["Vector"])
         links.new(turn.outputs["Vector"], texture.inputs["Vector"])
 
@@ -216,7 +224,8 @@ def test_nothing_is_made_anew_while_nothing_moves():
     _, head = shown_head()
     light = lamp("POINT", (1.0, -0.5, 1.0), 30.0)
     bpy.ops.mesh.primitive_cube_add(size=0.1, location=(1, 1, 1))
-    cube, cache = bpy.context.object, SplatCache()
+    cube = bpy.context.object
+    cache = SplatCache()
 
     def again() -> Relit:
         bpy.context.view_layer.update()
@@ -246,8 +255,11 @@ def test_shadow_onto_the_scene(engine, tmp_path):
     bpy.ops.mesh.primitive_plane_add(size=2, location=(0.4, -0.2, 0.0))
     scene = bpy.context.scene
     active_camera((0.4, -0.2, 3.0))
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = engine, 4, False
-    scene.eevee.taa_render_samples, scene.eevee.shadow_pool_size = 1, "16"
+    scene.render.engine = engine
+    scene.cycles.samples = 4
+    scene.cycles.use_denoising = False
+    scene.eevee.taa_render_samples = 1
+    scene.eevee.shadow_pool_size = "16"
     scene.eevee.shadow_resolution_scale = 0.1
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.view_settings.view_transform = "Raw"
@@ -273,13 +285,15 @@ def test_shadow_onto_the_scene(engine, tmp_path):
 @pytest.mark.slow
 def test_estimate_light(extension, tmp_path):
     """Catches a light other than training's, that does not reach the splats, or reaches others."""
-    run, scene = tmp_path / "run", bpy.context.scene
+    run = tmp_path / "run"
+    scene = bpy.context.scene
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     bpy.ops.stga.train(directory=str(run), iterations=6)
     trained = read_avatar(run / "avatar.npz")
     write_avatar(run / "avatar.npz", replace(trained, light=None))
     bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
-    shown, scene.stga.run_folder = scene.stga.splats, str(run)
+    shown = scene.stga.splats
+    scene.stga.run_folder = str(run)
     assert stored_avatar(shown).light is None
     add_sun()
     scene.stga_lighting.mode = "scene"

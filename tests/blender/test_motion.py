@@ -146,7 +146,8 @@ def test_sampled_motion_equals_the_keyframes(head, own):
     read = sample_motion(head, own, range(1, 7), warn=said.append)
     for index, frame in enumerate(map(own.frame, own.timesteps)):
         for name in FIELDS:
-            found, wanted = getattr(read.frame(index), name), getattr(frame, name)
+            found = getattr(read.frame(index), name)
+            wanted = getattr(frame, name)
             np.testing.assert_allclose(found, wanted, atol=2e-6)
     np.testing.assert_allclose(read.shape, own.shape)
     assert said == []
@@ -162,14 +163,16 @@ def test_sampled_motion_equals_the_keyframes(head, own):
 
 def test_sampled_motion_includes_edits_by_hand(head, own):
     """Fails when poses without keyframes, constraints or identity sliders are ignored."""
-    rig, keys = rig_of(head), head.data.shape_keys.key_blocks
+    rig = rig_of(head)
+    keys = head.data.shape_keys.key_blocks
     rig.animation_data.action = head.data.shape_keys.animation_data.action = None
     rig.pose.bones["neck"].rotation_quaternion = (0.9, 0.3, 0.1, 0.2)
     turned = bpy.data.objects.new("turned", None)
     turned.rotation_euler = (0.4, 0, 0)
     bpy.context.scene.collection.objects.link(turned)
     rig.pose.bones["jaw"].constraints.new("COPY_ROTATION").target = turned
-    keys["identity_002"].value, keys["expr_001"].value = 1.5, -2.0
+    keys["identity_002"].value = 1.5
+    keys["expr_001"].value = -2.0
     said = []
     read = sample_motion(head, own, (1,), warn=said.append)
     assert read.shape[2] == pytest.approx(own.shape[2] + 1.5)

@@ -27,7 +27,8 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     it: sizes as logarithms or without their factor, opacities as logits or dropped, splats that do
     not move with the mesh, harmonics in another order or turned with triangles, and colors without
     deformation, selection or new light."""
-    avatar, rng = driven_avatar("stga", count=400), np.random.default_rng(4)
+    avatar = driven_avatar("stga", count=400)
+    rng = np.random.default_rng(4)
     splats = replace(avatar.splats, sh=rng.normal(0, 0.4, (400, 16, 3)).astype(np.float32))
     avatar = replace(avatar, splats=splats)
     turn = [[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]]

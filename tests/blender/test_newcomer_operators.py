@@ -36,7 +36,8 @@ BUTTONS = {
 def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
     """Catches a remedy that the status bar cuts off, and an error that stays after a success."""
     monkeypatch.setattr(extension.ui.train_panel, "has_training_python", lambda context: False)
-    common, reports = extension.operators.common, []
+    common = extension.operators.common
+    reports = []
 
     def fail(self, context):
         raise extension.stga_addon.errors.StgaError(sentence)
@@ -60,7 +61,8 @@ def test_long_errors_are_in_the_panel(extension, head, monkeypatch, sentence):
 
 def test_the_file_knows_its_run(extension, head, tmp_path):
     """Catches a run lost when an avatar is shown, or the file moved with it or saved elsewhere."""
-    settings, folder = bpy.context.scene.stga, tmp_path / "work"
+    settings = bpy.context.scene.stga
+    folder = tmp_path / "work"
     (folder / "run").mkdir(parents=True)
     (folder / "run/run.json").write_text("{}")
     write_ball_avatar(folder / "run/avatar.npz")
@@ -85,7 +87,9 @@ def test_a_file_made_without_the_panel(extension, head, tmp_path):
     (tmp_path / "run/run.json").write_text("{}")
     write_ball_avatar(tmp_path / "run/avatar.npz")
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "run/avatar.npz"))
-    settings, name, path = bpy.context.scene.stga, head.name, str(tmp_path / "demo.blend")
+    settings = bpy.context.scene.stga
+    name = head.name
+    path = str(tmp_path / "demo.blend")
     settings.splats[tags.AVATAR] = "//run/avatar.npz"
     for each in ("head", "splats", "avatar", "run_folder"):
         settings.property_unset(each)
@@ -128,7 +132,8 @@ def test_a_display_is_chosen_with_a_shading_that_shows_it(extension, head, tmp_p
 
 def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     """Catches an avatar washed out by the world, and an exposure that a click takes back."""
-    avatar, scene = lit_avatar(), bpy.context.scene
+    avatar = lit_avatar()
+    scene = bpy.context.scene
     mesh = bpy.data.objects.new("head", triangle_mesh("head", avatar.neutral, avatar.faces))
     scene.collection.objects.link(mesh)
     bpy.context.view_layer.update()
@@ -138,7 +143,8 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
     lighting = scene.stga_lighting
     lighting.mode = "scene"
     (layer,) = visible_layers(bpy.context.evaluated_depsgraph_get(), SplatCache())
-    eye, relit = np.array((0.0, 0.0, 1.0)), layer.relit
+    eye = np.array((0.0, 0.0, 1.0))
+    relit = layer.relit
     recorded = replace(relit.lighting, mode="recorded")
     means = [
         relit.relighter.radiance(relit.mesh, eye, each).mean()
@@ -154,7 +160,8 @@ def test_the_first_click_on_scene_light_is_as_bright_as_trained(extension):
 
 def test_appended_and_deleted_heads(head, tmp_path):
     """Catches a panel that does not know an appended head, or works on one that is deleted."""
-    file, name = str(tmp_path / "head.blend"), head.name
+    file = str(tmp_path / "head.blend")
+    name = head.name
     bpy.ops.wm.save_as_mainfile(filepath=file)
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.append(directory=f"{file}/Object/", filename=name)

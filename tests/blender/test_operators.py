@@ -65,7 +65,8 @@ def shown(mesh_capture, tmp_path) -> tuple[Capture, Avatar]:
 def write_ball_avatar(path: Path, neutral: np.ndarray | None = None, **options: Any) -> Avatar:
     """An avatar of the captures' ball, or of a mesh of its triangles, off the lattice."""
     vertices, faces = ball()
-    vertices, faces = vertices if neutral is None else neutral, faces.astype(np.int32)
+    vertices = vertices if neutral is None else neutral
+    faces = faces.astype(np.int32)
     splats = lattice_splats(vertices, faces, **{"sh_degree": 1, **options})
     off = np.random.default_rng(0).normal(0, 0.002, splats.xyz.shape).astype(np.float32)
     splats = replace(splats, xyz=splats.xyz + off)
@@ -85,7 +86,8 @@ def operators() -> set[str]:
 
 def test_registration_is_all_or_nothing(extension, monkeypatch):
     """Catches what stays behind after disabling or a failed enabling."""
-    menu, all_of_them = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs), operators()
+    menu = len(bpy.types.TOPBAR_MT_file_import.draw._draw_funcs)
+    all_of_them = operators()
     assert len(all_of_them) > 40
     extension.unregister()
     monkeypatch.setattr(extension.operators.command_line, "register", lambda at_end: 1 / 0)
@@ -139,7 +141,8 @@ def test_from_import_to_show(tmp_path, layout):
     left in the scene, or in the saved file; and splats that stand still once the head's mesh, which
     keys or bones move, is hidden."""
     if layout == "mesh":
-        folder, model = write_mesh_capture(tmp_path / "capture"), None
+        folder = write_mesh_capture(tmp_path / "capture")
+        model = None
     else:
         folder, model = write_flame_capture(tmp_path / "capture")
     capture = open_capture(folder, model)
@@ -177,8 +180,12 @@ def test_exports(shown, tmp_path):
     bpy.context.scene.render.fps = 30
     bpy.context.scene.frame_set(3)
     formats = {
-        "one.ply": "ply", "many": "ply-sequence", "a.usdz": "usd", "a.glb": "gltf", "a.spz": "spz"
-    }  # fmt: skip
+        "one.ply": "ply",
+        "many": "ply-sequence",
+        "a.usdz": "usd",
+        "a.glb": "gltf",
+        "a.spz": "spz",
+    }
     for name, format in formats.items():
         bpy.ops.stga.export_avatar(filepath=str(tmp_path / name), format=format)
         assert (tmp_path / name).stat().st_size > 0
@@ -207,7 +214,9 @@ def test_exports(shown, tmp_path):
 
 def range_export(extension, write, frames: range, stop_after: int | None = None) -> Any:
     """What a range exported as the dialog does ends with; cancelled after some steps."""
-    operator, said, shown = extension.operators.export.ExportAvatar, [], []
+    operator = extension.operators.export.ExportAvatar
+    said = []
+    shown = []
     context = SimpleNamespace(
         window_manager=SimpleNamespace(event_timer_remove=shown.append),
         workspace=SimpleNamespace(status_text_set=shown.append),
@@ -267,7 +276,8 @@ def test_import_ply(tmp_path):
 
 def test_mistakes_are_sentences(mesh_capture, tmp_path):
     """Catches tracebacks, silence, objects of a failed import, and steps without a head."""
-    mesh, broken = mesh_capture / "meshes/00003.obj", tmp_path / "broken.ply"
+    mesh = mesh_capture / "meshes/00003.obj"
+    broken = tmp_path / "broken.ply"
     whole = mesh.read_text()
     mesh.write_text("v 0 0 nan\n")
     broken.write_bytes(b"ply\n")

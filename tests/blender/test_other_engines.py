@@ -76,15 +76,19 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
     splats = overlapping_splats()
     set_input(show_world_splats(splats, "ball"), DISPLAY, QUADS)
     camera = active_camera((0, 0, 0.6))
-    camera.data.lens, scene.world = 80, bpy.data.worlds.new("black")
+    camera.data.lens = 80
+    scene.world = bpy.data.worlds.new("black")
     enable_nodes(scene.world).nodes["Background"].inputs["Color"].default_value = (0, 0, 0, 1)
     render = scene.render
-    render.engine, render.filepath = engine, str(tmp_path / "image.png")
+    render.engine = engine
+    render.filepath = str(tmp_path / "image.png")
     render.resolution_x = render.resolution_y = SIZE_PX
-    render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
+    render.image_settings.file_format = "PNG"
+    render.image_settings.color_mode = "RGB"
     scene.view_settings.view_transform = "Standard"
     if engine == "CYCLES":
-        scene.cycles.samples, scene.cycles.use_denoising = SAMPLES, False
+        scene.cycles.samples = SAMPLES
+        scene.cycles.use_denoising = False
     else:
         scene.eevee.taa_render_samples = SAMPLES
     bpy.ops.render.render(write_still=True)
@@ -100,13 +104,18 @@ def test_images_without_noise(engine: str, tmp_path: Path) -> None:
 
 def test_images_of_recorded_light_say_so(extension, tmp_path, capsys):
     """Catches F12 and animations in another light that do not say so, or do each image."""
-    scene, cast = bpy.context.scene, "the light of this frame"
+    scene = bpy.context.scene
+    cast = "the light of this frame"
     shown, _ = show(with_light(textured(avatar_of("stga"))))
     camera_at()
     add_sun()
-    scene.stga.splats, scene.render.engine, scene.cycles.samples = shown, "CYCLES", 1
+    scene.stga.splats = shown
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 1
     scene.render.resolution_x = scene.render.resolution_y = 8
-    scene.render.filepath, scene.frame_start, scene.frame_end = f"{tmp_path}/", 5, 7
+    scene.render.filepath = f"{tmp_path}/"
+    scene.frame_start = 5
+    scene.frame_end = 7
 
     def said(**how: bool) -> str:
         bpy.ops.render.render(**how)
@@ -136,7 +145,8 @@ def test_relit_color_of_a_frame(lighting) -> None:
     """Catches relit colors that do not reach the nodes, or stay when taken back."""
     avatar = with_light(textured(avatar_of("stga")))
     shown, _ = show(avatar)
-    camera, before = camera_at(), displayed_colors(shown)
+    camera = camera_at()
+    before = displayed_colors(shown)
     add_sun(3.0)
     with pytest.raises(StgaError, match="as recorded"):
         relight_frame(shown, bpy.context.scene)

@@ -23,7 +23,9 @@ from .test_operators import write_ball_avatar
 def trained(extension, head, tmp_path, monkeypatch):
     """A scene whose run has finished, with curve and refined tracking, as the timer has read it."""
     bpy.ops.stga.select(threshold=0.0005)
-    run, jobs, monitor = tmp_path / "run", extension.stga_addon.jobs, extension.operators.monitor
+    run = tmp_path / "run"
+    jobs = extension.stga_addon.jobs
+    monitor = extension.operators.monitor
     folder = jobs.perform.request_folder(run)
     settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
     jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
@@ -154,7 +156,8 @@ def test_curve_image():
 
 def test_preview_follows_the_evaluations(extension, tmp_path):
     """Catches an image that stays, is empty or saved, and a panel that fails on damage."""
-    curve, monitor = extension.ui.sidebar, extension.operators.monitor
+    curve = extension.ui.sidebar
+    monitor = extension.operators.monitor
     drawn = []
     layout = SimpleNamespace(
         column=lambda **_: SimpleNamespace(

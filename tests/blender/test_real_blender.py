@@ -34,7 +34,8 @@ pytestmark = [
     pytest.mark.skipif(not BLENDERS, reason="STGA_BLENDER does not say how to start a Blender"),
 ]
 SCRIPT = Path(__file__).with_name("complete_script.py")
-ITERATIONS, UPDATE_ITERATIONS = 60, 3000
+ITERATIONS = 60
+UPDATE_ITERATIONS = 3000
 """Of a training; of one that is still at work when the update has ended."""
 MAX_DIFFERENCE_DB = 0.3
 TIMEOUT_S = 1800.0
@@ -132,7 +133,8 @@ def test_train(command: list[str], home: Path, demo: Path, tmp_path: Path) -> No
 def test_update_while_a_worker_trains(command: list[str], home: Path) -> None:
     """Catches an update that fails, ends a training, or disturbs another Blender."""
     seen = script(command, home, False, UPDATE_ITERATIONS)
-    run, others = Path(seen["run"]), other_profiles(home, seen["version"])
+    run = Path(seen["run"])
+    others = other_profiles(home, seen["version"])
     while not (run / "job/preview.npz").exists() and inspect_worker(run / "job").state.is_alive:
         time.sleep(0.2)
     new = next((home.parent / name_of(command)).glob("*.zip"))

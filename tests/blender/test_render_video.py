@@ -41,7 +41,9 @@ def shown(extension, tmp_path):
     write_avatar(tmp_path / "avatar.npz", replace(avatar, splats=replace(avatar.splats, sh=colors)))
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
     render = bpy.context.scene.render
-    render.resolution_percentage, render.fps, render.film_transparent = 200, 10, True
+    render.resolution_percentage = 200
+    render.fps = 10
+    render.film_transparent = True
     bpy.context.scene.frame_set(1)
     return tmp_path
 
@@ -59,8 +61,10 @@ def temporary(tmp_path, monkeypatch):
 def engine_image(frame: int, path: Path) -> np.ndarray:
     """The frame as the render engine writes it, (H, W, 4) uint8."""
     scene = bpy.context.scene
-    scene.render.engine, scene.render.filepath = "STGA_SPLATS", str(path)
-    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.render.engine = "STGA_SPLATS"
+    scene.render.filepath = str(path)
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGBA"
     scene.frame_set(frame)
     bpy.ops.render.render(write_still=True)
     return np.asarray(Image.open(path)).astype(int)
@@ -86,7 +90,8 @@ def around_each_image(extension, monkeypatch, before, after) -> None:
 def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     """Catches another camera, size, frame, transparency or scene than the engine's, and splats of
     every recorded frame that stay in memory until the video is rendered."""
-    own, render = bpy.context.scene, {"path": "scene", "format": "png"}
+    own = bpy.context.scene
+    render = {"path": "scene", "format": "png"}
     bpy.ops.stga.render_video(filepath=str(shown / "images"), **render)
     assert own.frame_current == 1
     written = sorted((shown / "images").glob("*.png"))
@@ -94,7 +99,8 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
     other = bpy.data.scenes.new("other")
     other.frame_set(7)
     window = bpy.context.window_manager.windows[0]
-    posed, counts = extension.operators.render_video.PosedSplats, []
+    posed = extension.operators.render_video.PosedSplats
+    counts = []
 
     def count() -> None:
         gc.collect()
@@ -152,7 +158,8 @@ def test_turntable_of_a_ply(extension, tmp_path):
     bpy.ops.stga.import_ply(filepath=str(tmp_path / "scan.ply"))
     scene = bpy.context.scene
     active_camera((3, -1, 1)).rotation_euler = (np.pi / 2, 0, 0)
-    scene.render.resolution_percentage, scene.frame_end = 5, 3
+    scene.render.resolution_percentage = 5
+    scene.frame_end = 3
     bpy.ops.stga.render_video(filepath=str(tmp_path / "turn"), format="png", seconds=0.5)
     paths = sorted((tmp_path / "turn").glob("*.png"))
     images = [np.asarray(Image.open(path)).astype(int) for path in paths]

@@ -52,7 +52,9 @@ def extension(blender: list[str], profile: Path, *arguments: str) -> str:
 @pytest.mark.parametrize("blender", BLENDERS, ids=name_of)
 def test_install_and_update(blender, zips, served, tmp_path):
     """Catches an index that Blender cannot read, and an update that fails."""
-    (folder, address), profile, (old, new) = served, tmp_path / "profile", zips
+    (folder, address) = served
+    profile = tmp_path / "profile"
+    (old, new) = zips
     index = write_repository([old], folder / "stga", blender)
     assert index == folder / "stga" / INDEX
     extension(blender, profile, "repo-add", "stga_test", "--url", f"{address}/stga/{INDEX}")

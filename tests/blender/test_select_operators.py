@@ -75,7 +75,9 @@ def test_the_table_counts_what_each_frame_trains(head, tmp_path):
     painted = read_selection(head)
     corners = np.array([polygon.vertices[:] for polygon in head.data.polygons])
     inside = np.zeros(len(head.data.vertices), bool)
-    inside[np.unique(corners[chosen[3]])], inside[80:120], inside[:80] = True, True, False
+    inside[np.unique(corners[chosen[3]])] = True
+    inside[80:120] = True
+    inside[:80] = False
     np.testing.assert_array_equal(painted[3], inside[corners].all(1))
     assert painted[3].sum() != chosen[3].sum()
     assert rows() == [
@@ -111,7 +113,8 @@ def test_heat_map(head, tmp_path):
     assert head.data.color_attributes.active_color.name == HEAT
     color = heat(head, HEAT, "color", 4).reshape(-1, 3, 4)
     assert (color == color[:, :1]).all(), "a triangle's corners differ"
-    hottest, never = color[expected.argmax(), 0], color[expected.argmin(), 0]
+    hottest = color[expected.argmax(), 0]
+    never = color[expected.argmin(), 0]
     assert hottest[0] > 0.8 > 0.2 > never[0]
     assert materials_of(head) == {"STGA Heat Map"}
     bpy.ops.stga.heat_map(show=False)

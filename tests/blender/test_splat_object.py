@@ -40,7 +40,8 @@ def sphere(rings: int = 12, segments: int = 16) -> tuple[np.ndarray, np.ndarray]
     theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, rings), around)
     ball = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
     i, j = np.meshgrid(np.arange(segments), np.arange(rings - 1), indexing="ij")
-    a, b = i * rings + j, (i + 1) % segments * rings + j
+    a = i * rings + j
+    b = (i + 1) % segments * rings + j
     halves = np.stack([a, b, b + 1], -1), np.stack([a, b + 1, a + 1], -1)
     faces = np.concatenate([half.reshape(-1, 3) for half in halves])
     turn = rng.integers(0, 3, len(faces))
@@ -123,7 +124,8 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
     assert np.abs(at[1] - at[9]).max() > 1e-3, "the head did not move, so nothing was tested"
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    shown, head = bpy.data.objects["head splats"], bpy.data.objects["head"]
+    shown = bpy.data.objects["head splats"]
+    head = bpy.data.objects["head"]
     for frame in reversed(FRAMES):
         bpy.context.scene.frame_set(frame)
         np.testing.assert_allclose(assert_follows(shown, head, avatar), at[frame], atol=1e-6)
@@ -208,12 +210,15 @@ def driven_avatar(
     leave the range of normals.
     """
     avatar = avatar_of(convention, count)
-    rng, neutral, faces = np.random.default_rng(seed), avatar.neutral.copy(), avatar.faces
+    rng = np.random.default_rng(seed)
+    neutral = avatar.neutral.copy()
+    faces = avatar.faces
     neutral[faces[7, 2]] = neutral[faces[7, 1]]
     fin = np.append(faces[100, :2], len(neutral))
     neutral = np.append(neutral, [1.2 * neutral[faces[100, 0]] - 0.2 * neutral.mean(0)], axis=0)
     faces = np.append(faces, [fin], axis=0).astype(np.int32)
-    lowest, highest = [[-2, -0.3], [-0.3, -0.02]], [[-0.3, 2], [0.02, 0.3]]
+    lowest = [[-2, -0.3], [-0.3, -0.02]]
+    highest = [[-0.3, 2], [0.02, 0.3]]
     ends = [rng.uniform(*np.repeat(each, 3, 0).T, (len(faces), 6)) for each in (lowest, highest)]
     moves = 0.004 if convention == "stga" else 0.3
     sizes = {POSITION: moves, SCALE: 0.1, COLOR: 0.5}
@@ -225,7 +230,8 @@ def driven_avatar(
             each[face_areas(neutral, faces) == 0] = 0
     splats = replace(avatar.splats, face=rng.integers(0, len(faces), count).astype(np.int32))
     avatar = replace(avatar, splats=splats, neutral=neutral.astype(np.float32), faces=faces)
-    limits, offsets = np.stack(ends, 1).astype(np.float32), dict(zip(names, values, strict=True))
+    limits = np.stack(ends, 1).astype(np.float32)
+    offsets = dict(zip(names, values, strict=True))
     return replace(avatar, strain_range=limits, driven_offsets=offsets)
 
 
@@ -235,7 +241,8 @@ def driven_avatar(
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_splats_follow_the_deformation(convention, names, tmp_path):
     """Catches strain, normals or coefficients other than numpy's, or that a saved file loses."""
-    avatar, is_all = driven_avatar(convention, names), len(names) == len(OFFSETS)
+    avatar = driven_avatar(convention, names)
+    is_all = len(names) == len(OFFSETS)
     splats = replace(avatar.splats, sh=avatar.splats.sh[:, :1])
     avatar = replace(avatar, splats=splats, antialiased=is_all)
     # at a boundary, inside, an edge of three
@@ -244,7 +251,8 @@ def test_splats_follow_the_deformation(convention, names, tmp_path):
     shown = show_avatar(avatar, head)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
-    shown, head = bpy.data.objects["head splats"], bpy.data.objects["head"]
+    shown = bpy.data.objects["head splats"]
+    head = bpy.data.objects["head"]
     stored = stored_avatar(shown)
     assert set(stored.driven_offsets) == set(names)
     assert stored.antialiased == avatar.antialiased == is_all
@@ -355,7 +363,8 @@ def test_quads_face_the_camera_and_cover_the_splat():
     set_input(shown, splat_nodes.DISPLAY, QUADS)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     quads = [np.array(i.matrix_world) for i in depsgraph.object_instances if i.is_instance]
-    quads, to_world = np.array(quads, np.float64), np.array(shown.matrix_world, np.float64)
+    quads = np.array(quads, np.float64)
+    to_world = np.array(shown.matrix_world, np.float64)
     placed = centre @ to_world[:3, :3].T + to_world[:3, 3]
     np.testing.assert_allclose(quads[:, :3, 3], placed, atol=1e-5)
     # In the quad's own space each splat is a sphere, and the camera right above its center.
@@ -401,7 +410,8 @@ TREES = [("stga", 3, ("normal_color",)), (None, 0, ()), ("gaussian_avatars", 3, 
 @pytest.mark.parametrize("kind", TREES)
 def test_trees_are_built_one_node_group_at_a_time(kind):
     """Catches what blocks the UI, groups built again, and needless strain nodes."""
-    built, options = [], splat_nodes.TreeOptions(*kind)
+    built = []
+    options = splat_nodes.TreeOptions(*kind)
     while splat_nodes.build_next_node_group(options):
         built.append(len(bpy.data.node_groups))
     assert built == list(range(1, len(built) + 1))

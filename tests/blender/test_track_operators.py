@@ -58,7 +58,8 @@ def test_the_whole_way_of_the_panel(extension, take, tmp_path, monkeypatch):
     monkeypatch.setenv("STGA_PYTHON", sys.executable)
     tracked = tmp_path / "capture"
     assert track(take, tracked) == {"FINISHED"}
-    scene, settings = bpy.context.scene, bpy.context.scene.stga
+    scene = bpy.context.scene
+    settings = bpy.context.scene.stga
     head = settings.head
     assert list(head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert settings.tracking_capture == str(tracked)
@@ -130,7 +131,8 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path):
 
 def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monkeypatch):
     """Catches a result lost where Blender was closed, or its file saved, meanwhile."""
-    out, settings = tmp_path / "capture", bpy.context.scene.stga
+    out = tmp_path / "capture"
+    settings = bpy.context.scene.stga
     asked(extension, take, out)
     settings.tracking_capture = str(out)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))

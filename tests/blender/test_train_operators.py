@@ -29,7 +29,8 @@ def head(head):
 @pytest.fixture
 def worker(extension, head, tmp_path):
     """A stand-in for a worker of the scene's training: the test says what it does."""
-    jobs, monitor = extension.stga_addon.jobs, extension.operators.monitor
+    jobs = extension.stga_addon.jobs
+    monitor = extension.operators.monitor
     with ExitStack() as stack:
         run = tmp_path / "run"
         settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
@@ -38,7 +39,8 @@ def worker(extension, head, tmp_path):
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
         writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
         writer.report(Progress(0.25, "Training"))
-        writer.run, writer.leave = run, stack.close
+        writer.run = run
+        writer.leave = stack.close
         yield writer
 
 
@@ -67,7 +69,8 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     pytest.importorskip("torch")
     one = write_mesh_capture(tmp_path / "one")
     other = write_mesh_capture(tmp_path / "other", timesteps=(0, 5))
-    run, folder = tmp_path / "run", str(tmp_path / "run")
+    run = tmp_path / "run"
+    folder = str(tmp_path / "run")
     bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
     bpy.ops.stga.train(directory=folder, iterations=3, device="cpu")
     with pytest.raises(RuntimeError, match="already holds a run"):
@@ -88,10 +91,13 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
 
 def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
     """Catches a device or GPU's name that training does not get, and another Python's list."""
-    asked, test = ask_only(monkeypatch, extension), extension.operators.request.test
+    asked = ask_only(monkeypatch, extension)
+    test = extension.operators.request.test
     for device, adapter, wanted in (
-        ("gpu", "", "gpu"), ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"), ("cpu", "Card", "cpu")
-    ):  # fmt: skip
+        ("gpu", "", "gpu"),
+        ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"),
+        ("cpu", "Card", "cpu"),
+    ):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), device=device, adapter=adapter)
         assert asked[-1].device == wanted
     for adapters in ((), ("Card (Vulkan)", "Card (Vulkan) #2")):
@@ -167,7 +173,8 @@ def test_dismiss_follows_no_path_to_other_folders(extension, tmp_path):
 
 def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
     """Catches an object for each preview, and splats whose number may not change."""
-    monitor, scene = extension.operators.monitor, bpy.context.scene
+    monitor = extension.operators.monitor
+    scene = bpy.context.scene
     preview = worker.folder / "preview.npz"
     write_ball_avatar(preview)
     tick_until(monitor, lambda: scene.stga.splats is not None)
@@ -198,7 +205,8 @@ def test_live_preview_refreshes_one_object(extension, worker, tmp_path):
 @pytest.mark.parametrize("wanted", [True, False])
 def test_result_reaches_the_scene_once(extension, worker, wanted):
     """Catches a result not shown, unwanted, or shown again at every reopening."""
-    monitor, scene = extension.operators.monitor, bpy.context.scene
+    monitor = extension.operators.monitor
+    scene = bpy.context.scene
     scene.stga.show_result = wanted
     write_ball_avatar(worker.run / "avatar.npz")
     worker.leave()
@@ -214,7 +222,8 @@ def test_result_reaches_the_scene_once(extension, worker, wanted):
 
 def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
     """Catches a training that a saved file or undo forgets, or that cannot be cancelled at once."""
-    monitor, path = extension.operators.monitor, str(tmp_path / "head.blend")
+    monitor = extension.operators.monitor
+    path = str(tmp_path / "head.blend")
     bpy.ops.wm.save_as_mainfile(filepath=path)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert monitor.tick() is None
@@ -236,9 +245,11 @@ def test_save_and_reopen_while_it_trains(extension, worker, tmp_path):
 
 def test_moved_blend_file(extension, worker, tmp_path):
     """Catches a training lost when file and run move together, and silence when it is gone."""
-    monitor, scene = extension.operators.monitor, bpy.context.scene
+    monitor = extension.operators.monitor
+    scene = bpy.context.scene
     worker.leave()
-    scene.stga.run_folder, scene.stga.show_result = "//run", False
+    scene.stga.run_folder = "//run"
+    scene.stga.show_result = False
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "head.blend"))
     moved = tmp_path / "moved"
     moved.mkdir()

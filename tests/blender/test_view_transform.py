@@ -19,7 +19,8 @@ from .test_splat_object import active_camera, random_splats
 
 def scene_with(view: str, exposure: float = 0.0):
     scene = bpy.data.scenes.new(view)
-    scene.view_settings.view_transform, scene.view_settings.exposure = view, exposure
+    scene.view_settings.view_transform = view
+    scene.view_settings.exposure = exposure
     return scene
 
 
@@ -37,7 +38,8 @@ def test_scenes_with_different_view_transforms():
     assert np.abs(agx.to_linear(gray) - 0.107).min() > 0.01
     rng = np.random.default_rng(0)
     skin = rng.uniform(0.1, 1.3, (4000, 1)) * [0.75, 0.55, 0.45] + rng.normal(0, 0.04, (4000, 3))
-    scene, skin = scene_with("AgX"), np.clip(skin, 0, 1)
+    scene = scene_with("AgX")
+    skin = np.clip(skin, 0, 1)
     measure(scene)
     agx = inverse_view(scene)
     assert agx is not None
@@ -51,7 +53,8 @@ def test_an_animated_exposure_keeps_a_few(monkeypatch):
     monkeypatch.setattr(view_transform, "_measured", {})
     monkeypatch.setattr(view_transform, "_shown", lambda scene, axis: scene.view_settings.exposure)
     monkeypatch.setattr(view_transform, "InverseView", lambda axis, exposure: exposure)
-    still, animated = scene_with("Filmic", exposure=-3.0), scene_with("AgX")
+    still = scene_with("Filmic", exposure=-3.0)
+    animated = scene_with("AgX")
     for frame in range(50):
         animated.view_settings.exposure = 0.1 * frame
         measure(still)
@@ -65,7 +68,8 @@ def test_an_animated_exposure_keeps_a_few(monkeypatch):
 
 def sheet(color: np.ndarray | None = None) -> None:
     """A sheet of soft splats of one color, else of mid-tones of skin, in front of the camera."""
-    rng, count = np.random.default_rng(8), 600
+    rng = np.random.default_rng(8)
+    count = 600
     skin = rng.uniform(0.3, 0.75, (count, 1)) * [1, 0.8, 0.68] + rng.normal(0, 0.02, (count, 3))
     colors = skin if color is None else np.tile(color, (count, 1))
     xyz = np.column_stack([rng.uniform(-0.35, 0.35, (count, 2)), np.zeros(count)])
@@ -89,7 +93,8 @@ def saved_picture(folder: Path, **view: object) -> np.ndarray:
         setattr(scene.view_settings, name, value)
     settings = scene.render.image_settings
     choose_format(settings, "IMAGE", "PNG")
-    settings.color_mode, settings.color_depth = "RGBA", "16"
+    settings.color_mode = "RGBA"
+    settings.color_depth = "16"
     scene.render.dither_intensity = 0
     scene.render.filepath = str(folder / "picture.png")
     bpy.ops.render.render(write_still=True)
@@ -103,7 +108,8 @@ def saved_picture(folder: Path, **view: object) -> np.ndarray:
 
 def test_standard_view_transform_shows_trained_colors(tmp_path):
     """Catches colors other than trained in Standard, and a table where none is needed."""
-    trained, scene = np.array([0.8, 0.5, 0.1]), bpy.context.scene
+    trained = np.array([0.8, 0.5, 0.1])
+    scene = bpy.context.scene
     sheet(trained)
     for name, needed in (("Standard", False), ("Raw", False), ("AgX", True)):
         scene.view_settings.view_transform = name

@@ -29,7 +29,8 @@ class Recorder:
 
     def __init__(self, error: Exception | None = None, waits: bool = False) -> None:
         self.rendered: list[tuple[RenderRequest, float]] = []
-        self.error, self.go = error, threading.Semaphore(0 if waits else 10**6)
+        self.error = error
+        self.go = threading.Semaphore(0 if waits else 10**6)
         self.started = threading.Event()
         self.renderer = ViewportRenderer(self.render)
 
@@ -112,7 +113,8 @@ def test_failures_are_reported(error):
 
 def test_viewports_are_redrawn_from_the_main_thread():
     """Catches bpy in the render thread, a lost last image, and an idle timer."""
-    recorder, engine = Recorder(waits=True), Engine()
+    recorder = Recorder(waits=True)
+    engine = Engine()
     recorder.renderer.request(request())
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)
     assert bpy.app.timers.is_registered(engine_viewport._poll)
@@ -134,7 +136,8 @@ def test_viewports_are_redrawn_from_the_main_thread():
 @pytest.mark.parametrize("freed", [False, True])
 def test_a_closed_viewport_ends_its_thread(freed):
     """Catches a thread nobody sees, an engine kept by the timer, and a timer that fails."""
-    recorder, engine = Recorder(waits=True), Engine(freed)
+    recorder = Recorder(waits=True)
+    engine = Engine(freed)
     recorder.renderer.request(request())
     recorder.started.wait()
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)
@@ -156,7 +159,8 @@ def test_a_closed_viewport_ends_its_thread(freed):
 
 def test_stopping_ends_timer_and_threads():
     """Catches an extension that still renders, or calls its timer, after it was disabled."""
-    recorder, engine = Recorder(waits=True), Engine()
+    recorder = Recorder(waits=True)
+    engine = Engine()
     recorder.renderer.request(request())
     recorder.started.wait()
     engine_viewport.redraw_when_rendered(recorder.renderer, engine)

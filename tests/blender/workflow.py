@@ -46,12 +46,14 @@ def main(archive: str, folder: Path, python: str) -> dict[str, object]:
         bpy.data.objects.remove(bpy.context.scene.stga.splats)
     ops.show_avatar(filepath=str(folder / "a.npz"))
     ops.apply_motion(filepath=str(folder / "other.npz"), start=1)
-    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 5
+    bpy.context.scene.frame_start = 1
+    bpy.context.scene.frame_end = 5
     ops.export_avatar(filepath=str(folder / "pair"), format="gaussian-avatars")
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "head.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(folder / "head.blend"))
     ops.export_avatar(filepath=str(folder / "plys"), format="ply-sequence")
-    shown, frame = positions(), bpy.context.scene.frame_current
+    shown = positions()
+    frame = bpy.context.scene.frame_current
     command_line = importlib.import_module(MODULE + ".operators.command_line")
     assert command_line._run(["select", "--threshold", "0.0005"]) == 0
 

@@ -13,8 +13,12 @@ from stga_addon.avatar.file import Avatar, write_avatar
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.capture.model import Capture
 
-WIDTH, HEIGHT, FOCAL = 40, 60, 200.0
-CX, CY = 19.0, 36.0  # OpenCV; the files hold HEIGHT − CY
+WIDTH = 40
+HEIGHT = 60
+FOCAL = 200.0
+# OpenCV; the files hold HEIGHT − CY
+CX = 19.0
+CY = 36.0
 RADIUS = 0.1
 SPLITS = ("train", "val", "test")
 
@@ -28,7 +32,8 @@ def ball() -> tuple[np.ndarray, np.ndarray]:
 def pose(camera: int) -> np.ndarray:
     """Camera-to-world, OpenGL axes, one meter from the ball and looking at it."""
     angle = 0.4 * camera - 0.5
-    cos, sin = np.cos(angle), np.sin(angle)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
     return np.array([[cos, 0, sin, sin], [0, 1, 0, 0], [-sin, 0, cos, cos], [0, 0, 0, 1]])
 
 
@@ -53,11 +58,20 @@ def moved(timestep: int, vertices: np.ndarray) -> np.ndarray:
 def frame(timestep: int, camera: int, **more: Any) -> dict[str, Any]:
     name = f"{timestep:05d}_{camera:02d}.png"
     return {
-        "timestep_index": timestep, "camera_index": camera, "camera_id": f"cam{camera}",
-        "file_path": f"images/{name}", "fg_mask_path": f"fg_masks/{name}",
-        "transform_matrix": pose(camera).tolist(), "fl_x": FOCAL, "fl_y": FOCAL, "cx": CX,
-        "cy": HEIGHT - CY, "w": WIDTH, "h": HEIGHT, **more,
-    }  # fmt: skip
+        "timestep_index": timestep,
+        "camera_index": camera,
+        "camera_id": f"cam{camera}",
+        "file_path": f"images/{name}",
+        "fg_mask_path": f"fg_masks/{name}",
+        "transform_matrix": pose(camera).tolist(),
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": CX,
+        "cy": HEIGHT - CY,
+        "w": WIDTH,
+        "h": HEIGHT,
+        **more,
+    }
 
 
 def write_images(root: Path, timesteps: Sequence[int], cameras: Sequence[int]) -> None:
@@ -183,7 +197,8 @@ def write_avatar_of(capture: Capture, path: Path, is_colored: bool = False, **la
     splats = lattice_splats(capture.neutral, capture.faces, **{"order": 0, **lattice})
     if is_colored:
         splats.sh[:, 0] = np.random.default_rng(0).normal(0, 1.5, (len(splats), 3))
-    neutral, faces = capture.neutral.astype(np.float32), capture.faces.astype(np.int32)
+    neutral = capture.neutral.astype(np.float32)
+    faces = capture.faces.astype(np.int32)
     write_avatar(path, Avatar(splats, "stga", neutral, faces))
     return path
 

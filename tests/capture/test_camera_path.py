@@ -42,11 +42,16 @@ def test_orbit():
     assert np.abs(np.diff(np.append(degrees, degrees[0]))).max() < 2
 
 
-@pytest.mark.parametrize(("angles", "start", "expected"), [
-    ((-70, -30, 0, 40, 80), 0, (-70, 80)), ((-70, -30, 0, 40, 80), -70, (0, 150)),
-    ((110, 150, 180, 220, 250), 180, (-70, 70)), ((0, 90, 180, 270), 0, (-180, 180)),
-    ((30,), 30, (0, 0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("angles", "start", "expected"),
+    [
+        ((-70, -30, 0, 40, 80), 0, (-70, 80)),
+        ((-70, -30, 0, 40, 80), -70, (0, 150)),
+        ((110, 150, 180, 220, 250), 180, (-70, 70)),
+        ((0, 90, 180, 270), 0, (-180, 180)),
+        ((30,), 30, (0, 0)),
+    ],
+)
 def test_covered_angles(angles, start, expected):
     """Catches a turntable that shows a side which no camera saw, or leaves out one that they
     did."""

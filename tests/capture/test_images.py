@@ -17,7 +17,8 @@ from stga_addon.capture.model import View
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
 
-WIDTH, HEIGHT = 48, 32
+WIDTH = 48
+HEIGHT = 32
 RANDOM = np.random.default_rng(3)
 COLOUR = RANDOM.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
 GREY = RANDOM.integers(0, 256, (HEIGHT, WIDTH), np.uint8)
@@ -25,8 +26,15 @@ ALPHA = RANDOM.integers(0, 255, (HEIGHT, WIDTH), np.uint8)
 LEVELS = {"a": 30, "b": 90, "c": 150, "d": 210}
 # How a viewer shows the corners a b / c d of the stored picture (EXIF 2.32, tag Orientation).
 ORIENTATIONS = {
-    1: "ab cd", 2: "ba dc", 3: "dc ba", 4: "cd ab", 5: "ac bd", 6: "ca db", 7: "db ca", 8: "bd ac",
-}  # fmt: skip
+    1: "ab cd",
+    2: "ba dc",
+    3: "dc ba",
+    4: "cd ab",
+    5: "ac bd",
+    6: "ca db",
+    7: "db ca",
+    8: "bd ac",
+}
 
 
 def view_of(image, width=WIDTH, height=HEIGHT, mask=None):
@@ -55,13 +63,15 @@ def test_transparency_is_laid_over_the_background(tmp_path, background):
 
 def test_gray_and_palette(tmp_path):
     """Catches a missing channel axis of gray or palettes, and 16-bit gray cut off at 255."""
-    bits, few = GREY > 127, (COLOUR // 128) * 255
+    bits = GREY > 127
+    few = (COLOUR // 128) * 255
     la = np.dstack([GREY, np.where(bits, 255, 0).astype(np.uint8)])
     wide = RANDOM.integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)
     for pixels, expected in (
-        (GREY, np.dstack([GREY] * 3)), (bits, np.dstack([bits * 255] * 3)),
+        (GREY, np.dstack([GREY] * 3)),
+        (bits, np.dstack([bits * 255] * 3)),
         (la, np.dstack([np.where(bits, GREY, 255)] * 3)),
-    ):  # fmt: skip
+    ):
         found = read_image(view_of(saved(tmp_path / "x.png", pixels)))
         np.testing.assert_array_equal(found, expected)
     image = read_image(view_of(saved(tmp_path / "x.png", wide)))
@@ -203,13 +213,15 @@ STORED = {
     "damaged profile": (RED_IN_P3, [icc(DISPLAY_P3[:140])], RED_IN_P3),
     "cICP of Display P3": (RED_IN_P3, [chunk(b"cICP", bytes([12, 13, 0, 1]))], (255, 0, 0)),
     "cICP of sRGB before a profile": (
-        RED_IN_P3, [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)], RED_IN_P3,
+        RED_IN_P3,
+        [chunk(b"cICP", bytes([1, 13, 0, 1])), icc(DISPLAY_P3)],
+        RED_IN_P3,
     ),
     "cICP of PQ": ((148, 148, 148), [chunk(b"cICP", bytes([9, 16, 0, 1]))], (255, 255, 255)),
     "linear gAMA": ((55, 55, 55), [LINEAR], (128, 128, 128)),
     "usual gAMA": ((55, 55, 55), [chunk(b"gAMA", struct.pack(">I", 45455))], (55, 55, 55)),
     "gAMA beside sRGB": ((55, 55, 55), [LINEAR, chunk(b"sRGB", b"\0")], (55, 55, 55)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", STORED)

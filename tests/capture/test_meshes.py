@@ -29,11 +29,13 @@ def test_order_is_kept(tmp_path, suffix):
     """Catches vertices merged, sorted or dropped, by a mesh with a duplicate and an unused vertex;
     and STL triangles welded by position, which would join lips and eyelids that merely touch."""
     vertices, faces = factory.ball()
-    vertices, faces = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices]), faces + 2
+    vertices = np.concatenate([vertices[:1], [[1.0, 2.0, 3.0]], vertices])
+    faces = faces + 2
     factory.write_mesh(tmp_path / f"mesh{suffix}", vertices, faces)
     read, triangles = read_mesh(tmp_path / f"mesh{suffix}")
     if suffix == ".stl":  # which has no shared vertices
-        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+        vertices = vertices[faces].reshape(-1, 3)
+        faces = np.arange(faces.size).reshape(-1, 3)
     np.testing.assert_allclose(read, vertices, atol=1e-7)
     np.testing.assert_array_equal(triangles, faces)
     assert (read.dtype, triangles.dtype) == (np.float64, np.int32)
@@ -142,9 +144,11 @@ def test_procrustes_as_scipy_has_it():
     """Catches a reflection, a transposed rotation or ignored weights, against scipy's
     align_vectors."""
     random = np.random.default_rng(1)
-    (source, target), weights = random.normal(size=(2, 30, 3)), random.random(30)
+    (source, target) = random.normal(size=(2, 30, 3))
+    weights = random.random(30)
     rotation, translation = weighted_procrustes(source, target, weights)
-    a, b = np.average(source, 0, weights), np.average(target, 0, weights)
+    a = np.average(source, 0, weights)
+    b = np.average(target, 0, weights)
     expected, _ = Rotation.align_vectors(target - b, source - a, weights)
     np.testing.assert_allclose(rotation, expected.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(rotation @ a + translation, b, atol=1e-12)
@@ -168,7 +172,8 @@ def test_names_and_files(toy, tmp_path):
     """Catches a region of other triangles than those painted, weights of another mesh taken for
     this one's, and a refinement that would train nothing and say so nowhere."""
     np.testing.assert_array_equal(find_region(toy, "mouth"), toy.regions["mouth"])
-    path, weights = tmp_path / "painted.npz", np.linspace(0, 1, len(toy.faces))
+    path = tmp_path / "painted.npz"
+    weights = np.linspace(0, 1, len(toy.faces))
     write_npz(path, {"weights": weights})
     np.testing.assert_array_equal(find_region(toy, str(path)), weights >= 0.5)
     triangle = toy.faces[7]
@@ -211,12 +216,11 @@ def test_every_pixel_shows_the_nearest_triangle():
     rng = np.random.default_rng(0)
     camera = replace(look_at((0.2, 0.1, 2.0), (0, 0, 0), 37, 29, 40.0), cx=17.0, cy=15.5)
     sizes = np.repeat([0.005, 0.05, 0.3, 3.0], [150, 60, 30, 8])
-    centers, shapes = (
-        rng.uniform(-0.7, 0.7, (len(sizes), 1, 3)),
-        rng.normal(size=(len(sizes), 3, 3)),
-    )
+    centers = rng.uniform(-0.7, 0.7, (len(sizes), 1, 3))
+    shapes = rng.normal(size=(len(sizes), 3, 3))
     corners = centers + sizes[:, None, None] * shapes
-    vertices, faces = corners.reshape(-1, 3), np.arange(3 * len(sizes)).reshape(-1, 3)
+    vertices = corners.reshape(-1, 3)
+    faces = np.arange(3 * len(sizes)).reshape(-1, 3)
     in_front = (camera.project(vertices)[1][faces] > 0.05).all(1)
     triangle, weights = rasterize(vertices, faces[in_front], camera)
     expected, expected_weights = by_equations(vertices, faces[in_front], camera)

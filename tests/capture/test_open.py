@@ -44,11 +44,14 @@ def test_mesh_capture(tmp_path, suffix):
     vertices, faces = factory.ball()
     assert (capture.layout, capture.timesteps, capture.flame) == ("mesh", (0, 1, 3), None)
     assert [(name, len(views)) for name, views in capture.views.items()] == [
-        ("train", 4), ("val", 2), ("test", 3)
-    ]  # fmt: skip
+        ("train", 4),
+        ("val", 2),
+        ("test", 3),
+    ]
     np.testing.assert_allclose(capture.neutral[capture.faces], vertices[faces], atol=1e-7)
     for timestep in capture.timesteps:
-        mesh, moved = capture.mesh(timestep), factory.moved(timestep, vertices)
+        mesh = capture.mesh(timestep)
+        moved = factory.moved(timestep, vertices)
         np.testing.assert_allclose(mesh[capture.faces], moved[faces], atol=1e-7)
     for view in (view for split in capture.views.values() for view in split):
         expected = factory.picture(view.timestep, view.camera_index)
@@ -81,7 +84,8 @@ def test_flame_capture(tmp_path):
     capture = open_capture(root, model_file)
     assert capture.flame is not None
     model = read_flame(model_file)
-    offset, shape = np.full((len(model.v_template), 3), np.float32(0.0005)), np.full(4, 0.3, "f4")
+    offset = np.full((len(model.v_template), 3), np.float32(0.0005))
+    shape = np.full(4, 0.3, "f4")
     assert (capture.layout, capture.timesteps, capture.warnings) == ("flame", (0, 1, 3), ())
     for timestep in capture.timesteps:
         frame = read_frame(root / f"flame_param/{timestep:05d}.npz", model)
@@ -126,16 +130,22 @@ def test_published_topology_gets_teeth(tmp_path, shared_data, rows):
     The real template and triangles; skinning and expressions are filled in, for they are not
     published openly."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
-        template, faces = data["v_template"].astype(float), data["faces"]
+        template = data["v_template"].astype(float)
+        faces = data["faces"]
     count = len(template)
     root, model_file = factory.write_flame_capture(tmp_path / "capture", timesteps=(0,))
     weights = np.zeros((count, 5))
     weights[:, 1] = 1
     np.savez(
-        model_file, v_template=template, shapedirs=np.zeros((count, 3, 6)), n_identity=4,
-        J_regressor=np.full((5, count), 1 / count), weights=weights, f=faces,
+        model_file,
+        v_template=template,
+        shapedirs=np.zeros((count, 3, 6)),
+        n_identity=4,
+        J_regressor=np.full((5, count), 1 / count),
+        weights=weights,
+        f=faces,
         kintree_table=np.array([[-1, 0, 1, 1, 1], [0, 1, 2, 3, 4]]),
-    )  # fmt: skip
+    )
     offset = np.full((1, rows, 3), 0.001, np.float32)
     parameters = factory.flame_parameters(0) | {"static_offset": offset}
     np.savez(root / "flame_param/00000.npz", **parameters)
@@ -303,9 +313,11 @@ BROKEN_MESH_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
     (in_a_point("meshes/neutral.obj"), r"neutral\.obj: all vertices of the mesh lie in one point"),
     (in_a_point("meshes/00001.obj"), r"00001\.obj: all vertices of the mesh lie in one point"),
     (edited(lambda own: own[1].pop("mesh_path")), r"val\.json: frames\[1\]\.mesh_path: is missing"),
-    (edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
-     r"val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already"),
-]  # fmt: skip
+    (
+        edited(lambda own: own[0].update(mesh_path="meshes/00003.obj")),
+        r"val\.json: frames\[0\]\.mesh_path: is .*00003\.obj, but timestep 0 already",
+    ),
+]
 
 
 def parameters(change: dict[str, np.ndarray | None]) -> Callable[[Path], None]:
@@ -329,7 +341,9 @@ BROKEN_FLAME_CAPTURES: list[tuple[Callable[[Path], object], str]] = [
 ]
 
 
-IDS, SOUP, NO_SOUP = "training_faces/0000.npy", "meshes/mesh_0000.json", r"0000\.json: triangles: "
+IDS = "training_faces/0000.npy"
+SOUP = "meshes/mesh_0000.json"
+NO_SOUP = r"0000\.json: triangles: "
 BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
     (written(IDS, np.array([0, 320])), r"0000\.npy: names triangles 0 to 320, but .* 0 to 319"),
     (written(IDS, np.array([-1])), r"0000\.npy: names triangles"),
@@ -339,10 +353,12 @@ BROKEN_RELEASES: list[tuple[Callable[[Path], object], str]] = [
     (written(SOUP, "[]"), NO_SOUP),
     (written(SOUP, '{"triangles": []}'), NO_SOUP),
     (written(SOUP, '{"triangles": [{"Vertices": [[0, 0], [1, 0], [0, 1]]}]}'), NO_SOUP),
-    (written(SOUP, '{"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]}'),
-     "json: vertex 0"),
+    (
+        written(SOUP, '{"triangles": [{"Vertices": [[NaN, 0, 0], [1, 0, 0], [0, 1, 0]]}]}'),
+        "json: vertex 0",
+    ),
     (remove("meshes/mesh_0001.json"), r"mesh_0001\.json: cannot be read"),
-]  # fmt: skip
+]
 
 
 BROKEN_CAPTURES = [

@@ -42,9 +42,12 @@ def test_timesteps_follow_each_other(toy):
         timesteps = [view.timestep - start for view in both[len(views) :]]
         assert timesteps == [view.timestep for view in views]
     for first, second, expected in (
-        (60.0, 60.0, 60.0), (None, 60.0, 60.0), (60.0, None, 60.0), (None, None, None),
+        (60.0, 60.0, 60.0),
+        (None, 60.0, 60.0),
+        (60.0, None, 60.0),
+        (None, None, None),
         (60.0, 25.0, None),
-    ):  # fmt: skip
+    ):
         joined = join_takes([replace(toy, fps=first), replace(moved(toy, 0.1), fps=second)])
         assert joined.fps == expected, (first, second)
     with pytest.raises(StgaError, match=r"^other: its neutral mesh is up to 1\.7 mm from that of"):
@@ -56,7 +59,8 @@ def test_timesteps_follow_each_other(toy):
 
 def test_cameras_keep_their_index_only_where_they_are_the_same(toy):
     """Catches exposure of one camera corrected in another's images, and two that count as one."""
-    views, train = [], toy.views["train"]
+    views = []
+    train = toy.views["train"]
     for view in train:
         camera = turned(view.camera) if view.camera_index == 1 else view.camera
         views.append(replace(view, camera=camera))

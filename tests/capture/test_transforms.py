@@ -28,7 +28,8 @@ def test_projection_is_that_of_an_opengl_camera(tmp_path, convention, cx, cy):
     camera = read_one(tmp_path, factory.frame(0, 2), convention).view.camera
     points = np.random.default_rng(0).normal(scale=0.1, size=(50, 3))
     x, y, z, _ = np.linalg.inv(factory.pose(2)) @ np.c_[points, np.ones(50)].T
-    u, v = cx + factory.FOCAL * x / -z, cy - factory.FOCAL * y / -z
+    u = cx + factory.FOCAL * x / -z
+    v = cy - factory.FOCAL * y / -z
     pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, np.c_[u, v], atol=1e-9)
     np.testing.assert_allclose(depth, -z, atol=1e-12)
@@ -38,7 +39,8 @@ def test_projection_is_that_of_an_opengl_camera(tmp_path, convention, cx, cy):
 def test_own_intrinsics_win(tmp_path):
     """Catches a reader that trusts the top level, which real exports get wrong, or loses it as a
     fallback; a frame's own angle wins over a focal length at the top."""
-    own, half = factory.frame(0, 0), {"w": 8, "h": 8, "cx": 1.0, "cy": 1.0}
+    own = factory.frame(0, 0)
+    half = {"w": 8, "h": 8, "cx": 1.0, "cy": 1.0}
     bare = {key: own[key] for key in ("file_path", "transform_matrix")}
     shared = {"w": 40, "h": 60, "camera_angle_x": 2 * math.atan(20 / 200)}
     angles = {"camera_angle_x": 2 * math.atan(20 / 300), "camera_angle_y": 2 * math.atan(30 / 150)}
@@ -82,9 +84,12 @@ def test_cameras_of_a_single_file(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     assert [frame.view.camera_index for frame in read_splits(tmp_path).frames] == [0, 0, 1]
     entries = [
-        factory.frame(0, 0), factory.frame(1, 0), factory.frame(2, 0), factory.frame(3, 0),
+        factory.frame(0, 0),
+        factory.frame(1, 0),
+        factory.frame(2, 0),
+        factory.frame(3, 0),
         factory.frame(4, 1),
-    ]  # fmt: skip
+    ]
     entries[2]["fl_x"] += 1.0
     entries[3]["cy"] += 1.0
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": entries}))
@@ -97,8 +102,10 @@ def test_cameras_of_a_single_file(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     splits = read_splits(tmp_path).splits
     assert [(name, len(own)) for name, own in splits.items()] == [
-        ("train", 3), ("val", 0), ("test", 0)
-    ]  # fmt: skip
+        ("train", 3),
+        ("val", 0),
+        ("test", 0),
+    ]
 
 
 def test_static_capture_without_timesteps(tmp_path):
@@ -121,11 +128,23 @@ def test_union_paths_stay_beside_the_capture(tmp_path):
     assert inside(root, "..foo/1.png", "x") == root / "..foo/1.png"
 
 
-@pytest.mark.parametrize("path", [
-    "../../secret.png", "images/../../../secret.png", "../seq/../../secret.png",
-    "..\\..\\secret.png", "/etc/passwd", "\\\\server\\share\\x.png", "C:\\x.png", "C:x.png",
-    "images/C:/x.png", "..", "", "a\0b",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../../secret.png",
+        "images/../../../secret.png",
+        "../seq/../../secret.png",
+        "..\\..\\secret.png",
+        "/etc/passwd",
+        "\\\\server\\share\\x.png",
+        "C:\\x.png",
+        "C:x.png",
+        "images/C:/x.png",
+        "..",
+        "",
+        "a\0b",
+    ],
+)
 @pytest.mark.parametrize("field", ["file_path", "fg_mask_path", "mesh_path", "flame_param_path"])
 def test_paths_that_leave_are_refused(tmp_path, path, field):
     """Catches path traversal: a downloaded capture must not read files elsewhere, on any operating

@@ -7,7 +7,8 @@ from capture import factory
 
 from stga_addon.cli.main import main
 
-TIMESTEPS, CAMERAS = (0, 1, 3), range(3)
+TIMESTEPS = (0, 1, 3)
+CAMERAS = range(3)
 
 
 @pytest.fixture(scope="session")

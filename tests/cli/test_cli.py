@@ -85,7 +85,8 @@ def test_train_and_eval(trained, root, capsys):
 
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:
     """Catches --budget ignored, and --resume that starts anew or goes beyond the budget."""
-    out, options = tmp_path / "run", "--budget 0.2s --strategy gaussian-avatars"
+    out = tmp_path / "run"
+    options = "--budget 0.2s --strategy gaussian-avatars"
     assert stga("train", root, "--out", out, options) == 0
     first = read_checkpoint(out)
     assert 0.2 <= first.elapsed_s < 1.5
@@ -137,7 +138,8 @@ def test_names_of_a_long_capture() -> None:
 
 def test_export_of_frames(trained, root, tmp_path, capsys):
     """Catches a PLY of another frame or in local coordinates, and a range cut in silence."""
-    avatar, capture = read_avatar(trained / "avatar.npz"), open_capture(root)
+    avatar = read_avatar(trained / "avatar.npz")
+    capture = open_capture(root)
     meshes = {None: avatar.neutral, 3: capture.mesh(3)}
     for timestep, mesh in meshes.items():
         out = tmp_path / f"{timestep}.ply"
@@ -174,7 +176,9 @@ def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
 def test_files_that_have_moved(tmp_path, capsys, trained, root):
     """Catches a run lost with its FLAME file's or capture's old place, or measured on another."""
     tracked, model = factory.write_flame_capture(tmp_path / "flame")
-    out, pair, elsewhere = tmp_path / "run", tmp_path / "pair", tmp_path / "elsewhere.npz"
+    out = tmp_path / "run"
+    pair = tmp_path / "pair"
+    elsewhere = tmp_path / "elsewhere.npz"
     options = "--flame", model, "--iterations 2 --strategy gaussian-avatars"
     assert stga("train", tracked, "--out", out, *options) == 0
     assert stga("export", out, "--format gaussian-avatars --out", pair) == 0
@@ -321,7 +325,8 @@ def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     """Catches frames, cameras or rates other than asked for, and a page that needs a capture."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture"))
     avatar_file = write_avatar_of(capture, tmp_path / "anna.npz", order=2, sh_degree=1)
-    first, last = capture.timesteps[1], capture.timesteps[-1]
+    first = capture.timesteps[1]
+    last = capture.timesteps[-1]
     words = ["--capture", str(capture.root), "--frames", f"{first}:{last}", "--fps", "30"]
     assert stga("export", avatar_file, "--format web", *words, "--out", tmp_path / "a.stga") == 0
     header, arrays = read_web_data((tmp_path / "a.stga").read_bytes())

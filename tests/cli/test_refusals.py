@@ -17,74 +17,138 @@ from .conftest import TIMESTEPS, refused
 REFUSALS = [
     # Options that have no effect, or none there
     ("info {root} --presets", "--presets: has no effect without --json"),
-    ("export {run} --format gltf --frames 0:1 --out {o}",
-     "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web"),
-    ("export {run} --format usd --timestep 1 --out {o}",
-     "--timestep cannot be combined with --format usd"),
-    ("export {run} --format ply --motion-only --out {o}",
-     "--motion-only cannot be combined with --format ply, only with web"),
-    ("export {run} --format usd --out {o}.usda",
-     "o.usda: expected a name that ends in .usdc or .usdz"),
+    (
+        "export {run} --format gltf --frames 0:1 --out {o}",
+        "--frames cannot be combined with --format gltf, only with ply-sequence, usd, web",
+    ),
+    (
+        "export {run} --format usd --timestep 1 --out {o}",
+        "--timestep cannot be combined with --format usd",
+    ),
+    (
+        "export {run} --format ply --motion-only --out {o}",
+        "--motion-only cannot be combined with --format ply, only with web",
+    ),
+    (
+        "export {run} --format usd --out {o}.usda",
+        "o.usda: expected a name that ends in .usdc or .usdz",
+    ),
     ("export {avatar} --format web --out {o}.txt", ".html"),
-    *((f"render {{run}} {options}", says) for options, says in (
-        ("--video {o}.avi", "ends in .mp4"),
-        ("--video {o}.mp4 --camera 7", "there are only 0, 1, 2"),
-        ("--video {o}.mp4 --fps 0", "frame rate (--fps) must be from 0.01"),
-        ("--out {o}", "needs --cameras"),
-        ("--out {o} --camera 1", "--camera: has no effect without --video or --turntable"),
-        ("--out {o} --turntable --seconds 1e9",
-         "--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000"),
-        ("--out {o} --cameras {cameras} --frames 7:9", "--frames 7:9: there is no such timestep"),
-        ("--out {o} --turntable 90 --frames 1:3", "--frames: has no effect with --turntable"))),
+    *(
+        (f"render {{run}} {options}", says)
+        for options, says in (
+            ("--video {o}.avi", "ends in .mp4"),
+            ("--video {o}.mp4 --camera 7", "there are only 0, 1, 2"),
+            ("--video {o}.mp4 --fps 0", "frame rate (--fps) must be from 0.01"),
+            ("--out {o}", "needs --cameras"),
+            ("--out {o} --camera 1", "--camera: has no effect without --video or --turntable"),
+            (
+                "--out {o} --turntable --seconds 1e9",
+                "--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000",
+            ),
+            (
+                "--out {o} --cameras {cameras} --frames 7:9",
+                "--frames 7:9: there is no such timestep",
+            ),
+            ("--out {o} --turntable 90 --frames 1:3", "--frames: has no effect with --turntable"),
+        )
+    ),
     ("refine {run}", "--region: is missing"),
     ("extend {run}", "CAPTURE: is missing"),
     # Options that another replaces, or that have no effect without another
-    *((f"train {{root}} --out {{o}} --iterations 1 {options}", says) for options, says in (
-        ("--schedule paper --strategy gaussian-avatars",
-         "--schedule paper: cannot be combined with --strategy "
-         "gaussian-avatars, which has settings of its own"),
-        ("--schedule paper --preset draft", "--preset: cannot be combined with --schedule paper"),
-        ("--preset final --strategy gaussian-avatars",
-         "--preset: cannot be combined with --strategy gaussian-avatars"),
-        ("--threshold 0.01",
-         "--threshold: has no effect without --strategy selective, or --schedule paper"),
-        ("--threshold 0.01 --strategy global --schedule paper",
-         "--threshold: has no effect without"))),
-    ("avatar {root} --model m.npz --out {o} --threshold 0.01",
-     "--threshold: has no effect without --strategy"),
-    ("render {avatar} --video v.mp4 --capture {root} --principal-point opencv",
-     "--principal-point: has no effect without --cameras"),
-    ("export {avatar} --format ply --out {o}.ply --motion take.csv",
-     "--motion: has no effect with --format ply without --timestep"),
+    *(
+        (f"train {{root}} --out {{o}} --iterations 1 {options}", says)
+        for options, says in (
+            (
+                "--schedule paper --strategy gaussian-avatars",
+                "--schedule paper: cannot be combined with --strategy "
+                "gaussian-avatars, which has settings of its own",
+            ),
+            (
+                "--schedule paper --preset draft",
+                "--preset: cannot be combined with --schedule paper",
+            ),
+            (
+                "--preset final --strategy gaussian-avatars",
+                "--preset: cannot be combined with --strategy gaussian-avatars",
+            ),
+            (
+                "--threshold 0.01",
+                "--threshold: has no effect without --strategy selective, or --schedule paper",
+            ),
+            (
+                "--threshold 0.01 --strategy global --schedule paper",
+                "--threshold: has no effect without",
+            ),
+        )
+    ),
+    (
+        "avatar {root} --model m.npz --out {o} --threshold 0.01",
+        "--threshold: has no effect without --strategy",
+    ),
+    (
+        "render {avatar} --video v.mp4 --capture {root} --principal-point opencv",
+        "--principal-point: has no effect without --cameras",
+    ),
+    (
+        "export {avatar} --format ply --out {o}.ply --motion take.csv",
+        "--motion: has no effect with --format ply without --timestep",
+    ),
     # A resumed run goes on as it began
-    *((f"train {{root}} --out {{run}} --resume {option}",
-     f"{option.split()[0]}: this run began with")
-      for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")),
-    *((f"{command} {{none}} {option} --resume",
-       f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with "
-       f"--resume, which "
-       "continues RUN as it began")
-      for command, option in (
-        ("refine", "--region mouth"), ("refine", "--frames 1-3"), ("refine", "--growth 0.5"),
-         ("refine", "--budget 1m"),
-        ("refine", "--out anna_2"), ("extend", "--iterations 9"), ("extend", "--seed 1"),
-         ("extend", "smile"))),
+    *(
+        (
+            f"train {{root}} --out {{run}} --resume {option}",
+            f"{option.split()[0]}: this run began with",
+        )
+        for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")
+    ),
+    *(
+        (
+            f"{command} {{none}} {option} --resume",
+            f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with "
+            f"--resume, which "
+            "continues RUN as it began",
+        )
+        for command, option in (
+            ("refine", "--region mouth"),
+            ("refine", "--frames 1-3"),
+            ("refine", "--growth 0.5"),
+            ("refine", "--budget 1m"),
+            ("refine", "--out anna_2"),
+            ("extend", "--iterations 9"),
+            ("extend", "--seed 1"),
+            ("extend", "smile"),
+        )
+    ),
     ("refine {run} --resume", "does not continue another run"),
     # Captures that are missing, broken, or others
     ("train {none} --out {o} --iterations 3", "is not a folder"),
-    *((f"{command} {{broken}}{options}", "transforms_val.json: is not valid JSON")
-      for command,
-      options in (("train", " --out {o} --iterations 3"), ("info", ""), ("select", ""))),
+    *(
+        (f"{command} {{broken}}{options}", "transforms_val.json: is not valid JSON")
+        for command, options in (
+            ("train", " --out {o} --iterations 3"),
+            ("info", ""),
+            ("select", ""),
+        )
+    ),
     ("train {bare} --out {o} --iterations 3", "has no training views"),
     ("eval {moved} --split test", "has other images"),
-    ("train {cameras5} --out {run} --resume",
-     "was trained on {root} (3 cameras, 3 timesteps), but {cameras5} (5 cameras"),
-    ("render {avatar} --capture {coarse} --cameras {cameras} --out {o}",
-     "{coarse}: its mesh has other triangles"),
-    ("export {run} --capture {coarse} --format ply-sequence --out {o}",
-     "{coarse}: its mesh has other triangles"),
-    ("export {run} --format gaussian-avatars --out {o}",
-     "needs the FLAME parameters of a FLAME capture"),
+    (
+        "train {cameras5} --out {run} --resume",
+        "was trained on {root} (3 cameras, 3 timesteps), but {cameras5} (5 cameras",
+    ),
+    (
+        "render {avatar} --capture {coarse} --cameras {cameras} --out {o}",
+        "{coarse}: its mesh has other triangles",
+    ),
+    (
+        "export {run} --capture {coarse} --format ply-sequence --out {o}",
+        "{coarse}: its mesh has other triangles",
+    ),
+    (
+        "export {run} --format gaussian-avatars --out {o}",
+        "needs the FLAME parameters of a FLAME capture",
+    ),
     # Runs and avatars that are missing, broken, or there already
     ("train {root} --out {run} --iterations 3", "already holds a run; resume it"),
     ("refine {run} --region mouth --out {run}", "already holds a run"),
@@ -92,9 +156,13 @@ REFUSALS = [
     ("train {root} --out {file} --iterations 3", "cannot be written"),
     ("eval {avatar}", "avatar.npz"),
     ("eval {root}", "holds no run"),
-    *((f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}",
-     f"{name}: ")
-      for name in ("half.npz", "foreign.npz", "none.npz")),
+    *(
+        (
+            f"render {{folder}}/{name} --capture {{root}} --cameras {{cameras}} --out {{o}}",
+            f"{name}: ",
+        )
+        for name in ("half.npz", "foreign.npz", "none.npz")
+    ),
     ("render {folder}/mesh.ply --cameras {cameras} --out {o}", "mesh.ply: "),
     ("render {folder}/none.ply --cameras {cameras} --out {o}", "none.ply: "),
     # What a capture has not, or is to keep
@@ -106,9 +174,11 @@ REFUSALS = [
     ("export {run} --format ply --timestep 2 --out {o}.ply", "has no timestep 2"),
     ("render {run} --cameras {later} --out {o}", "has no mesh for timestep 2"),
     ("refine {run} --region chin", "neither a region of the capture"),
-    ("render {run} --cameras {cameras} --out {root}/meshes/../images --device cpu",
-     "is an image of the capture; choose another --out"),
-]  # fmt: skip
+    (
+        "render {run} --cameras {cameras} --out {root}/meshes/../images --device cpu",
+        "is an image of the capture; choose another --out",
+    ),
+]
 """Command -> part of the sentence that refuses it, with the names of `refusable`."""
 
 

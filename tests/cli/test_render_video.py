@@ -50,7 +50,8 @@ def test_video_of_the_motion(parts, tmp_path):
     assert render(parts, "--video", tmp_path / "v.mp4", "--camera", 2, "--fps", 10) == 0
     rate, images = decoded(tmp_path / "v.mp4")
     assert (rate, len(images)) == (10, 3)
-    avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
+    avatar = read_avatar(parts["avatar"])
+    capture = open_capture(parts["capture"])
     camera = camera_of(capture, 2)
     for image, timestep in zip(images, (0, 1, 3), strict=True):
         errors = {
@@ -81,8 +82,10 @@ def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
     assert render(parts, "--turntable", 360, "--out", out, *options) == 0
     pictures = sorted(out.glob("*.png"))
     assert [path.name for path in pictures] == [f"{index:04d}.png" for index in range(1, 9)]
-    avatar, capture = read_avatar(parts["avatar"]), open_capture(parts["capture"])
-    start, first = camera_of(capture, 0), capture.mesh(0)
+    avatar = read_avatar(parts["avatar"])
+    capture = open_capture(parts["capture"])
+    start = camera_of(capture, 0)
+    first = capture.mesh(0)
     center = (first.min(0) + first.max(0)) / 2
     for index, timestep in ((0, 0), (2, 3), (3, 1), (5, 1)):
         camera = orbited(start, center, (0, 1, 0), np.radians(45 * index))
@@ -92,7 +95,8 @@ def test_turntable_as_pictures(parts: dict[str, Path], tmp_path: Path) -> None:
 
 def test_turntable_of_a_ply(parts: dict[str, Path], tmp_path: Path) -> None:
     """Catches a PLY, which has neither timesteps nor capture, that cannot be turned."""
-    ply, cameras = tmp_path / "scan.ply", parts["capture"] / "transforms_train.json"
+    ply = tmp_path / "scan.ply"
+    cameras = parts["capture"] / "transforms_train.json"
     write_ply(ply, read_avatar(parts["avatar"]).splats)
     assert main(["render", str(ply), "--video", str(tmp_path / "v.mp4"), "--turntable"]) == 2
     arguments = ["--turntable", "--cameras", str(cameras), "--seconds", "0.2"]

@@ -27,9 +27,13 @@ def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a bash command line in which `stga` is the command line; its exit code."""
     script = f'stga() {{ {STGA} "$@"; }}\n{command}\nexit ${{PIPESTATUS[0]}}'
     return subprocess.run(
-        ["bash", "-c", script], capture_output=True, text=True, cwd=ROOT,
-        env={**os.environ, **environment}, timeout=120,
-    )  # fmt: skip
+        ["bash", "-c", script],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        timeout=120,
+    )
 
 
 @pytest.mark.parametrize("command", ["info", "select", "presets --help"])

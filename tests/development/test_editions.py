@@ -74,7 +74,9 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
 def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys):
     """Catches gigabytes that nothing uses, and a refusal without a remedy."""
     monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
-    wheels, offered, index = wheel_folder(LINUX), tmp_path / "offered", tmp_path / "index"
+    wheels = wheel_folder(LINUX)
+    offered = tmp_path / "offered"
+    index = tmp_path / "index"
     for folder in (wheels, offered, index):
         folder.mkdir(parents=True)
     wheel_set(wheels, LINUX)
@@ -131,9 +133,15 @@ def test_manifest_of_an_edition(tmp_path):
     )
     assert small == {name: value for name, value in manifest.items() if name != "build"}
     wheel = make_wheel(
-        tmp_path, "torch", "2.13.0", "py3-none-any", 'cuda; platform_system == "Linux"',
-        'dll; os_name == "nt"', 'old; python_version < "3.12"', 'more; extra == "more"',
-    )  # fmt: skip
+        tmp_path,
+        "torch",
+        "2.13.0",
+        "py3-none-any",
+        'cuda; platform_system == "Linux"',
+        'dll; os_name == "nt"',
+        'old; python_version < "3.12"',
+        'more; extra == "more"',
+    )
     assert needs(wheel, LINUX) == ["cuda", "old"]
     assert needs(wheel, WINDOWS, {"more"}) == ["dll", "more"]
 

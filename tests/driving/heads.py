@@ -11,7 +11,8 @@ from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT
 from stga_addon.driving.shapes import face_points, face_shapes
 from stga_addon.flame.model import FlameModel
 
-KERNEL_M, REACH_M = 0.006, 0.012
+KERNEL_M = 0.006
+REACH_M = 0.012
 RIGID = tuple(name for name in ARKIT_SHAPES if name.startswith("jaw"))
 LOOKS = [
     ("Up", "Down", "Left"),
@@ -80,7 +81,8 @@ def random_poses(count: int, rng: np.random.Generator) -> np.ndarray:
 def _with_eyes(model: FlameModel) -> FlameModel:
     """The model whose eyeballs, the smaller parts of the mesh, follow their joints."""
     label = connected_parts(len(model.v_template), model.faces)
-    weights, regressor = model.weights.copy(), model.j_regressor.copy()
+    weights = model.weights.copy()
+    regressor = model.j_regressor.copy()
     for part in np.unique(label)[1:]:
         inside = label == part
         joint = 3 if model.v_template[inside, 0].mean() > 0 else 4

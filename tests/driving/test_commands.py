@@ -50,9 +50,18 @@ def files(tmp_path_factory) -> dict[str, Path]:
     camera = look_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), 64, 64, 130.0)
     world = np.linalg.inv(np.vstack([camera.world_to_camera, [0, 0, 0, 1]])[:4])
     world[:, 1:3] *= -1
-    entry = {"file_path": "x.png", "timestep_index": 0, "camera_index": 0,
+    entry = {
+        "file_path": "x.png",
+        "timestep_index": 0,
+        "camera_index": 0,
         "transform_matrix": world.tolist(),
-             "fl_x": 130.0, "fl_y": 130.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}  # fmt: skip
+        "fl_x": 130.0,
+        "fl_y": 130.0,
+        "cx": 32.0,
+        "cy": 32.0,
+        "w": 64,
+        "h": 64,
+    }
     (folder / "cameras.json").write_text(json.dumps({"frames": [entry]}))
     return {name: folder / name for name in ("flame.npz", "a.npz", "take.csv", "cameras.json")}
 
@@ -60,7 +69,9 @@ def files(tmp_path_factory) -> dict[str, Path]:
 def test_convert_there_and_back(files, tmp_path, capsys):
     """Catches an unreadable or refitted motion, another rate, and a mirror or strength without
     effect."""
-    out, back, flame = tmp_path / "motion.npz", tmp_path / "back.csv", files["flame.npz"]
+    out = tmp_path / "motion.npz"
+    back = tmp_path / "back.csv"
+    flame = files["flame.npz"]
     assert stga("drive", files["take.csv"], "--flame", flame, "--fps", 60, "--out", out) == 0
     model = small_head(0)
     motion = read_motion(out, model)
@@ -81,10 +92,12 @@ def test_convert_there_and_back(files, tmp_path, capsys):
         np.testing.assert_allclose(found.head[-1], [0.4 * share, 0, 0.2 * share], atol=0.01)
     assert stga("drive", out, "--out", tmp_path / "x.npz") == 2
     assert "holds FLAME parameters already" in capsys.readouterr().err
-    out, back = tmp_path / "bundled.npz", tmp_path / "bundled.csv"
+    out = tmp_path / "bundled.npz"
+    back = tmp_path / "bundled.csv"
     assert stga("drive", files["take.csv"], "--out", out) == 0
     assert stga("drive", out, "--out", back) == 0
-    given, found = read_performance(files["take.csv"]), read_performance(back)
+    given = read_performance(files["take.csv"])
+    found = read_performance(back)
     np.testing.assert_allclose(found.weights, given.weights, atol=1e-6)
     np.testing.assert_allclose(found.head, given.head, atol=1e-5)
 
@@ -115,7 +128,10 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
 @pytest.mark.parametrize("misfit", [0.1, 0.8])
 def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit):
     """Catches another motion, rate or head than tracked, a stranger's avatar, and folders left."""
-    root, run, video, steps = tmp_path / "capture", tmp_path / "run", tmp_path / "face.mp4", []
+    root = tmp_path / "capture"
+    run = tmp_path / "run"
+    video = tmp_path / "face.mp4"
+    steps = []
     write_flame_capture(root)
     rng = np.random.default_rng(0)
     model = small_head(0)
@@ -150,7 +166,8 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     write_report(tmp_path / "a.npz.check", 1 - misfit, [])
     assert stga(*drive, tmp_path / "a.npz", "--fps", 2 * DEFAULT_FPS) == 0
     assert stga(*drive, tmp_path / "a.csv") == 0
-    motion, head = read_motion(tmp_path / "a.npz", model), read_performance(tmp_path / "a.csv").head
+    motion = read_motion(tmp_path / "a.npz", model)
+    head = read_performance(tmp_path / "a.csv").head
     assert not [*tmp_path.glob("*.tracking"), *tmp_path.glob("*.check")]
     if misfit > MAX_MISFIT:
         assert steps == [2, 2]

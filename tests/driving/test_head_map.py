@@ -25,8 +25,14 @@ from stga_addon.flame.teeth import flame_model
 
 from .heads import generated_flame, random_poses, with_expressions
 
-NOSE_TIP, UPPER_LIP, LOWER_LIP, CHIN, RIGHT_EYE, LEFT_EYE = 4, 13, 14, 152, 33, 263
-MOUTH_LEFT, MOUTH_RIGHT = 291, 61
+NOSE_TIP = 4
+UPPER_LIP = 13
+LOWER_LIP = 14
+CHIN = 152
+RIGHT_EYE = 33
+LEFT_EYE = 263
+MOUTH_LEFT = 291
+MOUTH_RIGHT = 61
 
 
 def sequence_of(model, shape=None) -> FlameSequence:
@@ -52,7 +58,8 @@ def rich():
 def posed(sequence, found, weights) -> np.ndarray:
     """(N, 3) face points of one row of weights."""
     row = found.parameters(weights[None])[0]
-    count, zero = sequence.model.n_expression, np.zeros(3)
+    count = sequence.model.n_expression
+    zero = np.zeros(3)
     frame = FlameFrame(row[:count], zero, zero, row[count : count + 3], zero, row[count + 3 :])
     mesh = flame_forward(sequence.model, sequence.shape, frame)
     return found.points.on(mesh, sequence.model.faces)
@@ -69,7 +76,8 @@ def test_points_lie_where_the_masks_are(demo):
     """Catches points on another feature, mirrored, or on the back of the head."""
     model = demo[0].model
     places, used = face_points(model, "demo")
-    at, corners = places.on(model.v_template, model.faces), model.faces[places.face]
+    at = places.on(model.v_template, model.faces)
+    corners = model.faces[places.face]
     assert used.sum() > 440
     for point, mask in ((NOSE_TIP, "nose"), (UPPER_LIP, "lips"), (LOWER_LIP, "lips")):
         assert np.isin(corners[point], model.masks[mask]).any(), mask
@@ -99,7 +107,8 @@ def test_points_agree_with_the_detector(shared_data):
 def test_directions(demo):
     """Catches a jaw, lips, eyes or tongue that move the other way, or at all."""
     sequence, found = demo
-    model, rest = sequence.model, posed(*demo, weights_of())
+    model = sequence.model
+    rest = posed(*demo, weights_of())
     row = {number: index for index, number in enumerate(np.flatnonzero(found.used))}
     opened = posed(*demo, weights_of(jawOpen=1.0)) - rest
     assert opened[row[CHIN], 1] < -0.008
@@ -108,12 +117,14 @@ def test_directions(demo):
     assert smile[row[MOUTH_LEFT]] > smile[row[MOUTH_RIGHT]]
     assert posed(*demo, weights_of(jawLeft=1.0))[row[CHIN], 0] > rest[row[CHIN], 0] + 0.002
     np.testing.assert_allclose(posed(*demo, weights_of(tongueOut=1.0)), rest, atol=1e-12)
-    zero, ball = np.zeros(3), model.weights[:, 3] > 0.9
+    zero = np.zeros(3)
+    ball = model.weights[:, 3] > 0.9
     before = model.v_template[ball]
     pupil = before[:, 2].argmax()
     for name, axis, sign in (("Up", 1, 1), ("Out", 0, 1), ("In", 0, -1)):
         values = found.parameters(weights_of(**{f"eyeLook{name}Left": 1.0})[None])[0]
-        eyes, rest_face = values[model.n_expression + 3 :], np.zeros(model.n_expression)
+        eyes = values[model.n_expression + 3 :]
+        rest_face = np.zeros(model.n_expression)
         frame = FlameFrame(rest_face, zero, zero, zero, zero, eyes)
         moved = flame_forward(model, sequence.shape, frame)[ball][pupil] - before[pupil]
         assert sign * moved[axis] > 0.003, name
@@ -123,9 +134,13 @@ def test_directions(demo):
 def test_combinations_against_a_free_fit(rich):
     """Catches a map that adds up shapes wrongly: closed lips on an open jaw are among the poses."""
     sequence, found = rich
-    count, zero, faces = sequence.model.n_expression, np.zeros(3), sequence.model.faces
+    count = sequence.model.n_expression
+    zero = np.zeros(3)
+    faces = sequence.model.faces
     weights = random_poses(12, np.random.default_rng(3))
-    rest, missed, best = posed(*rich, weights_of()), [], []
+    rest = posed(*rich, weights_of())
+    missed = []
+    best = []
     for row in weights:
         wanted = rest + np.tensordot(effective_weights(row), found.targets, 1)
 
@@ -185,10 +200,12 @@ def test_a_head_without_a_face():
 
 def test_points_that_move_far_find_other_triangles():
     """Catches neighbors of a search before that are kept where points have left them."""
-    model, rng = flame_model(None), np.random.default_rng(0)
+    model = flame_model(None)
+    rng = np.random.default_rng(0)
     surface = _Surface(model.v_template, model.faces)
     chosen = rng.choice(len(model.faces), 50)
-    points, normals = surface.centers[chosen] + 1e-4 * surface.normals[chosen], surface.normals
+    points = surface.centers[chosen] + 1e-4 * surface.normals[chosen]
+    normals = surface.normals
     surface.nearest(points[::-1], normals[chosen[::-1]])
     found, fresh = (
         each.nearest(points, normals[chosen])

@@ -34,7 +34,8 @@ def talking(bias: np.ndarray, count: int = 60) -> list[FlameFrame]:
 
 def test_the_performers_own_face_is_left_out():
     """Catches a neutral from the middle of speech, or with the other's face in it."""
-    bias, own = np.array([1.5, -0.7, 0.3, 2.0]), np.array([0.2, 0.0, -0.1, 0.0])
+    bias = np.array([1.5, -0.7, 0.3, 2.0])
+    own = np.array([0.2, 0.0, -0.1, 0.0])
     frames = talking(bias)
     theirs = quiet_neutral(frames)
     np.testing.assert_allclose(theirs["face"], bias)

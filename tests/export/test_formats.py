@@ -120,7 +120,8 @@ def test_rate_of_a_capture(tmp_path, timesteps, fps, in_a_row, at_their_numbers)
 @pytest.mark.parametrize("room", [0.0, 0.6, 0.99999])
 def test_every_format_without_room(name, room, tmp_path):
     """Catches a message without file or cause, and leftovers of half an export."""
-    resource, head = pytest.importorskip("resource"), make_head()
+    resource = pytest.importorskip("resource")
+    head = make_head()
     format, dot, suffix = name.partition(".")
     path = tmp_path / f"new/anna{dot}{suffix}"
 

@@ -19,7 +19,9 @@ from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, sequence_mesh
 
-VERTICES, IDENTITY, EXPRESSION = 20, 6, 4
+VERTICES = 20
+IDENTITY = 6
+EXPRESSION = 4
 PROPERTIES = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(f"f_rest_{i}" for i in range(45)),
@@ -56,7 +58,8 @@ def sequence() -> FlameSequence:
 
 
 def avatar_on(sequence: FlameSequence, convention: str) -> Avatar:
-    neutral, faces = neutral_mesh(sequence).astype(np.float32), sequence.model.faces
+    neutral = neutral_mesh(sequence).astype(np.float32)
+    faces = sequence.model.faces
     splats = random_splats(6, 50, len(faces), sh_degree=3)
     return Avatar(replace(splats, unbound=np.zeros(50, bool)), convention, neutral, faces)
 
@@ -107,7 +110,8 @@ def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
     splats = bound_splats(tmp_path / "point_cloud.ply")
     motion = read_motion(tmp_path / "flame_param.npz", sequence.model)
     for name in ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound"):
-        found, expected = getattr(splats, name), getattr(avatar.splats, name)
+        found = getattr(splats, name)
+        expected = getattr(avatar.splats, name)
         np.testing.assert_array_equal(found, expected, err_msg=name)
         assert found.dtype == expected.dtype
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
@@ -135,7 +139,8 @@ def viewer_world(row: Splats, corners: np.ndarray) -> tuple[np.ndarray, np.ndarr
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_colors_are_those_of_the_neutral_mesh(tmp_path, sequence, convention):
     """Catches driven colors in a pair, by a least compression that is not 0."""
-    avatar, rng = avatar_on(sequence, convention), np.random.default_rng(1)
+    avatar = avatar_on(sequence, convention)
+    rng = np.random.default_rng(1)
     shape = len(avatar.faces), 3, 3
     driven = {name: rng.normal(0, 0.2, shape).astype(np.float32) for name in OFFSETS}
     limits = trained_range(len(avatar.faces))

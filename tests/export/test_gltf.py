@@ -19,7 +19,8 @@ from stga_addon.export.formats import export_avatar
 
 PREFIX = "KHR_gaussian_splatting:"
 SHAPES = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
-FLOAT, UNSIGNED_BYTE = 5126, 5121
+FLOAT = 5126
+UNSIGNED_BYTE = 5121
 COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 

@@ -128,7 +128,8 @@ def test_numbers_of_every_type(tmp_path, type_):
 def test_elements_before_and_after_the_vertices_and_windows_line_ends(tmp_path):
     """Catches reading vertices from the start of the data where another element comes first, and a
     data offset computed for \\n only."""
-    kinds, rows = dict.fromkeys(layout(0), "float"), numbered_rows(layout(0))
+    kinds = dict.fromkeys(layout(0), "float")
+    rows = numbered_rows(layout(0))
     before = "element camera 2", "property float a", "property uchar b"
     content = by_hand("binary_little_endian", kinds, rows, *before)
     head, mark, body = content.partition(b"end_header\n")

@@ -17,7 +17,8 @@ from stga_addon.errors import StgaError
 from stga_addon.export.formats import FORMATS, export_avatar
 from stga_addon.export.playback import Playback
 
-PLAYBACK, MISSING = Playback(fps=30.0), "the package usd-core is not installed"
+PLAYBACK = Playback(fps=30.0)
+MISSING = "the package usd-core is not installed"
 
 
 def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple[int, np.ndarray]]:
@@ -27,7 +28,8 @@ def moved(avatar: Avatar, frames: tuple[int, ...] = (3, 4, 7)) -> Iterator[tuple
 
 
 def colored(avatar: Avatar) -> Avatar:
-    rng, shape = np.random.default_rng(3), (len(avatar.faces), 3, 3)
+    rng = np.random.default_rng(3)
+    shape = (len(avatar.faces), 3, 3)
     driven = {
         name: rng.normal(0, 0.1, shape).astype(np.float32)
         for name in ("strain_color", "normal_color")
@@ -46,12 +48,14 @@ def splats_at(stage: Any, time: float) -> Splats:
     field = vol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/Avatar/Splats"))
     assert field
     xyz = np.array(field.GetPositionsAttr().Get(time))
-    count, degree = len(xyz), field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    count = len(xyz)
+    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
     sh = field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(time)
     sh = sh or field.GetRadianceSphericalHarmonicsCoefficientshAttr().Get(time)
     rotation = [(q.GetReal(), *q.GetImaginary()) for q in field.GetOrientationsAttr().Get(time)]
     opacity = np.array(field.GetOpacitiesAttr().Get(time), np.float64)
-    log_scale, sh = np.log(np.array(field.GetScalesAttr().Get(time))), np.array(sh)
+    log_scale = np.log(np.array(field.GetScalesAttr().Get(time)))
+    sh = np.array(sh)
     return world_splats(xyz, rotation, log_scale, opacity, sh.reshape(count, (degree + 1) ** 2, 3))
 
 

@@ -27,7 +27,8 @@ def open_flame(shared_data: Path) -> FlameModel:
     model = model_of(arrays, n_identity=60)
     jaw = jaw_weights(model.v_template, model.faces)
     weights = np.zeros_like(model.weights)
-    weights[:, 1], weights[:, 2] = 1 - jaw, jaw
+    weights[:, 1] = 1 - jaw
+    weights[:, 2] = jaw
     homogeneous = np.vstack([model.v_template.T, np.ones(5023)])
     targets = np.vstack([JOINT_POSITIONS_M.T, np.ones(5)])
     regressor = np.linalg.lstsq(homogeneous, targets, rcond=None)[0].T
@@ -78,11 +79,14 @@ def crossings(vertices: np.ndarray, skin: np.ndarray, teeth: np.ndarray) -> int:
 
 def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> int:
     edges = np.unique(np.sort(edges_of(edged), axis=1), axis=0)
-    ends, corners = vertices[edges], vertices[pierced]
+    ends = vertices[edges]
+    corners = vertices[pierced]
     ends, corners = _near(ends, corners), _near(corners, ends)
-    start, direction = ends[:, None, 0], (ends[:, 1] - ends[:, 0])[:, None]
+    start = ends[:, None, 0]
+    direction = (ends[:, 1] - ends[:, 0])[:, None]
     origin, u, v = corners.transpose(1, 0, 2)[:, None]
-    u, v = u - origin, v - origin
+    u = u - origin
+    v = v - origin
     across = np.cross(direction, v)
     determinant = (across * u).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,7 +100,8 @@ def _pierced(vertices: np.ndarray, edged: np.ndarray, pierced: np.ndarray) -> in
 
 def _near(some: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Those of some (n, k, 3) that touch the box around the others."""
-    low, high = others.min((0, 1)), others.max((0, 1))
+    low = others.min((0, 1))
+    high = others.max((0, 1))
     return np.asarray(some[((some.min(1) <= high) & (some.max(1) >= low)).all(1)])
 
 
@@ -104,10 +109,13 @@ def covered_from_front(vertices: np.ndarray, skin: np.ndarray, points: np.ndarra
     """(n,) bool: points (n, 3) with a triangle of the skin in front of them, along z."""
     corners = vertices[skin]
     corners = corners[corners[:, :, 2].max(1) > points[:, 2].min()]
-    a, b, c = corners[None, :, 0], corners[None, :, 1], corners[None, :, 2]
+    a = corners[None, :, 0]
+    b = corners[None, :, 1]
+    c = corners[None, :, 2]
 
     def twice_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-        first, second = q - p, r - p
+        first = q - p
+        second = r - p
         return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
     at = points[:, None]

@@ -16,9 +16,17 @@ from stga_addon.flame.model import MASK_PREFIX, FlameModel, read_flame
 
 FILE = Path(__file__).with_name("small_head.npz")
 EXPRESSIONS = (
-    "smile", "pucker", "frown", "brows_up", "brows_down", "cheek_puff", "blink_left", "blink_right",
-    "lips_open", "squint",
-)  # fmt: skip
+    "smile",
+    "pucker",
+    "frown",
+    "brows_up",
+    "brows_down",
+    "cheek_puff",
+    "blink_left",
+    "blink_right",
+    "lips_open",
+    "squint",
+)
 """Of which a coefficient of 1 is one full action. Ten components of identity come before them."""
 
 
@@ -64,11 +72,14 @@ def write_flame(model: FlameModel, path: Path) -> None:
     them."""
     parents = model.parents.astype(np.int64) % (1 << 32)  # FLAME spells the root's parent 2**32 - 1
     arrays = {
-        "v_template": model.v_template, "shapedirs": model.shapedirs, "posedirs": model.posedirs,
+        "v_template": model.v_template,
+        "shapedirs": model.shapedirs,
+        "posedirs": model.posedirs,
         "J_regressor": model.j_regressor,
         "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.uint32),
-        "weights": model.weights, "f": model.faces.astype(np.uint32),
+        "weights": model.weights,
+        "f": model.faces.astype(np.uint32),
         "n_identity": np.array(model.n_identity),
-    }  # fmt: skip
+    }
     masks = {MASK_PREFIX + name: ids for name, ids in model.masks.items()}
     write_npz(path, arrays | masks, compressed=True)

@@ -20,8 +20,11 @@ from stga_addon.tracking.solve import LID_SHAPES
 
 from .small_head import small_head, write_flame
 
-MAX_BYTES, MIN_TRIANGLES, MAX_TRIANGLES = 6e6, 20_000, 26_000
-METERS_PER_UNIT, SETBACK_M = 0.01, 0.0007
+MAX_BYTES = 6e6
+MIN_TRIANGLES = 20_000
+MAX_TRIANGLES = 26_000
+METERS_PER_UNIT = 0.01
+SETBACK_M = 0.0007
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,8 @@ def test_eyeballs_turn_in_their_lids(head):
     looking = posed(head, eyes_pose=np.array([0, 0.4, 0, 0, 0.4, 0]))
     joints = joint_positions(head, head.v_template)
     for side, joint in (("left", "left_eye"), ("right", "right_eye")):
-        eyeball, center = head.masks[f"{side}_eyeball"], joints[JOINTS.index(joint)]
+        eyeball = head.masks[f"{side}_eyeball"]
+        center = joints[JOINTS.index(joint)]
         radius = [np.linalg.norm(mesh[eyeball] - center, axis=1) for mesh in (straight, looking)]
         np.testing.assert_allclose(*radius, atol=1e-9)
         assert np.ptp(radius[0]) < 0.0025  # a ball with a cornea
@@ -91,9 +95,11 @@ def seen_eyeball(model, shape, **weights):
     """Square millimeters of the left eyeball that are seen from the front between the lids, and
     through their skin."""
     frame = replace(neutral_frame(model), expr=expression(model, **weights))
-    mesh, joint = flame_forward(model, shape, frame), JOINTS.index("left_eye")
+    mesh = flame_forward(model, shape, frame)
+    joint = JOINTS.index("left_eye")
     at = mesh[model.masks["left_eyeball"]].mean(0)
-    eye, pixel_mm = at + np.array([0, 0, 0.5]), 0.5
+    eye = at + np.array([0, 0, 0.5])
+    pixel_mm = 0.5
     camera = look_at(eye, at, 80, 80, 80 / 0.08)
     is_ball = (model.weights[model.faces, joint] == 1).all(1)
     lids = np.isin(model.faces, model.masks["left_eye_region"]).all(1)
@@ -102,14 +108,16 @@ def seen_eyeball(model, shape, **weights):
     first, _ = rasterize(mesh, model.faces, camera)
     skin = np.flatnonzero(~is_ball)
     behind, _ = rasterize(mesh, model.faces[skin], camera)
-    ball, skin_behind = (first >= 0) & is_ball[first], (behind >= 0) & lids[skin[behind]]
+    ball = (first >= 0) & is_ball[first]
+    skin_behind = (behind >= 0) & lids[skin[behind]]
     return pixel_mm**2 * np.array([(ball & ~skin_behind).sum(), (ball & skin_behind).sum()])
 
 
 def test_lids_close_before_the_eyeballs(head):
     """Catches eyeballs that poke through lids on their way, of people other than the average, and
     lids that do not close where tracking takes them to be closed."""
-    average, rng = np.zeros(head.n_identity), np.random.default_rng(0)
+    average = np.zeros(head.n_identity)
+    rng = np.random.default_rng(0)
     people = [average, *rng.normal(size=(4, head.n_identity))]
     looking_down = {"eyeLookDownLeft": 1.0, "eyeBlinkLeft": 1 - LID_SHAPES["eyeLookDown"]}
     ways = [{name: w} for name in ("eyeBlinkLeft", "eyeLookDownLeft") for w in (0.5, 1.0)]
@@ -125,7 +133,8 @@ def test_lids_close_before_the_eyeballs(head):
 
 def test_neck_turns_the_skull_alone(head):
     """Catches shoulders that turn along, a skull that bends, and teeth left behind."""
-    turned, straight = posed(head, neck_pose=np.array([0, 0.5, 0])), posed(head)
+    turned = posed(head, neck_pose=np.array([0, 0.5, 0]))
+    straight = posed(head)
     skull = np.flatnonzero(head.weights[:, JOINTS.index("neck")] == 1)
     assert np.isin(head.masks["teeth"], skull).all()
     assert np.isin(head.masks["nose"], skull).all()

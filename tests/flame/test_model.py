@@ -39,7 +39,8 @@ def test_the_dialect_of_the_published_files():
 @pytest.mark.parametrize("protocol", range(6))
 def test_every_pickle_protocol(tmp_path, protocol):
     """Catches a protocol, sparse layout or numpy module name that is not understood."""
-    arrays, path = random_arrays(), tmp_path / "model.pkl"
+    arrays = random_arrays()
+    path = tmp_path / "model.pkl"
     layout = ("csc_matrix", "csr_matrix", "coo_matrix")[protocol % 3]
     sparse = getattr(scipy.sparse, layout)(arrays["J_regressor"])
     stored = dict(arrays, J_regressor=sparse, n_identity=np.int64(9))
@@ -86,27 +87,34 @@ def test_mask_file_beside_the_model(tmp_path):
 
 class _Attack:
     def __init__(self, call: Any, *arguments: Any) -> None:
-        self.call, self.arguments = call, arguments
+        self.call = call
+        self.arguments = arguments
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         return self.call, self.arguments
 
 
-@pytest.mark.parametrize(("attack", "name"), [
-    (_Attack(os.system, "touch {}"), "posix.system"),
-    (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
-    (_Attack(getattr, "text", "format"), "builtins.getattr"),
-    (_Attack(np.load, "{}"), "numpy.load"), (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
-    (_Attack(pickle.loads, b"N."), "_pickle.loads"),
-    (_Attack(bytearray, 10**15), "builtins.bytearray"),
-], ids=lambda value: value if isinstance(value, str) else "")  # fmt: skip
+@pytest.mark.parametrize(
+    ("attack", "name"),
+    [
+        (_Attack(os.system, "touch {}"), "posix.system"),
+        (_Attack(eval, "open('{}', 'w')"), "builtins.eval"),
+        (_Attack(getattr, "text", "format"), "builtins.getattr"),
+        (_Attack(np.load, "{}"), "numpy.load"),
+        (_Attack(scipy.sparse.load_npz, "{}"), "load_npz"),
+        (_Attack(pickle.loads, b"N."), "_pickle.loads"),
+        (_Attack(bytearray, 10**15), "builtins.bytearray"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_other_classes_are_refused_by_name(tmp_path, attack, name, protocol):
     # Catches a pickle that gets anything executed: the witness file must not appear, and the class
     # must be named.
     witness = tmp_path / "witness"
     texts = (a.format(witness) if isinstance(a, str) else a for a in attack.arguments)
-    attack.arguments, path = tuple(texts), tmp_path / "model.pkl"
+    attack.arguments = tuple(texts)
+    path = tmp_path / "model.pkl"
     stored = dict(random_arrays(), extra=attack)
     path.write_bytes(pickle.dumps(stored, protocol=protocol, fix_imports=False))
     with pytest.raises(StgaError, match=f"model.pkl.*{name.replace('.', '[.]')}"):
@@ -114,10 +122,15 @@ def test_other_classes_are_refused_by_name(tmp_path, attack, name, protocol):
     assert not witness.exists()
 
 
-@pytest.mark.parametrize("name", [
-    "_codecs\nencode", "copy_reg\n_reconstructor", "numpy.core.multiarray\n_reconstruct",
-    "__builtin__\nset",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "_codecs\nencode",
+        "copy_reg\n_reconstructor",
+        "numpy.core.multiarray\n_reconstruct",
+        "__builtin__\nset",
+    ],
+)
 @pytest.mark.parametrize("state", [b"}S'left'\nI1\ns", b"N}S'_call'\nI1\ns\x86"])
 def test_functions_cannot_be_changed(tmp_path, name, state):
     """Catches a pickle that sets attributes of a function by BUILD, which would outlive its

@@ -87,9 +87,11 @@ def test_offsets_without_and_with_teeth(tmp_path, tiny_flame, rows):
 def test_meshes_of_a_sequence(tiny_flame):
     # Catches which parameters count as head motion and which as expression.
     rng = np.random.default_rng(6)
-    shape, offset = rng.normal(size=8), rng.normal(0, 0.01, (40, 3))
+    shape = rng.normal(size=8)
+    offset = rng.normal(0, 0.01, (40, 3))
     sequence = replace(_motion(tiny_flame), shape=shape, static_offset=offset)
-    frame, zero = sequence.frame(7), np.zeros(3)
+    frame = sequence.frame(7)
+    zero = np.zeros(3)
 
     def mesh(**changed):
         new = replace(frame, **changed)
@@ -112,7 +114,9 @@ def test_a_motion_is_its_frames(tmp_path, tiny_flame):
     # GaussianAvatars' files alike.
     frames = [_arrays(seed, tiny_flame) for seed in (10, 11, 12)]
     moving = {name: np.concatenate([own[name] for own in frames]) for name in FRAME_FIELDS}
-    shape, offset, dynamic = frames[0]["shape"], frames[0]["static_offset"], np.zeros((3, 40, 3))
+    shape = frames[0]["shape"]
+    offset = frames[0]["static_offset"]
+    dynamic = np.zeros((3, 40, 3))
     dynamic[2] = 0.01
     moving |= {"shape": shape, "static_offset": offset[0], "dynamic_offset": dynamic}
     motion = read_motion(_write(tmp_path / "flame_param.npz", moving), tiny_flame)
@@ -132,7 +136,8 @@ def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
     # Catches another tracker's names or packing read into the wrong joint, and an identity that is
     # insisted on.
     rng = np.random.default_rng(20)
-    expr, pose = rng.normal(size=(3, 4)), rng.normal(0, 0.4, (3, 15))
+    expr = rng.normal(size=(3, 4))
+    pose = rng.normal(0, 0.4, (3, 15))
     path = _write(tmp_path / "a.npz", {"exp": expr[:, :2], "pose": pose[:, :6]})
     short = read_motion(path, tiny_flame)
     frame = short.frame(1)
@@ -203,7 +208,9 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
     assert len(frames) == 6  # timesteps 2 to 7
     for index, timestep in ((0, 2), (1, 3), (5, 7)):
         _assert_same(frames[index], motion.frame(timestep))
-    start, end, between = motion.frame(3), motion.frame(7), frames[2]
+    start = motion.frame(3)
+    end = motion.frame(7)
+    between = frames[2]
     np.testing.assert_allclose(between.expr, 0.75 * start.expr + 0.25 * end.expr, atol=1e-12)
     expected = _between(start.jaw_pose, end.jaw_pose, 0.25)
     np.testing.assert_allclose(_matrices(between.jaw_pose)[0], expected, atol=1e-12)
@@ -238,8 +245,10 @@ def test_strength(tiny_flame):
 
 def test_driven_by_the_neutral_mesh_alone(tiny_flame):
     # Catches joints of the mean face, and the other person's identity or offsets on this one.
-    rng, ones = np.random.default_rng(3), np.ones((40, 3))
-    shape, offset = rng.normal(size=8), rng.normal(0, 0.01, (40, 3))
+    rng = np.random.default_rng(3)
+    ones = np.ones((40, 3))
+    shape = rng.normal(size=8)
+    offset = rng.normal(0, 0.01, (40, 3))
     motion = replace(_motion(tiny_flame), shape=rng.normal(size=8), static_offset=ones)
     motion = replace(motion, frame=lambda t: replace(random_frame(t, 4), dynamic_offset=ones))
     neutral = flame_forward(tiny_flame, shape, neutral_frame(tiny_flame), offset)

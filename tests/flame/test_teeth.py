@@ -16,9 +16,13 @@ from .mouths import covered_from_front, crossings, jaw_opened, open_edges, open_
 # The added vertices stand in this order, in rows of 15.
 UR, LR, UE, LE, URB, UEB, LRB, LEB = range(8)
 STRIP_ROWS = {
-    "upper front": (UR, UE), "upper back": (URB, UEB), "upper bottom": (UE, UEB),
-    "lower front": (LR, LE), "lower back": (LRB, LEB), "lower top": (LE, LEB),
-}  # fmt: skip
+    "upper front": (UR, UE),
+    "upper back": (URB, UEB),
+    "upper bottom": (UE, UEB),
+    "lower front": (LR, LE),
+    "lower back": (LRB, LEB),
+    "lower top": (LE, LEB),
+}
 LAYOUT_CRC32 = 0xB43FE122
 
 
@@ -91,7 +95,8 @@ def test_rows_bite(toothed):
 @pytest.mark.parametrize("jaw_deg", [0, 10, 20])
 def test_teeth_stay_behind_the_lips(toothed, jaw_deg):
     """Catches teeth in the flesh, or through the lips, of the mean face and of others."""
-    skin, teeth = toothed.faces[:9976], toothed.faces[9976:]
+    skin = toothed.faces[:9976]
+    teeth = toothed.faces[9976:]
     for seed in range(5):
         shape = np.random.default_rng(seed).normal(size=60) * (seed > 0)
         mesh = jaw_opened(toothed, jaw_deg, shape)
@@ -113,10 +118,13 @@ def test_identity_carries_the_teeth(flame_open):
     shapes[:, 1, 2] = template[:, 1]
     shapes[:, 2, 3] = template[:, 0] ** 2
     teeth = with_teeth(replace(flame_open, shapedirs=shapes, n_identity=4))
-    at, found = teeth.v_template[5023:], teeth.shapedirs[5023:]
+    at = teeth.v_template[5023:]
+    found = teeth.shapedirs[5023:]
     expected = np.zeros_like(found)
     expected[:, :, 0] = [0.001, 0.002, 0.003]
-    expected[:, 0, 1], expected[:, 1, 2], expected[:, 2, 3] = at[:, 0], at[:, 1], at[:, 0] ** 2
+    expected[:, 0, 1] = at[:, 0]
+    expected[:, 1, 2] = at[:, 1]
+    expected[:, 2, 3] = at[:, 0] ** 2
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
@@ -124,7 +132,8 @@ def test_teeth_and_lips_come_from_the_mesh(flame_open, toothed):
     """Catches lists of one mesh's vertices, lengths in meters, and lips paired wrongly."""
     order = np.random.default_rng(1).permutation(5023)
     number = np.argsort(order)
-    faces, shapes = number[flame_open.faces].astype(np.int32), flame_open.shapedirs[order]
+    faces = number[flame_open.faces].astype(np.int32)
+    shapes = flame_open.shapedirs[order]
     template = 2 * flame_open.v_template[order]
     other = with_teeth(replace(flame_open, v_template=template, shapedirs=shapes, faces=faces))
     np.testing.assert_allclose(other.v_template[5023:], 2 * toothed.v_template[5023:], atol=1e-9)

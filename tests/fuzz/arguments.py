@@ -93,7 +93,7 @@ BATCH_PLANS = (
     '[job.a]\nrequest = "track"\nminutes = {value}\n',
     "[job.a]\nrequest = {value}\nafter = [{value}]\n",
     "{value}",
-)  # fmt: skip
+)
 
 
 def batch_plan(rng: random.Random, case: Path) -> list[str]:
@@ -103,39 +103,54 @@ def batch_plan(rng: random.Random, case: Path) -> list[str]:
     return [str(case / "plan.toml")]
 
 
-FLAME, MODEL = (0.2, "--flame", "@flame/model.npz"), "@flame/model.npz"
+FLAME = (0.2, "--flame", "@flame/model.npz")
+MODEL = "@flame/model.npz"
 POINT = (0.2, "--principal-point", "vhap", "opencv", "center", *TEXTS)
 BARE = ["@mesh mesh release mesh/meshes", (0.05, "--flame", MODEL)]
 CAPTURE: list[Any] = [[BARE, BARE, ["@flame motion.npz", (0.9, "--flame", MODEL)]], POINT]
 CHOICES = [f"{e}={c}" for e in ("jaw", "teeth", "tracking", "exposure") for c in ("on", "off")]
 EFFECT = (0.2, "--effect", *CHOICES, "jaw=auto", *TEXTS, "jaw=", "=on", "a" * 5000)
 DEVICE = (0.2, "--device", "cpu", "auto", "tpu")
-SEED, THRESHOLD = (0.2, "--seed", "5", *NUMBERS), (0.2, "--threshold", "0.001", *NUMBERS)
-OUT, FPS = (1, "--out", "@new"), (0.2, "--fps", "25", *NUMBERS)
+SEED = (0.2, "--seed", "5", *NUMBERS)
+THRESHOLD = (0.2, "--threshold", "0.001", *NUMBERS)
+OUT = (1, "--out", "@new")
+FPS = (0.2, "--fps", "25", *NUMBERS)
 TRAIN: list[Any] = [
-    SEED, THRESHOLD, (0.2, "--target-psnr", "30", *NUMBERS), (0.1, "--stop-when-flat"),
+    SEED,
+    THRESHOLD,
+    (0.2, "--target-psnr", "30", *NUMBERS),
+    (0.1, "--stop-when-flat"),
     (0.3, "--schedule", "paper", "default"),
     (0.3, "--strategy", "global", "selective", "gaussian-avatars", "x"),
-]  # fmt: skip
+]
 RESUMED = [["@mesh", (1, "--out", "@run unfinished")], ["@flame", (1, "--out", "@tracked run")]]
 RESUME: list[Any] = [RESUMED, (1, "--resume"), FLAME, [[], [], [], [], TRAIN]]
 ITERATIONS = (1, "--iterations", "1", "2")
 BUDGET = [[ITERATIONS], [ITERATIONS], [ITERATIONS], [(1, "--budget", "0.01s", *NUMBERS[:9])]]
 CONTINUE: list[Any] = [
-    (1, "--iterations", "1", "2", "0", "x"), OUT, (0.2, "--growth", "0.5", *NUMBERS), SEED,
-    (0.05, "--resume"), DEVICE,
-]  # fmt: skip
+    (1, "--iterations", "1", "2", "0", "x"),
+    OUT,
+    (0.2, "--growth", "0.5", *NUMBERS),
+    SEED,
+    (0.05, "--resume"),
+    DEVICE,
+]
 TAKE = "@take mesh flame"
-TRACK: list[Any] = [[
-    [lambda _, case: tracked_footage(case), OUT, (0.2, "--focal", "900", *NUMBERS)],
+TRACK: list[Any] = [
     [
-        "@mesh flame mesh/images", (1, "--model", MODEL), OUT,
-        *((0.3, name, "@mesh mesh/transforms.json") for name in ("--landmarks", "--cameras")),
-        *((0.2, f"--{name}", "1", *NUMBERS) for name in ("start", "stop", "step", "focal")),
-        (0.2, "--sync", "auto", "motion", *TEXTS), (0.2, "--world", "keep", *TEXTS),
-        (0.2, "--offset", "0=1", *TEXTS),
-    ],
-]]  # fmt: skip
+        [lambda _, case: tracked_footage(case), OUT, (0.2, "--focal", "900", *NUMBERS)],
+        [
+            "@mesh flame mesh/images",
+            (1, "--model", MODEL),
+            OUT,
+            *((0.3, name, "@mesh mesh/transforms.json") for name in ("--landmarks", "--cameras")),
+            *((0.2, f"--{name}", "1", *NUMBERS) for name in ("start", "stop", "step", "focal")),
+            (0.2, "--sync", "auto", "motion", *TEXTS),
+            (0.2, "--world", "keep", *TEXTS),
+            (0.2, "--offset", "0=1", *TEXTS),
+        ],
+    ]
+]
 FORMATS = ("ply", "ply-sequence", "gaussian-avatars", "usd", "web", "gltf", "spz", "obj")
 SUFFIXES = {"usd": ".usdc", "web": ".html", "gltf": ".glb", "spz": ".spz"}
 COMMANDS: dict[str, tuple[float, list[Any]]] = {

@@ -63,7 +63,8 @@ def mutate_bytes(rng: random.Random, path: Path) -> str:
 
 def mutated(rng: random.Random, content: bytes) -> bytes:
     """A replacement, insertion, deletion, repetition or another bit, and sometimes an early end."""
-    at, length = rng.randrange(len(content) + 1), rng.choice([0, 1, 2, 4, 8, 40])
+    at = rng.randrange(len(content) + 1)
+    length = rng.choice([0, 1, 2, 4, 8, 40])
     part = content[at : at + length]
     flipped = bytes(byte ^ 1 << rng.randrange(8) for byte in part)
     piece = rng.choice([rng.choice(BYTES), rng.randbytes(4), part * 2, part * 50, b"", flipped])
@@ -116,7 +117,8 @@ def mutate_npz(rng: random.Random, path: Path) -> str:
         return mutate_bytes(rng, path)
     if not arrays:
         return "nothing"
-    name, chance = rng.choice(list(arrays)), rng.random()
+    name = rng.choice(list(arrays))
+    chance = rng.random()
     if chance > 0.7:
         stored[f"{name}.npy"] = mutated(rng, stored[f"{name}.npy"])
         with zipfile.ZipFile(path, "w") as archive:
@@ -175,5 +177,8 @@ def replace_file(rng: random.Random, path: Path) -> str:
 
 
 MUTATIONS: dict[str, Callable[[random.Random, Path], str]] = {
-    ".json": mutate_json, ".jsonl": mutate_json, ".npz": mutate_npz, ".png": mutate_picture,
-}  # fmt: skip
+    ".json": mutate_json,
+    ".jsonl": mutate_json,
+    ".npz": mutate_npz,
+    ".png": mutate_picture,
+}

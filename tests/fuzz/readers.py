@@ -115,7 +115,8 @@ def metrics(path: Path) -> None:
         metrics_log.append_metrics(path.parent, {"iteration": n, **LINE, "psnr": 20.5, "ssim": 0.9})
 
 
-RIG, NAMES = scenes.rig(2), ["cam0.png", "cam1.png"]
+RIG = scenes.rig(2)
+NAMES = ["cam0.png", "cam1.png"]
 LANDMARK_CAMERA = FootageCamera("cam0", RIG[0], ImageFrames(dict.fromkeys(range(4))))
 ROW = "{},1,2,3,10,20,30,24.3,0.01,-0.01,0.1,0.02,0,0,0.001,0\n"
 
@@ -142,7 +143,8 @@ def colmap_target(file: str) -> Target:
 
 
 def write_colmap_binary(folder: Path) -> None:
-    cameras, images = [struct.pack("<Q", 2)], [struct.pack("<Q", 2)]
+    cameras = [struct.pack("<Q", 2)]
+    images = [struct.pack("<Q", 2)]
     for number, (camera, name) in enumerate(zip(RIG, NAMES, strict=True), start=1):
         values = camera.fl_x, camera.fl_y, camera.cx, camera.cy, 0.1, 0.0, 0.0, 0.0
         cameras.append(struct.pack("<IiQQ8d", number, 4, camera.width, camera.height, *values))
@@ -189,69 +191,82 @@ def linear_head(path: Path) -> None:
 
 
 COLMAP = ("cameras.txt", "images.txt", "cameras.bin", "images.bin")
-TARGETS = {name: Target(*row) for name, row in {
-    "metashape": (
-        "cameras.xml",
-        lambda p: test_calibrations.write_export(p, RIG, NAMES),
-        lambda p: undistorted(read_metashape(p)[0])
-    ),
-    "realitycapture csv": (
-        "cameras.csv",
-        lambda p: p.write_text("\n".join([test_calibrations.HEADER, *map(ROW.format, NAMES)])),
-        lambda p: undistorted(read_realitycapture_csv(p, size_of))
-    ),
-    "realitycapture xmp": (
-        "a.xmp", lambda p: test_calibrations.write_xmp(p, RIG[0]),
-        lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0])
-    ),
-    "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p))),
-    "landmarks": ("cam0.npz", landmarks, lambda p: read_camera(p, LANDMARK_CAMERA)),
-    "places": ("head_model.npz", places, lambda p: read_places(p, 4)),
-    "head model npz": ("head.npz", linear_head, read_head_model),
-    "head model glb": (
-        "head.glb", lambda p: p.write_bytes(test_head_model.simple()), read_head_model
-    ),
-    "avatar": ("a.npz", avatar, read_avatar),
-    "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_ply),
-    "splats as text": ("a.ply", ascii_splats, read_ply),
-    "flame npz": ("a.npz", lambda p: np.savez(p, **random_arrays(vertices=6)), read_flame),
-    "flame pickle 2": ("a.pkl", flame_pickle(2), read_flame),
-    "flame pickle 5": ("a.pkl", flame_pickle(5), read_flame),
-    "flame masks": (
-        "a.pkl",
-        lambda p: p.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 2)),
-        read_pickled_arrays
-    ),
-    "flame frame": (
-        "a.npz", flame_frame, lambda p: (read_frame(p, MODEL), read_identity(p, MODEL))
-    ),
-    "flame motion": ("a.npz", flame_motion, lambda p: read_motion(p, MODEL)),
-    "transforms": ("transforms.json", transforms, read_transforms),
-    "regions": (
-        "r.json", lambda p: p.write_text('{"nose": [0, 1, 2], "lips": []}'),
-        lambda p: read_regions(p, FACES, 12)
-    ),
-    "soup": (
-        "a.json",
-        lambda p: p.write_text(json.dumps({"triangles": [{"Vertices": np.eye(3).tolist()}] * 3})),
-        read_soup
-    ),
-    "face ids": ("a.npy", lambda p: np.save(p, np.arange(4)), lambda p: read_face_ids(p, 5)),
-    "run": (
-        "run.json", lambda p: run_folder.write_run(p.parent, make_run()),
-        lambda p: run_folder.read_run(p.parent)
-    ),
-    "checkpoint": (
-        "checkpoint.npz", lambda p: checkpoints.write_checkpoint(p.parent, make_checkpoint()),
-        lambda p: checkpoints.read_checkpoint(p.parent)
-    ),
-    "selection": (
-        "selection.npz",
-        lambda p: checkpoints.write_selection(p.parent, {7: np.ones(5, bool)}, "a"),
-        lambda p: checkpoints.read_selection(p.parent, 5)
-    ),
-    "metrics": ("metrics.jsonl", metrics, lambda p: metrics_log.read_metrics(p.parent)),
-}.items()}  # fmt: skip
+TARGETS = {
+    name: Target(*row)
+    for name, row in {
+        "metashape": (
+            "cameras.xml",
+            lambda p: test_calibrations.write_export(p, RIG, NAMES),
+            lambda p: undistorted(read_metashape(p)[0]),
+        ),
+        "realitycapture csv": (
+            "cameras.csv",
+            lambda p: p.write_text("\n".join([test_calibrations.HEADER, *map(ROW.format, NAMES)])),
+            lambda p: undistorted(read_realitycapture_csv(p, size_of)),
+        ),
+        "realitycapture xmp": (
+            "a.xmp",
+            lambda p: test_calibrations.write_xmp(p, RIG[0]),
+            lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0]),
+        ),
+        "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p))),
+        "landmarks": ("cam0.npz", landmarks, lambda p: read_camera(p, LANDMARK_CAMERA)),
+        "places": ("head_model.npz", places, lambda p: read_places(p, 4)),
+        "head model npz": ("head.npz", linear_head, read_head_model),
+        "head model glb": (
+            "head.glb",
+            lambda p: p.write_bytes(test_head_model.simple()),
+            read_head_model,
+        ),
+        "avatar": ("a.npz", avatar, read_avatar),
+        "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_ply),
+        "splats as text": ("a.ply", ascii_splats, read_ply),
+        "flame npz": ("a.npz", lambda p: np.savez(p, **random_arrays(vertices=6)), read_flame),
+        "flame pickle 2": ("a.pkl", flame_pickle(2), read_flame),
+        "flame pickle 5": ("a.pkl", flame_pickle(5), read_flame),
+        "flame masks": (
+            "a.pkl",
+            lambda p: p.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 2)),
+            read_pickled_arrays,
+        ),
+        "flame frame": (
+            "a.npz",
+            flame_frame,
+            lambda p: (read_frame(p, MODEL), read_identity(p, MODEL)),
+        ),
+        "flame motion": ("a.npz", flame_motion, lambda p: read_motion(p, MODEL)),
+        "transforms": ("transforms.json", transforms, read_transforms),
+        "regions": (
+            "r.json",
+            lambda p: p.write_text('{"nose": [0, 1, 2], "lips": []}'),
+            lambda p: read_regions(p, FACES, 12),
+        ),
+        "soup": (
+            "a.json",
+            lambda p: p.write_text(
+                json.dumps({"triangles": [{"Vertices": np.eye(3).tolist()}] * 3})
+            ),
+            read_soup,
+        ),
+        "face ids": ("a.npy", lambda p: np.save(p, np.arange(4)), lambda p: read_face_ids(p, 5)),
+        "run": (
+            "run.json",
+            lambda p: run_folder.write_run(p.parent, make_run()),
+            lambda p: run_folder.read_run(p.parent),
+        ),
+        "checkpoint": (
+            "checkpoint.npz",
+            lambda p: checkpoints.write_checkpoint(p.parent, make_checkpoint()),
+            lambda p: checkpoints.read_checkpoint(p.parent),
+        ),
+        "selection": (
+            "selection.npz",
+            lambda p: checkpoints.write_selection(p.parent, {7: np.ones(5, bool)}, "a"),
+            lambda p: checkpoints.read_selection(p.parent, 5),
+        ),
+        "metrics": ("metrics.jsonl", metrics, lambda p: metrics_log.read_metrics(p.parent)),
+    }.items()
+}
 TARGETS |= {f"colmap {file}": colmap_target(file) for file in COLMAP}
 for kind in ("obj", "ply", "glb", "stl"):
     TARGETS[f"mesh {kind}"] = Target(f"a.{kind}", mesh, read_mesh)

@@ -92,11 +92,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def requests_about(case: Path) -> dict[str, ask.Request]:
     """A request of each kind, by its name, about the files of the case."""
-    capture, run, footage = case / "mesh", case / "splats", case / "footage"
+    capture = case / "mesh"
+    run = case / "splats"
+    footage = case / "footage"
     once = {"iterations": 1, "device": "cpu"}
     settings = read_run(case / "run").settings
     key = np.zeros(small_head(0).n_expression + 18)
-    avatar, played = case / "run/avatar.npz", Played({4: open_capture(capture).neutral})
+    avatar = case / "run/avatar.npz"
+    played = Played({4: open_capture(capture).neutral})
     tracking = ask.Track(
         footage / "footage", footage / "head.npz", case / "asked", landmarks=footage / "points"
     )
@@ -142,7 +145,8 @@ def _without_what_takes_minutes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def call(arguments: list[Any]) -> tuple[Any, str, str]:
     """Exit code, stdout and stderr of the command line."""
-    out, error = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    error = io.StringIO()
     with redirect_stdout(out), redirect_stderr(error):
         try:
             code = main([str(argument) for argument in arguments])
@@ -156,7 +160,8 @@ def call(arguments: list[Any]) -> tuple[Any, str, str]:
 def test_command_line(folder, monkeypatch, part):
     """Catches tracebacks, other exit codes, long messages, numeric warnings, hangs and files left
     half-written."""
-    case, scratch = folder / "case", folder / "scratch"
+    case = folder / "case"
+    scratch = folder / "scratch"
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     monkeypatch.chdir(folder / "start")  # relative names of outputs end up in FOLDER
     failures = {}

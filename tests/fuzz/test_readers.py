@@ -44,7 +44,8 @@ from stga_addon.training.run import checkpoint as checkpoints
 from .damages import damage_content
 from .readers import TARGETS
 
-MAX_READ_S, MAX_READ_BYTES = 2.0, 200e6
+MAX_READ_S = 2.0
+MAX_READ_BYTES = 200e6
 GIGA = 10**9
 """As many values as a malformed file says it holds."""
 SECONDS = float(os.environ.get("STGA_FUZZ_SECONDS", 0))
@@ -61,7 +62,8 @@ def behaves(read: Callable[[], Any], folder: Path) -> str:
         inside = [os.path.join(base, name) for base, a, b in walk for name in (*a, *b)]
         return sorted([*inside, *os.listdir(folder.parent)])
 
-    before, message = listing(), ""
+    before = listing()
+    message = ""
     begin = time.process_time()  # of this process: other programs may keep it waiting
     tracemalloc.start()
     try:
@@ -82,17 +84,26 @@ def behaves(read: Callable[[], Any], folder: Path) -> str:
 
 
 JUNK = {
-    "empty": b"", "zeros": bytes(10_000), "not utf-8": b'{"format": "\xff\xfe"}',
-    "utf-16": '{"a": 1}'.encode("utf-16"), "byte order mark": b"\xef\xbb\xbf{}",
-    "brackets": b"[" * 100_000, "objects": b'{"a":' * 100_000, "digits": b"9" * 100_000,
-    "nan": b"NaN", "string": b'"text"', "zip": b"PK\x05\x06" + bytes(18),
+    "empty": b"",
+    "zeros": bytes(10_000),
+    "not utf-8": b'{"format": "\xff\xfe"}',
+    "utf-16": '{"a": 1}'.encode("utf-16"),
+    "byte order mark": b"\xef\xbb\xbf{}",
+    "brackets": b"[" * 100_000,
+    "objects": b'{"a":' * 100_000,
+    "digits": b"9" * 100_000,
+    "nan": b"NaN",
+    "string": b'"text"',
+    "zip": b"PK\x05\x06" + bytes(18),
     "pickle": pickle.dumps({"a": 1}),
     "zip of millions": b"PK\x05\x06" + struct.pack("<4H2LH", 0, 0, 65535, 65535, 2**31, 0, 0),
-}  # fmt: skip
+}
 IN_PLACE: dict[str, Callable[[Path], object]] = {
-    "link to itself": lambda path: path.symlink_to(path.name), "pipe": os.mkfifo,
-    "device": lambda path: path.symlink_to("/dev/zero"), "folder": Path.mkdir,
-}  # fmt: skip
+    "link to itself": lambda path: path.symlink_to(path.name),
+    "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+}
 """What is no file, in the place of one."""
 NAMES = ("nul\0byte", "\ud800", "x" * 5000)
 """That no file can have, and a capture's JSON may hold."""
@@ -104,7 +115,8 @@ OF_A_FOLDER = ("run", "checkpoint", "selection", "metrics", "colmap")
 def test_reader(tmp_path, name):
     """Catches a reader that neither loads a damaged file nor raises StgaError."""
     target = TARGETS[name]
-    path, broken = tmp_path / "good" / target.name, tmp_path / "broken" / target.name
+    path = tmp_path / "good" / target.name
+    broken = tmp_path / "broken" / target.name
     path.parent.mkdir()
     broken.parent.mkdir()
     target.write(path)
@@ -112,7 +124,8 @@ def test_reader(tmp_path, name):
     for content in JUNK.values():
         broken.write_bytes(content)
         behaves(lambda: target.read(broken), broken.parent)
-    whole, end = path.read_bytes(), time.monotonic() + SECONDS / len(TARGETS)
+    whole = path.read_bytes()
+    end = time.monotonic() + SECONDS / len(TARGETS)
     for example in itertools.count():
         if example >= EXAMPLES and time.monotonic() > end:
             return
@@ -161,19 +174,26 @@ def archive(path: Path, entries: dict[str, bytes], packing: int = zipfile.ZIP_DE
 
 
 LYING_ARRAYS = {
-    "gigabytes promised": npy(), "product wraps around": npy(shape=(2**32, 2**32)),
-    "beyond 64 bits": npy(shape=(10**30,)), "negative": npy(shape=(-1, 3)),
-    "true": npy(shape=(True,), data=bytes(4)), "no size": npy("|V0", (10**12,)),
-    "one huge string": npy("<U1000000000", (1,)), "objects": npy("|O", (1,), pickle.dumps([1])),
+    "gigabytes promised": npy(),
+    "product wraps around": npy(shape=(2**32, 2**32)),
+    "beyond 64 bits": npy(shape=(10**30,)),
+    "negative": npy(shape=(-1, 3)),
+    "true": npy(shape=(True,), data=bytes(4)),
+    "no size": npy("|V0", (10**12,)),
+    "one huge string": npy("<U1000000000", (1,)),
+    "objects": npy("|O", (1,), pickle.dumps([1])),
     "nested type": npy([("a", "<f4", (10**6, 10**6))], (1,)),
     "type of itself": npy([("a", [("b", "O")])], (1,)),
     "half a header": b"\x93NUMPY\x01\x00\xff\xff{",
     "header of gigabytes": b"\x93NUMPY\x02\x00\xff\xff\xff\xff{",
-    "header cut in a string": npy(header="{'descr': '''<f4"), "brackets": npy(header="[" * 5000),
-    "minus signs": npy(header="-" * 9000 + "1"), "header of a number": npy(header="9" * 9000),
+    "header cut in a string": npy(header="{'descr': '''<f4"),
+    "brackets": npy(header="[" * 5000),
+    "minus signs": npy(header="-" * 9000 + "1"),
+    "header of a number": npy(header="9" * 9000),
     "header runs code": npy(header="{'descr': __import__('os').system('touch witness')}"),
-    "format 9": b"\x93NUMPY\x09\x00" + npy()[8:], "trailing bytes": npy(shape=(1,), data=bytes(8)),
-}  # fmt: skip
+    "format 9": b"\x93NUMPY\x09\x00" + npy()[8:],
+    "trailing bytes": npy(shape=(1,), data=bytes(8)),
+}
 
 
 @pytest.mark.parametrize("lie", LYING_ARRAYS)
@@ -207,10 +227,15 @@ def gltf(**changes: Any) -> bytes:
     primitive = {"attributes": {"POSITION": 0}, "indices": 1}
     views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 12}]
     document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}], "accessors": accessors(), "bufferViews": views,
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors(),
+        "bufferViews": views,
         "buffers": [{"byteLength": 48}],
-    }  # fmt: skip
+    }
     return head_glb({**document, **changes}, points + np.array([0, 1, 2], "<u4").tobytes())
 
 
@@ -231,10 +256,11 @@ def ply(vertices: int, rest: bytes, kind: str = "binary_little_endian") -> bytes
 
 
 MESHES = {
-    "whole.glb": gltf(), "huge matrices.glb": gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]),
+    "whole.glb": gltf(),
+    "huge matrices.glb": gltf(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]),
     "includes.obj": b"mtllib /etc/passwd\ncall x.obj\n" + OBJ,
     "one polygon.obj": OBJ + b"f " + b"1 " * 150_000 + b"\n",
-}  # fmt: skip
+}
 """That load."""
 BROKEN_MESHES = {
     "billion points.glb": gltf(accessors=accessors(count=GIGA)),
@@ -256,16 +282,22 @@ BROKEN_MESHES = {
     "billion triangles.stl": bytes(80) + struct.pack("<L", GIGA) + bytes(50),
     "text.stl": b"solid x\n" + b"facet normal 0 0 1\nouter loop\n" * 1000,
     "huge indices.obj": OBJ + b"f 1 2 " + b"9" * 5000 + b"\n",
-    "huge numbers.obj": OBJ.replace(b"v 0 0 0", b"v 0 0 1e400"), "lines.obj": b"\n" * 1_000_000,
-    "empty.obj": b"", "text.obj": b"hello", "no face.obj": OBJ[:-8], "no vertex.obj": b"f 1 2 3\n",
-    **{f"face {words}.obj": OBJ[:-8] + f"f {words}\n".encode() for words in (
-        "1 2", "1 2 4", "0 1 2", "1 2 -4", "a b c", "1 2 99999999999999999999"
-    )},
-    **{f"vertex {words}.obj": OBJ.replace(b"0 0 0", words.encode()) for words in (
-        "0 0", "0 0 x", "0 0 nan", "0 0 inf"
-    )},
+    "huge numbers.obj": OBJ.replace(b"v 0 0 0", b"v 0 0 1e400"),
+    "lines.obj": b"\n" * 1_000_000,
+    "empty.obj": b"",
+    "text.obj": b"hello",
+    "no face.obj": OBJ[:-8],
+    "no vertex.obj": b"f 1 2 3\n",
+    **{
+        f"face {words}.obj": OBJ[:-8] + f"f {words}\n".encode()
+        for words in ("1 2", "1 2 4", "0 1 2", "1 2 -4", "a b c", "1 2 99999999999999999999")
+    },
+    **{
+        f"vertex {words}.obj": OBJ.replace(b"0 0 0", words.encode())
+        for words in ("0 0", "0 0 x", "0 0 nan", "0 0 inf")
+    },
     "flat.obj": b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", [*MESHES, *BROKEN_MESHES])
@@ -289,12 +321,14 @@ def zeros(count: Any, **more: Any) -> list[dict[str, Any]]:
     return [{"componentType": 5126, "count": count, "type": "VEC3", **more}] * 2
 
 
-DRACO, MANY = ["KHR_draco_mesh_compression"], zeros(100_000)
+DRACO = ["KHR_draco_mesh_compression"]
+MANY = zeros(100_000)
 FAR = [{"buffer": 0, "byteOffset": 60, "byteLength": 36}] * 2
 HUGE = {"mesh": 0, "scale": [1e308] * 3, "rotation": [1e308] * 4}
 REPEATED = {"nodes": [{"mesh": 0}] * 999, "scenes": [{"nodes": [*range(999)]}]}
 HEADS = [
-    (b"", "is not a readable GLB"), (b"glTF" + bytes(40), "is not a readable GLB"),
+    (b"", "is not a readable GLB"),
+    (b"glTF" + bytes(40), "is not a readable GLB"),
     (simple(meshes=primitives(1, 0)), "neither identity nor expression"),
     (simple(extensionsRequired=DRACO), "export it without compression"),
     (simple(buffers=[{"uri": "../../etc/passwd", "byteLength": 72}]), "refers to other files"),
@@ -304,7 +338,8 @@ HEADS = [
     (simple(nodes=[{"mesh": 0, "scale": [99, 99, 99]}]), "measures"),
     (simple(accessors=zeros(1 << 40)), "more than the"),
     (simple(bufferViews=FAR), "beyond the file"),
-    (simple(accessors=zeros(np.inf)), "not a readable GLB"), (simple(nodes=[HUGE]), ""),
+    (simple(accessors=zeros(np.inf)), "not a readable GLB"),
+    (simple(nodes=[HUGE]), ""),
     (simple(nodes=[{"mesh": 0, "matrix": [1e308] * 16}]), ""),
     (simple(nodes=[{"mesh": 0, "translation": [1e308, 0, np.nan]}]), "values that are not finite"),
     (simple(meshes=primitives(400, 2), accessors=MANY), "its meshes hold .* numbers, more than"),
@@ -312,7 +347,7 @@ HEADS = [
     (simple(**REPEATED, accessors=zeros(9_000)), "more than"),
     (simple(accessors=zeros(3_000_000)), "its meshes hold .* numbers, more than"),
     (simple(accessors=zeros(100_000, bufferView=0), bufferViews=[{"byteStride": 0}]), "readable"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("data", "expected"), HEADS)
@@ -333,7 +368,8 @@ def pickled(value: bytes, key: bytes = b"v_template") -> bytes:
 RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
 SET_OF_OBJECT = b"c__builtin__\nset\nc__builtin__\nobject\n"
 PICKLES = {
-    "list of itself": pickled(b"]q\x01h\x01a"), "extension registry": pickled(b"\x82\x01"),
+    "list of itself": pickled(b"]q\x01h\x01a"),
+    "extension registry": pickled(b"\x82\x01"),
     "changes a function": pickled(b"c_codecs\nencode\nN}U\x0c__defaults__K\x05\x85s\x86b"),
     "bytes of gigabytes": pickled(b"\x8e" + struct.pack("<Q", 10**15)),
     "array of gigabytes": pickled(b"\x96" + struct.pack("<Q", 10**12)),
@@ -343,18 +379,21 @@ PICKLES = {
     "runs a command": pickled(b"cos\nsystem\nU\x0dtouch witness\x85R"),
     "runs a command by another name": pickled(RECONSTRUCT[:-1] + b".__globals__\n"),
     "runs by inheritance": pickled(b"cposix\nsystem\nU\x0dtouch witness\x85\x81"),
-    "list": pickle.dumps([1, 2]), "text": b"hello there", "persistent": b"\x80\x02P1\n.",
+    "list": pickle.dumps([1, 2]),
+    "text": b"hello there",
+    "persistent": b"\x80\x02P1\n.",
     "memo of 16 GB": b"\x80\x02Nr\xff\xff\xff\x7f.",
     "array's shape": b"\x80\x02" + RECONSTRUCT + b"(cnumpy\nndarray\n(J\xff\xff\xff\x7ft",
     "rebuilds a set": b"\x80\x02ccopy_reg\n_reconstructor\n(" + SET_OF_OBJECT + b"NtR.",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", PICKLES)
 def test_pickles(tmp_path, name):
     """Catches pickles whose size is a lie, that run what they name, that change how later files are
     read, or that never end."""
-    path, good = tmp_path / "a.pkl", tmp_path / "good.pkl"
+    path = tmp_path / "a.pkl"
+    good = tmp_path / "good.pkl"
     good.write_bytes(pickle.dumps(random_arrays(), 2))
     before = read_flame(good).v_template
     path.write_bytes(PICKLES[name])
@@ -367,7 +406,8 @@ def test_pickles(tmp_path, name):
 class Sparse:
     """Pickles as a scipy.sparse matrix of whatever state."""
 
-    __module__, __qualname__ = "scipy.sparse._csc", "csc_matrix"
+    __module__ = "scipy.sparse._csc"
+    __qualname__ = "csc_matrix"
 
     def __init__(self, **state: Any) -> None:
         self.__dict__.update(state)
@@ -379,7 +419,8 @@ def test_sparse_matrices_that_would_be_large(tmp_path, monkeypatch, shape):
     import scipy.sparse
 
     monkeypatch.setattr(scipy.sparse._csc, "csc_matrix", Sparse)
-    empty, path = np.zeros(0, np.int32), tmp_path / "a.pkl"
+    empty = np.zeros(0, np.int32)
+    path = tmp_path / "a.pkl"
     matrix = Sparse(_shape=shape, data=empty, indices=empty, indptr=np.zeros(1, np.int32))
     path.write_bytes(pickle.dumps({"v_template": matrix}, 4))
     assert "v_template" in behaves(lambda: read_pickled_arrays(path, ("v_template",)), tmp_path)
@@ -388,7 +429,8 @@ def test_sparse_matrices_that_would_be_large(tmp_path, monkeypatch, shape):
 @pytest.mark.parametrize("shape", [(-1, -6), ("a",), (10**400,), (2, 3, None), (1,) * 70])
 def test_shapes_that_are_none(tmp_path, shape):
     """Catches arithmetic on shapes that are not numbers, not positive or of too many axes."""
-    path, code = tmp_path / "a.pkl", pickle.dumps({"v_template": np.arange(6.0)}, 2)
+    path = tmp_path / "a.pkl"
+    code = pickle.dumps({"v_template": np.arange(6.0)}, 2)
     path.write_bytes(code.replace(pickle.dumps((6,), 2)[2:-1], pickle.dumps(shape, 2)[2:-1]))
     behaves(lambda: read_flame(path), tmp_path)
 
@@ -404,21 +446,30 @@ def capture_with(root: Path, change: Callable[[dict[str, Any]], object]) -> Path
 
 
 FRAME_VALUES: dict[str, dict[str, Any]] = {
-    "path of nul": {"file_path": "a\0b.png"}, "half a character": {"mesh_path": "\ud800.obj"},
-    "long path": {"file_path": "x" * 5000 + ".png"}, "deep path": {"mesh_path": "a/" * 5000},
+    "path of nul": {"file_path": "a\0b.png"},
+    "half a character": {"mesh_path": "\ud800.obj"},
+    "long path": {"file_path": "x" * 5000 + ".png"},
+    "deep path": {"mesh_path": "a/" * 5000},
     "home": {"fg_mask_path": "~/x.png"},
-    "path of a folder": {"file_path": "."}, "path of paths": {"file_path": ["x" * 700_000]},
-    "huge focal length": {"fl_x": 10**400}, "far focal length": {"fl_x": 1e30},
-    "no focal length": {"fl_x": 1e-30}, "no angle": {"fl_x": None, "camera_angle_x": 5e-324},
-    "huge size": {"w": 10**400}, "size of gigapixels": {"w": 10**6, "h": 10**6},
-    "huge centre": {"cx": 10**400}, "far centre": {"cy": -1e30},
-    "huge timestep": {"timestep_index": 10**400}, "far timestep": {"timestep_index": 10**15},
+    "path of a folder": {"file_path": "."},
+    "path of paths": {"file_path": ["x" * 700_000]},
+    "huge focal length": {"fl_x": 10**400},
+    "far focal length": {"fl_x": 1e30},
+    "no focal length": {"fl_x": 1e-30},
+    "no angle": {"fl_x": None, "camera_angle_x": 5e-324},
+    "huge size": {"w": 10**400},
+    "size of gigapixels": {"w": 10**6, "h": 10**6},
+    "huge centre": {"cx": 10**400},
+    "far centre": {"cy": -1e30},
+    "huge timestep": {"timestep_index": 10**400},
+    "far timestep": {"timestep_index": 10**15},
     "huge camera": {"camera_index": 10**400},
     "huge matrix": {"transform_matrix": [[10**400] * 4] * 4},
-    "matrix of lists": {"transform_matrix": [[[]] * 4] * 4}, "number as list": {"w": [40]},
+    "matrix of lists": {"transform_matrix": [[[]] * 4] * 4},
+    "number as list": {"w": [40]},
     "matrix of text": {"transform_matrix": [["1"] * 4] * 4},
     "camera of lists": {"camera_id": [[["x"]]], "camera_index": None},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FRAME_VALUES)
@@ -487,7 +538,7 @@ LANDMARK_ROWS = [
     ({"confidence": full(1e308, 4, 6)}, r"confidence: expected numbers from 0 to 1e\+06"),
     ({"confidence": full(np.nan, 4, 6)}, r"confidence: expected numbers from 0 to 1e\+06"),
     ({"confidence": full("high", 4, 6)}, "confidence holds <U4, expected numbers"),
-]  # fmt: skip
+]
 PLACE_ROWS = [
     ({"face": full(-1, 6)}, "face: uses 0 landmarks, expected at least 4"),
     ({"face": full("x", 6)}, "face: expected triangles from 0 to"),
@@ -497,10 +548,11 @@ PLACE_ROWS = [
     ({"barycentric": full(np.nan, 6, 3)}, "barycentric: expected finite numbers"),
     ({"barycentric": full(-1.0, 6, 3)}, "barycentric: expected numbers from 0 up"),
     ({"barycentric": full(0.5, 6, 3)}, "barycentric: expected rows that add up to 1"),
-]  # fmt: skip
+]
 HEAD_ROWS = [
     ({"identity": None, "expression": None}, "neither identity nor expression"),
-    ({"faces": np.array([[0, 1, 9]])}, "names vertices"), ({"mean": 30 * np.eye(4, 3)}, "meters"),
+    ({"faces": np.array([[0, 1, 9]])}, "names vertices"),
+    ({"mean": 30 * np.eye(4, 3)}, "meters"),
     ({"identity": full(1.0, 5, 3, 1)}, "identity has shape"),
     ({"mean": full("x", 4, 3)}, "mean holds <U1, expected numbers"),
     ({"mean": np.eye(4, 3) + 1e200}, r"mean reaches 1e\+200, expected at most 100000"),
@@ -511,10 +563,12 @@ HEAD_ROWS = [
     ({"expression": full(np.nan, 4, 3, 1)}, "expression holds values that are not finite"),
     ({"J_regressor": full(1e300, 5, 4)}, r"J_regressor reaches 1e\+300"),
     ({"weights": full(-1e300, 4, 5)}, r"weights reaches 1e\+300"),
-]  # fmt: skip
+]
 FRAME_ROWS = [
-    ({"expr": None}, "has no expr"), ({"translation": None}, "has no translation"),
-    ({"shape": None}, "has no shape"), ({"rotation": np.array(0.0)}, "rotation has shape"),
+    ({"expr": None}, "has no expr"),
+    ({"translation": None}, "has no translation"),
+    ({"shape": None}, "has no shape"),
+    ({"rotation": np.array(0.0)}, "rotation has shape"),
     ({"jaw_pose": full(0.0, 1, 4)}, r"jaw_pose has shape \(1, 4\), expected \(3,\)"),
     ({"expr": full(0.0, 1, 5)}, r"expr has shape \(1, 5\), expected \(3,\)"),
     ({"expr": full(0.0, 2, 3)}, r"expr has shape \(2, 3\)"),
@@ -522,50 +576,64 @@ FRAME_ROWS = [
     ({"static_offset": full(0.0, 1, 39, 3)}, r"static_offset .* expected \(40, 3\)"),
     ({"static_offset": full(0.0, 2, 40, 3)}, "static_offset has shape"),
     ({"shape": full("a", 9)}, "shape holds"),
-]  # fmt: skip
+]
 MOTION_ROWS = [
     ({"jaw_pose": full(0.0, 2, 3)}, r"jaw_pose has shape \(2, 3\), expected 4 timesteps first"),
-    ({"expr": full(0.0, 3)}, "expr has shape"), ({"eyes_pose": full(0.0, 4, 5)}, "eyes_pose has"),
+    ({"expr": full(0.0, 3)}, "expr has shape"),
+    ({"eyes_pose": full(0.0, 4, 5)}, "eyes_pose has"),
     ({"rotation": full(np.nan, 4, 3)}, "rotation holds values that are not finite"),
     ({"shape": full(np.inf, 9)}, "shape holds values that are not finite"),
     ({"pose": full(0.0, 4, 9)}, r"pose .* expected \(timesteps, 6\) or \(timesteps, 15\)"),
-    ({"pose": full(0.0, 0, 6)}, "pose has shape"), ({"pose": full(0.0, 6)}, "pose has shape"),
-    *(({"timesteps": np.array(own)}, "timesteps: expected 4 whole numbers") for own in (
-        [0, 1], [0, 2, 2, 3], [0.0, 1.0, 2.0, 3.0], [0, 1, 2, 2**63 + 1], [0, 1, 2, 2**40]
-    )),
-]  # fmt: skip
+    ({"pose": full(0.0, 0, 6)}, "pose has shape"),
+    ({"pose": full(0.0, 6)}, "pose has shape"),
+    *(
+        ({"timesteps": np.array(own)}, "timesteps: expected 4 whole numbers")
+        for own in (
+            [0, 1],
+            [0, 2, 2, 3],
+            [0.0, 1.0, 2.0, 3.0],
+            [0, 1, 2, 2**63 + 1],
+            [0, 1, 2, 2**40],
+        )
+    ),
+]
 MODEL_ROWS = [
-    ({"v_template": None}, "has no v_template"), ({"kintree_table": None}, "has no kintree_table"),
+    ({"v_template": None}, "has no v_template"),
+    ({"kintree_table": None}, "has no kintree_table"),
     ({"v_template": full(0.0, 6, 2)}, r"v_template has shape \(6, 2\), expected \(any, 3\)"),
     ({"shapedirs": full(0.0, 5, 3, 12)}, r"shapedirs .*expected \(6, 3, any\)"),
     ({"posedirs": full(0.0, 6, 3, 27)}, r"posedirs .*expected \(6, 3, 36\)"),
     ({"J_regressor": full(0.0, 4, 6)}, r"J_regressor .*expected \(5, 6\)"),
     ({"weights": full(np.nan, 6, 5)}, "weights holds values that are not finite"),
-    ({"weights": full("x", 6, 5)}, "weights"), ({"masks/nose": np.array([40])}, "mask nose"),
+    ({"weights": full("x", 6, 5)}, "weights"),
+    ({"masks/nose": np.array([40])}, "mask nose"),
     ({"f": full(40, 3, 3)}, "f names vertices 40 to 40, expected 0 to 5"),
     ({"f": full(0.5, 3, 3)}, "f holds float64, expected whole numbers"),
     ({"f": full(1e30, 3, 3)}, "f holds float64, expected whole numbers"),
     ({"kintree_table": np.array([[0, 4, 1, 1, 1], range(5)])}, "kintree_table names the parents"),
     ({"n_identity": np.array(13)}, "n_identity is 13, expected one number from 0 to 12"),
-]  # fmt: skip
-FOLDS, WIDE = "the distortion of its lens folds the image", "expected a focal length of 1 to 1e7"
+]
+FOLDS = "the distortion of its lens folds the image"
+WIDE = "expected a focal length of 1 to 1e7"
 COUNT = "expected a whole number, not '999"
 FOCAL = f"<f>{test_calibrations.INTRINSICS['f']}</f>"
 WRONG: dict[str, list[tuple[Any, str]]] = {
     "colmap cameras.txt": [
         (("PINHOLE", "EQUIRECTANGULAR"), "camera 1: model 'EQUIRECTANGULAR' is not one of"),
         (("PINHOLE", "OPENCV"), "camera 1: expected 8 parameters of OPENCV, not 4"),
-        (("50.0", "nan"), "line 2: expected finite numbers"), (("1 PINH", f"{DIGITS} PINH"), COUNT)
+        (("50.0", "nan"), "line 2: expected finite numbers"),
+        (("1 PINH", f"{DIGITS} PINH"), COUNT),
     ],
     "colmap images.txt": [
         ((" 2 cam1.png", " 7 cam1.png"), "image 'cam1.png': names camera 7, which .*cameras.txt"),
         ((" 1 cam0.png", ""), "line 2: expected number, quaternion, translation, camera and name"),
-        ((" 1 cam0.png", f" {DIGITS} cam0.png"), f"line 2: {COUNT}")
+        ((" 1 cam0.png", f" {DIGITS} cam0.png"), f"line 2: {COUNT}"),
     ],
     "metashape": [
         (("</document>", ""), "is not valid XML"),
         (("<document ", "<!DOCTYPE a [<!ENTITY b 'c'>]><document "), "declares a document type"),
-        (("<k1>", "<k1>1e308</k1><k1>"), FOLDS), (("<b1>", "<b1>1e308</b1><b1>"), FOLDS),
+        (("<k1>", "<k1>1e308</k1><k1>"), FOLDS),
+        (("<b1>", "<b1>1e308</b1><b1>"), FOLDS),
         ((FOCAL, ""), "sensor '0': has no calibration with f"),
         ((FOCAL, "<f>wide</f>"), "sensor '0': f: expected 1 finite number, not 'wide'"),
         ((FOCAL, "<f>0</f>"), f"sensor '0': f: {WIDE}"),
@@ -574,7 +642,7 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
         (("<p1>", "<p3>0.1</p3><p1>"), "sensor '0': p3 and p4 are not supported"),
         (('component_id="0" label="cam1', 'component_id="1" label="cam1'), "are in 2 components"),
         (("<transform>", "<transform>-"), "expected a rotation without|its axes are mirrored"),
-        (("<transform>", "<transform>1 "), "transform: expected 16 finite numbers, not")
+        (("<transform>", "<transform>1 "), "transform: expected 16 finite numbers, not"),
     ],
     "realitycapture csv": [
         ((CSV, "a.png,1,2"), "line 2: expected 16 columns, not 11"),
@@ -582,36 +650,44 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
         ((CSV, "a.png,1e308,-1e308,1e308,9,9,9,18"), r"line 2: expected a camera within 1e\+12"),
         (("0.1,0.02", "1e308,-1e308"), f"line 2: {FOLDS}"),
         ((CSV, "a" * 200_000), "line 2: is not readable CSV"),
-        (("heading", "direction"), "has no column heading; expected internal and external")
+        (("heading", "direction"), "has no column heading; expected internal and external"),
     ],
     "realitycapture xmp": [
         (('"brown4t2"', '"division"'), "xcr:DistortionModel 'division' is not one of perspective"),
         (("<xcr:Rotation>", "<xcr:Rotation>1 "), "xcr:Rotation: expected 9 finite numbers, not"),
         (('xcr:FocalLength35mm="24.3765359225552"', ""), "xcr:FocalLength35mm is missing"),
         (("24.3765359225552", "long"), "xcr:FocalLength35mm: expected 1 finite number, not 'long'"),
-        (("</x:xmpmeta>", ""), "is not valid XML"), (("24.3765359225552", "1e-320"), WIDE),
-        (("24.3765359225552", "1e308"), WIDE), (('AspectRatio="1"', 'AspectRatio="1e308"'), WIDE),
+        (("</x:xmpmeta>", ""), "is not valid XML"),
+        (("24.3765359225552", "1e-320"), WIDE),
+        (("24.3765359225552", "1e308"), WIDE),
+        (('AspectRatio="1"', 'AspectRatio="1e308"'), WIDE),
         (("-0.0046", "-1e308"), r"expected a principal point within 1e\+07 pixels"),
-        ((XMP, "1e308 -1e308"), FOLDS)
+        ((XMP, "1e308 -1e308"), FOLDS),
     ],
     "nerfstudio": [
         ({"k1": "much"}, r"frames\[1\].k1: expected a finite number, not 'much'"),
         ({"camera_model": "WIDE"}, r"frames\[1\].camera_model: 'WIDE' is not one of"),
-        ({"k1": -40.0}, FOLDS), ({"k1": 1e308, "k2": -1e308}, FOLDS), ({"cx": 1e6}, FOLDS),
+        ({"k1": -40.0}, FOLDS),
+        ({"k1": 1e308, "k2": -1e308}, FOLDS),
+        ({"cx": 1e6}, FOLDS),
         ({"k1": 10**400}, r"frames\[1\].k1: expected a finite number"),
-        ({"mask_path": "../../x"}, r"frames\[1\].mask_path: '../../x' leads outside")
+        ({"mask_path": "../../x"}, r"frames\[1\].mask_path: '../../x' leads outside"),
     ],
     "regions": [
-        (('[0, 1, 2]', text), "nose: expected a list of vertex indices from 0 to 11")
+        (("[0, 1, 2]", text), "nose: expected a list of vertex indices from 0 to 11")
         for text in ("3", '["a"]', "[-1]", "[12]", "[1.5]")
     ],
-    "landmarks": LANDMARK_ROWS, "places": PLACE_ROWS, "head model npz": HEAD_ROWS,
-    "flame frame": FRAME_ROWS, "flame motion": MOTION_ROWS, "flame npz": MODEL_ROWS,
+    "landmarks": LANDMARK_ROWS,
+    "places": PLACE_ROWS,
+    "head model npz": HEAD_ROWS,
+    "flame frame": FRAME_ROWS,
+    "flame motion": MOTION_ROWS,
+    "flame npz": MODEL_ROWS,
     "run": [
         (('"lattice": null', '"lattice": 1000000000'), "settings.lattice: expected"),
-        (('"views_per_visit": ', '"views_per_visit": -'), "settings.views_per_visit: expected")
+        (('"views_per_visit": ', '"views_per_visit": -'), "settings.views_per_visit: expected"),
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
@@ -632,11 +708,15 @@ def test_wrong_fields_are_named(tmp_path, reader, change, message):
 
 
 META_VALUES: dict[str, Any] = {
-    "iteration": ["5", -2, 1.5, None, 10**40, True], "visit": ["5", None],
-    "last_timestep": ["5", 1.5, [1]], "elapsed_s": ["5", None, float("nan"), [], True],
-    "best_difference": ["5", None, float("nan")], "evaluations": [None, "x"],
-    "losses": ["5", None, [None], ["a"], [float("nan")], {"a": 1}, 7], "initial_count": [None, "x"],
-}  # fmt: skip
+    "iteration": ["5", -2, 1.5, None, 10**40, True],
+    "visit": ["5", None],
+    "last_timestep": ["5", 1.5, [1]],
+    "elapsed_s": ["5", None, float("nan"), [], True],
+    "best_difference": ["5", None, float("nan")],
+    "evaluations": [None, "x"],
+    "losses": ["5", None, [None], ["a"], [float("nan")], {"a": 1}, 7],
+    "initial_count": [None, "x"],
+}
 
 
 def test_checkpoints_of_wrong_kinds(tmp_path):

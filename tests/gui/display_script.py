@@ -72,7 +72,9 @@ def set_up() -> Any:
     space.shading.background_color = (0.2, 0.3, 0.4)
     bpy.context.scene.world = None
     view = space.region_3d
-    view.view_perspective, view.view_distance, view.view_location = "PERSP", 0.6, (0.0, 0.0, 0.02)
+    view.view_perspective = "PERSP"
+    view.view_distance = 0.6
+    view.view_location = (0.0, 0.0, 0.02)
     view.view_rotation = (0.75, 0.6, 0.1, 0.2)
     bpy.context.view_layer.update()
     views["pose"] = np.array(shown.matrix_world, np.float64)
@@ -106,22 +108,26 @@ def picture(name: str) -> None:
 
 def pictures(shown: Any) -> None:
     _, area, _ = viewport()
-    space, scene = area.spaces.active, bpy.context.scene
+    space = area.spaces.active
+    scene = bpy.context.scene
     for mode in ("SOLID", "WIREFRAME", "MATERIAL"):
         space.shading.type = mode
         picture(mode.lower())
     space.overlay.show_overlays = True
     picture("material with overlays")
-    space.shading.type, space.overlay.show_overlays = "SOLID", False
+    space.shading.type = "SOLID"
+    space.overlay.show_overlays = False
     space.region_3d.view_perspective = "ORTHO"
     picture("orthographic")
     space.region_3d.view_perspective = "PERSP"
     scene.view_settings.view_transform = "Filmic"
     picture("filmic")
-    scene.view_settings.view_transform, space.shading.type = "AgX", "MATERIAL"
+    scene.view_settings.view_transform = "AgX"
+    space.shading.type = "MATERIAL"
     picture("material agx")
     scene.view_settings.view_transform = "Filmic"
-    scene.render.engine, space.shading.type = engine.ENGINE, "RENDERED"
+    scene.render.engine = engine.ENGINE
+    space.shading.type = "RENDERED"
     picture("engine filmic")
     set_input(shown, splat_nodes.DISPLAY, POINTS)
     space.overlay.show_overlays = True
@@ -155,7 +161,8 @@ def bones_in_front(shown: Any) -> None:
     with in_viewport():
         bpy.ops.object.mode_set(mode="EDIT")
     bone = data.edit_bones.new("bone")
-    bone.head, bone.tail = (0.0, 0.0, -0.04), (0.0, 0.0, 0.08)
+    bone.head = (0.0, 0.0, -0.04)
+    bone.tail = (0.0, 0.0, 0.08)
     with in_viewport():
         bpy.ops.object.mode_set(mode="OBJECT")
     overlay = viewport()[1].spaces.active.overlay
@@ -178,7 +185,8 @@ def shadows() -> None:
         data = bpy.data.lights.new(kind, kind)
         data.energy = energy
         lamps.append(bpy.data.objects.new(kind, data))
-        lamps[-1].location, lamps[-1].rotation_euler = place, (0.4, 0.5, 0.0)
+        lamps[-1].location = place
+        lamps[-1].rotation_euler = (0.4, 0.5, 0.0)
         bpy.context.scene.collection.objects.link(lamps[-1])
     settings = lighting.lighting_settings(bpy.context.scene)
     settings.mode = "scene"
@@ -227,7 +235,8 @@ def freed(held: list[Any]) -> bool:
 
 def pictures_per_redraw() -> int:
     """How often one redraw of the only viewport draws: more often where a handler stayed."""
-    count, draw = 0, SplatRenderer.draw
+    count = 0
+    draw = SplatRenderer.draw
 
     def counted(*arguments: Any) -> None:
         nonlocal count
@@ -309,7 +318,8 @@ def after_load() -> None:
 def start_render() -> None:
     """F12 in AgX in its own thread, whose view transform the main thread measures."""
     scene = bpy.context.scene
-    scene.render.engine, scene.view_settings.view_transform = engine.ENGINE, "AgX"
+    scene.render.engine = engine.ENGINE
+    scene.view_settings.view_transform = "AgX"
     scene.render.resolution_x = scene.render.resolution_y = 64
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
@@ -351,7 +361,8 @@ def steps() -> Any:
     end = perf_counter() + RENDER_PATIENCE_S
     yield lambda: "rendered" in seen or perf_counter() > end
     np.savez(FOLDER / "views.npz", **views)
-    seen["device"], seen["points"] = gpu.platform.backend_type_get(), POINTS
+    seen["device"] = gpu.platform.backend_type_get()
+    seen["points"] = POINTS
 
 
 in_window.play(steps(), FOLDER / "result.json")

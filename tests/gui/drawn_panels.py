@@ -30,7 +30,8 @@ def drawn() -> dict[str, Layout]:
 
 def buttons() -> dict[str, tuple[str, dict[str, Any]]]:
     """ "Panel: text" of each button in sidebar, menus and preferences -> operator and options."""
-    menus, operators = {"Import": Layout(), "Export": Layout()}, module("operators")
+    menus = {"Import": Layout(), "Export": Layout()}
+    operators = module("operators")
     operators._import_menu(SimpleNamespace(layout=menus["Import"]), bpy.context)
     operators._export_menu(SimpleNamespace(layout=menus["Export"]), bpy.context)
     found: dict[str, tuple[str, dict[str, Any]]] = {}

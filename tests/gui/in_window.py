@@ -49,14 +49,16 @@ def picture(file: Path) -> None:
 
 def play(steps: Iterator[Any], result: Path, patience_s: float = 180.0) -> None:
     """Take steps, each when what the one before yielded has come true; write `seen`, and quit."""
-    until, since = None, time.monotonic()
+    until = None
+    since = time.monotonic()
 
     def step() -> float | None:
         nonlocal until, since
         waited = time.monotonic() - since
         try:
             if until() if callable(until) else waited >= (until or 0):
-                until, since = next(steps), time.monotonic()
+                until = next(steps)
+                since = time.monotonic()
             elif waited > patience_s:
                 raise TimeoutError(f"waited in vain after {list(seen)}")
             return STEP_S

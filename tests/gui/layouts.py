@@ -6,7 +6,9 @@ from typing import Any
 import blf
 import bpy
 
-PADDING, ICON, NUMBER = 8, 20, 40
+PADDING = 8
+ICON = 20
+NUMBER = 40
 """Around a text in its button, an icon, and the value in a field, in pixels at a resolution scale
 of 1, as all widths."""
 NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
@@ -16,7 +18,9 @@ class Layout:
     """Takes the place of a panel's layout, and keeps what is drawn."""
 
     def __init__(self, kind: str = "column", **options: Any) -> None:
-        self.kind, self.options, self.items = kind, options, list[Any]()
+        self.kind = kind
+        self.options = options
+        self.items = list[Any]()
 
     def __getattr__(self, kind: str) -> Any:
         if kind.startswith("__"):
@@ -52,15 +56,21 @@ class Leaf:
     """A label, field or button, with its width: that of the text, the icon and the value."""
 
     def __init__(self, kind: str, arguments: Any, options: dict[str, Any]) -> None:
-        self.kind, self.arguments, self.options = kind, arguments, options
-        self.leaves, self.button, self.text, self.is_number = [self], SimpleNamespace(), "", False
+        self.kind = kind
+        self.arguments = arguments
+        self.options = options
+        self.leaves = [self]
+        self.button = SimpleNamespace()
+        self.text = ""
+        self.is_number = False
         if kind == "operator":
             group, name = arguments[0].split(".")
             self.text = getattr(getattr(bpy.ops, group), name).get_rna_type().name
         elif kind in ("prop", "prop_search") and hasattr(arguments[0], "bl_rna"):
             field = arguments[0].bl_rna.properties.get(arguments[1])
             if field is not None:  # no custom property
-                self.text, self.is_number = field.name, field.type in ("INT", "FLOAT")
+                self.text = field.name
+                self.is_number = field.type in ("INT", "FLOAT")
         self.text = options.get("text", self.text)
 
     @property

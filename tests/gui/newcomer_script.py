@@ -27,9 +27,14 @@ from in_window import ARGUMENTS, chosen, extension, in_viewport, module, play, s
 
 FOLDER = Path(ARGUMENTS[0])
 FIRST = FOLDER / "first.blend"
-NECK_ANGLE, MOUTH, PORT = 0.3, 0.6, 21112
-DRIVEN_S, RATE, PACKETS = 5.0, 60, 10_000
-IMAGE_PX, SAMPLES = 160, 2
+NECK_ANGLE = 0.3
+MOUTH = 0.6
+PORT = 21112
+DRIVEN_S = 5.0
+RATE = 60
+PACKETS = 10_000
+IMAGE_PX = 160
+SAMPLES = 2
 OUTSIDE = ("wm.path_open", "wm.save_mainfile")
 """Buttons that leave Blender, or the file."""
 STARTED = time.monotonic()
@@ -47,7 +52,8 @@ def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -
     """Do what a click does, and draw the window; notes for how long both hold Blender up, in
     seconds of processor time of its thread, without what a window costs in which nothing changes,
     and by the clock; or its message."""
-    begin, cpu = time.perf_counter(), time.thread_time()
+    begin = time.perf_counter()
+    cpu = time.thread_time()
     try:
         with in_viewport():
             return action(*how, **options)
@@ -57,7 +63,8 @@ def click(name: str, action: Callable[..., Any], /, *how: Any, **options: Any) -
     finally:
         done = time.thread_time()
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
-        shown, wall = time.thread_time(), time.perf_counter() - begin
+        shown = time.thread_time()
+        wall = time.perf_counter() - begin
         bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
         drawing = max(0.0, 2 * shown - done - time.thread_time())
         seen["clicks"][name] = [round(value, 3) for value in (done - cpu, drawing, wall)]
@@ -141,7 +148,8 @@ def press(state: str) -> Iterator[Any]:
     """Press every button to be seen, and undo, close or cancel what it does."""
     for what, (name, options) in drawn_panels.buttons().items():
         group, function = name.split(".")
-        operator, label = getattr(getattr(bpy.ops, group), function), f"{state}, {what}"
+        operator = getattr(getattr(bpy.ops, group), function)
+        label = f"{state}, {what}"
         with in_viewport():
             if name in OUTSIDE or not operator.poll():
                 seen["pressed"].setdefault(what, "gray")
@@ -255,7 +263,9 @@ def corners() -> np.ndarray:
 
 def drive(head: str) -> Iterator[Any]:
     """Drive the head by a phone, press the button that there is meanwhile, and stop by Esc."""
-    resting, ended, counted = corners(), threading.Event(), {"poses": 0, "draws": 0}
+    resting = corners()
+    ended = threading.Event()
+    counted = {"poses": 0, "draws": 0}
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
@@ -269,7 +279,8 @@ def drive(head: str) -> Iterator[Any]:
 
     chosen().drive.port = PORT
     click(f"Drive Live, {head}", bpy.ops.stga.drive_live)
-    session, space = module("operators.drive").session(), bpy.types.SpaceView3D
+    session = module("operators.drive").session()
+    space = bpy.types.SpaceView3D
     show = session.show_again
     session.show_again = lambda: (count("poses"), show())
     handle = space.draw_handler_add(count, ("draws",), "WINDOW", "POST_PIXEL")
@@ -283,7 +294,8 @@ def drive(head: str) -> Iterator[Any]:
     click(f"Set Neutral, {head}", bpy.ops.stga.calibrate_live)
     shot(f"driven {head}")
     window, _, region = viewport()
-    x, y = region.x + region.width // 2, window.height - region.y - region.height // 2
+    x = region.x + region.width // 2
+    y = window.height - region.y - region.height // 2
     subprocess.run(["xdotool", "mousemove", str(x), str(y)], check=True)
     yield 0.5
     subprocess.run(["xdotool", "key", "Escape"], check=True)
@@ -306,7 +318,8 @@ def live() -> Iterator[Any]:
 
 
 def display() -> Iterator[Any]:
-    shading, lighting = viewport()[1].spaces.active.shading, bpy.context.scene.stga_lighting
+    shading = viewport()[1].spaces.active.shading
+    lighting = bpy.context.scene.stga_lighting
     seen["shading"] = {}
     modes = bpy.ops.stga.choose_display.get_rna_type().properties["display"].enum_items
     for mode in sorted(modes.keys(), key=lambda mode: mode == "As Trained"):
@@ -407,7 +420,8 @@ def disable() -> Iterator[Any]:
 def render() -> Iterator[Any]:
     """An image, and a video of two frames, with each engine."""
     yield opened(FIRST)
-    scene, settings = bpy.context.scene, bpy.context.scene.render
+    scene = bpy.context.scene
+    settings = bpy.context.scene.render
     click("Preview for EEVEE/Cycles", bpy.ops.stga.preview_images)
     shot("preview of images")
     bpy.context.preferences.view.render_display_type = "NONE"

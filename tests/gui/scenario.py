@@ -125,7 +125,8 @@ def second() -> Iterator[Callable[[], bool]]:
 
 def videos() -> Iterator[Callable[[], bool]]:
     """A video cancelled while it is recorded, one while rendered, and a finished one."""
-    folder, scene = Path(BLEND).parent, bpy.context.scene
+    folder = Path(BLEND).parent
+    scene = bpy.context.scene
     scene.frame_set(1)
     for name in ("recording", "rendering", "finished"):
         with in_viewport():
@@ -153,7 +154,8 @@ def looks_at_head() -> bool:
     """Whether every viewport shows the head, and little else."""
     head = chosen().head
     corners = [head.matrix_world @ Vector(corner) for corner in head.bound_box]
-    center, size = sum(corners, Vector()) / len(corners), (corners[6] - corners[0]).length
+    center = sum(corners, Vector()) / len(corners)
+    size = (corners[6] - corners[0]).length
     areas = [
         area
         for area in bpy.context.window_manager.windows[0].screen.areas

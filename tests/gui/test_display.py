@@ -56,7 +56,8 @@ def shown(
     folder = tmp_path_factory.mktemp("display")
     of = avatar(3)
     transfer, occlusion = transfer_of(of.neutral, of.faces, 64)
-    world, skin = uniform(np.ones(3)).astype(np.float32), np.zeros(len(of.neutral), np.float32)
+    world = uniform(np.ones(3)).astype(np.float32)
+    skin = np.zeros(len(of.neutral), np.float32)
     light = AvatarLight(
         world, transfer, occlusion, (transfer @ world).astype(np.float32), skin, 0.0
     )
@@ -84,7 +85,9 @@ def on_screen(folder: Path, result: dict[str, Any], name: str) -> tuple[np.ndarr
         pixels = np.asarray(screenshot.convert("RGB"), np.float32)[
             y : y + camera.height, x : x + camera.width
         ]
-    width, height, m = camera.width - 2 * BORDER_PX, camera.height - 2 * BORDER_PX, BORDER_PX
+    width = camera.width - 2 * BORDER_PX
+    height = camera.height - 2 * BORDER_PX
+    m = BORDER_PX
     middle = replace(camera, width=width, height=height, cx=camera.cx - m, cy=camera.cy - m)
     return pixels[m:-m, m:-m].transpose(2, 0, 1) / 255, middle
 
@@ -100,7 +103,8 @@ def test_viewport_equals_the_rasterizer(shown: tuple[Path, dict[str, Any]], name
     layer = PosedSplats(
         expected.splats, expected.frames(expected.neutral), pose, expected.antialiased
     )
-    image, behind = compose([layer], camera), np.zeros(3) if name == "engine" else BEHIND
+    image = compose([layer], camera)
+    behind = np.zeros(3) if name == "engine" else BEHIND
     picture = np.clip(image.rgb + (1 - image.alpha) * behind[:, None, None], 0, 1)
     print(f"{name}: {psnr_db(found, picture):.1f} dB")
     assert image.alpha.mean() > 0.02, "nothing to compare"
@@ -122,7 +126,8 @@ def test_view_transforms_leave_colors(shown: tuple[Path, dict[str, Any]], name: 
 def test_shadow_maps(shown: tuple[Path, dict[str, Any]]) -> None:
     """Catches a head that throws no shadow on itself."""
     folder, result = shown
-    atlas, of = np.load(folder / "shadows.npy"), avatar(3)
+    atlas = np.load(folder / "shadows.npy")
+    of = avatar(3)
     assert set(result["lights"]) == {"sun", "point"}
     for index, (kind, place) in enumerate(result["lights"].items()):
         light = Light(kind, np.ones(3), place[:3], direction=place[3:])
@@ -162,7 +167,8 @@ def test_what_else_is_displayed(shown: tuple[Path, dict[str, Any]]) -> None:
     assert 0.3 < colored["clipped"].sum() / colored["solid"].sum() < 0.85
     with Image.open(folder / "four views.png") as screenshot:
         whole = np.ptp(np.asarray(screenshot.convert("RGB"), np.float32) / 255, axis=2) > 0.5
-    height, width = whole.shape[0] * 9 // 10, whole.shape[1] * 8 // 10
+    height = whole.shape[0] * 9 // 10
+    width = whole.shape[1] * 8 // 10
     assert all(
         whole[y : y + height // 2, x : x + width // 2].sum() > 100
         for y in (0, height // 2)

@@ -16,13 +16,16 @@ from stga_addon.development.demo.capture import unpack_capture
 from .conftest import BLENDER
 
 SCRIPT = Path(__file__).with_name("newcomer_script.py")
-MAX_MESSAGE, MAX_WORDS, MIN_POSES_PER_SECOND = 90, 3, 30
+MAX_MESSAGE = 90
+MAX_WORDS = 3
+MIN_POSES_PER_SECOND = 30
 
 
 def test_the_first_hour(tmp_path: Path) -> None:
     """Catches what misbehaves in the first hour, and what only a window has."""
     unpack_capture(tmp_path / "demo")
-    archive, home = complete_zip(BLENDER, tmp_path / "dist", tmp_path / "demo"), tmp_path / "home"
+    archive = complete_zip(BLENDER, tmp_path / "dist", tmp_path / "demo")
+    home = tmp_path / "home"
     home.mkdir()
     folder = Path(os.environ.get("STGA_GUI_FOLDER", tmp_path))
     folder.mkdir(exist_ok=True)

@@ -29,8 +29,11 @@ PLAYED = Played(
 )
 REQUESTS: tuple[Request, ...] = (
     Train(
-        Path("r"), HEAD, make_settings(iterations=3, preset="draft"), device="gpu:Name",
-        selection={0: np.ones(4, bool)}
+        Path("r"),
+        HEAD,
+        make_settings(iterations=3, preset="draft"),
+        device="gpu:Name",
+        selection={0: np.ones(4, bool)},
     ),
     Resume(Path("r"), HEAD, Path("flame.pkl"), "opencv", selection={7: np.zeros(4, bool)}),
     Refine(Path("r_2"), Path("r"), "mouth", frames=(3, 5), growth=0.5, seconds=20.0),
@@ -41,25 +44,41 @@ REQUESTS: tuple[Request, ...] = (
     Select(HEAD, Path("flame.pkl"), threshold=0.01, zero_pose="all"),
     SelectForTake(Path("r"), Path("/smile")),
     Track(
-        Path("f"), Path("m.glb"), Path("o"), focal=900.0, stop=9, step=3, offset={"left": -3},
-        meshes=True, mattes="none"
+        Path("f"),
+        Path("m.glb"),
+        Path("o"),
+        focal=900.0,
+        stop=9,
+        step=3,
+        offset={"left": -3},
+        meshes=True,
+        mattes="none",
     ),
     MakeAvatar(
         Track(Path("v.mp4"), None, Path("o/capture"), focal=900.0),
-        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu")
+        Train(Path("o/run"), Path("o/capture"), make_settings(iterations=3), device="cpu"),
     ),
     SolveAgain(HEAD, Path("flame.npz"), {12: np.linspace(0, 1, 5), 3: np.zeros(5)}),
     RenderRecording(Path("a/b.bin"), Path("v.mp4"), 3, 25.0, (1.0, 0.5, 0.0)),
     Render(Path("r"), Path("v.mp4"), True, turntable=90.0, camera=2, seconds=3.0, played=PLAYED),
     Render(
-        Path("a.npz"), Path("p"), cameras=Path("t.json"), motion=Path("m.npz"),
-        background=(0.0, 1.0, 0.5)
+        Path("a.npz"),
+        Path("p"),
+        cameras=Path("t.json"),
+        motion=Path("m.npz"),
+        background=(0.0, 1.0, 0.5),
     ),
     Benchmark(Path("b"), HEAD, 30.0, seed=2, only=("draft", "final")),
     RenderBlend(Path("/shots/head.blend"), Path("p"), (3, 12), "CYCLES"),
     Export(
-        Path("r"), Path("a.html"), "web", HEAD, played=PLAYED, frames=(3, 12), fps=30.0,
-        motion_only=True
+        Path("r"),
+        Path("a.html"),
+        "web",
+        HEAD,
+        played=PLAYED,
+        frames=(3, 12),
+        fps=30.0,
+        motion_only=True,
     ),
     TimePresets(HEAD, principal_point="opencv", device="cpu"),
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
@@ -67,10 +86,12 @@ REQUESTS: tuple[Request, ...] = (
     Relight(Path("r"), card=(0.5, 0.4, 0.5), capture=HEAD),
     Render(Path("r"), Path("v.mp4"), True, light=Path("sunset.hdr"), light_turn=360.0),
     ConvertMotion(
-        Path("take.csv"), Path("m.npz"), HEAD,
-        options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None)
+        Path("take.csv"),
+        Path("m.npz"),
+        HEAD,
+        options=MotionOptions(gains={"jaw": 0.5}, stay_trained=None),
     ),
-)  # fmt: skip
+)
 RESULTS: tuple[Result, ...] = (
     Written(Path("a.npz"), ("PSNR 30 dB", "avatar: a.npz")),
     Selected({3: np.arange(4) < 2}),

@@ -13,7 +13,8 @@ from stga_addon.jobs.avatar_source import ARRAYS, HEAD, OpenHead, Played, read_h
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import perform
 
-FACES, VERTICES = 320, 162
+FACES = 320
+VERTICES = 162
 
 
 @pytest.fixture
@@ -29,8 +30,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_head_is_read_back(folder: Path) -> None:
     """Catches frames of the scene, which may be negative, that lose their sign, order or meshes."""
-    head, capture = read_head(folder), open_capture(folder / "capture")
-    found, played = head.selection(), head.played()
+    head = read_head(folder)
+    capture = open_capture(folder / "capture")
+    found = head.selection()
+    played = head.played()
     for selection in (found or {}, played.selection or {}):
         assert {frame: int(faces.sum()) for frame, faces in selection.items()} == {-2: 0, 10: 40}
     assert sorted(played.meshes) == [-2, 10]
@@ -55,7 +58,8 @@ def test_damaged_folders(folder: Path) -> None:
         read_head(folder)
 
 
-MESH, MOTION = np.zeros((VERTICES, 3)), r"played: (expr|pose) has shape"
+MESH = np.zeros((VERTICES, 3))
+MOTION = r"played: (expr|pose) has shape"
 
 
 @pytest.mark.parametrize(
@@ -74,7 +78,8 @@ MESH, MOTION = np.zeros((VERTICES, 3)), r"played: (expr|pose) has shape"
 )
 def test_what_a_head_cannot_have_played(folder, changes, expected):
     """Catches a traceback for arrays of another head, or parts of different frames."""
-    root, model = folder / "capture", None
+    root = folder / "capture"
+    model = None
     if "motion" in changes:
         root, model = write_flame_capture(folder / "flame")
     capture = open_capture(root, model)

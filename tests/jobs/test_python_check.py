@@ -20,9 +20,12 @@ from stga_addon.worker.training_python import (
 )
 
 FOUND = {
-    "python": "3.11.7", "versions": dict.fromkeys(REQUIREMENTS, "1.0"), "failures": {},
-    "device": "CPU with 4 threads", "adapters": ["Card (Vulkan)"],
-}  # fmt: skip
+    "python": "3.11.7",
+    "versions": dict.fromkeys(REQUIREMENTS, "1.0"),
+    "failures": {},
+    "device": "CPU with 4 threads",
+    "adapters": ["Card (Vulkan)"],
+}
 
 
 def check(python: object, timeout_s: float = 120.0):

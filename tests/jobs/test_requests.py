@@ -197,12 +197,14 @@ def test_a_worker_renders_and_exports_what_the_command_line_would(tmp_path, capt
         process = start_worker(folder, sys.executable, jobs.worker_arguments(folder))
         assert process.wait(300) == 0, log_lines(folder, 50)
         assert jobs.read_result(folder) == Written(tmp_path / name)
-        here, there = tmp_path / "here" / name, tmp_path / name
+        here = tmp_path / "here" / name
+        there = tmp_path / name
         assert main([*words, str(here)]) == 0
         assert contents(there)
         # Kernels of another process may round another way, and the encoder then chooses another.
         if name.endswith(".mp4"):
-            found, expected = film(here), film(there)
+            found = film(here)
+            expected = film(there)
             assert found.shape == expected.shape
             assert len(found) == 4
             difference = np.abs(found.astype(int) - expected)
@@ -272,7 +274,8 @@ def test_a_request_continues_what_it_began(tmp_path, capture):
     )
     assert min(n for n in iterations if n) >= 5
     assert max(iterations) == 40
-    seen, found = inspect_worker(folder), jobs.read_result(folder)
+    seen = inspect_worker(folder)
+    found = jobs.read_result(folder)
     assert seen.state == WorkerState.FINISHED
     assert {"splats", "psnr", "loss", "memory_mb", "per_second"} <= set(seen.status.figures)
     assert found.lines[-1] == f"avatar: {request.run / 'avatar.npz'}"
@@ -292,7 +295,9 @@ def test_previews_while_it_trains(tmp_path, capture, monkeypatch):
     """Catches a preview that never comes, changes the training, or ends it where disks are full."""
     pytest.importorskip("torch")
     monkeypatch.setattr("stga_addon.worker.status.PREVIEW_INTERVAL_S", 0.0)
-    run, quiet, previews = tmp_path / "run", tmp_path / "quiet", []
+    run = tmp_path / "run"
+    quiet = tmp_path / "quiet"
+    previews = []
     folder = asked(training(run, capture))
 
     def look(progress: Progress) -> bool:

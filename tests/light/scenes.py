@@ -25,7 +25,8 @@ def ball_and_plate(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
 def blocked(points, direction, vertices, faces):
     """(N,) bool: whether rays from points meet a triangle (Möller and Trumbore), float64."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    first, second = b - a, c - a
+    first = b - a
+    second = c - a
     across = np.cross(direction, second)
     determinant = (first * across).sum(1)
     crossed = np.abs(determinant) > 1e-15
@@ -35,14 +36,16 @@ def blocked(points, direction, vertices, faces):
         offset = point - a
         u = (offset * across).sum(1) * scale
         turned = np.cross(offset, first)
-        v, distance = turned @ direction * scale, (second * turned).sum(1) * scale
+        v = turned @ direction * scale
+        distance = (second * turned).sum(1) * scale
         found[n] = (crossed & (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 1e-6)).any()
     return found
 
 
 def middle_splats(face: np.ndarray, log_scale: float, coefficients: int = 1) -> Splats:
     """A gray splat in the middle of each of the triangles."""
-    zeros, turn = np.zeros((len(face), 3), np.float32), np.float32([1, 0, 0, 0])
+    zeros = np.zeros((len(face), 3), np.float32)
+    turn = np.float32([1, 0, 0, 0])
     return Splats(
         xyz=zeros,
         rotation=np.tile(turn, (len(face), 1)),
@@ -62,7 +65,8 @@ def lit_avatar(albedo=(0.5, 0.3, 0.2), radiance=0.5, degree=0):
     light = uniform(np.full(3, radiance))
     arriving = transfer @ light
     arriving = arriving + Bounce(vertices, faces, occlusion).light(arriving)
-    skin, recorded = np.zeros(len(vertices), np.float32), arriving.astype(np.float32)
+    skin = np.zeros(len(vertices), np.float32)
+    recorded = arriving.astype(np.float32)
     avatar_light = AvatarLight(light.astype(np.float32), transfer, occlusion, recorded, skin, 0.0)
     splats = middle_splats(np.arange(len(faces)), -6, (degree + 1) ** 2)
     color = linear_to_srgb(arriving[faces].mean(1) / np.pi * (np.array(albedo) + HIGHLIGHT_SHARE))

@@ -103,7 +103,8 @@ def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(
 
 def test_cameras_are_compared_as_one(run: Path, root: Path, tmp_path: Path) -> None:
     """Catches a light estimated without the exposure correction of the avatar's colors."""
-    gain, offset = np.array([0.7, 0.8, 0.6]), np.array([12.0, 5.0, 8.0])
+    gain = np.array([0.7, 0.8, 0.6])
+    offset = np.array([12.0, 5.0, 8.0])
     shutil.copytree(root, tmp_path / "capture")
     for path in (tmp_path / "capture/images").glob("*_02.png"):
         with Image.open(path) as image:

@@ -27,7 +27,8 @@ def rgbe(pixels: np.ndarray) -> np.ndarray:
 def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
     """A Radiance picture with flat rows, or run-length encoded ones."""
     height, width = pixels.shape[:2]
-    body, data = rgbe(pixels), b""
+    body = rgbe(pixels)
+    data = b""
     for row in body:
         if not packed:
             data += row.tobytes()
@@ -36,7 +37,8 @@ def write_hdr(path: Path, pixels: np.ndarray, packed: bool) -> Path:
         for channel in row.T:
             rest = channel
             if len(set(channel)) == 1:
-                data, rest = data + bytes([255, channel[0]]), channel[127:]
+                data = data + bytes([255, channel[0]])
+                rest = channel[127:]
             for start in range(0, len(rest), 100):
                 part = rest[start : start + 100]
                 data += bytes([len(part)]) + part.tobytes()
@@ -55,7 +57,8 @@ def test_hdr_pixels(tmp_path, packed):
     assert found.dtype == np.float32
     scale = np.exp2(np.floor(np.log2(pixels.max(-1, keepdims=True))) + 1) / 256
     assert (np.abs(found - pixels) <= scale).all()
-    whole, damaged = path.read_bytes(), tmp_path / "b.hdr"
+    whole = path.read_bytes()
+    damaged = tmp_path / "b.hdr"
     huge = whole.replace(b"-Y 5 +X 200", b"-Y 999999 +X 999999")
     for data in (whole[:-1], whole[:40], whole[:10], b"", huge):
         damaged.write_bytes(data)

@@ -69,7 +69,8 @@ def test_what_is_rarely_seen_is_lit_as_when_it_is_seen():
     direct = np.stack([np.full((len(vertices), 3), 0.1), np.full((len(vertices), 3), 2.0)])
     cameras = np.full((2, len(faces)), 4)
     hidden = vertices[faces].mean(1)[:, 0] < 0
-    cameras[0, hidden], cameras[:, vertices[faces].mean(1)[:, 0] < -0.08] = 0, 0
+    cameras[0, hidden] = 0
+    cameras[:, vertices[faces].mean(1)[:, 0] < -0.08] = 0
     open_sky = Bounce(vertices, faces, np.ones(len(vertices)))
     found = recorded_irradiance(direct, cameras, faces, open_sky)
     at = vertices[:, 0]
@@ -94,7 +95,8 @@ def test_harmonics_turn_with_their_axes():
     """Catches a rotation that is applied the other way round."""
     rng = np.random.default_rng(0)
     turn = Rotation.random(random_state=0).as_matrix()
-    sky, light = even_directions(2000), rng.normal(size=3)
+    sky = even_directions(2000)
+    light = rng.normal(size=3)
     project = basis(sky).T * (4 * np.pi / len(sky))
     sharp, turned = (np.maximum(sky @ axis, 0)[:, None] for axis in (light, turn @ light))
     np.testing.assert_allclose(rotated(project @ sharp, turn), project @ turned, atol=2e-3)
@@ -104,7 +106,8 @@ def test_transfer_and_occlusion_are_those_of_cast_rays():
     """Catches depth maps that are mirrored, coarse or shade themselves, and another solid angle."""
     vertices, faces = ball_and_plate(2)
     transfer, occlusion = transfer_of(vertices, faces, directions=48)
-    normals, sky = vertex_normals(vertices, faces), even_directions(48)
+    normals = vertex_normals(vertices, faces)
+    sky = even_directions(48)
     points = vertices + LIFT_M * normals
     seen = np.stack([~blocked(points, direction, vertices, faces) for direction in sky])
     cosine = np.maximum(sky @ normals.T, 0)

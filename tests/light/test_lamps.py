@@ -88,14 +88,24 @@ LIGHTS = (
     Light("sun", np.array([1.0, 2.0, 3.0]), direction=(-0.3, -1, 0.1), angle=0.1),
     Light("point", np.ones(3), (0.3, 0.8, 0.2), radius=0.1, specular=0.5),
     Light(
-        "spot", np.ones(3) * 5, (0.0, 0.9, 0.2), direction=(0.1, -1, 0), cone=0.3, blend=0.5,
+        "spot",
+        np.ones(3) * 5,
+        (0.0, 0.9, 0.2),
+        direction=(0.1, -1, 0),
+        cone=0.3,
+        blend=0.5,
         casts_shadow=False,
     ),
     Light(
-        "area", np.ones(3), (0.5, 0.5, 0.2), direction=(-1, -1, 0), size=(0.3, 0.4),
-        shape="ellipse", diffuse=0.7,
+        "area",
+        np.ones(3),
+        (0.5, 0.5, 0.2),
+        direction=(-1, -1, 0),
+        size=(0.3, 0.4),
+        shape="ellipse",
+        diffuse=0.7,
     ),
-)  # fmt: skip
+)
 
 
 def test_a_light_loads_no_numba():

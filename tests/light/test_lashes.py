@@ -16,7 +16,8 @@ from stga_addon.light.values import Light, Lighting
 from stga_addon.scene.gpu.packing import relit_scene
 from stga_addon.scene.layers import Relit, SceneLayer
 
-EYE_RADIUS, LID_HEIGHT = 0.012, 0.016
+EYE_RADIUS = 0.012
+LID_HEIGHT = 0.016
 EYE = np.array([0.0, 0.0, 1.0])
 SUN = Light("sun", np.full(3, 3.0), direction=(0, -1, 0))
 
@@ -73,7 +74,8 @@ def test_a_lash_shades_the_eye_as_cast_rays_say():
     faces = np.concatenate([avatar.faces, len(vertices) + np.array([[0, 1, 2], [0, 2, 3]])])
     up = normals[:, 1] > 0.5
     eye = np.flatnonzero(up & (np.linalg.norm(points, axis=1) < EYE_RADIUS))
-    lifted, sunward = points[eye] + 0.001 * normals[eye], np.array([0.0, 1, 0])
+    lifted = points[eye] + 0.001 * normals[eye]
+    sunward = np.array([0.0, 1, 0])
     dark = blocked(lifted, sunward, with_lid, faces)
     alone = blocked(lifted, sunward, vertices, avatar.faces)
     assert 20 < (dark & ~alone).sum() < (~alone).sum() - 20

@@ -47,7 +47,8 @@ def test_albedo_is_what_was_recorded_without_its_light(relighter):
 
 def normals_of(relighter):
     """(N, 3) the neutral mesh's smooth normals at the splats."""
-    mesh, faces = relighter.avatar.neutral.astype(np.float64), relighter.avatar.faces
+    mesh = relighter.avatar.neutral.astype(np.float64)
+    faces = relighter.avatar.faces
     normals = vertex_normals(mesh, faces)[relighter.corners]
     normals = np.einsum("nk,nkc->nc", relighter.weights, normals)
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -61,7 +62,8 @@ def test_light_that_turns_with_the_head_changes_nothing(relighter):
     world[1:4] = [[0.05] * 3, [0.1] * 3, [-0.1] * 3]
     lamp = Light("point", np.array([20.0, 15.0, 10.0]), (0.4, 0.6, 0.3))
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, [0.3, 0.1, -0.2]
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = [0.3, 0.1, -0.2]
     here = relighter.radiance(mesh, EYE, Lighting(world, (lamp,)))
     there_light = Lighting(rotated(world, rotation), (lamp.transformed(matrix),))
     there = relighter.radiance(moved, matrix[:3, :3] @ EYE + matrix[:3, 3], there_light)
@@ -72,7 +74,8 @@ def test_light_that_turns_with_the_head_changes_nothing(relighter):
 def test_a_still_head_under_still_light_does_not_flicker(relighter):
     """Catches anything random, or a state that one frame leaves to the next."""
     lamp = Light("spot", np.ones(3) * 40, (0.2, 0.3, 0.8), direction=(-0.2, -0.3, -0.8))
-    mesh, lighting = relighter.avatar.neutral, Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
+    mesh = relighter.avatar.neutral
+    lighting = Lighting(uniform((0.1, 0.1, 0.2)), (lamp,))
     first = relighter.colors(mesh, EYE, lighting)
     relighter.colors(turned(mesh, 20)[0], EYE, Lighting(uniform((1, 1, 1))))
     np.testing.assert_array_equal(relighter.colors(mesh, EYE, lighting), first)
@@ -82,7 +85,8 @@ def test_a_still_head_under_still_light_does_not_flicker(relighter):
 def test_recorded_and_mix(relighter):
     """Catches a mix in display values, and modes that are exchanged."""
     sun = Light("sun", np.array([3.0, 2.0, 1.0]), direction=(1, 0, 0))
-    mesh, lighting = relighter.avatar.neutral, Lighting(uniform((0.1, 0.02, 0.02)), (sun,))
+    mesh = relighter.avatar.neutral
+    lighting = Lighting(uniform((0.1, 0.02, 0.02)), (sun,))
     sh = relighter.avatar.splats.sh
     recorded = relighter.colors(mesh, EYE, replace(lighting, mode="recorded"))
     np.testing.assert_allclose(recorded, sh_color(sh, np.tile(EYE, (len(sh), 1))), atol=1e-5)
@@ -94,8 +98,10 @@ def test_recorded_and_mix(relighter):
 
 def test_only_recorded_colors_follow_the_normals(relighter):
     """Catches the capture's light left in relit colors or lost in recorded ones."""
-    mesh, count = relighter.avatar.neutral * [1.1, 0.8, 1.0], len(relighter.avatar.faces)
-    rng, names = np.random.default_rng(5), ("strain_color", "normal_color")
+    mesh = relighter.avatar.neutral * [1.1, 0.8, 1.0]
+    count = len(relighter.avatar.faces)
+    rng = np.random.default_rng(5)
+    names = ("strain_color", "normal_color")
     values = {n: rng.normal(0, 0.3, (count, 3, 3)).astype(np.float32) for n in names}
     ends = np.repeat([[-2.0, -0.05], [2.0, 0.03]], 3, axis=1).astype(np.float32)
     avatar = replace(relighter.avatar, strain_range=np.tile(ends, (count, 1, 1)))
@@ -109,7 +115,8 @@ def test_only_recorded_colors_follow_the_normals(relighter):
     lit = colors("scene", *names)
     np.testing.assert_array_equal(lit, colors("scene", "strain_color"))
     assert np.abs(lit - colors("scene")).mean() > 0.01
-    recorded, frames = colors("recorded"), replace(avatar, driven_offsets=values).frames(mesh)
+    recorded = colors("recorded")
+    frames = replace(avatar, driven_offsets=values).frames(mesh)
     expected = np.maximum(recorded + frames.color[avatar.splats.face], 0)
     np.testing.assert_allclose(colors("recorded", *names), expected, atol=1e-5)
     assert np.abs(expected - colors("recorded", "strain_color")).mean() > 0.01

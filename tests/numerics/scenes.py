@@ -137,7 +137,14 @@ def assert_close(errors: dict[str, float], image: float, gradient: float) -> Non
 
 
 __all__ = [
-    "NAMES", "Scene", "assert_close", "compare", "facing", "kernel_gradients",
+    "NAMES",
+    "Scene",
+    "assert_close",
+    "compare",
+    "facing",
+    "kernel_gradients",
     "random_cotangents",
-    "reference_gradients", "rows", "steady_pixels",
-]  # fmt: skip
+    "reference_gradients",
+    "rows",
+    "steady_pixels",
+]

@@ -38,7 +38,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     def between(low: float, high: float) -> float:
         return draw(st.floats(low, high, width=32))
 
-    count, seed = draw(st.integers(1, 30)), draw(st.integers(0, 2**32 - 1))
+    count = draw(st.integers(1, 30))
+    seed = draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
     size = draw(st.integers(1, 40)), draw(st.integers(1, 40))
     focal = max(size) * 10 ** between(-1.5, 1.5)
@@ -47,13 +48,17 @@ def scenes(draw: st.DrawFn) -> Scene:
     beside = rng.normal(0, 10 ** between(-3, 0.5), (count, 2)) * depth[:, None] * max(size) / focal
     degree = draw(st.integers(0, 3))
     return facing(
-        count, seed, size, focal, degree,
+        count,
+        seed,
+        size,
+        focal,
+        degree,
         xyz=np.c_[beside, depth],
         rotation=rng.normal(size=(count, 4)) * 10 ** between(-10, 10),
         log_scale=np.clip(rng.normal(between(-12, 3), between(0, 5), (count, 3)), -27, 7),
         opacity=rng.normal(between(-8, 12), between(0, 20), count),
         sh=rng.normal(0, 10 ** between(-3, 4), (count, (degree + 1) ** 2, 3)),
-    )  # fmt: skip
+    )
 
 
 def steady_colors(scene: Scene) -> bool:
@@ -125,7 +130,8 @@ def test_gradient_is_the_central_difference(name):
     every pixel where the step crosses one of the renderer's jumps (alpha 1/255 and 0.999,
     transmittance 1e-4).
     """
-    scene, step = facing(25, log_scale=np.random.default_rng(5).normal(-1.8, 0.6, (25, 3))), 1e-6
+    scene = facing(25, log_scale=np.random.default_rng(5).normal(-1.8, 0.6, (25, 3)))
+    step = 1e-6
     steady = torch.from_numpy(steady_pixels(scene, margin=1e-3))
     assert steady.float().mean() > 0.8
     cotangents = [v * steady for v in random_cotangents(scene.camera)]

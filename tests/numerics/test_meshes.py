@@ -71,7 +71,8 @@ def test_rounding_does_not_turn_a_line(convention, name):
     posed = DEGENERATE[name]
     noise = np.random.default_rng(0).uniform(-2e-9, 2e-9, (20, 3, 3))
     triangles = [posed, *(posed + noise)]
-    vertices, faces = np.concatenate(triangles), np.arange(63).reshape(-1, 3)
+    vertices = np.concatenate(triangles)
+    faces = np.arange(63).reshape(-1, 3)
     frames = face_frames(vertices, faces, np.tile(WHOLE, (21, 1)), convention)
     np.testing.assert_allclose(
         frames.rotation[1:], np.broadcast_to(frames.rotation[0], (20, 3, 3)), atol=2e-5

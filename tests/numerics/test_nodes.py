@@ -51,7 +51,8 @@ def test_degenerate_triangles_are_numpys(convention, when):
     With the node's substitutes, and areas compared with zero, rotations differ by up to half a
     turn, and splats of a triangle that is a line in the neutral mesh only fly up to 100 m away.
     """
-    flat, whole = list(DEGENERATE.values()), [WHOLE + 0.02 * n for n in range(len(DEGENERATE))]
+    flat = list(DEGENERATE.values())
+    whole = [WHOLE + 0.02 * n for n in range(len(DEGENERATE))]
     posed, neutral = {
         "now": (flat, whole),
         "in the neutral mesh": (whole, flat),

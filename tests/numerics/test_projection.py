@@ -233,7 +233,8 @@ def test_a_head_far_from_the_origin_is_the_same_head(back_end, shift):
     """Catches frames or cameras composed in float32: at 100 m that is 8 µm a coordinate, at 10 km a
     millimeter."""
     posed, neutral, faces = triangles()
-    camera, cotangents = head_camera(), random_cotangents(head_camera())
+    camera = head_camera()
+    cotangents = random_cotangents(head_camera())
     scene, face = embedded(camera)
     images, gradients = kernel_gradients(
         scene, cotangents, face_frames(posed, faces, neutral), face

@@ -11,7 +11,8 @@ from stga_addon.training.optimize import adam
 from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state
 
-HEIGHT, WIDTH = 30, 33
+HEIGHT = 30
+WIDTH = 33
 RATE = dict.fromkeys((*Parameters._fields, "sh_rest"), 1e-3)
 
 
@@ -69,7 +70,8 @@ def test_loss_never_runs_away(kind, value):
     An image is training's to change, so what counts is that every pixel is pulled towards the
     target no harder than the loss can: by about one per pixel from L1 and a few more from SSIM.
     """
-    image, target = image_of(kind, value), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    image = image_of(kind, value)
+    target = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     out = np.full_like(image, np.nan)
     _, ssim = image_gradient(image, target, whole_image(HEIGHT, WIDTH), 0.2, out)
     assert np.isfinite(out).all()
@@ -81,7 +83,9 @@ def test_loss_never_runs_away(kind, value):
 def test_limit_of_one_enormous_splat():
     """Catches squares that overflow: the other rows' gradients must stay what the formula says."""
     log_scale = np.log(np.float32([[1, 1, 1], [2, 2, 2], [1e15, 1, 1]]))
-    rows, face, unbound = np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.zeros(3, bool)
+    rows = np.arange(3, dtype=np.int32)
+    face = np.zeros(3, np.int32)
+    unbound = np.zeros(3, bool)
     gradient = np.zeros((3, 3), np.float32)
     norm = scale_limit(rows, log_scale, face, unbound, np.float32([[0.5], [0.5]]), 1.0, gradient)
     scale = np.exp(log_scale.astype(np.float64))
@@ -95,7 +99,8 @@ def float64_adam(gradients: np.ndarray, steps: int = 0) -> np.ndarray:
     mean = square = moved = 0.0
     path = []
     for n, g in enumerate(gradients.astype(np.float64), steps + 1):
-        mean, square = 0.9 * mean + 0.1 * g, 0.999 * square + 0.001 * g * g
+        mean = 0.9 * mean + 0.1 * g
+        square = 0.999 * square + 0.001 * g * g
         moved -= (mean / (1 - 0.9**n)) / (np.sqrt(square / (1 - 0.999**n)) + 1e-15)
         path.append(moved)
     return np.array(path)
@@ -140,7 +145,8 @@ def test_adam_is_float64s(history):
     spike that overflows the second moment (it moves by a few rates and is forgotten); and 1 − β^n
     that cancels at the first steps or overflows a count at the last."""
     gradients, steps, tolerance = histories()[history]
-    found, expected = adam_path(gradients, steps), float64_adam(gradients, steps)
+    found = adam_path(gradients, steps)
+    expected = float64_adam(gradients, steps)
     np.testing.assert_allclose(found, expected, atol=tolerance, rtol=1e-5 if steps else 1e-7)
 
 

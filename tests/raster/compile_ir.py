@@ -26,7 +26,8 @@ def assembly(ir: str, cpu: str, triple: str) -> str | None:
     )
     for level in (0, 3):
         tuning = llvm.create_pipeline_tuning_options(speed_level=level)
-        tuning.loop_vectorization, tuning.slp_vectorization = level > 0, False
+        tuning.loop_vectorization = level > 0
+        tuning.slp_vectorization = False
         builder = llvm.create_pass_builder(machine, tuning)
         passes = builder.getModulePassManager()
         if level == 0:

@@ -56,9 +56,11 @@ class _Blend(torch.autograd.Function):
 def render(options, camera_frames, face, splats, cotangents=None, rasterizer=None):
     """Image and transmittance, and the gradients where there are cotangents of these two."""
     rasterizer = rasterizer or shared_rasterizer()
-    device, (height, width) = rasterizer.device, (options.camera.height, options.camera.width)
+    device = rasterizer.device
+    (height, width) = (options.camera.height, options.camera.width)
     while True:
-        table, frames = upload_splats(device, splats, face), upload_frames(device, camera_frames)
+        table = upload_splats(device, splats, face)
+        frames = upload_frames(device, camera_frames)
         gradients = device.upload("gradients", np.zeros((table.count, table.stride), np.float32))
         v_images = [device.upload(f"v {n}", v) for n, v in enumerate(cotangents or ())]
         with device.record() as work:

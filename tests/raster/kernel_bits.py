@@ -12,7 +12,8 @@ from stga_addon.raster.cpu.rasterize import frames_in_camera, render_backward, r
 from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
 
 rng = np.random.default_rng(0)
-n, pose = 300, np.eye(4)
+n = 300
+pose = np.eye(4)
 pose[2, 3] = 4
 splats = Parameters(
     rng.normal(0, 0.8, (n, 3)),

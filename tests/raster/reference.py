@@ -87,7 +87,8 @@ def project(xyz, rotation, log_scale, camera):
     turn = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=xyz.dtype, device=xyz.device)
     axes = turn @ (rotation_matrix(rotation) * log_scale.exp()[:, None, :])
     x, y, z = camera_space(xyz, camera).unbind(-1)
-    fx, fy = camera.fl_x, camera.fl_y
+    fx = camera.fl_x
+    fy = camera.fl_y
     slope_x = clamp_to_frustum(x / z, camera.width, fx, camera.cx)
     slope_y = clamp_to_frustum(y / z, camera.height, fy, camera.cy)
     zero = torch.zeros_like(z)
@@ -140,7 +141,9 @@ def sh_basis(direction: Tensor) -> Tensor:
     Splatting's signs."""
     assert direction.shape == (len(direction), 3), direction.shape
     x, y, z = direction.unbind(-1)
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     return torch.stack(
         [
             torch.full_like(x, sqrt(1 / (4 * pi))),
@@ -192,7 +195,8 @@ def blend(alpha: Tensor, color: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, 
     assert depth.shape == (n,), depth.shape
     transmittance = alpha.new_ones(shape)
     running = torch.ones(shape, dtype=torch.bool, device=alpha.device)
-    rgb, distance = alpha.new_zeros(3, *shape), alpha.new_zeros(shape)
+    rgb = alpha.new_zeros(3, *shape)
+    distance = alpha.new_zeros(shape)
     for a, c, z in zip(alpha, color, depth, strict=True):
         remaining = transmittance * (1 - a)
         running = running & (remaining > MIN_TRANSMITTANCE)
@@ -217,7 +221,10 @@ def image_loss(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     def blur(values: Tensor) -> Tensor:
         return conv2d(values[:, None], window[None, None], padding=5)[:, 0]
 
-    x, y, c1, c2 = blur(image), blur(target), 0.01**2, 0.03**2
+    x = blur(image)
+    y = blur(target)
+    c1 = 0.01**2
+    c2 = 0.03**2
     variances = blur(image * image) - x**2 + blur(target * target) - y**2
     covariance = blur(image * target) - x * y
     ssim = (2 * x * y + c1) * (2 * covariance + c2) / ((x**2 + y**2 + c1) * (variances + c2))

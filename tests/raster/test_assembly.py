@@ -23,7 +23,8 @@ from numba.core import config  # noqa: E402
 from stga_addon.raster.cpu import FASTMATH, blend, image_loss, optimizer, splat_block  # noqa: E402
 
 DRIVER = str(Path(__file__).with_name("compile_ir.py"))
-X86, ARM = "x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"
+X86 = "x86_64-unknown-linux-gnu"
+ARM = "aarch64-unknown-linux-gnu"
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,12 @@ MASKED_X86 = r"\svp?maskmov|\sv\w*(gather|scatter)|\sv\w*mov\w*\s.*\(.*\{%k"
 AVX2 = Processor(X86, "%ymm", PACKED_X86, SCALAR_X86, MASKED_X86)
 AVX512 = Processor(X86, "%zmm", PACKED_X86, SCALAR_X86, MASKED_X86)
 NEON = Processor(
-    ARM, r"\.4s", r"\sf\w+\s+v.*\.4s", r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d",
+    ARM,
+    r"\.4s",
+    r"\sf\w+\s+v.*\.4s",
+    r"\sf(add|sub|mul|div|sqrt|min|max|n?m\w+)\s+s\d",
     r"\s(ld|st)\d\s",
-)  # fmt: skip
+)
 PROCESSORS = {"znver3": AVX2, "znver4": AVX512, "sapphirerapids": AVX2, "apple-m1": NEON}
 """LLVM prefers 256 bits on Sapphire Rapids, whose wider instructions lower the clock."""
 
@@ -144,7 +148,9 @@ LOOPS = {
     "SSIM": (image_loss._similarity_row, f"void({STATE}, i8, i8, {STATE}, {STATE})", 1, 8),
     "gradient of the loss": (
         image_loss._gradient_row,
-        f"void({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE}, {STATE})", 1, 4,
+        f"void({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE}, {STATE})",
+        1,
+        4,
     ),
     "Adam": (optimizer._adam_block, ADAM, 2, 1),
     "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 80),
@@ -152,12 +158,17 @@ LOOPS = {
     "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),
     "gradient of the projection": (
         splat_block.differentiate_geometry,
-        f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)", 1, 230,
+        f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)",
+        1,
+        230,
     ),
     "gradient of the harmonics": (
-        splat_block.differentiate_position, f"void({STATE}, f4[:, ::1])", 1, 52,
+        splat_block.differentiate_position,
+        f"void({STATE}, f4[:, ::1])",
+        1,
+        52,
     ),
-}  # fmt: skip
+}
 """name -> function, signature, its vectorized loops, and the spills that each may have"""
 
 

@@ -38,7 +38,8 @@ def test_exponential_and_logarithm_are_numpys():
     logarithms(positive, found)
     exact = np.log(positive.astype(np.float64))
     assert (np.abs(found - exact) / np.maximum(1, np.abs(exact))).max() < 3e-7
-    x, found = np.array([np.nan, np.inf, 1e30, -np.inf, -1e30], np.float32), np.empty(5, np.float32)
+    x = np.array([np.nan, np.inf, 1e30, -np.inf, -1e30], np.float32)
+    found = np.empty(5, np.float32)
     exponentials(x, found)
     assert np.isnan(found[0])
     assert np.isposinf(found[1:3]).all()

@@ -34,22 +34,30 @@ def random_state(count: int = 700, seed: int = 1) -> SimpleNamespace:
     tables = {name: rng.normal(size=(count, STRIDE)).astype(np.float32) for name in TABLES}
     tables["second"] **= 2
     return SimpleNamespace(
-        **tables, steps=rng.integers(0, 3000, count).astype(np.int32),
-        face=rng.integers(0, 11, count).astype(np.int32), unbound=rng.random(count) < 0.3,
-        limits=rng.uniform(0.2, 2, (3, 11)).astype(np.float32), wanted=rng.random(count) < 0.7,
-    )  # fmt: skip
+        **tables,
+        steps=rng.integers(0, 3000, count).astype(np.int32),
+        face=rng.integers(0, 11, count).astype(np.int32),
+        unbound=rng.random(count) < 0.3,
+        limits=rng.uniform(0.2, 2, (3, 11)).astype(np.float32),
+        wanted=rng.random(count) < 0.7,
+    )
 
 
 def on_device(device, state, weights=(0, 0, 0), options=OPTIONS):
     """The tables after a step; weights: of scale, distance, opacity."""
-    n, upload = len(state.steps), device.upload
+    n = len(state.steps)
+    upload = device.upload
     buffers = {name: upload(f"test {name}", getattr(state, name)) for name in TABLES}
-    history, traits = np.zeros((n, 3), np.int32), np.zeros((n, 2), np.float32)
-    history[:, 0], traits[:, 0] = state.steps, state.unbound
+    history = np.zeros((n, 3), np.int32)
+    traits = np.zeros((n, 2), np.float32)
+    history[:, 0] = state.steps
+    traits[:, 0] = state.unbound
     tables = OptimizerTables(
-        *(buffers[name] for name in TABLES[2:]), upload("test history", history),
-        upload("test traits", traits), upload("test limits", state.limits.T),
-    )  # fmt: skip
+        *(buffers[name] for name in TABLES[2:]),
+        upload("test history", history),
+        upload("test traits", traits),
+        upload("test limits", state.limits.T),
+    )
     given = {name: buffers[name] for name in TABLES[:2]}
     given["view"] = device.uniform("View", splats=n, coefficients=COEFFICIENTS)
     given |= {"face": upload("test face", state.face), "screen": device.buffer("test screen", n)}
@@ -86,10 +94,13 @@ def test_a_step_at_any_age(device, steps, ahead):
     """Catches 1 − βⁿ computed as a difference of nearly equal numbers, and Nesterov's momentum that
     gets into the moments; compared with float64."""
     state = random_state(64)
-    state.wanted[:], state.steps[:] = True, steps
+    state.wanted[:] = True
+    state.steps[:] = steps
     options = OPTIONS._replace(ahead=np.float32(ahead), ema_share=np.float32(0))
     got = on_device(device, state, options=options)
-    n, beta1, beta2 = steps + 1.0, float(OPTIONS.beta1), float(OPTIONS.beta2)
+    n = steps + 1.0
+    beta1 = float(OPTIONS.beta1)
+    beta2 = float(OPTIONS.beta2)
     first = beta1 * state.first.astype(float) + (1 - beta1) * state.gradients
     second = beta2 * state.second.astype(float) + (1 - beta2) * state.gradients.astype(float) ** 2
     correct = 1 / (1 - (1 - ahead) * beta1**n), 1 / np.sqrt(-np.expm1(n * np.log(beta2)))
@@ -108,7 +119,8 @@ def test_a_step_at_any_age(device, steps, ahead):
 def test_limit_of_one_enormous_splat(device, log_scale):
     """Catches a square that overflows, and with it everybody's gradient; compared with float64."""
     state = random_state()
-    state.splats[5, 7:10], state.wanted[5] = log_scale, True
+    state.splats[5, 7:10] = log_scale
+    state.wanted[5] = True
     state.gradients[:] = 0
     got = on_device(device, state, (0.3, 0, 0)).gradients
     scale = np.exp(state.splats[:, 7:10].astype(float))

@@ -24,7 +24,8 @@ def test_the_same_bits_twice_and_from_used_buffers():
     for name in ("plain", "opaque layers", "one pixel", "exact tiles", "plain"):
         scene = SCENES[name]
         splats = Parameters(*(scene.splats[field] for field in NAMES))
-        frames, face = frames_in_camera(WORLD, scene.camera), np.zeros(len(splats.xyz), int)
+        frames = frames_in_camera(WORLD, scene.camera)
+        face = np.zeros(len(splats.xyz), int)
         v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
         cotangents = v_image.float().numpy(), -v_alpha.float().numpy()
         given = ViewOptions(scene.camera, scene.degree), frames, face, splats, cotangents
@@ -33,7 +34,8 @@ def test_the_same_bits_twice_and_from_used_buffers():
         )
         np.testing.assert_array_equal(same, image, err_msg=name)
         for field in NAMES:
-            want, got = getattr(gradients, field), getattr(others, field)
+            want = getattr(gradients, field)
+            got = getattr(others, field)
             np.testing.assert_array_equal(got, want, err_msg=f"{name}: {field}")
 
 

@@ -89,10 +89,14 @@ def on_device(device, image, target, touched, **options):
     device.upload("v_image", np.full_like(image, 77))
     with device.record() as work:
         v_image, loss = image_loss(
-            work, width, height, view=view,
+            work,
+            width,
+            height,
+            view=view,
             image=device.upload("image", image),
-            touched=device.upload("touched", touched.astype(np.uint32)), whole=bool(touched.all()),
-        )  # fmt: skip
+            touched=device.upload("touched", touched.astype(np.uint32)),
+            whole=bool(touched.all()),
+        )
     return device.read(v_image, image.shape), float(device.read(loss, (1,))[0])
 
 
@@ -111,7 +115,8 @@ def test_loss_and_gradient_are_the_cpus(device, size, kind):
     """Catches a window, padding, byte or sign that differs, and a tile left out of the sum."""
     image, target = pictures(*size)
     if kind == "bright and flat":
-        image, target = np.full_like(image, 0.999), np.full_like(target, 255)
+        image = np.full_like(image, 0.999)
+        target = np.full_like(target, 255)
         image[:, 20:30, 40:60] = 0.5
     if kind == "equal":
         image = np.ascontiguousarray(
@@ -154,8 +159,10 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
     if mesh == "lines in the neutral mesh":
         posed, neutral = neutral, posed
     if mesh == "far away":
-        shift, pose = np.array([1e4, -1e4, 1e4]), camera.world_to_camera
-        posed, pose[:3, 3] = posed + shift, -pose[:3, :3] @ shift
+        shift = np.array([1e4, -1e4, 1e4])
+        pose = camera.world_to_camera
+        posed = posed + shift
+        pose[:3, 3] = -pose[:3, :3] @ shift
     ends = np.random.default_rng(8).uniform(0, 1.5, (len(faces), 2, 6))
     ends[:, 0] *= -1
     basis = strain_basis(neutral, faces, np.float32(ends) if mesh == "ball" else None)
@@ -173,7 +180,8 @@ def test_frames_and_signals_are_numpys(device, convention, mesh):
     np.testing.assert_allclose(frames[:, 3:12].reshape(-1, 3, 3), expected.matrix, atol=tolerance)
     assert not frames[:, FRAME_COLOR:].any()
     for name, signal in SIGNALS.items():
-        found, wanted = device.read(step.signals[name], (len(faces), 3)), signal(basis, in_world)
+        found = device.read(step.signals[name], (len(faces), 3))
+        wanted = signal(basis, in_world)
         assert wanted.any()
         if mesh == "lines in the neutral mesh" or (mesh, name) == ("collapsed", "normal"):
             # A deformation per area that is hardly there; float64 has few digits of it, too.

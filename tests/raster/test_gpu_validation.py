@@ -38,7 +38,8 @@ def test_vulkan_validation_has_nothing_to_say(toy_root, tmp_path):
     """Catches a race between dispatches, or a buffer's use, that one driver forgives and another
     does not."""
     device = gpu_device.device()
-    log, settings = tmp_path / "validation.log", tmp_path / "vk_layer_settings.txt"
+    log = tmp_path / "validation.log"
+    settings = tmp_path / "vk_layer_settings.txt"
     log.touch()
     settings.write_text(
         "khronos_validation.debug_action = VK_DBG_LAYER_ACTION_LOG_MSG\n"
@@ -47,9 +48,11 @@ def test_vulkan_validation_has_nothing_to_say(toy_root, tmp_path):
     )
     tests = Path(__file__).parents[1]
     environment = {
-        **os.environ, "VK_INSTANCE_LAYERS": LAYER, "VK_LAYER_SETTINGS_PATH": str(settings),
+        **os.environ,
+        "VK_INSTANCE_LAYERS": LAYER,
+        "VK_LAYER_SETTINGS_PATH": str(settings),
         "PYTHONPATH": os.pathsep.join(map(str, (tests, tests.parent))),
-    }  # fmt: skip
+    }
     command = [sys.executable, "-c", SCRIPT, device.name, str(toy_root)]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert ran.returncode == 0, ran.stderr

@@ -53,10 +53,12 @@ def test_reference_stages_are_gsplats():
     center, covariance, depth, compensation = reference.project(xyz, rotation, log_scale, CAMERA)
     color = reference.sh_color(sh, xyz - torch.from_numpy(CAMERA.position), 3)
     found = {
-        "means2d": center, "conics": conics(covariance.numpy()), "depths": depth,
+        "means2d": center,
+        "conics": conics(covariance.numpy()),
+        "depths": depth,
         "compensations": compensation,
         "colors": color,
-    }  # fmt: skip
+    }
     for name, values in found.items():
         np.testing.assert_allclose(values, DATA[name], rtol=1e-6, atol=1e-6, err_msg=name)
 
@@ -72,7 +74,8 @@ def test_reference_image_is_gsplats(antialiased):
 
 def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
     """(N, PROJECTED) of the scene, by the kernels of one back end."""
-    parameters, face = Parameters(*(DATA[name] for name in NAMES)), np.zeros(24, np.int32)
+    parameters = Parameters(*(DATA[name] for name in NAMES))
+    face = np.zeros(24, np.int32)
     frames = frames_in_camera(WORLD, CAMERA)
     if back_end == "cpu":
         return render_forward(parameters, face, frames, 3, antialiased=antialiased).projection[0]
@@ -88,7 +91,9 @@ def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
 def test_projection_kernels_are_gsplats(back_end, antialiased):
     """Catches a projection that is wrong in both our reference and our kernels."""
     columns = projected_columns(back_end, antialiased)
-    x, shear, y = columns[:, PRECISION_X], columns[:, SHEAR], columns[:, PRECISION_Y]
+    x = columns[:, PRECISION_X]
+    shear = columns[:, SHEAR]
+    y = columns[:, PRECISION_Y]
     opacity = 1 / (1 + np.exp(-DATA["opacity"])) * (DATA["compensations"] if antialiased else 1)
     # Splats below 1/255 are never projected.
     seen = (opacity > 1 / 254) & (

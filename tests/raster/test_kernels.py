@@ -44,7 +44,8 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     axes *= np.sign(np.diag(upper))
     axes[0] *= np.linalg.det(axes)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = axes, [0.1, -0.2, 4.0]
+    pose[:3, :3] = axes
+    pose[:3, 3] = [0.1, -0.2, 4.0]
     return pose
 
 
@@ -181,7 +182,8 @@ def test_image_and_gradients_are_the_references(back_end, name):
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])
 def test_embedded_splats_render_and_train_in_their_frames(back_end, convention):
     """Catches a kernel that turns, scales or differentiates in the wrong frame."""
-    scene, rng = cloud(1), np.random.default_rng(30)
+    scene = cloud(1)
+    rng = np.random.default_rng(30)
     vertices = rng.normal(size=(12, 3)) * 0.6
     faces = rng.permuted(np.tile(np.arange(12), (9, 1)), axis=1)[:, :3]
     neutral = vertices + rng.normal(size=vertices.shape) * 0.2
@@ -217,7 +219,8 @@ def raw_gradients(scene: Scene, fill: float = 0.0, buffers: BufferPool | None = 
 
 def test_background_shows_through_and_pulls_on_the_splats():
     """Catches a background left out of the image, of its gradient, or counted twice."""
-    scene, background = SCENES["plain"], np.float32([0.9, 0.2, 0.6])
+    scene = SCENES["plain"]
+    background = np.float32([0.9, 0.2, 0.6])
     rendering, gradients, _, _ = raw_gradients(scene, background=background)
     v_image, v_alpha, _ = random_cotangents(scene.camera, 3)
     behind = torch.from_numpy(background)[:, None, None]
@@ -260,8 +263,10 @@ def test_screen_gradient_is_that_of_the_projected_center():
 def test_color_is_added_with_the_right_gradient(back_end):
     """Catches color of the wrong triangle or in the wrong unit, and a gradient that misses the
     clamp."""
-    scene, rng = SCENES["dark"], np.random.default_rng(31)
-    count, neutral = len(scene.splats["xyz"]), rng.normal(size=(9, 3))
+    scene = SCENES["dark"]
+    rng = np.random.default_rng(31)
+    count = len(scene.splats["xyz"])
+    neutral = rng.normal(size=(9, 3))
     faces = rng.permuted(np.tile(np.arange(9), (7, 1)), axis=1)[:, :3]
     posed = neutral + 0.1 * rng.normal(size=neutral.shape)
     color = rng.normal(0, 0.3, (len(faces), 3)).astype(np.float32)
@@ -280,7 +285,8 @@ def test_color_is_added_with_the_right_gradient(back_end):
 def test_antialiasing_takes_what_the_low_pass_adds(back_end, name):
     """Catches a compensation of the wrong determinant, and gradients that leave it out: scale,
     rotation, position."""
-    scene, cotangents = SCENES[name], random_cotangents(SCENES[name].camera, 6)
+    scene = SCENES[name]
+    cotangents = random_cotangents(SCENES[name].camera, 6)
     images, gradients = kernel_gradients(scene, cotangents, antialiased=True)
     expected_images, expected = reference_gradients(scene, cotangents, antialiased=True)
     plain, _ = kernel_gradients(scene, cotangents)
@@ -307,7 +313,8 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
     assert 0 < len(rows) <= focus.sum()
     assert focus[rows].all()
     for name in NAMES:
-        found, want = getattr(gradients, name), getattr(expected, name)
+        found = getattr(gradients, name)
+        want = getattr(expected, name)
         np.testing.assert_array_equal(found[focus], want[focus], err_msg=name)
         assert (found[~focus] == 123).all(), name
         assert (found[rows] != 123).any(), name
@@ -316,7 +323,8 @@ def test_focused_rendering_gives_selected_rows_the_full_images_gradient(count):
 def test_results_do_not_depend_on_threads():
     """Catches races, and sums whose order depends on scheduling: a resumed run must equal an
     unbroken one."""
-    scene, before = SCENES["opaque layers"], threads()
+    scene = SCENES["opaque layers"]
+    before = threads()
     many = [kernel_gradients(scene, random_cotangents(scene.camera)) for _ in range(2)]
     set_threads(1)
     try:

@@ -14,7 +14,8 @@ from stga_addon.raster.cpu.tiles import RUN_BUCKETS, SPLATS_PER_SORT, heaviest_f
 def by_depth(depth: np.ndarray, rect: np.ndarray) -> tuple[np.ndarray, ...]:
     """`sort_by_depth` of splats with depths (N,) and bounds (N, 4)."""
     projection = new_projection(len(depth), BufferPool())
-    projection.depth[:], projection.rect[:] = depth, rect
+    projection.depth[:] = depth
+    projection.rect[:] = rect
     return sort_by_depth(projection, BufferPool())
 
 

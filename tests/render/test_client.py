@@ -42,7 +42,8 @@ def world(splats: Splats, place: np.ndarray = HERE) -> PosedSplats:
 
 def embedded() -> PosedSplats:
     rng = np.random.default_rng(1)
-    faces, neutral = np.array([[0, 1, 2], [1, 3, 2]]), rng.normal(0, 0.2, (4, 3)) + AHEAD
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    neutral = rng.normal(0, 0.2, (4, 3)) + AHEAD
     frames = face_frames(1.1 * neutral, faces, neutral)
     frames = replace(frames, color=rng.normal(0, 0.3, (2, 3)).astype(np.float32))
     splats = cloud(60, 2, 2)
@@ -73,12 +74,14 @@ def test_layers_are_sorted_together():
     """Catches layers composited one over the other, and depth that is not divided by alpha."""
     splats = cloud()
     half = np.arange(len(splats)) % 2 == 0
-    whole, halves = (compose(layers, CAMERA, True) for layers in (
-        [world(splats)], [world(splats.rows(half)), world(splats.rows(~half))]
-    ))  # fmt: skip
+    whole, halves = (
+        compose(layers, CAMERA, True)
+        for layers in ([world(splats)], [world(splats.rows(half)), world(splats.rows(~half))])
+    )
     np.testing.assert_allclose(halves.rgb, whole.rgb, atol=2e-6)
     np.testing.assert_allclose(halves.depth, whole.depth, atol=1e-5)
-    xyz, log_scale = np.array([[0, 0, 3]], np.float32), np.full((1, 3), -1, np.float32)
+    xyz = np.array([[0, 0, 3]], np.float32)
+    log_scale = np.full((1, 3), -1, np.float32)
     splats = replace(cloud(1), xyz=xyz, log_scale=log_scale)
     depth = compose([world(splats)], CAMERA, True).depth
     assert depth is not None
@@ -93,7 +96,8 @@ def test_the_server_renders_the_same(monkeypatch):
     remote = RenderClient(lambda: sys.executable)
     layers = [embedded(), world(cloud())]
     for camera in (CAMERA, CAMERA.scaled(0.5)):
-        here, there = compose(layers, camera, True), remote.compose(layers, camera, True)
+        here = compose(layers, camera, True)
+        there = remote.compose(layers, camera, True)
         for name in ("rgb", "alpha", "depth"):
             np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
     assert remote._server is not None

@@ -118,7 +118,8 @@ def test_the_server_renders_on_the_wanted_device(adapter, monkeypatch):
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     device = [f"gpu:{adapter}"]
     remote = RenderClient(lambda: sys.executable, lambda: device[0])
-    layers, want = scene(), compose(scene(), CAMERA, True)
+    layers = scene()
+    want = compose(scene(), CAMERA, True)
     on_gpu = remote.compose(layers, CAMERA, True)
     assert remote._server is not None
     _, first = remote._server

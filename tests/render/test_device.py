@@ -17,7 +17,9 @@ from stga_addon.raster.gpu import device as gpu_device
 from stga_addon.raster.gpu import trial
 from stga_addon.raster.gpu.trial import Trial
 
-CARD, OTHER, SOFTWARE = "Card 9000 (Vulkan)", "Card 9000 (DX12)", "llvmpipe (Vulkan)"
+CARD = "Card 9000 (Vulkan)"
+OTHER = "Card 9000 (DX12)"
+SOFTWARE = "llvmpipe (Vulkan)"
 
 
 @pytest.fixture
@@ -109,7 +111,8 @@ def test_what_is_wrong_is_said(trials, monkeypatch, place, name, stand_in, reaso
 
 def test_a_driver_that_fails_leaves_the_cpu(trials, monkeypatch):
     """Catches "auto" that ends in a driver's traceback."""
-    works, broken = trial.try_device, {CARD}
+    works = trial.try_device
+    broken = {CARD}
     monkeypatch.setattr(trial, "try_device", lambda n: raises(n) if n in broken else works(n))
     assert choose_device("auto")[0] == f"gpu:{OTHER}"
     device_module._trial.cache_clear()

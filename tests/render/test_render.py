@@ -52,9 +52,7 @@ def test_look_at_gives_the_pose_worked_out_by_hand():
     pose = [[0, 0, -1, 0], [0, -1, 0, 2], [-1, 0, 0, 3], [0, 0, 0, 1]]
     np.testing.assert_allclose(camera.world_to_camera, pose, atol=1e-15)
     np.testing.assert_allclose(camera.position, [3, 2, 0], atol=1e-15)
-    assert vars(camera) | {"world_to_camera": None} == vars(
-        Camera(40, 30, 50, 50, 20, 15, None)
-    )  # fmt: skip
+    assert vars(camera) | {"world_to_camera": None} == vars(Camera(40, 30, 50, 50, 20, 15, None))
     with pytest.raises(ValueError, match="parallel to up"):
         look_at((0, 1, 0), (0, 0, 0), 40, 30, 50)
     splats = one_splat((0, 0, 0))
@@ -79,7 +77,8 @@ def test_a_gpu_renders_the_same_picture() -> None:
     from stga_addon.render.device import Composer
 
     posed, neutral, faces = bent_ball()
-    count, random = len(faces), np.random.default_rng(3)
+    count = len(faces)
+    random = np.random.default_rng(3)
     splats = Splats(
         xyz=random.normal(0, 0.1, (count, 3)).astype(np.float32),
         rotation=random.normal(size=(count, 4)).astype(np.float32),

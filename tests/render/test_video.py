@@ -38,7 +38,8 @@ def images(height: int = 61, width: int = 80, count: int = 10) -> list[np.ndarra
 
 def test_a_video_is_what_was_written(tmp_path: Path) -> None:
     """Catches lost or doubled frames, a wrong rate, and colors tagged as of another matrix."""
-    path, written = tmp_path / "a" / "video.mp4", images()
+    path = tmp_path / "a" / "video.mp4"
+    written = images()
     with video_writer(path, FPS) as write:
         for image in written:
             write(image)
@@ -182,7 +183,8 @@ def test_layers_without_what_the_reader_has() -> None:
 
 def test_images_are_those_recorded(tmp_path: Path) -> None:
     """Catches images of other splats, poses or cameras than recorded, and a recording left."""
-    folder, out = tmp_path / "job", tmp_path / "out"
+    folder = tmp_path / "job"
+    out = tmp_path / "out"
     images = [[layer(0)], [replace(layer(0), to_world=moved(0.3))], [layer(1), layer(0)]]
     record(folder, out, images)
     perform_in_folder(folder)
@@ -207,7 +209,8 @@ def test_a_cancelled_video_is_not_written(tmp_path: Path) -> None:
 
 def test_backgrounds() -> None:
     """Catches premultiplied color in a PNG with alpha, and a background before the splats."""
-    rgb, alpha = np.full((3, 1, 1), 0.25, np.float32), np.full((1, 1), 0.5, np.float32)
+    rgb = np.full((3, 1, 1), 0.25, np.float32)
+    alpha = np.full((1, 1), 0.5, np.float32)
     image = ComposedImage(rgb, alpha, None)
     assert finished(image, None, opaque=False).tolist() == [[[128, 128, 128, 128]]]
     assert finished(image, None, opaque=True).tolist() == [[[64, 64, 64]]]

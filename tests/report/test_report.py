@@ -25,11 +25,16 @@ from stga_addon.training.settings import make_settings
 def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     return [
         {
-            "seconds": 10.0 * n, "psnr": psnr, "ssim": 0.9, "detail_difference": 1 / psnr,
-            "iteration": n, "evaluation_s": 0.2, **more,
+            "seconds": 10.0 * n,
+            "psnr": psnr,
+            "ssim": 0.9,
+            "detail_difference": 1 / psnr,
+            "iteration": n,
+            "evaluation_s": 0.2,
+            **more,
         }
         for n, psnr in enumerate(values, 1)
-    ]  # fmt: skip
+    ]
 
 
 def test_summary_of_a_run():
@@ -84,7 +89,8 @@ def test_summary_of_a_continuation() -> None:
 def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
     """Catches metrics that the summary cannot read, and a missing picture or reason for it."""
     settings = make_settings(iterations=12, hull_points=False, lattice=0)
-    run, why = Run(toy.root, None, "vhap", settings), f"{CURVE} was not drawn: "
+    run = Run(toy.root, None, "vhap", settings)
+    why = f"{CURVE} was not drawn: "
     train(toy, tmp_path / "run", run)
     assert report_run(tmp_path / "run")[0].startswith("held-out views: ")
     assert (tmp_path / "run" / CURVE).stat().st_size > 1000
@@ -98,7 +104,8 @@ def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
 
 def test_the_curve_is_drawn_while_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a picture only at the end, drawn without need, or that takes more than its share."""
-    now, drawn = [0.0], []
+    now = [0.0]
+    drawn = []
 
     def draw(folder: Path) -> None:
         drawn.append(now[0])
@@ -162,7 +169,8 @@ def test_chart_of_a_benchmark():
         assert band.get_facecolor()[0, :3].tolist() == [
             int(str(line.get_color())[n : n + 2], 16) / 255 for n in (1, 3, 5)
         ]
-    long, short = np.linspace(1, 100, 50), np.linspace(1, 5, 5)
+    long = np.linspace(1, 100, 50)
+    short = np.linspace(1, 5, 5)
     curves = {n: MeanCurve(x, x, x, x) for n, x in (("long", long), ("short", short))}
     (axes,) = benchmark_chart(curves, "title").axes
     assert axes.get_ylim()[0] <= 5

@@ -80,20 +80,27 @@ def last_iteration(out: Path, faces: int) -> int:
 def main(root: Path, kills: int) -> None:
     capture = open_capture(factory.write_mesh_capture(root / "capture", (0, 1, 3, 4), range(4)))
     settings = quick_settings(
-        iterations=ITERATIONS, density_interval=5, density_span=(0.0, 1.0), stray_reset_interval=4,
-        stray_limit=0.3, lattice=1,
-    )  # fmt: skip
-    run, whole = Run(capture.root, None, "vhap", settings), root / "whole"
+        iterations=ITERATIONS,
+        density_interval=5,
+        density_span=(0.0, 1.0),
+        stray_reset_interval=4,
+        stray_limit=0.3,
+        lattice=1,
+    )
+    run = Run(capture.root, None, "vhap", settings)
+    whole = root / "whole"
     precompile_kernels()
     os.waitpid(spawn(run, whole), 0)
-    delays, out = random.Random(5), root / "run0"
+    delays = random.Random(5)
+    out = root / "run0"
     number = before = deaths = in_training = 0
     while deaths < kills:
         child = spawn(run, out)
         time.sleep(delays.uniform(0, LONGEST_S))
         os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
-        reached, iteration = struct.unpack("q", REACHED)[0], last_iteration(out, len(capture.faces))
+        reached = struct.unpack("q", REACHED)[0]
+        iteration = last_iteration(out, len(capture.faces))
         assert iteration >= max(before, reached - INTERVAL - 1), (out, before, reached, iteration)
         before = iteration
         if os.WIFSIGNALED(status):
@@ -102,7 +109,8 @@ def main(root: Path, kills: int) -> None:
         else:
             assert status == 0
             assert_same_state(out, whole)
-            number, before = number + 1, 0
+            number = number + 1
+            before = 0
             out = root / f"run{number}"
     assert os.waitpid(spawn(run, out), 0)[1] == 0
     assert_same_state(out, whole)

@@ -14,7 +14,8 @@ from stga_addon.training.optimize.trainer import Trainer
 
 pytestmark = pytest.mark.nightly
 ITERATIONS = int(os.environ.get("STGA_SOAK", 1500))
-STRAYS, DENSITY = 30, 40
+STRAYS = 30
+DENSITY = 40
 MARK = 250
 """Iterations between two looks at the whole state."""
 RSS_GROWTH = 24 << 20
@@ -44,18 +45,28 @@ def resident() -> int:
 def soak(capture) -> Soak:
     """Train, in each step another view and another random choice of triangles."""
     settings = quick_settings(
-        "selective", iterations=ITERATIONS, lattice=1, warm_up_share=0.02,
-        stray_reset_interval=STRAYS, stray_limit=0.5, density_interval=DENSITY,
-        density_span=(0.0, 1.0), growth=0.5, scale_limit=1.0,
-    )  # fmt: skip
-    rng, chosen, found = np.random.default_rng(0), dict[int, np.ndarray](), Soak()
+        "selective",
+        iterations=ITERATIONS,
+        lattice=1,
+        warm_up_share=0.02,
+        stray_reset_interval=STRAYS,
+        stray_limit=0.5,
+        density_interval=DENSITY,
+        density_span=(0.0, 1.0),
+        growth=0.5,
+        scale_limit=1.0,
+    )
+    rng = np.random.default_rng(0)
+    chosen = dict[int, np.ndarray]()
+    found = Soak()
     trainer = Trainer(capture, settings, chosen)
     views = [read_view(view) for view in capture.views["train"]]
     for iteration in range(ITERATIONS):
         view, image, _ = views[rng.integers(len(views))]
         share = rng.choice([0.0, 0.01, 0.2, 0.7, 1.0])
         chosen[view.timestep] = rng.random(len(capture.faces)) < share
-        face, before = trainer.state.face.copy(), bits(trainer.state)
+        face = trainer.state.face.copy()
+        before = bits(trainer.state)
         loss = trainer.step(view, image, iteration / ITERATIONS)
         if loss is not None:
             found.losses.append(loss)
@@ -63,7 +74,8 @@ def soak(capture) -> Soak:
             found.local += 1
             # strays and density may touch every row
             if trainer.iteration % STRAYS and trainer.iteration % DENSITY:
-                frozen, now = ~chosen[view.timestep][face], bits(trainer.state)
+                frozen = ~chosen[view.timestep][face]
+                now = bits(trainer.state)
                 kept = (np.array_equal(before[n][frozen], now[n][frozen]) for n in before)
                 found.thawed += [] if all(kept) else [iteration]
         if (iteration + 1) % MARK == 0:

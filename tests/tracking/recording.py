@@ -11,7 +11,8 @@ from stga_addon.tracking.landmarks import write_places
 
 from .test_fit import frame_at, places_on
 
-SIZE, LANDMARKS = 64, 120
+SIZE = 64
+LANDMARKS = 120
 
 
 def rig(count=5, size=SIZE):
@@ -40,7 +41,8 @@ def record(
 ):
     """Footage, a FLAME file, and exact landmarks of a moving head, none of them at timestep 2;
     returns its meshes. picture(mesh, camera) gives the pixels."""
-    cameras, places = rig(), places_on(head, LANDMARKS)
+    cameras = rig()
+    places = places_on(head, LANDMARKS)
     shape = np.zeros(head.model.n_identity)
     frames = [frame_at(head, timestep) for timestep in range(timesteps)]
     meshes = [flame_forward(head.model, shape, frame) for frame in frames]

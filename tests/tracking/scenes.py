@@ -5,7 +5,8 @@ from PIL import Image
 
 from stga_addon.capture.camera import look_at
 
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 
 
 def rig(count=3, width=WIDTH, height=HEIGHT):
@@ -34,7 +35,8 @@ def encode(path, frames, codec="libx264", options=None, rate=25, times=None, set
             if isinstance(frame, np.ndarray):
                 frame = av.VideoFrame.from_ndarray(frame, format="rgb24")
             if number == 0:
-                stream.width, stream.height = frame.width, frame.height
+                stream.width = frame.width
+                stream.height = frame.height
                 if set_up is not None:
                     set_up(stream)
             frame.pts = number if times is None else times[number]
@@ -61,7 +63,8 @@ def write_colmap_text(folder, cameras, names, model="PINHOLE", parameters=None):
     """A COLMAP model in text, one camera an image, as COLMAP writes it (comments, lines of
     points)."""
     folder.mkdir(parents=True, exist_ok=True)
-    lines, images = ["# Camera list"], ["# Image list with two lines of data per image:"]
+    lines = ["# Camera list"]
+    images = ["# Image list with two lines of data per image:"]
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         values = parameters or (camera.fl_x, camera.fl_y, camera.cx, camera.cy)
         words = " ".join(map(repr, map(float, values)))

@@ -46,7 +46,8 @@ def test_a_capture_is_footage(tmp_path):
     assert [camera.image(t)[0, 0, 0] for t, camera in footage.views()] == [0, 20, 10, 30]
     assert footage.cameras[1].file(3) == tmp_path / "images/00003_01.png"
     assert footage.cameras[0].camera.cy == HEIGHT - 12.0
-    found, expected = footage.cameras[1].camera, rig(2)[1]
+    found = footage.cameras[1].camera
+    expected = rig(2)[1]
     np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
 
 
@@ -59,17 +60,21 @@ def test_one_image_per_pose_is_one_timestep(tmp_path):
     assert [camera.name for camera in footage.cameras] == ["0", "1", "2"]
     assert footage.timesteps == (0,)
     assert footage.cameras[0].camera.cy == 12.0
-    split, (first, second) = tmp_path / "split", rig(2)
+    split = tmp_path / "split"
+    (first, second) = rig(2)
     train = [entry(own, f"a/{n}.png", timestep_index=0) for n, own in enumerate((first, second))]
     write_transforms(split, train, "transforms_train.json")
     write_transforms(split, [entry(first, "a/2.png", timestep_index=1)], "transforms_val.json")
     assert [camera.timesteps for camera in open_footage(split).cameras] == [(0, 1), (0,)]
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"file_path": "images/none.png"}, r"frames\[1\]: .* has no image, folder or video of"),
-    ({"mask_path": "masks/none.png"}, r"masks/none.png: does not .*frames\[1\] names it"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"file_path": "images/none.png"}, r"frames\[1\]: .* has no image, folder or video of"),
+        ({"mask_path": "masks/none.png"}, r"masks/none.png: does not .*frames\[1\] names it"),
+    ],
+)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_bad_entries_are_named(tmp_path, change, message):
     """Catches a traceback, or a message without file and field."""
@@ -99,9 +104,18 @@ def test_two_images_of_one_moment(tmp_path):
 # Metashape
 
 INTRINSICS = {
-    "f": 50.0, "cx": 1.25, "cy": -2.5, "b1": 0.53, "b2": -0.31, "k1": -0.0919, "k2": -0.0763,
-    "k3": 0.1163, "k4": -0.0761, "p1": -0.0031, "p2": 0.0012,
-}  # fmt: skip
+    "f": 50.0,
+    "cx": 1.25,
+    "cy": -2.5,
+    "b1": 0.53,
+    "b2": -0.31,
+    "k1": -0.0919,
+    "k2": -0.0763,
+    "k3": 0.1163,
+    "k4": -0.0761,
+    "p1": -0.0031,
+    "p2": 0.0012,
+}
 EXPORT = """<?xml version="1.0" encoding="UTF-8"?>
 <document version="2.0.0">
   <chunk label="Chunk 1" enabled="true">
@@ -157,14 +171,17 @@ def write_export(path, cameras, labels, kind="frame", intrinsics=INTRINSICS):
 def projected(points, angle_of=None):
     """Pixels of camera-space points by the formulas of Metashape's manual (appendix C), in plain
     numbers."""
-    values, found = INTRINSICS, []
+    values = INTRINSICS
+    found = []
     for x, y in points[:, :2] / points[:, 2:]:
         if angle_of:
             radius = np.hypot(x, y)
-            x, y = angle_of(radius) * x / radius, angle_of(radius) * y / radius
+            x = angle_of(radius) * x / radius
+            y = angle_of(radius) * y / radius
         r2 = x * x + y * y
         radial = 1 + sum(values[f"k{n}"] * r2**n for n in (1, 2, 3, 4))
-        p1, p2 = values["p1"], values["p2"]
+        p1 = values["p1"]
+        p2 = values["p2"]
         u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
         v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
         center = WIDTH / 2 + values["cx"], HEIGHT / 2 + values["cy"]
@@ -240,7 +257,8 @@ XMP_COEFFICIENTS = "-0.124217384759894 0.107339706650415 -0.0104748224573926 0.0
 
 
 def write_xmp(path, camera, model="brown4t2", coefficients=XMP_COEFFICIENTS, as_attributes=False):
-    rotation, position = words(camera.world_to_camera[:3, :3]), words(camera.position)
+    rotation = words(camera.world_to_camera[:3, :3])
+    position = words(camera.position)
     elements = f"<xcr:Rotation>{rotation}</xcr:Rotation><xcr:Position>{position}</xcr:Position>"
     attributes = f' xcr:Rotation="{rotation}" xcr:Position="{position}"'
     parts = {"attributes": attributes * as_attributes, "elements": elements * (not as_attributes)}
@@ -263,7 +281,8 @@ def test_xmp(tmp_path, as_attributes):
     focal = 24.3765359225552 / 36 * 40
     found = intrinsics(shot.camera)
     np.testing.assert_allclose(found, [focal, focal, 15 - 0.0046 * 40, 20 + 0.0082 * 40])
-    x, y = 0.3, -0.2
+    x = 0.3
+    y = -0.2
     r2 = x * x + y * y
     k1, k2, k3, k4, t1, t2 = map(float, XMP_COEFFICIENTS.split())
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
@@ -308,7 +327,8 @@ def test_csv(tmp_path):
     footage = open_footage(tmp_path)
     assert [camera.image(0)[0, 0, 0] for camera in footage.cameras] == [0, 50, 100]
     for camera, expected in zip(footage.cameras, rig(), strict=True):
-        found, center = camera.camera, [WIDTH / 2 + 0.01 * WIDTH, HEIGHT / 2 - 0.02 * WIDTH]
+        found = camera.camera
+        center = [WIDTH / 2 + 0.01 * WIDTH, HEIGHT / 2 - 0.02 * WIDTH]
         np.testing.assert_allclose(found.world_to_camera, expected.world_to_camera, atol=1e-9)
         np.testing.assert_allclose(intrinsics(found), [WIDTH / 2, WIDTH / 2, *center])
 

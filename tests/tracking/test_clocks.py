@@ -11,7 +11,10 @@ from .scenes import rig, write_colmap_text
 
 av = pytest.importorskip("av")
 
-SIZE, FPS, SOUND_HZ, FRAMES = 64, 25, 48000, 120
+SIZE = 64
+FPS = 25
+SOUND_HZ = 48000
+FRAMES = 120
 
 
 def scene(seed, seconds=12.0):
@@ -28,7 +31,9 @@ def write_camera(path, sound, levels, start, seed, codec="pcm_s16le"):
     rng = np.random.default_rng(seed)
     with av.open(str(path), "w") as container:
         video = container.add_stream("libx264", rate=FPS, options={"crf": "16"})
-        video.width, video.height, video.pix_fmt = SIZE, SIZE, "yuv420p"
+        video.width = SIZE
+        video.height = SIZE
+        video.pix_fmt = "yuv420p"
         if sound is not None:
             audio = container.add_stream(codec, rate=SOUND_HZ, layout="mono")
         for level in levels[start : start + FRAMES]:
@@ -43,7 +48,8 @@ def write_camera(path, sound, levels, start, seed, codec="pcm_s16le"):
         for at in range(0, len(part), 1024):
             block = (32767 * part[at : at + 1024]).astype(np.int16)[None]
             frame = av.AudioFrame.from_ndarray(block, format="s16", layout="mono")
-            frame.sample_rate, frame.pts = SOUND_HZ, at
+            frame.sample_rate = SOUND_HZ
+            frame.pts = at
             container.mux(audio.encode(frame))
         container.mux(audio.encode())
 
@@ -59,10 +65,14 @@ def footage(folder, starts, silent=(), codec="pcm_s16le", suffix=".mkv", seeds=(
     return folder
 
 
-@pytest.mark.parametrize(("silent", "sync", "codec", "suffix"), [
-    ((), "sound", "pcm_s16le", ".mkv"), ((), "auto", "aac", ".mp4"),
-    (("b",), "auto", "pcm_s16le", ".mkv"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("silent", "sync", "codec", "suffix"),
+    [
+        ((), "sound", "pcm_s16le", ".mkv"),
+        ((), "auto", "aac", ".mp4"),
+        (("b",), "auto", "pcm_s16le", ".mkv"),
+    ],
+)
 def test_clocks_that_differ(tmp_path, silent, sync, codec, suffix):
     """Catches an offset with the wrong sign, one that ignores where sound begins, and silence that
     stops it."""
@@ -97,12 +107,14 @@ def test_sound_that_is_asked_for_and_missing(tmp_path):
 def test_correlation_against_numpy():
     """Catches sums over what two signals do not share: against numpy's coefficient at each lag."""
     rng = np.random.default_rng(3)
-    reference, signal = rng.normal(5, 1, 300), rng.normal(-2, 3, 260)
+    reference = rng.normal(5, 1, 300)
+    signal = rng.normal(-2, 3, 260)
     signal[40:240] += 2.5 * reference[100:300]
     lag, correlation, distinction = best_lag(reference, signal, 60.0)
     expected = {}
     for shift in range(-240, 201):
-        low, high = max(0, -shift), min(300, 260 - shift)
+        low = max(0, -shift)
+        high = min(300, 260 - shift)
         if high - low >= 60:
             found = np.corrcoef(reference[low:high], signal[low + shift : high + shift])[0, 1]
             expected[shift] = found * np.sqrt(high - low)

@@ -73,16 +73,34 @@ DEPTH = repr(float(rig(1)[0].world_to_camera[2, 3]))
 NO_IMAGE = "has no image, folder or video of the name"
 
 
-@pytest.mark.parametrize(("file", "old", "new", "message"), [
-    ("cameras", "50.0", "0", "image 'left.png': expected a focal length of 1 to 1e7 pixels, not"),
-    ("cameras", f" {WIDTH} {HEIGHT} ", " 0 30 ", "'left.png': expected an image size in pixels"),
-    ("cameras", " 20.0", " 1e308", r"'left.png': expected a principal point within 1e\+07 pixels"),
-    ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units"),
-    ("images", " 2 right.png", " 2 left.png", "image 'left.png': two cameras are named left"),
-    ("images", " 1 left.png", " 1 gone.png", f"{NO_IMAGE} 'gone.png'"),
-    ("images", " 1 left.png", f" 1 {'9' * 5000}.png", f"{NO_IMAGE} '999"),
-    ("images", " 1 left.png", f" 1 {'a/' * 30000}.png", f"{NO_IMAGE} 'a/a/"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        (
+            "cameras",
+            "50.0",
+            "0",
+            "image 'left.png': expected a focal length of 1 to 1e7 pixels, not",
+        ),
+        (
+            "cameras",
+            f" {WIDTH} {HEIGHT} ",
+            " 0 30 ",
+            "'left.png': expected an image size in pixels",
+        ),
+        (
+            "cameras",
+            " 20.0",
+            " 1e308",
+            r"'left.png': expected a principal point within 1e\+07 pixels",
+        ),
+        ("images", DEPTH, "1e308", r"image 'left.png': expected a camera within 1e\+12 units"),
+        ("images", " 2 right.png", " 2 left.png", "image 'left.png': two cameras are named left"),
+        ("images", " 1 left.png", " 1 gone.png", f"{NO_IMAGE} 'gone.png'"),
+        ("images", " 1 left.png", f" 1 {'9' * 5000}.png", f"{NO_IMAGE} '999"),
+        ("images", " 1 left.png", f" 1 {'a/' * 30000}.png", f"{NO_IMAGE} 'a/a/"),
+    ],
+)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_models_that_do_not_fit_are_named(tmp_path, file, old, new, message):
     """Catches a traceback, or a message without file and field."""

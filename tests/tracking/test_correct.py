@@ -143,31 +143,41 @@ MISFIT = "image_misfit: expected shares by region and timestep"
 INTERPOLATED = r"interpolated: expected timesteps"
 PARAMETERS = rf"parameters: expected \(5, {SIZE}\) finite numbers"
 OTHERS = "timesteps: expected those of the capture"
-FIVE, POSES = np.arange(5), TAKE[:5]
+FIVE = np.arange(5)
+POSES = TAKE[:5]
 DAMAGES = {
     "report missing": (lambda out: (out / REPORT_FILE).unlink(), REPORT_FILE, "cannot be read"),
     "no landmark counts": (unconfident, LANDMARKS_FOLDER, "has no landmarks of a face"),
     "solved folder": (lambda out: (out / SOLVED_FILE).mkdir(), SOLVED_FILE, "is not a regular"),
     "solved empty": (replaced(SOLVED_FILE, b""), SOLVED_FILE, "is not a readable npz"),
-    **{f"report {content}": (replaced(REPORT_FILE, content), REPORT_FILE, INTERPOLATED)
-       for content in (b"[1]", b"null")},
+    **{
+        f"report {content}": (replaced(REPORT_FILE, content), REPORT_FILE, INTERPOLATED)
+        for content in (b"[1]", b"null")
+    },
     "report cut": (replaced(REPORT_FILE, b'{"interpolated": ['), REPORT_FILE, "is not valid JSON"),
-    **{f"interpolated {own}": (changed(REPORT_FILE, interpolated=own), REPORT_FILE, INTERPOLATED)
-       for own in (None, 3, [[1]], ["2"], [float("nan")])},
-    **{f"misfit {own}": (changed(REPORT_FILE, image_misfit={"face": own}), REPORT_FILE, MISFIT)
-       for own in ([0.1], {"0": "much"})},
-    **{f"solved {name}": (solved(**arrays), SOLVED_FILE, message) for name, arrays, message in (
-        ("without parameters", {"timesteps": FIVE}, PARAMETERS),
-        ("of fewer timesteps", {"timesteps": FIVE, "parameters": TAKE[:4]}, PARAMETERS),
-        ("as text", {"timesteps": FIVE, "parameters": POSES.astype(str)}, PARAMETERS),
-        ("as complex", {"timesteps": FIVE, "parameters": POSES.astype(complex)}, PARAMETERS),
-        ("not a number", {"timesteps": FIVE, "parameters": np.nan * POSES}, PARAMETERS),
-        ("astronomic", {"timesteps": FIVE, "parameters": POSES + 1e300}, PARAMETERS),
-        ("without timesteps", {"parameters": POSES}, OTHERS),
-        ("of others", {"timesteps": FIVE + 7, "parameters": POSES}, OTHERS),
-        ("of names", {"timesteps": np.array(list("01234")), "parameters": POSES}, OTHERS),
-    )},
-}  # fmt: skip
+    **{
+        f"interpolated {own}": (changed(REPORT_FILE, interpolated=own), REPORT_FILE, INTERPOLATED)
+        for own in (None, 3, [[1]], ["2"], [float("nan")])
+    },
+    **{
+        f"misfit {own}": (changed(REPORT_FILE, image_misfit={"face": own}), REPORT_FILE, MISFIT)
+        for own in ([0.1], {"0": "much"})
+    },
+    **{
+        f"solved {name}": (solved(**arrays), SOLVED_FILE, message)
+        for name, arrays, message in (
+            ("without parameters", {"timesteps": FIVE}, PARAMETERS),
+            ("of fewer timesteps", {"timesteps": FIVE, "parameters": TAKE[:4]}, PARAMETERS),
+            ("as text", {"timesteps": FIVE, "parameters": POSES.astype(str)}, PARAMETERS),
+            ("as complex", {"timesteps": FIVE, "parameters": POSES.astype(complex)}, PARAMETERS),
+            ("not a number", {"timesteps": FIVE, "parameters": np.nan * POSES}, PARAMETERS),
+            ("astronomic", {"timesteps": FIVE, "parameters": POSES + 1e300}, PARAMETERS),
+            ("without timesteps", {"parameters": POSES}, OTHERS),
+            ("of others", {"timesteps": FIVE + 7, "parameters": POSES}, OTHERS),
+            ("of names", {"timesteps": np.array(list("01234")), "parameters": POSES}, OTHERS),
+        )
+    },
+}
 
 
 @pytest.mark.parametrize("name", DAMAGES)

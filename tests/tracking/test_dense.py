@@ -39,7 +39,8 @@ from .test_surface import no_image
 
 JAW = 2
 OPENINGS = 0.0, 0.0, 0.1, 0.25, 0.4, 0.45, 0.3, 0.05  # Radians of the jaw at each timestep
-BROWS_UP, BROWS_DOWN = EXPRESSIONS.index("brows_up"), EXPRESSIONS.index("brows_down")
+BROWS_UP = EXPRESSIONS.index("brows_up")
+BROWS_DOWN = EXPRESSIONS.index("brows_down")
 DETECTOR_PULL = 1 / 3  # Share of the jaw's motion that landmarks do not follow
 
 
@@ -53,17 +54,20 @@ class Scene:
 
 
 def frame_at(opening, timestep):
-    expr, zero = np.zeros(10), np.zeros(3)
+    expr = np.zeros(10)
+    zero = np.zeros(3)
     expr[timestep % 3] = 0.3
     turn = np.array([0.03 * np.sin(timestep), 0.15 * np.sin(0.8 * timestep), 0.0])
-    jaw, moved = np.array([opening, 0, 0]), np.array([0.004, 0, 0]) * timestep
+    jaw = np.array([opening, 0, 0])
+    moved = np.array([0.004, 0, 0]) * timestep
     return FlameFrame(expr, turn, zero, jaw, moved, np.zeros(6))
 
 
 def skin_texture(rest):
     """(V, 1) factor of skin's colors: waves of 6 to 30 mm, since the small head's painted chin is
     of one color."""
-    rng, factor = np.random.default_rng(3), 1
+    rng = np.random.default_rng(3)
+    factor = 1
     for length, amount in [(0.006, 0.02), (0.010, 0.03), (0.018, 0.03), (0.03, 0.03)] * 4:
         phase = 2 * np.pi * rest @ (rng.normal(size=3) / 1.7) / length
         factor = factor + amount * np.sin(phase + rng.uniform(0, 6))
@@ -74,7 +78,8 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
     """brows: by which they are raised at timesteps 3 and 6, or lowered where it is negative."""
     tracked = small_head(0)
     pictured, tint = subdivided(tracked, small_head_colors())
-    head, rng = HeadModel(tracked, "flame"), np.random.default_rng(4)
+    head = HeadModel(tracked, "flame")
+    rng = np.random.default_rng(4)
     shape = rng.normal(0, 0.5, tracked.n_identity)
     frames = [frame_at(opening, t) for t, opening in enumerate(openings)]
     for t in (3, 6) if brows else ():
@@ -84,7 +89,9 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         look_at((1.1 * np.sin(a), 0.05, 1.1 * np.cos(a)), (0, -0.02, 0), *size, 3.7 * size[0])
         for a in eyes
     ]
-    meshes, landmarks, pictures = [], {}, {}
+    meshes = []
+    landmarks = {}
+    pictures = {}
     places = places_on(head, 300)
     wrong = rng.normal(0, 0.001, (300, 3))
     for t, frame in enumerate(frames):
@@ -95,7 +102,8 @@ def scene(eyes, openings=OPENINGS, pull=DETECTOR_PULL, size=(230, 300), brows=0.
         meshes.append(mesh)
         landmarks[t] = seen(cameras, points, noise=0.4, seed=t)
         pictures[t] = [(c, shaded_image(fine, pictured.faces, c, colors)) for c in cameras]
-    used, images = np.ones(300, bool), partial(shown, pictures)
+    used = np.ones(300, bool)
+    images = partial(shown, pictures)
     return Scene(head, meshes, RecordedTake(places, used, landmarks, images, metric=True))
 
 
@@ -155,7 +163,8 @@ def test_smoothing_stays_at_the_solution_of_its_own_terms(head):
     sign."""
     one = person(head, np.zeros(head.model.n_identity))
     places = places_on(head, 60)
-    root, observed = np.tile(np.eye(3), (60, 1, 1)), []
+    root = np.tile(np.eye(3), (60, 1, 1))
+    observed = []
     for t in range(4):
         mesh = flame_forward(head.model, np.zeros(10), frame_at(0.1, t))
         observed.append(Observation(places.on(mesh, head.model.faces), root, np.ones(60)))
@@ -183,7 +192,8 @@ def test_a_jaw_that_landmarks_leave_too_little_open_is_opened():
     first = fit_head(take.head, take.take)
     found, misfit = by_images(take.head, first, take.take, Helpers(1))
     wide = np.argsort(OPENINGS)[-3:]
-    before, after = jaw_errors(take, first), jaw_errors(take, found)
+    before = jaw_errors(take, first)
+    after = jaw_errors(take, found)
     assert before[wide].min() > 8
     assert after[wide].mean() < 1.2
     assert (after < before + 0.4).all()
@@ -221,7 +231,8 @@ def test_result_depends_on_neither_processes_nor_interruptions(tmp_path, monkeyp
 @pytest.mark.slow
 def test_raised_brows_are_not_lowered_by_images_that_prove_little():
     """Catches images that overrule landmarks though they look hardly more like another pose."""
-    eyes, still = np.radians([-50, 0, 50]), [0.0] * 8
+    eyes = np.radians([-50, 0, 50])
+    still = [0.0] * 8
     take, lowered = (scene(eyes, still, brows=brows) for brows in (1.5, -1.5))
 
     mixed = []

@@ -32,7 +32,8 @@ def pictures() -> list[np.ndarray]:
     """From the front, from the side, and turned in the image's plane before a wide dark
     background."""
     model = small_head(0)
-    mesh, faces = model.v_template, model.faces
+    mesh = model.v_template
+    faces = model.faces
     cameras = picture_cameras(mesh)
     front, side = (shaded_image(mesh, faces, cameras[number]) for number in (0, 3))
     wide = cv2.copyMakeBorder(front, 60, 20, 40, 400, cv2.BORDER_CONSTANT, value=(30, 40, 50))
@@ -68,10 +69,8 @@ def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
         shape = model.shapedirs[:, :, model.n_identity + model.expression_names.index(name)]
         return np.linalg.norm(places.on(shape, model.faces), axis=1)
 
-    upper, lower = (
-        moved("jawOpen")[[80, 82, 13, 312, 310]],
-        moved("jawOpen")[[88, 87, 14, 317, 318]],
-    )
+    upper = moved("jawOpen")[[80, 82, 13, 312, 310]]
+    lower = moved("jawOpen")[[88, 87, 14, 317, 318]]
     assert upper.max() < 0.01 < 0.025 < lower.min()
     on_eyeballs = (model.weights[model.faces, 3:] > EYEBALL_WEIGHT).any((1, 2))[places.face]
     assert np.flatnonzero(on_eyeballs).tolist() == sorted(IRIS_CENTERS)
@@ -84,7 +83,8 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path):
     its pictures, the bias stays."""
     anyone = read_head_model(None)
     head = person(anyone, np.zeros(anyone.model.n_identity))
-    mesh, faces = head.model.v_template, head.model.faces
+    mesh = head.model.v_template
+    faces = head.model.faces
     center = (mesh.min(0) + mesh.max(0)) / 2
     raised = Rotation.from_euler("x", -35, degrees=True).apply([0.0, 0.0, 1.0])
     camera = look_at(center + raised, center, 512, 512, 1500.0)
@@ -107,7 +107,8 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path):
     for name, drawn in (("biased", draw_nothing), ("corrected", draw)):
         known = KnownPerson(fit, drawn, None)
         track(footage, None, tmp_path / name, mattes=False, person=known)
-        capture, own_deg = open_capture(tmp_path / name), []
+        capture = open_capture(tmp_path / name)
+        own_deg = []
         for view in capture.views["train"]:
             seen = capture.mesh(view.timestep) @ view.camera.world_to_camera[:3, :3].T
             true = heads[view.timestep] @ camera.world_to_camera[:3, :3].T

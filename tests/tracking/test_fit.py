@@ -91,10 +91,12 @@ def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differenc
     skeleton = arrays["J_regressor"], np.array([-1, 0, 1, 1, 1]), arrays["weights"]
     shapes = arrays["v_template"], arrays["shapedirs"], 9, arrays["posedirs"]
     model = FlameModel(*shapes, *skeleton, arrays["f"].astype(np.int32))
-    frame, rng = random_frame(3, model.n_expression), np.random.default_rng(1)
+    frame = random_frame(3, model.n_expression)
+    rng = np.random.default_rng(1)
     shape = rng.normal(size=model.n_identity)
     places = SurfacePoints(np.arange(50), rng.dirichlet([1, 1, 1], 50))
-    points, values = PosedPoints(model, places), np.concatenate([shape, frame.parameters])
+    points = PosedPoints(model, places)
+    values = np.concatenate([shape, frame.parameters])
     positions, jacobian = points.linearized(*split(values))
     expected = places.on(flame_forward(model, shape, frame), model.faces)
     np.testing.assert_allclose(positions, expected, atol=1e-12)
@@ -105,7 +107,8 @@ def test_points_agree_with_the_forward_pass_and_their_derivatives_with_differenc
 
 def in_cameras_world(fit, timestep):
     """(V, 3) of the fitted head in the world of the cameras."""
-    world, mesh = fit.to_capture, posed_mesh(fit, fit.parameters[timestep])
+    world = fit.to_capture
+    mesh = posed_mesh(fit, fit.parameters[timestep])
     return (mesh - world.translation) @ world.rotation / world.scale
 
 
@@ -133,7 +136,8 @@ def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
     off."""
     shape = np.random.default_rng(5).normal(0, 0.7, head.model.n_identity)
     turn = Rotation.from_euler("xz", [90, 63], degrees=True).as_matrix()
-    world, places = Similarity(0.23, turn, np.array([3.0, -1.0, 2.0])), places_on(head, 100)
+    world = Similarity(0.23, turn, np.array([3.0, -1.0, 2.0]))
+    places = places_on(head, 100)
     foreign = [world.camera(camera) for camera in cameras(5)]
     meshes = [flame_forward(head.model, shape, frame_at(head, t)) for t in range(12)]
     take = recorded(head, foreign, [world.apply(mesh) for mesh in meshes], places, noise=0.3)
@@ -149,7 +153,8 @@ def test_a_take_is_found_in_a_world_of_any_scale_and_orientation(head):
 
 def test_jumps_are_not_smoothed(head):
     """Catches smoothing across cuts: a capture of single expressions would lose all of them."""
-    places, shape = places_on(head, 100), np.zeros(head.model.n_identity)
+    places = places_on(head, 100)
+    shape = np.zeros(head.model.n_identity)
     strong = np.resize(np.eye(head.model.n_expression), (6, head.model.n_expression))
     meshes = [
         flame_forward(head.model, shape, replace(frame_at(head, 0), expr=expr)) for expr in strong
@@ -163,8 +168,10 @@ def test_jumps_are_not_smoothed(head):
 def amounts_and_observations(head, amounts, noise):
     """A person without identity, and what is known of 100 landmarks at each timestep of one moving
     expression."""
-    one, places = person(head, np.zeros(head.model.n_identity)), places_on(head, 100)
-    rng, observed = np.random.default_rng(3), []
+    one = person(head, np.zeros(head.model.n_identity))
+    places = places_on(head, 100)
+    rng = np.random.default_rng(3)
+    observed = []
     for amount in amounts:
         frame = replace(frame_at(head, 0), expr=amount * np.eye(head.model.n_expression)[0])
         mesh = flame_forward(head.model, np.zeros(head.model.n_identity), frame)
@@ -183,7 +190,8 @@ def test_a_blink_of_one_timestep_is_followed():
     truth = np.zeros((7, model.n_expression + RIGID_SIZE))
     blink = model.expression_names.index("eyeBlinkLeft")
     truth[3, blink] = 1
-    posed, root = PosedPoints(one.model, places), np.tile(np.eye(3), (len(faces), 1, 1))
+    posed = PosedPoints(one.model, places)
+    root = np.tile(np.eye(3), (len(faces), 1, 1))
     weight = np.ones(len(root))
     observed = [Observation(posed.positions(*split(own)), root, weight) for own in truth]
     solved = solve_take(one, places, observed, np.zeros_like(truth), ordered=True)[:, blink]
@@ -217,7 +225,8 @@ def test_expressions_are_smoothed_in_order_alone(head):
 def test_one_camera_keeps_the_size_of_the_head(head):
     """Catches a world that is scaled up without end: the smaller the head, the nearer it passes to
     rays that no head meets all of, as those of a real person's landmarks."""
-    places, rig = places_on(head, 100), cameras(1)
+    places = places_on(head, 100)
+    rig = cameras(1)
     # a face that the model has not
     wrong = places.on(head.model.v_template, head.model.faces) * [1.25, 0.8, 1.0]
     take = {t: seen(rig, wrong, noise=4.0, seed=t) for t in range(8)}
@@ -236,7 +245,9 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
 
     Whether NumPy raises an error for eigenvalues of NaN depends on the processor.
     """
-    places, rig, shape = places_on(head, 100), cameras(count), np.zeros(head.model.n_identity)
+    places = places_on(head, 100)
+    rig = cameras(count)
+    shape = np.zeros(head.model.n_identity)
     meshes = [flame_forward(head.model, shape, frame_at(head, t)) for t in range(3)]
     take = recorded(head, rig, meshes, places).landmarks
     first = np.linalg.inv(rig[0].world_to_camera)
@@ -262,7 +273,8 @@ def test_landmarks_of_no_weight_stay_unknown(head, count):
 def test_rays_that_all_miss_give_a_start(head):
     """Catches weights that vanish, and the mean of no points, where no two cameras agree about any
     landmark."""
-    rig, rng = cameras(3), np.random.default_rng(0)
+    rig = cameras(3)
+    rng = np.random.default_rng(0)
     points = rng.normal(0, 0.05, (30, 3))
     landmarks = seen(rig, points, noise=100.0)
     found = triangulate(rig, landmarks.points, landmarks.confidence)
@@ -322,7 +334,8 @@ def test_prior_keeps_weights_between_0_and_1():
         for side in ("Left", "Right")
     ]
     shares = np.array(list(LID_SHAPES.values()))
-    count, rng = named.model.n_expression, np.random.default_rng(0)
+    count = named.model.n_expression
+    rng = np.random.default_rng(0)
     values = np.concatenate([rng.uniform(-1, 2, count), np.zeros(RIGID_SIZE)])
     values[lids[0]] = 0.9, 0.8  # each in its range
     pulled = (values[:count] < 0) | (values[:count] > 1)

@@ -23,7 +23,8 @@ from .scenes import write_image, write_video
 from .test_fit import places_on
 
 EQUIVALENT_MM = 28.0
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 EXPECTED = EQUIVALENT_MM / np.hypot(36, 24) * 80
 QUICKTIME_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -38,17 +39,20 @@ def write_photo(path, tags, size=(WIDTH, HEIGHT)):
 SENSOR = {0x920A: 4.8, 0xA002: 4000, 0xA003: 3000}
 
 
-@pytest.mark.parametrize(("tags", "expected"), [
-    ({0xA405: 28}, EXPECTED),
-    ({0xA405: 28, 0xA002: 4000, 0xA003: 3000}, EXPECTED),  # made smaller
-    ({0xA405: 28, 0xA002: 3000, 0xA003: 4000}, EXPECTED),  # turned
-    ({0xA405: 28, 0xA002: 4000, 0xA003: 2000}, None),  # cropped
-    ({**SENSOR, 0xA20E: 4000 / 6.4 * 25.4, 0xA210: 2}, 3000 * WIDTH / 4000),
-    ({**SENSOR, 0xA20E: 4000 / 6.4 * 10, 0xA210: 3}, 3000 * WIDTH / 4000),
-    ({0x920A: 4.8}, None),
-    ({0xA405: 0}, None),
-    ({}, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({0xA405: 28}, EXPECTED),
+        ({0xA405: 28, 0xA002: 4000, 0xA003: 3000}, EXPECTED),  # made smaller
+        ({0xA405: 28, 0xA002: 3000, 0xA003: 4000}, EXPECTED),  # turned
+        ({0xA405: 28, 0xA002: 4000, 0xA003: 2000}, None),  # cropped
+        ({**SENSOR, 0xA20E: 4000 / 6.4 * 25.4, 0xA210: 2}, 3000 * WIDTH / 4000),
+        ({**SENSOR, 0xA20E: 4000 / 6.4 * 10, 0xA210: 3}, 3000 * WIDTH / 4000),
+        ({0x920A: 4.8}, None),
+        ({0xA405: 0}, None),
+        ({}, None),
+    ],
+)
 def test_focal_length_of_photos(tmp_path, tags, expected):
     """Catches a photo's lens that is not read, is related to the wrong side, or survives a crop."""
     write_photo(tmp_path / "a.jpg", tags)
@@ -78,7 +82,8 @@ def with_metadata(path, value, kind, where, versioned):
     keys = box(b"keys", struct.pack(">II", 0, len(names)) + listed)
     meta = box(b"meta", bytes(4 * versioned) + hdlr + keys + box(b"ilst", b"".join(items)))
     data = bytearray(path.read_bytes())
-    holders, start = [], 0
+    holders = []
+    start = 0
     for name in (b"moov", b"trak")[: 1 + (where == "trak")]:
         while data[start + 4 : start + 8] != name:
             start += struct.unpack_from(">I", data, start)[0]
@@ -92,10 +97,16 @@ def with_metadata(path, value, kind, where, versioned):
 
 
 @pytest.mark.parametrize("where", ["moov", "trak"])
-@pytest.mark.parametrize(("name", "value", "kind"), [
-    ("a.mov", b"28", 1), ("a.mov", b"28.00mm", 1), ("a.mov", struct.pack(">i", 28), 21),
-    ("a.mp4", struct.pack(">f", 28), 23), ("a.mp4", struct.pack(">d", 28), 24),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("a.mov", b"28", 1),
+        ("a.mov", b"28.00mm", 1),
+        ("a.mov", struct.pack(">i", 28), 21),
+        ("a.mp4", struct.pack(">f", 28), 23),
+        ("a.mp4", struct.pack(">d", 28), 24),
+    ],
+)
 def test_focal_length_of_videos(tmp_path, name, value, kind, where):
     """Catches a phone's lens that is not read, as by FFmpeg, which leaves out the metadata of
     tracks."""
@@ -132,17 +143,21 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     Each landmark lies 2 mm beside its place on the model, in all frames alike, as a detector's do.
     """
     rng = np.random.default_rng(3)
-    places, shape = places_on(head, 300), rng.normal(0, 0.7, head.model.n_identity)
+    places = places_on(head, 300)
+    shape = rng.normal(0, 0.7, head.model.n_identity)
     own = rng.normal(0, 0.002, (300, 3))
-    usual, (width, height) = usual_focal(*size), size
+    usual = usual_focal(*size)
+    (width, height) = size
     camera, guessed = (
         camera_from_gl(np.eye(4), *size, f, f, width / 2, height / 2) for f in (focal, usual)
     )
     take = {}
     for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
-        angle, expression = np.radians(turn_deg) * share, np.zeros(head.model.n_expression)
+        angle = np.radians(turn_deg) * share
+        expression = np.zeros(head.model.n_expression)
         expression[timestep % 3] = 0.5
-        zero, moved = np.zeros(3), np.array([0.02 * share, 0.0, -0.6])
+        zero = np.zeros(3)
+        moved = np.array([0.02 * share, 0.0, -0.6])
         pose = np.array([0.1 * share**2, angle, 0.0])
         frame = FlameFrame(expression, pose, zero, zero, moved, np.zeros(6))
         turn = Rotation.from_rotvec([0, angle, 0]).as_matrix()
@@ -163,7 +178,8 @@ def test_focal_length_of_a_head_that_turns(head, factor, turn_deg):
     assert found == (pytest.approx(truth, rel=0.1) if turn_deg == 30 else None)
 
 
-SIZE, COUNT = (108, 192), 8
+SIZE = (108, 192)
+COUNT = 8
 
 
 def film(folder, head, turn_deg):
@@ -182,7 +198,8 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     """Catches the perspective of a phone where the person was filmed before, and another
     resolution taken for another lens."""
     film(tmp_path, head, 3)
-    footage, (width, height) = open_footage(tmp_path / "phone.mp4"), SIZE
+    footage = open_footage(tmp_path / "phone.mp4")
+    (width, height) = SIZE
     likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
     inputs = footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points"
     fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
@@ -198,14 +215,16 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     film(tmp_path, head, 30)
     # no helping processes, whose decoders would not be seen
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    decoded, decode = [], VideoFrames._frame
+    decoded = []
+    decode = VideoFrames._frame
 
     def decode_and_note(self, number):
         decoded.append(number)
         return decode(self, number)
 
     monkeypatch.setattr(VideoFrames, "_frame", decode_and_note)
-    footage, out = open_footage(tmp_path / "phone.mp4"), tmp_path / "out"
+    footage = open_footage(tmp_path / "phone.mp4")
+    out = tmp_path / "out"
     found = track(footage, tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
     assert decoded == list(range(COUNT))
     assert found.focal == "solved"

@@ -36,10 +36,15 @@ def morphed(corners, moved, **changes):
         for k in range(2)
     ]
     document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}]}],
-        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(data)}],
-    }  # fmt: skip
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
     return glb(document | changes, data)
 
 
@@ -114,7 +119,8 @@ def test_a_real_head_with_57_expressions(shared_data, tmp_path):
     """Catches limits that a model of real size exceeds: ICT-FaceKit's, through Blender's exporter
     and back."""
     ict = np.load(shared_data / "ict_facekit_light.npz")
-    mean, shapes = 0.01 * ict["neutral"], 0.01 * np.moveaxis(ict["expr"], 0, 2)
+    mean = 0.01 * ict["neutral"]
+    shapes = 0.01 * np.moveaxis(ict["expr"], 0, 2)
     blender_head(mean, ict["tris"], ict["expr_names"].tolist(), shapes)
     export(tmp_path / "head.glb", export_normals=False)  # which take the longest
     found = read_head_model(tmp_path / "head.glb").model

@@ -14,16 +14,21 @@ BROWN = Lens(radial=(-0.2, 0.07, 0.01), tangential=(0.003, -0.002))
 CAMERA = look_at((0, 0, 1), (0, 0, 0), 320, 240, 300.0)
 
 
-@pytest.mark.parametrize(("lens", "order"), [
-    (
-        Lens(
-            radial=(-0.2, 0.07, 0.01), rational=(0.03, -0.02, 0.01), tangential=(0.003, -0.002),
-            prism=(0.01, 0.002, -0.004, 0.003),
+@pytest.mark.parametrize(
+    ("lens", "order"),
+    [
+        (
+            Lens(
+                radial=(-0.2, 0.07, 0.01),
+                rational=(0.03, -0.02, 0.01),
+                tangential=(0.003, -0.002),
+                prism=(0.01, 0.002, -0.004, 0.003),
+            ),
+            [-0.2, 0.07, 0.003, -0.002, 0.01, 0.03, -0.02, 0.01, 0.01, 0.002, -0.004, 0.003],
         ),
-        [-0.2, 0.07, 0.003, -0.002, 0.01, 0.03, -0.02, 0.01, 0.01, 0.002, -0.004, 0.003],
-    ),
-    (Lens("fisheye", radial=(0.05, -0.02, 0.01, 0.004)), [0.05, -0.02, 0.01, 0.004]),
-])  # fmt: skip
+        (Lens("fisheye", radial=(0.05, -0.02, 0.01, 0.004)), [0.05, -0.02, 0.01, 0.004]),
+    ],
+)
 def test_lenses_are_opencvs(lens, order):
     """Catches swapped coefficients, a wrong power of a term, and another fisheye variable."""
     cv2 = pytest.importorskip("cv2")

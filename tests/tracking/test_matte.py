@@ -12,7 +12,8 @@ from stga_addon.tracking.mattes import by_plate, find_matte
 
 pytest.importorskip("cv2")
 
-WIDTH, HEIGHT = 200, 260
+WIDTH = 200
+HEIGHT = 260
 
 
 def room(height=HEIGHT, width=WIDTH, seed=0):
@@ -94,7 +95,8 @@ def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
     """Catches a network that is asked wrongly: true masks of a path-traced head before generated
     walls."""
     capture = open_capture(shared_data / "studio_head")
-    network, found = PersonNetwork(), []
+    network = PersonNetwork()
+    found = []
     for number, view in enumerate(capture.views["train"][2:80:13]):
         image, mask = with_a_body(read_image(view), read_mask(view))
         alpha = mask[..., None] / 255
@@ -108,9 +110,11 @@ def test_a_rendered_head_before_a_wall(shared_data, tmp_path):
 
 def with_a_body(image, mask):
     """The bust's lower edge continued to the image's: nobody ends in the air."""
-    image, mask = image.copy(), mask.copy()
+    image = image.copy()
+    mask = mask.copy()
     for x in range(mask.shape[1]):
         rows = np.flatnonzero(mask[:, x] > 127)
         if len(rows) and rows[-1] > 0.75 * len(mask):
-            image[rows[-1] - 3 :, x], mask[rows[-1] - 3 :, x] = image[rows[-1] - 3, x], 255
+            image[rows[-1] - 3 :, x] = image[rows[-1] - 3, x]
+            mask[rows[-1] - 3 :, x] = 255
     return image, mask

@@ -41,7 +41,8 @@ def footage(folder, cameras, timesteps):
         flat = (x - camera.cx) / camera.fl_x, (y - camera.cy) / camera.fl_y
         rays = np.stack([*flat, np.ones_like(x)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        turn = camera.world_to_camera[:3, :3]
+        shift = camera.world_to_camera[:3, 3]
         for t in range(timesteps):
             center = turn @ [0.02 * t, 0, 0] + shift
             covered = center @ center - (rays @ center) ** 2 < 0.1**2
@@ -66,7 +67,8 @@ def tiles(sheet, count):
     top = sheet.shape[0] - 12 - (-(-count // COLUMNS)) * (height + 18 + 8)
     for number in range(count):
         row, column = divmod(number, COLUMNS)
-        y, x = top + row * (height + 26), 12 + column * (2 * width + 8)
+        y = top + row * (height + 26)
+        x = 12 + column * (2 * width + 8)
         yield sheet[y : y + height, x : x + width], sheet[y : y + height, x + width : x + 2 * width]
 
 
@@ -130,7 +132,8 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
     pytest.importorskip("cv2")
     pytest.importorskip("av")
     write_head_video(tmp_path / "head.mp4", 2)
-    head, networks = read_head_model(None), FaceNetworks()
+    head = read_head_model(None)
+    networks = FaceNetworks()
     take = RecordedTake(*calibrate(head.model, networks, "head"), {})
     shown = []
     draw = pictures.with_mesh
@@ -140,8 +143,10 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
         shown.append(pictures.picture_of_first_frame(head, footage, networks, take))
     over, plain = (picture.astype(int) for picture in shown)
     assert over.shape == (pictures.SIZE, pictures.SIZE, 3)
-    drawn, skin = np.abs(over - plain).max(2) > 8, plain[..., 0] - plain[..., 2] > 20
+    drawn = np.abs(over - plain).max(2) > 8
+    skin = plain[..., 0] - plain[..., 2] > 20
     rows = np.flatnonzero(skin.any(1))
     above_the_neck = slice(0, rows[0] + 6 * len(rows) // 10)
-    drawn, skin = drawn[above_the_neck], skin[above_the_neck]
+    drawn = drawn[above_the_neck]
+    skin = skin[above_the_neck]
     assert (drawn & skin).sum() > 0.7 * (drawn | skin).sum() > 0

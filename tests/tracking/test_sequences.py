@@ -71,22 +71,44 @@ def of_other_length(images):
     (images / "b/frame_6.png").unlink()
 
 
-@pytest.mark.parametrize(("damage", "frames", "message"), [
-    (of_other_length, FrameRange(),
-     "b has 5 frames and camera a 6; expected recordings of the same length"),
-    (of_other_length, FrameRange(0, 6), "Camera b has 5 frames; expected all up to 6"),
-    (None, FrameRange(0, 6, 1, {"b": 1}), "b has 6 frames; expected all up to 6 and its offset"),
-    (None, FrameRange(offsets={"z": 1}), "Offset for camera z: expected one of a, b"),
-    (None, FrameRange(9), "Frames from 9 on: the cameras have only 6 in common"),
-    (without_one_frame, FrameRange(),
-     r"b/frame_4.png: is 3 frames after the first of camera b, where camera a "),
-    (without_a_recording, FrameRange(),
-     r"image 'b/frame_1.png': .* has no folder or video of this camera"),
-    (of_other_size, FrameRange(),
-     r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"),
-    (lambda images: of_other_size(images, [3]), FrameRange(),
-     r"b/frame_3.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("damage", "frames", "message"),
+    [
+        (
+            of_other_length,
+            FrameRange(),
+            "b has 5 frames and camera a 6; expected recordings of the same length",
+        ),
+        (of_other_length, FrameRange(0, 6), "Camera b has 5 frames; expected all up to 6"),
+        (
+            None,
+            FrameRange(0, 6, 1, {"b": 1}),
+            "b has 6 frames; expected all up to 6 and its offset",
+        ),
+        (None, FrameRange(offsets={"z": 1}), "Offset for camera z: expected one of a, b"),
+        (None, FrameRange(9), "Frames from 9 on: the cameras have only 6 in common"),
+        (
+            without_one_frame,
+            FrameRange(),
+            r"b/frame_4.png: is 3 frames after the first of camera b, where camera a ",
+        ),
+        (
+            without_a_recording,
+            FrameRange(),
+            r"image 'b/frame_1.png': .* has no folder or video of this camera",
+        ),
+        (
+            of_other_size,
+            FrameRange(),
+            r"b/frame_1.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
+        ),
+        (
+            lambda images: of_other_size(images, [3]),
+            FrameRange(),
+            r"b/frame_3.png: has 20 x 15 pixels, but .* image 'b/frame_1.png' has 40 x 30",
+        ),
+    ],
+)
 def test_recordings_out_of_step(tmp_path, damage, frames, message):
     """Catches frames of different moments silently paired, all later frames of a camera being one
     too early because one file is missing, a camera that disappears from the footage, and images of
@@ -137,11 +159,14 @@ def test_range_of_videos(tmp_path):
     np.testing.assert_allclose(found, [105, 145, 185], atol=3)
 
 
-@pytest.mark.parametrize(("rate", "damage", "message"), [
-    (30, None, r"camera b has 30 frames a second, that of camera a 25; expected one rate"),
-    (25, "cut", r"b.mp4: is not a readable video"),
-    (25, "no av", r"a.mp4: reading videos needs the package av \(PyAV\)"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rate", "damage", "message"),
+    [
+        (30, None, r"camera b has 30 frames a second, that of camera a 25; expected one rate"),
+        (25, "cut", r"b.mp4: is not a readable video"),
+        (25, "no av", r"a.mp4: reading videos needs the package av \(PyAV\)"),
+    ],
+)
 def test_videos_that_cannot_be_used(tmp_path, monkeypatch, rate, damage, message):
     """Catches 25 and 30 frames a second paired by number, an exception of FFmpeg's, and a traceback
     where the package is missing."""

@@ -84,7 +84,8 @@ def views(cameras, contrast=1.0):
 def test_offsets_lead_to_the_surface_in_the_images(offset):
     """Catches a wrong sign, a pixel center that is off by half, or a wrong patch: the ball would be
     missed."""
-    cameras, normals = rig(5), ball_points()
+    cameras = rig(5)
+    normals = ball_points()
     points = (RADIUS_M - offset) * normals
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
     found, correlation = surface_offsets(views(cameras), cosines, points, normals, SWEEP)
@@ -95,7 +96,8 @@ def test_offsets_lead_to_the_surface_in_the_images(offset):
 
 def test_nothing_is_found_without_texture_or_with_one_camera():
     """Catches noise taken for a surface, which would move the head at random."""
-    cameras, normals = rig(5), ball_points()
+    cameras = rig(5)
+    normals = ball_points()
     points = RADIUS_M * normals
     cosines = np.stack([facing(camera, points, normals) for camera in cameras])
     assert not surface_offsets(views(cameras, 0), cosines, points, normals, SWEEP)[1].any()
@@ -121,12 +123,15 @@ def test_large_images_are_reduced_to_the_size_of_a_sample():
 def test_points_are_of_skin_that_is_in_sight(head):
     """Catches the back of the head compared in images of the face, and points on eyeballs and
     teeth, which reflections and lids make look elsewhere."""
-    vertices, faces, masks = head.model.v_template, head.model.faces, head.model.masks
+    vertices = head.model.v_template
+    faces = head.model.faces
+    masks = head.model.masks
     points = surface_points(head, 400)
     inner = [masks[name] for name in ("left_eyeball", "right_eyeball", "teeth")]
     assert len(points) > 250
     assert not np.isin(faces[points.face], np.concatenate(inner)).any()
-    at, camera = points.on(vertices, faces), look_at((0, 0, 1.2), (0, 0, 0), 400, 400, 1300)
+    at = points.on(vertices, faces)
+    camera = look_at((0, 0, 1.2), (0, 0, 0), 400, 400, 1300)
     visible = in_sight(camera, vertices, faces, at)
     back, front = np.quantile(vertices[:, 2], [0.15, 0.85])
     assert visible[at[:, 2] > front].mean() > 0.8
@@ -135,7 +140,8 @@ def test_points_are_of_skin_that_is_in_sight(head):
 
 def test_offsets_are_smooth_robust_and_local(head):
     """Catches outliers that dent a face, and offsets that spread to where nothing was seen."""
-    vertices, faces = head.model.v_template, head.model.faces
+    vertices = head.model.v_template
+    faces = head.model.faces
     points = surface_points(head, 2000)
     at = points.on(vertices, faces)
     rng = np.random.default_rng(0)
@@ -167,7 +173,8 @@ def test_offsets_do_not_depend_on_how_the_surface_is_cut_into_triangles():
 
 def pictured(head, cameras, meshes):
     """Images of a take, in colors of the vertices without a pattern."""
-    count, faces = len(head.model.v_template), head.model.faces
+    count = len(head.model.v_template)
+    faces = head.model.faces
     colors = np.random.default_rng(2).uniform(0.25, 1, (count, 1)) * np.ones(3)
     pictures = [[(c, shaded_image(mesh, faces, c, colors)) for c in cameras] for mesh in meshes]
     return partial(shown, pictures)
@@ -176,12 +183,15 @@ def pictured(head, cameras, meshes):
 def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
     """Catches a surface that does not reach the fit, or the person's own offset that is lost:
     landmarks alone, wrong by 3 mm each, leave errors of millimeters."""
-    model, cameras = head.model, rig(5)
+    model = head.model
+    cameras = rig(5)
     rng = np.random.default_rng(5)
-    shape, front = rng.normal(0, 0.7, model.n_identity), model.v_template[:, 2] > 0.04
+    shape = rng.normal(0, 0.7, model.n_identity)
+    front = model.v_template[:, 2] > 0.04
     bump = 0.002 * np.sin(model.v_template[:, :1] * 60) * front[:, None] * [0, 0, 1]
     meshes = [flame_forward(model, shape, frame_at(head, t), bump) for t in (0, 6)]
-    images, wrong = pictured(head, cameras, meshes), rng.normal(0, 0.0018, (150, 3))
+    images = pictured(head, cameras, meshes)
+    wrong = rng.normal(0, 0.0018, (150, 3))
     take = recorded(head, cameras, meshes, places_on(head, 150), wrong=wrong, images=images)
     first = fit_head(head, take)
     fit = fit_surface(head, first, take, Helpers(1))
@@ -199,11 +209,14 @@ def test_a_head_is_moved_onto_the_skin_that_the_cameras_see(head):
 def test_one_timestep_does_not_tell_the_errors_of_landmarks(head, monkeypatch):
     """Catches landmarks that count as corrected for the person, although their errors may be the
     one expression."""
-    model, cameras, wrong = head.model, rig(5), np.random.default_rng(5).normal(0, 0.0018, (150, 3))
+    model = head.model
+    cameras = rig(5)
+    wrong = np.random.default_rng(5).normal(0, 0.0018, (150, 3))
     mesh = flame_forward(model, np.zeros(model.n_identity), frame_at(head, 6))
     images = pictured(head, cameras, [mesh])
     take = recorded(head, cameras, [mesh], places_on(head, 150), wrong=wrong, images=images)
-    first, found = fit_head(head, take), []
+    first = fit_head(head, take)
+    found = []
     for share in (0.2, 5.0):
         monkeypatch.setattr("stga_addon.tracking.surface.TAKE_LANDMARK_SHARE", share)
         found.append(fit_surface(head, first, take, Helpers(1)).parameters[0])
@@ -222,11 +235,15 @@ def test_skin_slides_as_dense_tracking_has_it(head, count, share):
     """Catches poses that follow the detector's landmarks where the surface does not tell, or that
     of three cameras follow the surface: the detector has the lower face 6 mm to one side, at each
     timestep another."""
-    model, cameras, places = head.model, rig(count, 280), places_on(head, 150)
-    shape, front = np.zeros(model.n_identity), model.v_template[:, 2] > 0.04
+    model = head.model
+    cameras = rig(count, 280)
+    places = places_on(head, 150)
+    shape = np.zeros(model.n_identity)
+    front = model.v_template[:, 2] > 0.04
     meshes = [flame_forward(model, shape, frame_at(head, t)) for t in (0, 3, 6)]
     lower = (places.on(model.v_template, model.faces)[:, 1] < 0)[:, None] * [0.006, 0, 0]
-    right, errors = recorded(head, cameras, meshes, places).landmarks, []
+    right = recorded(head, cameras, meshes, places).landmarks
+    errors = []
     at = [places.on(mesh, model.faces) + (t - 1) * lower for t, mesh in enumerate(meshes)]
     wrong = {t: seen(cameras, own) for t, own in enumerate(at)}
     images = pictured(head, cameras, meshes)
@@ -252,7 +269,8 @@ CAMERA = look_at((0.3, 0.1, 1.0), (0.01, 0, 0), 120, 160, 500)
 
 def ball(radius):
     """Vertices and triangles of a ball, and a thousand unit directions to its surface."""
-    mesh, directions = trimesh.creation.icosphere(4, radius), np.random.default_rng(0)
+    mesh = trimesh.creation.icosphere(4, radius)
+    directions = np.random.default_rng(0)
     directions = directions.normal(size=(1000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return np.array(mesh.vertices), np.array(mesh.faces), directions
@@ -298,12 +316,18 @@ def test_what_the_mask_does_not_show_is_left_open():
 def test_mattes_that_are_too_wide_are_not_followed(head):
     """Catches a face that grows by a matte's margin, or by hair: those of real captures are a pixel
     or two too wide."""
-    places, used, frame = places_on(head, 150), np.ones(150, bool), frame_at(head, 0)
-    shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
-    mesh, faces = flame_forward(head.model, shape, frame), head.model.faces
+    places = places_on(head, 150)
+    used = np.ones(150, bool)
+    frame = frame_at(head, 0)
+    shape = np.zeros(head.model.n_identity)
+    world = Similarity(1.0, np.eye(3), np.zeros(3))
+    mesh = flame_forward(head.model, shape, frame)
+    faces = head.model.faces
     fit = HeadFit(person(head, shape), shape, {0: frame.parameters}, world)
-    points, take = surface_points(head, 2000), RecordedTake(places, used, {}, no_image)
-    near, sweep = near_landmarks(head, points, take), Sweep(0.003, 0.0005, 0.001)
+    points = surface_points(head, 2000)
+    take = RecordedTake(places, used, {}, no_image)
+    near = near_landmarks(head, points, take)
+    sweep = Sweep(0.003, 0.0005, 0.001)
     for wide, agree in ((0, True), (2, False)):
         shown = []
         for camera in rig(5):

@@ -62,9 +62,11 @@ SWING_DEG = 20 * np.sin(np.arange(TIMESTEPS) / 1.5 - 2)  # Of what turns, at eac
 LIFT_M = 0.012 * np.sin(1.3 * np.arange(TIMESTEPS))[:, None] * [0.5, 1.0, 0.2]
 """By which shoulders are shifted at each timestep."""
 SLIDE_M = 0.01 * np.sin(0.9 * np.arange(TIMESTEPS))[:, None] * [1.0, 0.3, 0.0]
-CLOTH_CENTER_M, CLOTH_SIGMA_M = np.array([0.04, -0.23, 0.03]), 0.05
+CLOTH_CENTER_M = np.array([0.04, -0.23, 0.03])
+CLOTH_SIGMA_M = 0.05
 """By which cloth slides over the shoulders at each timestep; where, and how far around."""
-CHEST_SIZE_M, CHEST_CENTER_M = np.array([0.17, 0.08, 0.085]), np.array([0.0, -0.215, -0.04])
+CHEST_SIZE_M = np.array([0.17, 0.08, 0.085])
+CHEST_CENTER_M = np.array([0.0, -0.215, -0.04])
 HERE = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
@@ -136,14 +138,19 @@ def take(head, heads, torsos, size=SIZE, shifts=None):
         look_at((np.sin(a), 0.0, np.cos(a)), (0, -0.07, 0), *size, 2.6 * size[0])
         for a in (-0.6, 0.0, 0.6)
     ]
-    frames, shape = [Frames() for _ in cameras], np.zeros(pictured.n_identity)
+    frames = [Frames() for _ in cameras]
+    shape = np.zeros(pictured.n_identity)
     one = person(head, np.zeros(head.model.n_identity))
-    joints, parameters = joint_positions(one.model, one.model.v_template), {}
-    every, zero = np.concatenate([colors, cloth_colors]), np.zeros(3)
+    joints = joint_positions(one.model, one.model.v_template)
+    parameters = {}
+    every = np.concatenate([colors, cloth_colors])
+    zero = np.zeros(3)
     turns = zip(np.radians(heads), np.radians(torsos), strict=True)
     for timestep, (turned, carried) in enumerate(turns):
-        expr, moved = np.zeros(one.model.n_expression), np.array([0.002 * timestep, 0, 0])
-        root, neck = np.array([0, carried, 0]), np.array([0, turned - carried, 0])
+        expr = np.zeros(one.model.n_expression)
+        moved = np.array([0.002 * timestep, 0, 0])
+        root = np.array([0, carried, 0])
+        neck = np.array([0, turned - carried, 0])
         frame = FlameFrame(expr, root, neck, zero, moved, np.zeros(6))
         turn, straight = axis_angle_matrices(np.array([root, [0, turned, 0]]))
         shoulders = (cloth - joints[ROOT]) @ turn.T + joints[ROOT] + frame.translation
@@ -178,7 +185,8 @@ def test_a_torso_that_turns_against_the_head_is_followed(head, heads, torsos, mo
     """Catches shoulders that ride on the head, and a head that is moved to turn them."""
     fit, parameters, footage = take(head, heads * SWING_DEG, torsos * SWING_DEG)
     followed = follow(fit, parameters, footage)
-    torso, meshes = followed.motion, {t: followed.mesh(t) for t in parameters}
+    torso = followed.motion
+    meshes = {t: followed.mesh(t) for t in parameters}
     assert torso.motion in motions
     wrong = torso_angles(fit.head.model, meshes) - torsos * SWING_DEG
     assert np.abs(wrong - wrong.mean()).max() < 3.0
@@ -217,7 +225,8 @@ def test_the_necks_end_is_drawn_over_the_chest(fine_head):
     that is moved, and a back that is made up."""
     cloth, _, _ = ellipsoid()
     sheet = torso_sheet(fine_head.model)
-    at, base = fine_head.model.v_template[sheet.vertices], np.array([0.0, -0.14, -0.04])
+    at = fine_head.model.v_template[sheet.vertices]
+    base = np.array([0.0, -0.14, -0.04])
     shown = cloth[(cloth[:, 2] > CHEST_CENTER_M[2] + 0.02) & (cloth[:, 1] < base[1] - 0.01)]
     after = draped(sheet, at - base, shown - base) + base
     moved = np.linalg.norm(after - at, axis=1) > 0.02
@@ -242,7 +251,8 @@ def test_cloth_that_slides_over_the_shoulders_is_followed(fine_head):
     fit, parameters, footage = take(fine_head, SWING_DEG / 2, 0 * SWING_DEG, shifts=shifts)
     posed = TorsoTake(fit, parameters, footage.cameras)
     motion = posed.motion({t: TorsoPose(np.eye(3), LIFT_M[t]) for t in parameters}, rigid=True)
-    first, moved = 3, np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
+    first = 3
+    moved = np.arange(TIMESTEPS)[:, None] * [0.002, 0, 0] + LIFT_M
     shown = (cloth + slides[first] + moved[first])[cloth[:, 2] > CHEST_CENTER_M[2] + 0.02]
     walk = BothWays(Helpers(1), lambda *_: None, TIMESTEPS)
     bending = found_bending(posed, motion, TorsoPoints(first, shown), sorted(parameters), walk)
@@ -284,9 +294,11 @@ def test_without_masks_the_torso_is_not_told_from_the_wall(head):
 
 def test_turning_the_root_leaves_the_head_in_its_place(head):
     """Catches a neck that turns about another point than the model's."""
-    one, rng = person(head, np.zeros(head.model.n_identity)), np.random.default_rng(0)
+    one = person(head, np.zeros(head.model.n_identity))
+    rng = np.random.default_rng(0)
     expr = rng.normal(0, 0.3, one.model.n_expression)
-    root, neck = rng.normal(0, 0.4, 3), rng.normal(0, 0.2, 3)
+    root = rng.normal(0, 0.4, 3)
+    neck = rng.normal(0, 0.2, 3)
     frame = FlameFrame(expr, root, neck, np.zeros(3), rng.normal(0, 1, 3), np.zeros(6))
     # the throat's correctives are another thing
     model = replace(one.model, posedirs=np.zeros_like(one.model.posedirs))
@@ -305,11 +317,13 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     """Catches a drape that offsets repeat, or that template or static offset lack, an earlier
     static offset that is lost, cloth that does not bend, a head that offsets move, and figures of
     the report in other units or of another joint."""
-    bare, rng = person(fine_head, np.zeros(fine_head.model.n_identity)), np.random.default_rng(3)
+    bare = person(fine_head, np.zeros(fine_head.model.n_identity))
+    rng = np.random.default_rng(3)
     size = bare.model.v_template.shape
     static = rng.normal(0, 1e-3, size) * earlier
     one = with_offset(bare, static)
-    model, expressions = one.model, bare.model.n_expression
+    model = one.model
+    expressions = bare.model.n_expression
     tracked = {t: rng.normal(0, 0.2, expressions + 18) for t in (2, 5, 9)}
     posed = {t: PosedTorso(values, rng.normal(0, 0.01, 3)) for t, values in tracked.items()}
     fit = HeadFit(one, np.zeros(0), tracked, HERE, static if earlier else None)
@@ -326,7 +340,8 @@ def test_a_take_on_its_torso_has_the_vertices_that_motion_and_cloth_say(fine_hea
     for timestep, torso in posed.items():
         expression, pose = np.split(torso.parameters, [expressions])
         rest = model.v_template + model.shapedirs @ expression
-        turn, joint = Rotation.from_rotvec(pose[:3]).as_matrix(), model.j_regressor[ROOT] @ rest
+        turn = Rotation.from_rotvec(pose[:3]).as_matrix()
+        joint = model.j_regressor[ROOT] @ rest
         rigid = (rest - joint) @ turn.T + joint + pose[-3:] + torso.shift
         wanted = share * rigid + (1 - share) * posed_mesh(fit, torso.parameters)
         if bends:
@@ -369,7 +384,8 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
         points = np.stack([camera.project(places.on(mesh, head.model.faces))[0] for mesh in meshes])
         arrays = {"timesteps": np.arange(TIMESTEPS), "points": points}
         write_npz(tmp_path / f"points/cam{number}.npz", arrays)
-    footage, out = open_footage(tmp_path / "footage"), tmp_path / "out"
+    footage = open_footage(tmp_path / "footage")
+    out = tmp_path / "out"
     result = track(footage, tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
     found = read_torso_motion(out)
     assert found == result.torso
@@ -380,7 +396,8 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     assert all(list(own) == list(map(str, range(TIMESTEPS))) for own in misfit.values())
     assert all(0 < value < 0.5 for own in misfit.values() for value in own.values())
     capture = open_capture(out, tmp_path / "head.npz")
-    sequence, used = capture.flame, np.unique(capture.faces[torso_faces(capture.flame.model)])
+    sequence = capture.flame
+    used = np.unique(capture.faces[torso_faces(capture.flame.model)])
     lifts = np.array([capture.mesh(timestep)[used].mean(0)[1] for timestep in range(TIMESTEPS)])
     assert np.corrcoef(lifts, LIFT_M[:, 1])[0, 1] > 0.95
     necks = np.degrees([sequence.frame(timestep).neck_pose[1] for timestep in range(TIMESTEPS)])

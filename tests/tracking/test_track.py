@@ -91,7 +91,8 @@ def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
 def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head):
     """Catches wrong axes, units or a principal point in what is written, and a bar's jumps."""
     folder, meshes = recorded
-    paths, told = (folder / "footage", folder / "head.npz", folder / "out"), []
+    paths = (folder / "footage", folder / "head.npz", folder / "out")
+    told = []
     request = Track(*paths, landmarks=folder / "points", meshes=True)
     written = perform(request, lambda progress: bool(told.append(progress)), print)
     assert "interpolated: 2" in str(written.lines)
@@ -137,7 +138,8 @@ def test_the_cameras_world_is_kept(recorded, capsys, head, scale, arguments):
     assert unit == (pytest.approx(1.0, rel=1e-9) if scale < 2 else pytest.approx(0.001, rel=0.03))
     filmed = {camera.name: camera.camera for camera in open_footage(folder / "footage").cameras}
     for view in capture.views["train"]:
-        camera, turned = filmed[f"cam{view.camera_index}"], view.camera.world_to_camera[:3, :3]
+        camera = filmed[f"cam{view.camera_index}"]
+        turned = view.camera.world_to_camera[:3, :3]
         np.testing.assert_allclose(view.camera.position, unit * camera.position, atol=1e-6)
         np.testing.assert_allclose(turned, camera.world_to_camera[:3, :3], atol=1e-9)
     for timestep in (0, 3):
@@ -173,7 +175,8 @@ def test_offsets_that_are_none(recorded, capsys, offset):
 
 def test_a_linear_model_gives_a_mesh_capture(recorded, head):
     """Catches a layout that only FLAME's own files open in."""
-    folder, model = recorded[0], head.model
+    folder = recorded[0]
+    model = head.model
     shapes = np.split(model.shapedirs, [model.n_identity], axis=2)
     named = dict(zip(("identity", "expression"), shapes, strict=True))
     write_npz(folder / "head.npz", {"mean": model.v_template, "faces": model.faces, **named})
@@ -187,17 +190,36 @@ ONE_POINT = {"face": np.zeros(LANDMARKS, int), "barycentric": np.full((LANDMARKS
 OTHERS = {"points": np.zeros((5, 7, 2)), "confidence": np.ones((5, 7))}
 
 
-@pytest.mark.parametrize(("file", "changes", "more", "message"), [
-    ("cam3", lambda points: {"points": points * [-1, 1] + [SIZE + 9, 0]}, (),
-     r"camera cam3: .* timestep"),
-    ("cam3", lambda points: {"points": np.roll(points, 3, axis=0)}, (),
-     r"camera cam3: .* at timestep \d, .* check its calibration, synchroniz"),
-    ("cam0", lambda _: OTHERS, (), "points: the files have different numbers of landmarks"),
-    ("head_model", lambda _: ONE_POINT, (),
-     "head_model.npz: face: its landmarks lie in one point of the head model"),
-    ("cam0", lambda _: {}, ("--offset", "cam1=3"),
-     "transforms.json: lists images, which offsets do not apply to"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("file", "changes", "more", "message"),
+    [
+        (
+            "cam3",
+            lambda points: {"points": points * [-1, 1] + [SIZE + 9, 0]},
+            (),
+            r"camera cam3: .* timestep",
+        ),
+        (
+            "cam3",
+            lambda points: {"points": np.roll(points, 3, axis=0)},
+            (),
+            r"camera cam3: .* at timestep \d, .* check its calibration, synchroniz",
+        ),
+        ("cam0", lambda _: OTHERS, (), "points: the files have different numbers of landmarks"),
+        (
+            "head_model",
+            lambda _: ONE_POINT,
+            (),
+            "head_model.npz: face: its landmarks lie in one point of the head model",
+        ),
+        (
+            "cam0",
+            lambda _: {},
+            ("--offset", "cam1=3"),
+            "transforms.json: lists images, which offsets do not apply to",
+        ),
+    ],
+)
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_what_does_not_fit_is_named(recorded, capsys, file, changes, more, message):
     """Catches a camera mirrored, misplaced or started later, and others' landmarks."""
@@ -212,7 +234,8 @@ def test_what_does_not_fit_is_named(recorded, capsys, file, changes, more, messa
 def test_a_mirrored_rig_is_named(recorded, capsys, head):
     """Catches images that are all mirrored, where no camera stands out from the others."""
     folder, meshes = recorded
-    template, faces = head.model.v_template, head.model.faces
+    template = head.model.v_template
+    faces = head.model.faces
     mirrored = places_on(head, LANDMARKS).on(template, faces) * [-1, 1, 1]
     twins, _ = nearest_points(template, faces, mirrored)
     for number, camera in enumerate(rig()):
@@ -271,12 +294,15 @@ def test_a_camera_at_the_side_is_not_blamed_for_what_landmarks_get_wrong_there(
     """Catches a warning on a sound camera that sees the face nearly in profile, where landmarks are
     of another size by up to 7 % on the path-traced head; and a wrong focal length at the side that
     is no longer told."""
-    places, used = places_on(head, LANDMARKS), np.ones(LANDMARKS, bool)
+    places = places_on(head, LANDMARKS)
+    used = np.ones(LANDMARKS, bool)
     parameters = {t: np.zeros(head.model.n_expression + RIGID_SIZE) for t in range(3)}
-    shape, world = np.zeros(head.model.n_identity), Similarity(1.0, np.eye(3), np.zeros(3))
+    shape = np.zeros(head.model.n_identity)
+    world = Similarity(1.0, np.eye(3), np.zeros(3))
     fit = HeadFit(person(head, shape), shape, parameters, world)
     at = places.on(head.model.v_template, head.model.faces)
-    cameras, points = [], []
+    cameras = []
+    points = []
     for number, angle in enumerate(np.radians([-30, -10, 10, 30, side_deg])):
         eye = at.mean(0) + 0.9 * np.array([np.sin(angle), 0, np.cos(angle)])
         camera = look_at(eye, at.mean(0), 200, 200, 500.0)
@@ -295,7 +321,8 @@ class Counting:
     """A detector that sees `faces` in each image."""
 
     def __init__(self, faces):
-        self.faces, self.calls = faces, 0
+        self.faces = faces
+        self.calls = 0
 
     def detect(self, image):
         self.calls += 1
@@ -306,7 +333,8 @@ def test_detection_resumes_camera_by_camera(recorded):
     """Catches a canceled detection that starts from the beginning, or keeps half a camera, and a
     head that jumps between two people."""
     folder, _ = recorded
-    footage, detector = open_footage(folder / "footage"), Counting([np.ones((3, 2))] * 2)
+    footage = open_footage(folder / "footage")
+    detector = Counting([np.ones((3, 2))] * 2)
     with pytest.raises(KeyboardInterrupt):
         detect_landmarks(footage, detector, folder / "found", Helpers(1), cancel)
     assert len(list((folder / "found").iterdir())) == 2
@@ -351,13 +379,15 @@ def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
     numbers."""
     number = iter(range(25))
     meshes = record(tmp_path, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
-    places, rng = places_on(head, LANDMARKS), np.random.default_rng(0)
+    places = places_on(head, LANDMARKS)
+    rng = np.random.default_rng(0)
     exact = [
         camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
     ]
     noisy = [points + rng.normal(0, 0.1, points.shape) for points in exact]
     use_detector(monkeypatch, Remembering(noisy), places)
-    footage, model = open_footage(tmp_path / "footage"), tmp_path / "head.npz"
+    footage = open_footage(tmp_path / "footage")
+    model = tmp_path / "head.npz"
     track(footage, model, tmp_path / "unbroken")
     with pytest.raises(KeyboardInterrupt):
         track(footage, model, tmp_path / "resumed", report=cancel)
@@ -397,7 +427,8 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     use_detector(monkeypatch, Counting([]), places_on(head, LANDMARKS))
     for name in ("out", "out_0", "out_1"):
         (tmp_path / name).mkdir()  # else nothing is left of footage without a face
-    none, other = "shows no face", "holds landmarks of other footage"
+    none = "shows no face"
+    other = "holds landmarks of other footage"
     for offset, message in ((1, none), (1, none), (2, other)):
         frames = FrameRange(stop=6, offsets={"b": offset})
         with pytest.raises(StgaError, match=message):

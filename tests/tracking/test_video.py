@@ -14,11 +14,18 @@ from .scenes import encode, rig, write_colmap_text
 
 av = pytest.importorskip("av")
 
-BLOCK, COLUMNS, ROWS = 16, 6, 4
+BLOCK = 16
+COLUMNS = 6
+ROWS = 4
 FRAMES = 52
 X264 = {
-    "bf": "3", "b_strategy": "0", "g": "12", "keyint_min": "12", "sc_threshold": "0", "crf": "12",
-}  # fmt: skip
+    "bf": "3",
+    "b_strategy": "0",
+    "g": "12",
+    "keyint_min": "12",
+    "sc_threshold": "0",
+    "crf": "12",
+}
 OPEN_X264 = X264 | {"x264-params": "open-gop=1:b-adapt=0"}
 OPEN_X265 = {
     "x265-params": "open-gop=1:keyint=12:min-keyint=12:scenecut=0:bframes=3:b-adapt=0:crf=12:"
@@ -41,14 +48,16 @@ VIDEOS = {
     "MPEG-2 in MXF": ("a.mxf", "mpeg2video", MPEG4),
     "Motion JPEG in AVI": ("a.avi", "mjpeg", {"qmin": "2", "qmax": "3"}),
     "VP9": (
-        "a.webm", "libvpx-vp9",
+        "a.webm",
+        "libvpx-vp9",
         {"g": "12", "b": "2000000", "cpu-used": "8", "deadline": "realtime"},
     ),
     "VP8 with hidden reference frames": (
-        "a.webm", "libvpx",
+        "a.webm",
+        "libvpx",
         {"g": "40", "b": "2000000", "auto-alt-ref": "1", "lag-in-frames": "10", "cpu-used": "4"},
     ),
-}  # fmt: skip
+}
 
 
 def picture(number):
@@ -149,10 +158,15 @@ def test_frames_hidden_by_an_edit_list(tmp_path, codec, suffix):
     assert_numbers(path, list(range(7, FRAMES)))
 
 
-@pytest.mark.parametrize(("codec", "options", "name"), [
-    ("libx265", OPEN_X265, "a.mov"), ("libx265", OPEN_X265, "a.mkv"),
-    ("libx265", OPEN_X265, "a.mts"), ("libx264", OPEN_X264, "a.mts"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("codec", "options", "name"),
+    [
+        ("libx265", OPEN_X265, "a.mov"),
+        ("libx265", OPEN_X265, "a.mkv"),
+        ("libx265", OPEN_X265, "a.mts"),
+        ("libx264", OPEN_X264, "a.mts"),
+    ],
+)
 def test_beginning_that_cannot_be_decoded(tmp_path, codec, options, name):
     """Catches pictures counted whose references were cut away, and frames shown in their place."""
     whole = tmp_path / f"whole{name[1:]}"
@@ -182,7 +196,8 @@ def test_variable_frame_rate(tmp_path):
     """Catches frames of a phone played evenly although gaps lie between them: out of step with
     sound and other cameras, and motion taken for a jump."""
     durations = [1, 1, 1, 2, 1, 3, 1, 75] * 8
-    count, path = len(durations), tmp_path / "a.mkv"
+    count = len(durations)
+    path = tmp_path / "a.mkv"
     write_numbered(path, "libx264", X264, count, rate=50, durations=durations)
     footage = open_footage(tmp_path)
     (warning,) = footage.warnings
@@ -212,19 +227,22 @@ def test_cameras_whose_rate_varies_apart(tmp_path):
 # A display matrix in the file's track header, and how a player shows the corners a b / c d of the
 # stored picture.
 TURNS = {
-    "as stored": ((1, 0, 0, 1), "ab cd"), "mirrored": ((-1, 0, 0, 1), "ba dc"),
-    "upside down": ((-1, 0, 0, -1), "dc ba"), "mirrored top to bottom": ((1, 0, 0, -1), "cd ab"),
+    "as stored": ((1, 0, 0, 1), "ab cd"),
+    "mirrored": ((-1, 0, 0, 1), "ba dc"),
+    "upside down": ((-1, 0, 0, -1), "dc ba"),
+    "mirrored top to bottom": ((1, 0, 0, -1), "cd ab"),
     "turned clockwise": ((0, 1, -1, 0), "ca db"),
     "turned counterclockwise": ((0, -1, 1, 0), "bd ac"),
     "mirrored and turned": ((0, 1, 1, 0), "ac bd"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("turn", TURNS)
 def test_display_matrices(tmp_path, turn):
     """Catches a front camera's video that is shown mirrored, lying or upside down."""
     matrix, expected = TURNS[turn]
-    path, levels = tmp_path / "phone.mp4", {"a": 30, "b": 90, "c": 150, "d": 210}
+    path = tmp_path / "phone.mp4"
+    levels = {"a": 30, "b": 90, "c": 150, "d": 210}
     stored = np.reshape(list(levels.values()), (2, 2))
     image = np.kron(stored, np.ones((32, 48))).astype(np.uint8)
     encode(path, [np.repeat(image[..., None], 3, axis=2)], options={"crf": "8"})
@@ -258,16 +276,20 @@ SIGNALS = {
 def test_colors_of_phones(tmp_path, name):
     """Catches HDR shown flat and dark, and wide colors shown pale."""
     (primaries, transfer, matrix), signal, expected = SIGNALS[name]
-    path, deep = tmp_path / "a.mov", transfer != 1
+    path = tmp_path / "a.mov"
+    deep = transfer != 1
     codec, pixels = ("libx265", "yuv444p10le") if deep else ("libx264", "yuv444p")
     if codec not in av.codecs_available:
         pytest.skip(f"this PyAV lacks {codec}")
     options = {"crf": "4"} | ({"x265-params": "log-level=0"} if deep else {})
 
     def set_up(stream):
-        stream.pix_fmt, context = pixels, stream.codec_context
-        context.color_primaries, context.color_trc = primaries, transfer
-        context.colorspace, context.color_range = matrix, 1
+        stream.pix_fmt = pixels
+        context = stream.codec_context
+        context.color_primaries = primaries
+        context.color_trc = transfer
+        context.colorspace = matrix
+        context.color_range = 1
 
     image = np.broadcast_to(np.round(65535 * np.array(signal)), (64, 64, 3)).astype(np.uint16)
     frame = av.VideoFrame.from_ndarray(image, format="rgb48le").reformat(
@@ -300,7 +322,8 @@ def test_file_that_is_cut_off(tmp_path):
     path = tmp_path / "cut.mp4"
     copy_packets(tmp_path / "a.mp4", path, options={"movflags": "faststart"})
     packets = packets_of(path)
-    times, last = [packet.pts for packet in packets], packets[33]
+    times = [packet.pts for packet in packets]
+    last = packets[33]
     numbers = [sorted(times).index(time) for time in sorted(times[:33])]
     path.write_bytes(path.read_bytes()[: last.pos + last.size // 2])
     footage = open_footage(path)
@@ -316,7 +339,8 @@ def test_frame_that_the_decoder_leaves_out(tmp_path):
     path = tmp_path / "a.mov"
     write_numbered(path, "libx265", OPEN_X265)
     packet = sorted(packets_of(path), key=lambda packet: packet.pts)[41]
-    begin, end = packet.pos, packet.pos + packet.size
+    begin = packet.pos
+    end = packet.pos + packet.size
     data = bytearray(path.read_bytes())
     while begin < end:
         data[begin + 4] = 38 << 1  # makes filler data of the unit, which decoders pass over

@@ -14,7 +14,8 @@ from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
 from stga_addon.render.render import render, to_uint8
 
-TIMESTEPS, CAMERAS = (0, 2, 3, 5, 6), range(5)
+TIMESTEPS = (0, 2, 3, 5, 6)
+CAMERAS = range(5)
 """The last timestep is `test`, the last camera `val`."""
 PLACES = (0, 1, 3, 4, 2)
 """Of the cameras, side by side: `val` is in the middle."""

@@ -12,8 +12,13 @@ from stga_addon.training.settings import TrainingSettings
 from .toys import bits, random_splats, random_state
 
 RATES = {
-    "xyz": 1e-3, "rotation": 5e-3, "log_scale": 2e-2, "opacity": 5e-2, "sh": 1e-2, "sh_rest": 1e-3,
-}  # fmt: skip
+    "xyz": 1e-3,
+    "rotation": 5e-3,
+    "log_scale": 2e-2,
+    "opacity": 5e-2,
+    "sh": 1e-2,
+    "sh_rest": 1e-3,
+}
 OPTIONS = adam.PLAIN._replace(
     beta2=np.float32(0.99), ema_share=np.float32(0.2), epsilon=np.float32(1e-5)
 )
@@ -77,7 +82,8 @@ def test_each_row_is_torchs_adam_with_its_own_history(seed, degree):
     for n, row in enumerate(rows):
         for name in ("xyz", "rotation", "log_scale", "opacity"):
             # 25 float32 steps of at most the rate each
-            found, wanted = getattr(state.parameters, name)[n], row[name].detach()
+            found = getattr(state.parameters, name)[n]
+            wanted = row[name].detach()
             np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=25 * RATES[name] * 1e-5)
         color = torch.cat([row["sh"], row["sh_rest"]]).detach()
         np.testing.assert_allclose(
@@ -132,7 +138,8 @@ def test_many_rows(ahead):
         square = (0.999 * old[f"second/{name}"] + 0.001 * gradient**2) / (1 - 0.999**per_row)
         rate = np.full(value.shape[1:], RATES[name])
         if name == "sh":
-            rate[1:], rate[4:] = RATES["sh_rest"], 0
+            rate[1:] = RATES["sh_rest"]
+            rate[4:] = 0
         step = rate * mean / np.sqrt(square)
         # Where the random second moment is near zero a step is many rates long, and rounded in
         # proportion.

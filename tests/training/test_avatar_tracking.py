@@ -89,7 +89,8 @@ def test_a_finished_avatar_finds_the_head(
     """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too
     early, and a drift of the last timestep, which is tracked right already."""
     capture, true = lost
-    tracking, stages = RefinedTracking(capture, "stga"), list[tuple[int, int]]()
+    tracking = RefinedTracking(capture, "stga")
+    stages = list[tuple[int, int]]()
 
     def report(done: int, total: int) -> bool:
         stages.append((done, total))
@@ -97,7 +98,8 @@ def test_a_finished_avatar_finds_the_head(
 
     found = track_by_avatar(*person, capture, report=report)
     tracking.take(found, TIMESTEPS)
-    before, after = millimeters(capture, true), millimeters(tracking.refined(capture), true)
+    before = millimeters(capture, true)
+    after = millimeters(tracking.refined(capture), true)
     assert (before[:-1] > 2).all()
     assert np.median(after[:-1] / before[:-1]) < 0.3
     assert after[-1] < 0.8  # a third of a pixel
@@ -121,10 +123,12 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
 def test_time_says_what_images_do_not(right: Made) -> None:
     """Catches jitter in depth that a single camera does not see, motion that it does see but that
     is smoothed away, a blurred cut, and shifts and poses that change places."""
-    model, count = right[0].flame.model, 40
+    model = right[0].flame.model
+    count = 40
     known = np.full(model.n_expression + 3 + 18, 1e-5) ** -2.0
     known[[0, -1]] = 0.1**-2, 0.01**-2
-    values, noise = np.zeros((count, model.n_expression + 18)), np.random.default_rng(0)
+    values = np.zeros((count, model.n_expression + 18))
+    noise = np.random.default_rng(0)
     values[count // 2 :, 0] = 3  # a cut
     values[:, -3:] = noise.normal(0, 0.003, (count, 3))
     shift = noise.normal(0, 0.003, (count, 3))
@@ -142,7 +146,8 @@ def differences(
     tracking: RefinedTracking, timestep: int, loss: Callable[[], float], step: float
 ) -> np.ndarray:
     """(P,) central differences of a loss; step: meters by which vertices move, about."""
-    row, before = tracking.sequence.timesteps.index(timestep), tracking.parameters.copy()
+    row = tracking.sequence.timesteps.index(timestep)
+    before = tracking.parameters.copy()
     sizes = step * np.repeat([250.0, 10.0, 1.0], [2, 15, 3])
     found = []
     for number, size in enumerate(sizes):
@@ -180,10 +185,19 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
         origin, turn, scale = (torch.from_numpy(getattr(frames(), name)[face]) for name in NAMES)
         w, x, y, z = (rotation / rotation.norm(dim=1, keepdim=True)).unbind(1)
         own = torch.stack(
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1
-        ).reshape(-1, 3, 3)  # fmt: skip
+            [
+                1 - 2 * (y * y + z * z),
+                2 * (x * y - w * z),
+                2 * (x * z + w * y),
+                2 * (x * y + w * z),
+                1 - 2 * (x * x + z * z),
+                2 * (y * z - w * x),
+                2 * (x * z - w * y),
+                2 * (y * z + w * x),
+                1 - 2 * (x * x + y * y),
+            ],
+            1,
+        ).reshape(-1, 3, 3)
         place = scale[:, None] * (turn @ xyz[..., None])[..., 0] + origin
         axes = scale[:, None, None] * turn @ own * log_scale.exp()[:, None]
         return (toward * place).sum() + 0.1 * (along * (axes @ axes.mT)).sum()
@@ -225,7 +239,8 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
         train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
     refined = with_refined_tracking(capture, tmp_path / "True")
-    before, after = millimeters(capture, true), millimeters(refined, true)
+    before = millimeters(capture, true)
+    after = millimeters(refined, true)
     assert np.median(after[:-1] / before[:-1]) < 0.6
     assert quality[True] > quality[False] + 1.0
     assert re.search(r"left out gain [1-9]\.\d\d dB", "\n".join(report_run(tmp_path / "True")))
@@ -237,7 +252,8 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
 ) -> None:
     """Catches tracking that is judged by images that it has fitted, by the wrong sign, or kept
     where the heads were right before; here it moves them by 4 mm."""
-    capture, given = right[0], []
+    capture = right[0]
+    given = []
     if held_out == "timesteps":
         capture = replace(capture, views={**capture.views, "val": ()})
         monkeypatch.setattr(session, "LEFT_OUT_INTERVAL", 2)
@@ -257,7 +273,8 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     train(capture, tmp_path, make_run(capture))
     tracked = TIMESTEPS[:-1] if held_out == "camera" else (0, 3)
     assert given == [(tracked, {0, 1, 2, 3})]  # and no timesteps of other splits afterwards
-    checkpoint, before = read_checkpoint(tmp_path), RefinedTracking(capture, "stga").parameters
+    checkpoint = read_checkpoint(tmp_path)
+    before = RefinedTracking(capture, "stga").parameters
     np.testing.assert_array_equal(checkpoint.tracking, before)
     said = "\n".join(report_run(tmp_path))
     assert re.search(r"left out lose \d\.\d\d dB, so heads stay as they were tracked", said)
@@ -329,7 +346,8 @@ def test_damaged_checkpoints(
 def test_the_runs_capture_has_the_refined_meshes(lost: Made, right: Made, run_folder: Path) -> None:
     """Catches a quality on other meshes than trained on, and meshes of another capture."""
     capture, _ = lost
-    checkpoint, tracking = read_checkpoint(run_folder), RefinedTracking(capture, "stga")
+    checkpoint = read_checkpoint(run_folder)
+    tracking = RefinedTracking(capture, "stga")
     assert checkpoint.tracking is not None
     tracking.parameters = checkpoint.tracking
     shown = with_refined_tracking(capture, run_folder)

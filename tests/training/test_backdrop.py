@@ -44,7 +44,8 @@ def person() -> tuple[np.ndarray, np.ndarray]:
 def test_soft_edge_keeps_no_wall():
     """Catches a rim of the wall's color, as plain blending has: against the true foreground."""
     colors, cover = person()
-    alpha, mask = cover[..., None], (255 * cover).round().astype(np.uint8)
+    alpha = cover[..., None]
+    mask = (255 * cover).round().astype(np.uint8)
     image = (alpha * colors + (1 - alpha) * room()).round().astype(np.uint8)
     expected = alpha * colors + (1 - alpha) * 255 * np.array(GREEN)
     error = np.abs(over_color(image, mask, GREEN) - expected)
@@ -132,7 +133,8 @@ def test_exchanged_background_is_the_composite_over_the_new_one():
     foreground = rng.integers(0, 256, (9, 7, 3))
     coverage = rng.integers(0, 256, (9, 7)).astype(np.uint8)
     alpha = coverage[..., None] / 255
-    before, after = np.array([255, 255, 255], np.float32), np.array([20, 130, 240], np.float32)
+    before = np.array([255, 255, 255], np.float32)
+    after = np.array([20, 130, 240], np.float32)
     image = np.rint(foreground * alpha + before * (1 - alpha)).astype(np.uint8)
     out = np.empty_like(image)
     change_background(image, coverage, before, after, out)
@@ -150,7 +152,8 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
         trainer.step(view, np.full_like(read_image(view), 255), n / 150, read_mask(view))
     errors = []
     for view in capture.views["val"]:
-        splats, frames = trainer.state.parameters, trainer.frames.of(view.timestep)
+        splats = trainer.state.parameters
+        frames = trainer.frames.of(view.timestep)
         rendering = trainer._backend._forward(splats, frames, view, np.zeros(3, np.float32), 0)
         mask = read_mask(view)
         assert mask is not None

@@ -14,7 +14,8 @@ from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 
 from .toys import bits, random_state
 
-FACES, COUNT = 6, 40
+FACES = 6
+COUNT = 40
 FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
@@ -58,8 +59,10 @@ def test_survivors_keep_everything_and_children_what_steadies_them():
     assert not new.gradient_count.any()
     assert {len(array) for array in arrays_of(new).values()} == {COUNT + 3}
     state = busy_state([])
-    state.screen_gradient[5], state.gradient_count[5] = 8.0, 2.0
-    state.screen_gradient[6], state.gradient_count[6] = 5.0, 1.0
+    state.screen_gradient[5] = 8.0
+    state.gradient_count[5] = 2.0
+    state.screen_gradient[6] = 5.0
+    state.gradient_count[6] = 1.0
     new = control(state, budget=1)
     left = {tuple(p) for p in new.splats().xyz.tolist()}
     assert tuple(state.parameters.xyz[6].tolist()) not in left
@@ -119,7 +122,8 @@ def test_a_split_covers_about_what_its_parent_did(opacity):
 
     state = new_state(splats)
     parent = cover(state)
-    state.screen_gradient[0], state.gradient_count[0] = 1.0, 1.0
+    state.screen_gradient[0] = 1.0
+    state.gradient_count[0] = 1.0
     split = control_density(state, 10, np.random.default_rng(0), 1.0)
     assert len(split) == 2
     children = cover(split)

@@ -34,7 +34,8 @@ def make_trainer(capture: Capture, *offsets: str, seed: int = 0) -> Trainer:
     settings = quick_settings(
         "global", lattice=1, driven_offsets=offsets or tuple(OFFSETS), random_background=False
     )
-    trainer, rng = Trainer(capture, settings, {}), np.random.default_rng(seed)
+    trainer = Trainer(capture, settings, {})
+    rng = np.random.default_rng(seed)
     for name, state in trainer.state.driven_offsets.items():
         state.value[:] = rng.normal(0, SIZES[OFFSETS[name].target], state.value.shape)
     return trainer
@@ -45,7 +46,8 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
     """Catches a gradient of the wrong sign, unit or axes, and one summed over other splats: against
     differences of the loss by each coefficient of a few triangles."""
     capture = squeezed(toy)
-    trainer, offset = make_trainer(capture, name), OFFSETS[name]
+    trainer = make_trainer(capture, name)
+    offset = OFFSETS[name]
     view = capture.views["train"][0]
     target = np.random.default_rng(1).integers(
         0, 255, (view.camera.height, view.camera.width, 3), np.uint8
@@ -64,7 +66,8 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
         return found
 
     loss(before)
-    stepped, first = position.value.copy(), position.first.copy()
+    stepped = position.value.copy()
+    first = position.first.copy()
     gradient = first / (1 - float(adam.PLAIN.beta1))
     assert position.steps.max() == 1
     touched = np.flatnonzero(position.steps)
@@ -90,10 +93,18 @@ def test_the_step_is_adams_on_the_gradient_of_the_loss(toy, name):
 def test_the_step_is_adam_in_float64():
     """Catches a bias correction, an average or a count that is not each triangle's own, gradients
     of splats that were not trained, and a broken gradient that gets in."""
-    rng, faces, rate, ema_share, epsilon = np.random.default_rng(2), 6, 0.02, 0.1, np.float32(1e-3)
-    state, offset = new_offset(rng.normal(0, 1, (faces, 3, 3))), OFFSETS["strain_position"]
-    value, average = state.value.astype(np.float64), state.value.astype(np.float64)
-    first, second, steps = np.zeros_like(value), np.zeros_like(value), np.zeros(faces, int)
+    rng = np.random.default_rng(2)
+    faces = 6
+    rate = 0.02
+    ema_share = 0.1
+    epsilon = np.float32(1e-3)
+    state = new_offset(rng.normal(0, 1, (faces, 3, 3)))
+    offset = OFFSETS["strain_position"]
+    value = state.value.astype(np.float64)
+    average = state.value.astype(np.float64)
+    first = np.zeros_like(value)
+    second = np.zeros_like(value)
+    steps = np.zeros(faces, int)
     for number in range(8):
         face = rng.choice([0, 1, 3, 4] if number % 2 else [0, 2, 3], 40).astype(np.int32)
         rows = rng.permutation(40).astype(np.int32)[:25]
@@ -105,7 +116,8 @@ def test_the_step_is_adam_in_float64():
             driven_offsets={offset.name: state}, face=face, gradients=SimpleNamespace(xyz=gradient)
         )
         options = adam.PLAIN._replace(ema_share=np.float32(ema_share), epsilon=np.float32(epsilon))
-        signal, rates = {offset.signal: smoothed}.__getitem__, {offset.rate: rate}
+        signal = {offset.signal: smoothed}.__getitem__
+        rates = {offset.rate: rate}
         adam.step_offsets(splats, rows, signal, rates, options)
         for f in np.unique(face[rows]):
             steps[f] += 1
@@ -115,7 +127,8 @@ def test_the_step_is_adam_in_float64():
                 continue
             first[f] = 0.9 * first[f] + 0.1 * g
             second[f] = 0.999 * second[f] + 0.001 * g**2
-            m, v = first[f] / (1 - 0.9 ** steps[f]), second[f] / (1 - 0.999 ** steps[f])
+            m = first[f] / (1 - 0.9 ** steps[f])
+            v = second[f] / (1 - 0.999 ** steps[f])
             value[f] -= offset.rate_share * rate * m / (np.sqrt(v) + epsilon)
             average[f] += max(ema_share, 4 / (steps[f] + 3)) * (value[f] - average[f])
     np.testing.assert_array_equal(state.steps, steps)
@@ -132,11 +145,13 @@ def test_tracking_follows_splats_that_move_and_grow(toy, monkeypatch):
     held = np.full((len(toy.faces), 3), [0.7, 0.7, 0], np.float32)
     monkeypatch.setitem(SIGNALS, "smoothed_strain", lambda basis, frames: held)
     trainer = make_trainer(squeezed(toy), "strain_position", "strain_scale")
-    offsets, view = trainer.state.driven_offsets, toy.views["train"][0]
+    offsets = trainer.state.driven_offsets
+    view = toy.views["train"][0]
     offsets["strain_scale"].value[:] = np.diag([-1, 0, 0])  # half as large
     offsets["strain_position"].value[:, 1] = 0.005 * np.eye(3)[2]  # outwards
     backend = CpuBackend(trainer.settings, trainer.frames, trainer.state)
-    target, black = read_view(view)[1], np.zeros(3, np.float32)
+    target = read_view(view)[1]
+    black = np.zeros(3, np.float32)
     mesh = trainer.frames.mesh(view.timestep).copy()
 
     def loss(posed):
@@ -160,10 +175,13 @@ def test_training_draws_what_the_avatar_draws(toy):
     view = capture.views["val"][0]
     seen = trained_strain_range(capture, capture.mesh, None)
     avatar = Avatar(
-        trainer.state.splats(averaged=True), "stga", capture.neutral.astype(np.float32),
-        capture.faces, strain_range=seen,
+        trainer.state.splats(averaged=True),
+        "stga",
+        capture.neutral.astype(np.float32),
+        capture.faces,
+        strain_range=seen,
         driven_offsets={n: state.average for n, state in trainer.state.driven_offsets.items()},
-    )  # fmt: skip
+    )
     drawn = trainer.render(view, 0.0)
     expected = render_avatar(avatar, capture.mesh(view.timestep), view.camera, (1.0, 1.0, 1.0))
     np.testing.assert_allclose(drawn, expected, atol=2e-5)

@@ -61,10 +61,13 @@ def test_run_round_trip(tmp_path, strategy):
         ("effect_plan", [{"effect": "jaw"}], r"effect_plan\.0: fields are missing or unknown"),
         ("identity", {"faces": 5}, r"identity: fields are missing or unknown \(cameras, "),
         ("takes", [{"capture": "a"}], r"takes\.0: fields are missing or .* \(identity, start\)"),
-        ("continuation", {"parent": "a", "avatar": "b", "first": 5, "last": 3},
-         "continuation: its last timestep 3 is before its first, 5"),
+        (
+            "continuation",
+            {"parent": "a", "avatar": "b", "first": 5, "last": 3},
+            "continuation: its last timestep 3 is before its first, 5",
+        ),
     ],
-)  # fmt: skip
+)
 def test_damaged_runs(tmp_path, field, value, message):
     """Catches a run of another version taken for one's own, and a traceback of one edited."""
     folder.write_run(tmp_path, make_run())

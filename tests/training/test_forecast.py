@@ -52,7 +52,8 @@ def test_a_curve_of_the_models_own_kind_is_continued_exactly():
 @pytest.mark.parametrize("noise", [0.03, 0.1])
 def test_four_of_five_forecasts_come_true(noise):
     """Catches an error that is too small to be honest or too large to say anything."""
-    misses, errors = [], []
+    misses = []
+    errors = []
     for seed in range(30):
         psnr = rising(TIMES, noise, seed)
         for count in range(8, 24):

@@ -59,7 +59,8 @@ def disturbed(capture: Capture, settings: TrainingSettings) -> TrainState:
     state.steps += np.arange(len(state), dtype=np.int32) % 7
     state.unbound[::5] = True
     state.unseen_share[::5] = 0.7
-    rng, shape = np.random.default_rng(5), (len(capture.faces), 3, 3)
+    rng = np.random.default_rng(5)
+    shape = (len(capture.faces), 3, 3)
     for name in settings.driven_offsets:
         size = SIZES[OFFSETS[name].target]
         state.driven_offsets[name] = OffsetState(
@@ -97,10 +98,14 @@ def pair(capture: Capture, settings: TrainingSettings) -> tuple[CpuBackend, GpuB
 def batch_of(capture, settings, timestep=1, **changes):
     view = view_of(capture, timestep)
     values = {
-        "view": view, "target": read_image(view), "mask": None, "background": np.ones(3,
-        np.float32), "sh_degree": 3,
-        "selected": None, "rates": learning_rates(settings.rates, 0.0),
-    }  # fmt: skip
+        "view": view,
+        "target": read_image(view),
+        "mask": None,
+        "background": np.ones(3, np.float32),
+        "sh_degree": 3,
+        "selected": None,
+        "rates": learning_rates(settings.rates, 0.0),
+    }
     return Batch(**{**values, **changes})
 
 
@@ -122,12 +127,14 @@ def test_one_step_is_the_cpus(toy, part):
     before = gpu.state.parameters.xyz
     cpu.step(batch)
     gpu.step(batch)
-    expected, state = arrays_of(cpu.state), arrays_of(gpu.state)
+    expected = arrays_of(cpu.state)
+    state = arrays_of(gpu.state)
     assert not np.array_equal(before, expected["parameters/xyz"])
     for name in state:
         if name.startswith("gradients/"):
             continue
-        got, want = state[name].astype(float), expected[name].astype(float)
+        got = state[name].astype(float)
+        want = expected[name].astype(float)
         off = np.abs(got - want) > 2e-4 * np.abs(want).max()
         # The first step is the rate times the gradient's sign, which rounding may turn where the
         # gradient is nothing.
@@ -157,7 +164,8 @@ def test_a_local_iteration_leaves_frozen_rows_bit_identical(toy):
     for _ in range(2):
         gpu.step(batch_of(toy, settings, selected=toy.regions["mouth"]))
     state = gpu.state
-    after, selected = bits(state), toy.regions["mouth"][state.face]
+    after = bits(state)
+    selected = toy.regions["mouth"][state.face]
     for name in before:
         np.testing.assert_array_equal(after[name][~selected], before[name][~selected], err_msg=name)
     for name in ("parameters/xyz", "parameters/sh", "first/opacity", "second/rotation", "steps"):
@@ -200,7 +208,8 @@ def test_an_iteration_is_one_submit(toy, part):
 
 def test_everything_is_compiled_before_the_first_iteration(toy):
     """Catches a kernel that is compiled in the time that is given to training."""
-    settings, device = settings_of(), Device()
+    settings = settings_of()
+    device = Device()
     device._kernels = {}  # instead of those that other tests have compiled
     frames = FrameStore(toy, settings.convention, True)
     gpu = GpuBackend(device, settings, frames, disturbed(toy, settings))
@@ -219,7 +228,8 @@ def test_a_lost_gpu_is_followed_by_the_cpu(toy, tmp_path, monkeypatch, caplog):
     device = f"gpu:{gpu_device.device().name}"
     run = replace(make_run(toy, "selective", iterations=12), device=device)
     train(toy, tmp_path, run, report=stop_at(5))
-    step, done = GpuBackend.step, []
+    step = GpuBackend.step
+    done = []
 
     def breaks(self, batch):
         done.append(batch)
@@ -288,7 +298,8 @@ def assert_near(got: TrainState, want: TrainState) -> None:
 @pytest.mark.parametrize("part", [None, "mouth"])
 def test_iterations_are_the_cpus(toy, part, offsets):
     """Catches splats not moved or colored, others' gradients, and another timestep's signal."""
-    capture, settings = squeezed(toy), settings_of(driven_offsets=offsets)
+    capture = squeezed(toy)
+    settings = settings_of(driven_offsets=offsets)
     cpu, gpu = pair(capture, settings)
     before = every_bit(cpu.state)
     selected = None if part is None else capture.regions[part]
@@ -308,7 +319,8 @@ def test_iterations_are_the_cpus(toy, part, offsets):
 
 def test_renders_with_the_average(toy):
     """Catches a view of the latest step, and gradients summed over splats of before density."""
-    capture, settings = squeezed(toy), settings_of()
+    capture = squeezed(toy)
+    settings = settings_of()
     cpu, gpu = pair(capture, settings)
     state = disturbed(capture, settings)
     for offset in state.driven_offsets.values():
@@ -335,7 +347,8 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy, tmp_path):
     in the order of chance: every bit must agree, across density control."""
     effects = {"driven_offsets": tuple(OFFSETS)}
     run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")
-    broken, whole = tmp_path / "broken", tmp_path / "whole"
+    broken = tmp_path / "broken"
+    whole = tmp_path / "whole"
     train(squeezed(toy), whole, run)
     train(squeezed(toy), broken, run, report=stop_at(6))
     assert read_checkpoint(broken).iteration == 6

@@ -45,7 +45,8 @@ def splats_on(capture: Capture, count: int, log_scale: float) -> Splats:
 def batch_of(capture: Capture, width: int, height: int) -> Batch:
     view = view_of(capture, 1)
     view = replace(view, camera=replace(view.camera, width=width, height=height))
-    target, mask = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
+    target = np.zeros((height, width, 3), np.uint8)
+    mask = np.zeros((height, width), np.uint8)
     for array in (target, mask):
         array.setflags(write=False)
     return Batch(
@@ -68,7 +69,8 @@ def cpu_bytes(capture, count, size, log_scale):
 
 def gpu_bytes(capture, count, size, capacity):
     rasterize.INITIAL_PAIR_CAPACITY = capacity
-    device, frames = Device(), FrameStore(capture, SETTINGS.convention)
+    device = Device()
+    frames = FrameStore(capture, SETTINGS.convention)
     state = new_state(splats_on(capture, count, -9.0))
     backend = GpuBackend(device, SETTINGS, frames, state)
     backend.step(batch_of(capture, *size))
@@ -87,7 +89,8 @@ def test_memory_is_the_cpus_and_as_documented(toy, monkeypatch):
     """Catches a table added to the GPU's iterations, and figures in the documentation that no
     longer hold."""
     monkeypatch.setattr(rasterize, "INITIAL_PAIR_CAPACITY", 1)  # restored at the end
-    small, wide = (320, 160), (640, 160)
+    small = (320, 160)
+    wide = (640, 160)
     sizes = (4096, small), (8192, small), (4096, wide)
     on_cpu = [cpu_bytes(toy, *size, -1.0) for size in sizes]
     on_cpu = per_item([*on_cpu, cpu_bytes(toy, 4096, small, 1.0)])

@@ -26,8 +26,11 @@ from stga_addon.training.optimize.initial_splats import (
     hull_points,
 )
 
-SIZE, FOCAL, FAR = 120, 300.0, 1.0
-CENTRE, RADIUS = np.array([0.06, 0.075, 0.02]), 0.03
+SIZE = 120
+FOCAL = 300.0
+FAR = 1.0
+CENTRE = np.array([0.06, 0.075, 0.02])
+RADIUS = 0.03
 TIMESTEP = 4
 
 
@@ -35,7 +38,8 @@ def cameras(count: int = 20) -> list[Camera]:
     """Cameras on a sphere of a meter around the origin (a Fibonacci spiral), looking at it."""
     found = []
     for n in range(count):
-        height, angle = 1 - 2 * (n + 0.5) / count, n * np.pi * (3 - np.sqrt(5))
+        height = 1 - 2 * (n + 0.5) / count
+        angle = n * np.pi * (3 - np.sqrt(5))
         x, z = np.sqrt(1 - height**2) * np.array([np.cos(angle), np.sin(angle)])
         camera = look_at(FAR * np.array([x, height, z]), (0, 0, 0), SIZE, SIZE, FOCAL)
         found.append(replace(camera, cx=SIZE / 2 + 2, cy=SIZE / 2 - 3))
@@ -57,7 +61,8 @@ def scene(root: Path, centre: np.ndarray = CENTRE, radius: float = RADIUS) -> Ca
     """A head mesh of 8 cm that at TIMESTEP is turned, moved and 10 % larger than the neutral one,
     and the ball."""
     ball = trimesh.creation.icosphere(4, 0.06)
-    neutral, faces = np.array(ball.vertices), np.array(ball.faces, np.int32)
+    neutral = np.array(ball.vertices)
+    faces = np.array(ball.faces, np.int32)
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     posed = 1.1 * neutral @ turn.T + [0.01, -0.005, 0.0]
     views = []
@@ -69,9 +74,16 @@ def scene(root: Path, centre: np.ndarray = CENTRE, radius: float = RADIUS) -> Ca
         Image.fromarray(mask.astype(np.uint8) * 255).save(paths[1])
         views.append(View(TIMESTEP, n, camera, str(n), *paths))
     return Capture(
-        root, "mesh", faces, neutral, {"train": tuple(views)}, (0, TIMESTEP), {},
-        lambda timestep: posed if timestep == TIMESTEP else neutral, lambda timestep, pose: neutral,
-    )  # fmt: skip
+        root,
+        "mesh",
+        faces,
+        neutral,
+        {"train": tuple(views)},
+        (0, TIMESTEP),
+        {},
+        lambda timestep: posed if timestep == TIMESTEP else neutral,
+        lambda timestep, pose: neutral,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +110,8 @@ def test_points_stand_on_the_balls_surface(beside, convention):
     assert height.max() < 2 * VOXEL_SIZE_M
     # Around the mesh's bounding box the grid ends, and near the mesh no points are wanted.
     sphere = CENTRE + RADIUS * np.array(trimesh.creation.icosphere(3).vertices)
-    low, high = beside.mesh(TIMESTEP).min(0), beside.mesh(TIMESTEP).max(0)
+    low = beside.mesh(TIMESTEP).min(0)
+    high = beside.mesh(TIMESTEP).max(0)
     margin = 0.25 * np.linalg.norm(high - low) - 2 * VOXEL_SIZE_M
     head = np.linalg.norm(sphere - beside.mesh(TIMESTEP).mean(0), axis=1) - 1.1 * 0.06
     wanted = ((sphere > low - margin) & (sphere < high + margin)).all(axis=1) & (
@@ -136,11 +149,13 @@ def test_blocks_leave_nothing_out(beside, tmp_path, monkeypatch, whole, shift):
     views = list(beside.views["train"])
     for number, view in enumerate(views[whole:], whole):
         assert view.mask
-        mask, path = Image.open(view.mask), tmp_path / view.mask.name
+        mask = Image.open(view.mask)
+        path = tmp_path / view.mask.name
         width = mask.getbbox()[0] + shift
         mask.crop((0, 0, width, SIZE)).save(path)
         views[number] = replace(view, camera=replace(view.camera, width=width), mask=path)
-    capture, found = replace(beside, views={"train": tuple(views)}), []
+    capture = replace(beside, views={"train": tuple(views)})
+    found = []
     for voxels in (1, 5):
         monkeypatch.setattr("stga_addon.training.optimize.initial_splats.BLOCK_VOXELS", voxels)
         found.append(hull_points(capture, views, "stga", 0).xyz)
@@ -191,9 +206,17 @@ def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
         views = scene(tmp_path, np.array(centre), 0.015).views
         side = max(views["train"], key=lambda view: float(view.camera.position[0]))
         capture = Capture(
-            tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
-            lambda timestep: mesh, lambda timestep, pose: mesh, head,
-        )  # fmt: skip
+            tmp_path,
+            "flame",
+            model.faces,
+            model.v_template,
+            views,
+            (TIMESTEP,),
+            {},
+            lambda timestep: mesh,
+            lambda timestep, pose: mesh,
+            head,
+        )
         place, shown = (flat_points, side) if one else (hull_points, views["train"])
         before, after = (place(capture, shown, "stga", 0, torso) for torso in (False, True))
         assert len(before) == len(after) > 20
@@ -213,11 +236,17 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
     capture = Capture(
-        tmp_path, "flame", model.faces, sequence_mesh(head, TIMESTEP + 1), {"train": views},
-        tuple(frames), {},
-        lambda timestep: sequence_mesh(head, timestep), lambda timestep, pose: sequence_mesh(head,
-        timestep), head,
-    )  # fmt: skip
+        tmp_path,
+        "flame",
+        model.faces,
+        sequence_mesh(head, TIMESTEP + 1),
+        {"train": views},
+        tuple(frames),
+        {},
+        lambda timestep: sequence_mesh(head, timestep),
+        lambda timestep, pose: sequence_mesh(head, timestep),
+        head,
+    )
     hull, many = (hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views))
     at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))
     write_torso_points(tmp_path, TorsoPoints(TIMESTEP + 1, at))
@@ -269,12 +298,21 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(tmp_path, right, u
     head = posed_head(model, neutral_frame(model))
     number = min(range(20), key=lambda n: abs(float(cameras()[n].position[1])))
     ball = right * cameras()[number].world_to_camera[0, :3] + [0.0, up, 0.0]
-    mesh, views = sequence_mesh(head, TIMESTEP), scene(tmp_path, ball, 0.08).views
+    mesh = sequence_mesh(head, TIMESTEP)
+    views = scene(tmp_path, ball, 0.08).views
     side = views["train"][number]
     capture = Capture(
-        tmp_path, "flame", model.faces, model.v_template, views, (TIMESTEP,), {},
-        lambda timestep: mesh, lambda timestep, pose: mesh, head,
-    )  # fmt: skip
+        tmp_path,
+        "flame",
+        model.faces,
+        model.v_template,
+        views,
+        (TIMESTEP,),
+        {},
+        lambda timestep: mesh,
+        lambda timestep, pose: mesh,
+        head,
+    )
     cut, whole = (
         in_world(capture, flat_points(capture, side, "stga", 0, torso)) for torso in (False, True)
     )

@@ -198,7 +198,8 @@ def test_another_flame_model_is_refused(toy, tmp_path):
     """Catches a run that goes on with the meshes of another FLAME model, though --flame may name a
     moved one, and one that blames the FLAME file where it is resumed on tracked meshes."""
     root, model = factory.write_flame_capture(tmp_path / "capture")
-    capture, out = open_capture(root, model), tmp_path / "run"
+    capture = open_capture(root, model)
+    out = tmp_path / "run"
     train(capture, out, make_run(capture, model), report=stop_at(4))
     moved = shutil.copy(model, tmp_path / "moved.npz")
     assert open_run(out, flame=moved).run.flame == moved
@@ -223,7 +224,8 @@ def test_every_command_checks_the_identity(copy, toy, tmp_path, capsys):
         assert stga("perform", request_folder(copy)) == 2
     assert {path.name: path.read_bytes() for path in copy.iterdir() if path.is_file()} == before
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
-    cameras, ply = other / "transforms_test.json", tmp_path / "a.ply"
+    cameras = other / "transforms_test.json"
+    ply = tmp_path / "a.ply"
     assert stga("eval", copy) == 2
     assert stga("render", copy, "--cameras", cameras, "--out", tmp_path / "pictures") == 2
     assert stga("export", copy, "--format ply --out", ply) == 2
@@ -316,7 +318,8 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
             signal.raise_signal(signal.SIGINT)
         return False
 
-    out, unbroken = tmp_path / "run", tmp_path / "unbroken"
+    out = tmp_path / "run"
+    unbroken = tmp_path / "unbroken"
     with pytest.raises(KeyboardInterrupt):
         train(toy, out, make_run(toy), report=interrupt)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -9,7 +9,8 @@ from stga_addon.training.optimize.post_step import reset_strays
 
 from .toys import bits, random_splats, random_state
 
-FACES, WEIGHT = 5, 0.7
+FACES = 5
+WEIGHT = 0.7
 
 
 @pytest.fixture(params=range(3))
@@ -73,7 +74,8 @@ def test_within_the_limits_nothing_happens(kernel):
     splats.xyz[0] = 0
     out = np.full((8, 3), 0.25, np.float32)
     values = splats.log_scale if kernel is scale_limit else splats.xyz
-    rows, limit = np.arange(8, dtype=np.int32), np.full(FACES, 10, np.float32)
+    rows = np.arange(8, dtype=np.int32)
+    limit = np.full(FACES, 10, np.float32)
     limit = np.stack([limit, limit]) if kernel is scale_limit else limit
     assert kernel(rows, values, splats.face, splats.unbound, limit, WEIGHT, out) == 0
     np.testing.assert_array_equal(out, 0.25)
@@ -85,7 +87,8 @@ def test_stray_resets(to):
     state = random_state(60, FACES)
     state.unbound[:] = np.arange(60) % 4 == 0
     limit = np.array([0.005, 0.012, 0.02, 0.03, 10.0], np.float32)
-    xyz, face = state.parameters.xyz.copy(), state.face
+    xyz = state.parameters.xyz.copy()
+    face = state.face
     far = [
         bool(np.hypot(np.hypot(*p[:2]), p[2]) > limit[f])
         for p, f in zip(xyz.astype(float), face, strict=True)

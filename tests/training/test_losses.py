@@ -87,7 +87,8 @@ def test_rectangles_have_the_whole_images_gradient(name):
     image, target = random_pair(59, 71, seed=1)
     rectangles = np.array(RECTANGLES[name], np.int64)
     expected, absolute, ssim = reference(image, target, 0.2)
-    inside, near = np.zeros((59, 71), bool), np.zeros((59, 71), bool)
+    inside = np.zeros((59, 71), bool)
+    near = np.zeros((59, 71), bool)
     for x0, y0, x1, y1 in rectangles:
         inside[y0:y1, x0:x1] = True
         near[
@@ -119,7 +120,8 @@ def test_rectangles_tile_the_image(height, width, bands):
 def test_bands_do_not_change_a_bit():
     """Catches a run that goes another way on another number of threads, and so bands."""
     image, target = random_pair(75, 110, seed=2)
-    whole, cut = np.empty_like(image), np.empty_like(image)
+    whole = np.empty_like(image)
+    cut = np.empty_like(image)
     losses = image_gradient(image, target, whole_image(75, 110, 1), 0.2, whole)
     for bands in (2, 5, 16):
         assert image_gradient(image, target, whole_image(75, 110, bands), 0.2, cut) == losses

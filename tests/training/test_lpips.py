@@ -26,9 +26,12 @@ from stga_addon.training.run.session import train
 from .toys import quick_settings, stop_at
 
 LAYERS = (
-    (3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1),
+    (3, 64, 11, 4, 2),
+    (64, 192, 5, 1, 2),
+    (192, 384, 3, 1, 1),
+    (384, 256, 3, 1, 1),
     (256, 256, 3, 1, 1),
-)  # fmt: skip
+)
 """Of AlexNet's features, as its authors have them: channels in and out, width, stride, padding."""
 REFERENCE = {(31, 40): 0.020162, (64, 33): 0.025562, (120, 90): 0.084581}
 """(H, W) of `pair` -> what the package lpips 0.1.4 (net="alex") says of it."""
@@ -70,8 +73,10 @@ def pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 def features(image: np.ndarray, weights: dict[str, Any]) -> list[np.ndarray]:
     """(C, H, W) after each convolution, of an image (3, H, W) in 0…1, in float64 by torch."""
-    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    x, found = torch.from_numpy(((2 * image.T.astype(float) - 1 - shift) / scale).T.copy()), []
+    shift = np.array([-0.030, -0.088, -0.188])
+    scale = np.array([0.458, 0.448, 0.450])
+    x = torch.from_numpy(((2 * image.T.astype(float) - 1 - shift) / scale).T.copy())
+    found = []
     for number, (_, _, _, stride, padding) in enumerate(LAYERS):
         if number in (1, 2):
             x = functional.max_pool2d(x, 3, 2)
@@ -115,7 +120,8 @@ def test_evaluation_measures_lpips_if_weights_are_named(tmp_path, weights_file, 
     image, target = pair(47, 68)
     evaluation_view = evaluation_view_of(tmp_path, target)
     quality = evaluate(lambda view: image, [evaluation_view], perceptual=True)
-    stored, network = np.round(255 * target).astype("f4") / 255, read_network(weights_file)
+    stored = np.round(255 * target).astype("f4") / 255
+    network = read_network(weights_file)
     assert quality.lpips == pytest.approx(network.distance(image, stored), rel=1e-6)
     assert "lpips" not in evaluate(lambda view: image, [evaluation_view]).as_json()
     where = np.zeros((47, 68), bool)

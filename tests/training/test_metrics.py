@@ -42,7 +42,8 @@ from stga_addon.training.settings import TrainingSettings
 
 from .toys import quick_settings
 
-HEIGHT, WIDTH = 31, 24
+HEIGHT = 31
+WIDTH = 24
 
 
 def random_image(seed: int) -> np.ndarray:
@@ -140,7 +141,8 @@ def expected(image: np.ndarray, target: np.ndarray, where: np.ndarray) -> float:
         down = (near[..., 2, :].sum(-1) - near[..., 0, :].sum(-1)) / 3
         return windows(np.sqrt(across**2 + down**2), 7).mean((-1, -2))
 
-    a, b = local(image), local(target)
+    a = local(image)
+    b = local(target)
     return float((abs(a - b) / (a + b + 0.02))[where].mean())
 
 
@@ -183,7 +185,8 @@ def head_and_image() -> tuple[np.ndarray, np.ndarray]:
 def test_inverts_what_training_corrects():
     """Catches gain and offset swapped, mixed channels, a background that changes."""
     head, image = head_and_image()
-    gain, offset = np.array([1.1, 0.9, 1.2]), np.array([5.0, -8.0, 2.0])
+    gain = np.array([1.1, 0.9, 1.2])
+    offset = np.array([5.0, -8.0, 2.0])
     levels = 255 * image.transpose(1, 2, 0)
     target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
     matched = match_exposure(image, target, head, head)
@@ -208,7 +211,8 @@ def test_a_rendering_of_one_color_stays_finite():
 def test_nothing_is_fitted_where_the_exposure_is_known(tmp_path):
     """Catches six numbers fitted where training knows the exposure, which hides its errors."""
     head, image = head_and_image()
-    gain, offset = np.array([0.8, 1.1, 0.9]), np.array([4.0, -6.0, 3.0])
+    gain = np.array([0.8, 1.1, 0.9])
+    offset = np.array([4.0, -6.0, 3.0])
     levels = 255 * image.transpose(1, 2, 0)
     target = np.where(head[..., None], gain * levels + offset, levels).round().astype(np.uint8)
     camera = Camera(SIDE, SIDE, 50.0, 50.0, 16.0, 16.0, np.eye(4))
@@ -251,7 +255,8 @@ def test_regions_of_a_view(toy, tmp_path):
     beside = where & ~factory.silhouette()
     assert not beside[:-1].any() or beside.mean() < 0.02
     assert not moving.target.flags.writeable
-    view, size = toy.views["val"][0], 400
+    view = toy.views["val"][0]
+    size = 400
     camera = replace(view.camera, width=size, height=size)
     mask = np.zeros((size, size), np.uint8)
     mask[100:300, 100:300] = 255
@@ -323,7 +328,8 @@ def test_an_error_belongs_to_the_triangles_that_show_it(toy):
     """Catches weights that depend on colors, as a gradient does where a color is clamped at black,
     and errors given to hidden or neighboring triangles. The weights are rendered: one triangle
     white, all others black, before black."""
-    avatar, views = plain_avatar(toy, -0.2), toy.views["train"][:2]
+    avatar = plain_avatar(toy, -0.2)
+    views = toy.views["train"][:2]
     found = triangle_residuals(avatar, toy, views)
     seen = np.flatnonzero(found.weight > 20)[::12]
     assert len(seen) > 3
@@ -337,7 +343,8 @@ def test_an_error_belongs_to_the_triangles_that_show_it(toy):
             sh = np.broadcast_to(white, avatar.splats.sh.shape).astype(np.float32)
             alone = replace(avatar, splats=replace(avatar.splats, sh=sh))
             share = render_avatar(alone, mesh, view.camera, (0.0, 0.0, 0.0))[0]
-            weight, error = weight + float(share.sum()), error + float((share * difference).sum())
+            weight = weight + float(share.sum())
+            error = error + float((share * difference).sum())
         np.testing.assert_allclose(
             [found.weight[triangle], found.error[triangle]], [weight, error], rtol=2e-3
         )

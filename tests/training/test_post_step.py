@@ -30,7 +30,8 @@ UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
 def place(trainer: Trainer, row: int, position: list[float]) -> None:
     """Make a splat an opaque, upright needle at a position in meters, which never moves."""
-    state, capture = trainer.state, trainer.capture
+    state = trainer.state
+    capture = trainer.capture
     frames = face_frames(capture.mesh(0), capture.faces, capture.neutral)
     needle = replace(
         state.splats().rows(np.array([row])),
@@ -97,7 +98,8 @@ def pictures(rng: np.random.Generator) -> tuple[list[Outline], dict[int, FaceFra
     """Five cameras around posed triangles, each with half of its image clear."""
     neutral = rng.normal(0, 0.1, (12, 3))
     faces = rng.permutation(12).reshape(4, 3)
-    frames, outlines = {}, []
+    frames = {}
+    outlines = []
     for timestep in range(5):
         posed = 1.3 * neutral @ Rotation.random(random_state=timestep).as_matrix().T + rng.normal(
             0, 0.02, 3
@@ -117,7 +119,8 @@ def outside_of_most(points: list[np.ndarray], outlines: list[Outline]) -> bool:
     for point, outline in zip(points, outlines, strict=True):
         camera = outline.camera
         x, y, z = camera.world_to_camera[:3] @ [*point, 1]
-        column, row = camera.fl_x * x / z + camera.cx, camera.fl_y * y / z + camera.cy
+        column = camera.fl_x * x / z + camera.cx
+        row = camera.fl_y * y / z + camera.cy
         if z > 0.01 and 0 <= column < camera.width and 0 <= row < camera.height:
             clear.append(bool(outline.clear[int(row), int(column)]))
     return sum(clear) > len(clear) / 2
@@ -133,13 +136,15 @@ def test_what_is_pruned(region):
     state.unbound[:] = (np.arange(300) % 3 == 0) & (state.face != 3)
     bald = np.flatnonzero((state.face == 3) & ~state.unbound)
     state.parameters.xyz[bald] = [0.05, 0, 0.1]
-    splats, pruned = state.splats(), np.zeros(300, bool)
+    splats = state.splats()
+    pruned = np.zeros(300, bool)
     for n in range(300):
         if region is not None and not region[splats.face[n]]:
             continue
         points = []
         for timestep in range(5):
-            frame, face = frames[timestep], splats.face[n]
+            frame = frames[timestep]
+            face = splats.face[n]
             points.append(
                 frame.origin[face] + frame.scale[face] * frame.rotation[face] @ splats.xyz[n]
             )
@@ -150,7 +155,8 @@ def test_what_is_pruned(region):
             pruned[bound[splats.opacity[bound].argmax()]] = False
     assert pruned[bald].sum() == len(bald) - 1
     assert 60 < pruned.sum() < 240
-    before, after = bits(state), bits(prune_outside(state, frames.__getitem__, outlines, region))
+    before = bits(state)
+    after = bits(prune_outside(state, frames.__getitem__, outlines, region))
     for name, old in before.items():
         np.testing.assert_array_equal(after[name], old[~pruned], err_msg=name)
 
@@ -169,7 +175,8 @@ def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     """Catches another side, normal or mirror plane, and a far side that takes any color."""
-    capture, sides = from_one_side, unseen_sides(from_one_side)
+    capture = from_one_side
+    sides = unseen_sides(from_one_side)
     neutral, posed = (
         mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))
     )
@@ -191,7 +198,8 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     image = read_image(view)
     for n in range(200):
         trainer.step(view, image, n / 200)
-    sides, splats = unseen_sides(capture), trainer.state.splats()
+    sides = unseen_sides(capture)
+    splats = trainer.state.splats()
     far = sides.triangles[splats.face]
     expected = (sides.color[splats.face[far]] - 0.5) / 0.28209479177387814
     np.testing.assert_allclose(splats.sh[far, 0], expected, atol=1e-6)

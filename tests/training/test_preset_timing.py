@@ -27,12 +27,14 @@ class Stopwatch:
 @pytest.fixture
 def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Shares of the budget that the steps were made at."""
-    watch, seen = Stopwatch(), []
+    watch = Stopwatch()
+    seen = []
 
     class Trainer:
         """Its state is the number of its splats, of which a turn adds 500, up to 2,000."""
 
-        state, settings = 1000, make_settings(iterations=1)
+        state = 1000
+        settings = make_settings(iterations=1)
 
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
@@ -68,7 +70,7 @@ def test_splats_grow_as_in_the_whole_run(toy, shares):
     split of the short run as the whole run has it more seldom."""
     settings = make_settings(
         iterations=1000, coarse_share=0, density_interval=100, density_span=(0.1, 0.6)
-    )  # fmt: skip
+    )
     pace = seconds_per_iteration(toy, settings, 1000, 6.0)
     # 1000, from 0.1 on 1500, from 0.2 on 2000
     steps = 0.024 * (0.1 * 1 + 0.1 * 1.5 + 0.8 * 2)

@@ -34,7 +34,10 @@ from stga_addon.worker.helpers import Helpers
 from .heads import TIMESTEPS
 from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
 
-SCALE, GAIN, OFFSET, SHADE = 1.02, 0.85, 12, 0.3
+SCALE = 1.02
+GAIN = 0.85
+OFFSET = 12
+SHADE = 0.3
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
@@ -46,14 +49,16 @@ def ignore(done: int, total: int) -> None:
 def recording(tmp_path: Path, lost, person) -> tuple[Path, Path]:  # noqa: F811
     """A run, and a capture that is darker, lit from a side, and in a world that is too large."""
     avatar, settings = person
-    run, root = tmp_path / "run", tmp_path / "recording"
+    run = tmp_path / "run"
+    root = tmp_path / "recording"
     run.mkdir()
     shutil.copytree(lost[0].root, root)
     write_run(run, Run(root, root / "model.npz", "vhap", settings))
     write_avatar(run / AVATAR, avatar)
     for view in (view for views in lost[0].views.values() for view in views):
         image, mask = (np.asarray(Image.open(path)) for path in (view.image, view.mask))
-        mesh, faces = lost[1][view.timestep], lost[0].faces
+        mesh = lost[1][view.timestep]
+        faces = lost[0].faces
         shown = rasterize(mesh, faces, view.camera)
         shade = 1 + SHADE * normal_images(mesh, faces, shown)[1][..., :1]
         darker = np.where(mask[..., None] > 0, image * GAIN * shade + OFFSET, image)
@@ -97,7 +102,9 @@ def test_another_recording_is_tracked(recording, lost):  # noqa: F811
 def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, recording, lost, person):  # noqa: F811
     """Catches colors that are looked up in other directions than training saw them from, a world
     turned though its light was too, or though it is kept, and heads that do not turn with it."""
-    (run, root), (avatar, settings), turn = recording, person, Rotation.from_rotvec([0.5, 0.2, 0])
+    (run, root) = recording
+    (avatar, settings) = person
+    turn = Rotation.from_rotvec([0.5, 0.2, 0])
     shutil.rmtree(root)
     shutil.copytree(lost[0].root, root)
     write_run(run, Run(lost[0].root, root / "model.npz", "vhap", settings))
@@ -108,7 +115,8 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     moved = Similarity(1.0, turn.as_matrix(), np.zeros(3))
     for view in (view for views in lost[0].views.values() for view in views):
         world = moved if light_turns else IDENTITY
-        mesh, camera = world.apply(lost[1][view.timestep]), world.camera(view.camera)
+        mesh = world.apply(lost[1][view.timestep])
+        camera = world.camera(view.camera)
         drawn = 255 * render_avatar(shiny, mesh, camera, settings.background)
         colors = np.clip(drawn.transpose(1, 2, 0), 0, 255).astype(np.uint8)
         Image.fromarray(colors).save(root / view.name)
@@ -146,8 +154,10 @@ def test_another_person_is_missed(recording):
 
 def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch):
     """Catches a cancelled tracking that begins anew, or goes on with another avatar's."""
-    (run, root), calls = recording, list[int]()
-    every, twice = [1] * len(TIMESTEPS), [len(TIMESTEPS)] * 2
+    (run, root) = recording
+    calls = list[int]()
+    every = [1] * len(TIMESTEPS)
+    twice = [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")
 
     def counted(*arguments):

@@ -43,10 +43,16 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With strain color, density control and hull points; the avatar is the last state's."""
     out = tmp_path_factory.mktemp("finished") / "run"
     settings = quick_settings(
-        "global", iterations=12, driven_offsets=("strain_color",), lattice=1, density_interval=10,
+        "global",
+        iterations=12,
+        driven_offsets=("strain_color",),
+        lattice=1,
+        density_interval=10,
         density_span=(0.0, 1.0),
-        stray_reset_interval=4, stray_limit=0.3, hull_points=True,
-    )  # fmt: skip
+        stray_reset_interval=4,
+        stray_limit=0.3,
+        hull_points=True,
+    )
     without_held_out = replace(toy, views={"train": toy.views["train"]})
     train(without_held_out, out, Run(toy.root, None, "vhap", settings))
     return out
@@ -90,7 +96,8 @@ def rows_of(state: TrainState, keep: np.ndarray) -> dict[str, np.ndarray]:
 
 def test_nothing_outside_the_region_changes_by_one_bit(parent, toy, tmp_path):
     """Catches momentum, averages, density or resets beyond the region, and doing nothing."""
-    before, region = read_avatar(parent / "avatar.npz"), toy.regions["mouth"]
+    before = read_avatar(parent / "avatar.npz")
+    region = toy.regions["mouth"]
     after = read_avatar(refine(parent, tmp_path / "refined") / "avatar.npz")
     outside = [~region[avatar.splats.face] for avatar in (before, after)]
     assert 0 < outside[0].sum() < len(before.splats)
@@ -204,7 +211,8 @@ def test_replayed_timesteps_differ_most(toy):
         toy, expression_mesh=lambda timestep, zero_pose: toy.neutral + offsets[timestep]
     )
     assert distinct_timesteps(capture, list(offsets), 3) == [0, 3, 4]
-    view, pairs = toy.views["train"][0], np.ndindex(5, 16)
+    view = toy.views["train"][0]
+    pairs = np.ndindex(5, 16)
     views = [replace(view, timestep=t, camera_index=c) for t, c in pairs]
     assert len(replayed_views(capture, views)) == 80
     kept = replayed_views(capture, views, 20)

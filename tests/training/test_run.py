@@ -78,9 +78,13 @@ def test_what_a_run_leaves(toy: Capture, unbroken: Path) -> None:
     np.testing.assert_array_equal(avatar.faces, toy.faces)
     assert avatar.settings["strategy"] == "selective"
     assert sorted(p.name for p in unbroken.iterdir()) == [
-        "avatar.npz", "checkpoint.npz", "metrics.jsonl", "residuals.npz", "run.json",
+        "avatar.npz",
+        "checkpoint.npz",
+        "metrics.jsonl",
+        "residuals.npz",
+        "run.json",
         "selection.npz",
-    ]  # fmt: skip
+    ]
 
 
 class Crash(Exception):
@@ -162,7 +166,8 @@ def test_resuming_a_finished_run_changes_nothing(
     shutil.copytree(unbroken, tmp_path / "run")
     train(toy, tmp_path / "run", make_run(toy), resume=True)
     assert_same_state(tmp_path / "run", unbroken)
-    ours, theirs = read_metrics(tmp_path / "run"), read_metrics(unbroken)
+    ours = read_metrics(tmp_path / "run")
+    theirs = read_metrics(unbroken)
     assert [line["iteration"] for line in ours] == [line["iteration"] for line in theirs]
 
 
@@ -192,7 +197,8 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
 @pytest.mark.parametrize("change", ["renamed", "emptied"])
 def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, change: str) -> None:
     """Catches a renamed run begun again under its old name, without what resuming needs."""
-    out, moved = tmp_path / "run", tmp_path / "moved"
+    out = tmp_path / "run"
+    moved = tmp_path / "moved"
 
     def move(progress: Progress) -> bool:
         if progress.figures().get("iteration", 0) == 7:

@@ -66,7 +66,8 @@ def test_rates_decay_to_their_ends():
     """Catches a rate without its own end, linear decay, and a rise past the budget."""
     rates = Rates(xyz=1e-3, sh=4e-2, sh_rest=2e-3, position_end=0.01, end=0.25)
     assert learning_rates(rates, 0.0) == {n: getattr(rates, n) for n in learning_rates(rates, 0.0)}
-    half, end = learning_rates(rates, 0.5), learning_rates(rates, 1.0)
+    half = learning_rates(rates, 0.5)
+    end = learning_rates(rates, 1.0)
     assert end["xyz"] == pytest.approx(1e-5)
     assert half["xyz"] == pytest.approx(1e-4)
     for name in ("rotation", "log_scale", "opacity", "sh", "sh_rest"):

@@ -37,7 +37,7 @@ def test_json_round_trip(strategy, schedule):
         ({"iterations": -3}, "iterations: expected a whole number from 1 up to 2147483647, got -3"),
         ({"effects": {"jaw": "on"}, "schedule": "paper"}, "cannot be combined with --schedule"),
     ],
-)  # fmt: skip
+)
 def test_impossible_settings(arguments, message):
     """Catches a budget of two kinds, unknown names, and settings at odds with each other."""
     with pytest.raises(StgaError, match=message):

@@ -11,7 +11,8 @@ def test_keep_and_join():
     """Catches an array left at its old length or in another order after pruning."""
     state = random_state(9, 5)
     keep = np.array([True, False, True, True, False, False, True, False, True])
-    kept, rest = keep_rows(state, keep), keep_rows(state, ~keep)
+    kept = keep_rows(state, keep)
+    rest = keep_rows(state, ~keep)
     assert (len(kept), len(rest)) == (5, 4)
     order = np.concatenate([np.flatnonzero(keep), np.flatnonzero(~keep)])
     joined = arrays_of(join(kept, rest))
@@ -24,7 +25,8 @@ def test_keep_and_join():
 def test_memory_is_shared_where_promised_and_only_there():
     """Catches training that changes the splats it began with, and Adam on a copy."""
     splats = random_splats(6, 4)
-    xyz, face = splats.xyz.copy(), splats.face.copy()
+    xyz = splats.xyz.copy()
+    face = splats.face.copy()
     state = new_state(splats)
     copy = state.splats()
     state.parameters.xyz[:] += 1

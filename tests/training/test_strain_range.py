@@ -62,9 +62,13 @@ def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
     neutral = toy.neutral.astype(np.float32)
     offsets = {"strain_color": np.zeros((count, 3, 3), np.float32)}
     parent = Avatar(
-        random_splats(20, count), "stga", neutral, toy.faces, strain_range=limits,
+        random_splats(20, count),
+        "stga",
+        neutral,
+        toy.faces,
+        strain_range=limits,
         driven_offsets=offsets,
-    )  # fmt: skip
+    )
     write_avatar(tmp_path / "avatar.npz", parent)
     continuation = Continuation(tmp_path, "", 0, 0)
     alone = trained_strain_range(toy, lambda t: deformed(toy, t), None)
@@ -102,7 +106,8 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy):
 def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
     """Catches an earlier version's run resumed in other colors, or that cannot be opened."""
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
+    run = Run(toy.root, None, "vhap", settings)
+    out = tmp_path / "run"
     path = train(toy, out, run, report=stop_at(2))
     avatar = read_avatar(path)
     wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 6)).copy()
@@ -120,7 +125,8 @@ def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
 
 def test_the_range_covers_an_expression_of_few_timesteps(toy):
     """Catches a blink of six frames in 1,200 that is trained, but clipped."""
-    view, blink = toy.views["train"][0], range(1003, 1009)
+    view = toy.views["train"][0]
+    blink = range(1003, 1009)
     views = {"train": tuple(replace(view, timestep=timestep) for timestep in range(1200))}
 
     def mesh(timestep):
@@ -152,9 +158,11 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_
 def test_another_runs_range_is_refused(toy, tmp_path):
     """Catches a resumed run that clips its colors to what another run has seen."""
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    run, out = Run(toy.root, None, "vhap", settings), tmp_path / "run"
+    run = Run(toy.root, None, "vhap", settings)
+    out = tmp_path / "run"
     train(toy, out, run, report=stop_at(2))
-    limits, digest = trained_range(len(toy.faces)), identity_of(toy, "vhap", settings).digest
+    limits = trained_range(len(toy.faces))
+    digest = identity_of(toy, "vhap", settings).digest
     for (stored, identity), says in (
         ((limits, "other"), "belongs to another run than run.json beside it"),
         ((limits[1:], digest), r"strain_range is float32 .*, expected float32 \(320, 2, 6\)"),

@@ -95,7 +95,8 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
     frames = step._moved_frames(view.timestep)
     rows, screen, loss = step._backward(frames, view, target, WHITE, degree, None)
     full = {name: array.copy() for name, array in trainer.state.gradients._asdict().items()}
-    screen_gradient, wanted = screen.copy(), rows[focus[rows]].copy()
+    screen_gradient = screen.copy()
+    wanted = rows[focus[rows]].copy()
     assert loss is not None
     for buffer in step._buffers._buffers.values():
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
@@ -158,7 +159,8 @@ def test_stray_resets_and_density_control_come_when_due(toy):
     options |= {"lattice": 2, "stray_reset_interval": 5}
     trainer = make_trainer(toy, "global", **options)
     view = view_of(toy, 1)
-    image, counts = read_image(view), []
+    image = read_image(view)
+    counts = []
     face = trainer.state.face
     trainer.state.parameters.xyz[7] = 1.0
     assert not trainer.state.unbound[7]
@@ -221,7 +223,8 @@ def test_unseen_share(toy):
     for view in (view for view in toy.views["train"] if view.timestep == first):
         camera = view.camera
         x, y, z = camera.world_to_camera[:3, :3] @ world.T + camera.world_to_camera[:3, 3:]
-        column, row = camera.fl_x * x / z + camera.cx, camera.fl_y * y / z + camera.cy
+        column = camera.fl_x * x / z + camera.cx
+        row = camera.fl_y * y / z + camera.cy
         beside = (column < 0) | (column >= camera.width) | (row < 0) | (row >= camera.height)
         unseen.append(beside | (z < 0.01))
     np.testing.assert_allclose(found[::2], np.mean(unseen, axis=0)[::2], atol=1e-6)

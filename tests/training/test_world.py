@@ -46,7 +46,8 @@ def camera_at(degrees: float) -> Camera:
 
 
 def plates_of(texture: np.ndarray) -> list[CleanPlate]:
-    cameras, seen = [camera_at(degrees) for degrees in (-24, -8, 8, 24)], np.ones((160, 120), bool)
+    cameras = [camera_at(degrees) for degrees in (-24, -8, 8, 24)]
+    seen = np.ones((160, 120), bool)
     return [CleanPlate(camera, wall(camera, texture), seen) for camera in cameras]
 
 
@@ -55,7 +56,8 @@ def test_a_wall_from_a_camera_that_did_not_see_it():
     noise = np.random.default_rng(0).random((512, 512, 3))
     texture = gaussian_filter(noise, (4, 4, 0), mode="wrap")
     texture = (texture - texture.min()) / (texture.max() - texture.min())
-    plates, center = plates_of(texture), np.zeros(3)
+    plates = plates_of(texture)
+    center = np.zeros(3)
     assert shell_radius(plates, center) == pytest.approx(WALL_M, rel=0.1)
     splats = trained_on(plates, center)
     for camera, least in ((plates[0].camera, 27.0), (camera_at(0), 24.0)):
@@ -128,7 +130,8 @@ def test_measured_with_the_world(walled, run, capsys, tmp_path):
         errors.append(-10 * np.log10(((rendered - recorded) ** 2).mean()))
     assert found == pytest.approx(np.mean(errors), abs=0.05)
     assert found > 18
-    avatar, cameras = tmp_path / "avatar.npz", walled / "transforms_test.json"
+    avatar = tmp_path / "avatar.npz"
+    cameras = walled / "transforms_test.json"
     avatar.write_bytes((run / "avatar.npz").read_bytes())
     asked = ("--world", "--capture", walled, "--cameras", cameras, "--out", tmp_path / "out")
     assert "world.ply: is missing; --world shows what a training with --effect world=on" in refused(

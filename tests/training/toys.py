@@ -52,7 +52,8 @@ def stop_at(iteration: int | None) -> Report:
 
 def assert_same_state(folder: Path, expected: Path) -> None:
     """The checkpoints of two runs, bit for bit."""
-    ours, theirs = read_checkpoint(folder), read_checkpoint(expected)
+    ours = read_checkpoint(folder)
+    theirs = read_checkpoint(expected)
     right = arrays_of(theirs.state)
     for name, array in arrays_of(ours.state).items():
         np.testing.assert_array_equal(

@@ -96,7 +96,8 @@ def test_what_was_found_is_not_worked_on_again(tmp_path, count):
 
     with pytest.raises(KeyboardInterrupt), Helpers(count, tmp_path / "kept") as helpers:
         helpers.map(halves, parts, interrupt, keep=True)
-    before, told = len(list((tmp_path / "kept").glob("*.npz"))), []
+    before = len(list((tmp_path / "kept").glob("*.npz")))
+    told = []
     assert before >= 1
     calls = len(list(called.iterdir()))
     with Helpers(count, tmp_path / "kept") as helpers:
@@ -132,7 +133,8 @@ def test_a_package_of_another_name_is_the_helpers_own(monkeypatch):
     helpers, progress, texts, errors = (
         import_module(f"installed.stga_addon.{name}") for name in modules
     )
-    right, wrong = progress.Progress(45.0), progress.Progress(44.0)
+    right = progress.Progress(45.0)
+    wrong = progress.Progress(44.0)
     with helpers.Helpers(2) as two:
         parts = [(right, texts.format_duration)] * 2
         assert two.map(is_own, parts, lambda steps: None) == [right, right]
@@ -164,7 +166,8 @@ def test_helpers_end_with_a_process_that_is_killed():
         "print(*(process.pid for process in helpers._processes), flush=True))"
     )
     path = os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])
-    command, variables = [sys.executable, "-c", script], {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", script]
+    variables = {**os.environ, "PYTHONPATH": path}
     asking = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
     pids = [int(pid) for pid in asking.stdout.readline().split()]
     asking.kill()

@@ -36,7 +36,8 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     path = tmp_path / "worker.lock"
     assert not is_locked(path)
     assert not path.exists()
-    command, pipe = [sys.executable, "-c", HOLD, str(tmp_path)], subprocess.PIPE
+    command = [sys.executable, "-c", HOLD, str(tmp_path)]
+    pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
@@ -58,7 +59,8 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
 def test_what_is_no_lock_file(tmp_path):
     """Catches a file overwritten through a link at the lock's path, and a read that never
     returns."""
-    path, target = tmp_path / "run.lock", tmp_path / "target"
+    path = tmp_path / "run.lock"
+    target = tmp_path / "target"
     target.write_text("mine")
     path.symlink_to(target)
     with pytest.raises(StgaError, match="cannot be written"), hold(path):
@@ -110,7 +112,8 @@ def test_storage_without_locks(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", flock)
     monkeypatch.setattr(lock, "BEAT_S", 0.05)
     monkeypatch.setattr(lock, "EXPIRY_S", 1.0)
-    folder, path = tmp_path / "job", tmp_path / "job/worker.lock"
+    folder = tmp_path / "job"
+    path = tmp_path / "job/worker.lock"
     lease = path.with_name("worker.lock.lease")
     with status_writer(folder) as writer:
         writer.report(Progress(0.5, "Working"))

@@ -159,8 +159,11 @@ def test_final_status_without_output_streams(tmp_path, streams, action):
     folder = tmp_path / "status"
     subprocess.run(
         f"{sys.executable} {tmp_path}/counting.py {folder} {action} {streams}",
-        shell=True, check=False, env=same_interpreter_environment(os.environ), timeout=60,
-    )  # fmt: skip
+        shell=True,
+        check=False,
+        env=same_interpreter_environment(os.environ),
+        timeout=60,
+    )
     expected = WorkerState.FINISHED if action == "done" else WorkerState.FAILED
     wait(lambda: (status.read_status(folder) or WorkerStatus()).state == expected)
 
@@ -195,7 +198,8 @@ def test_only_own_files_are_removed(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
 def test_symbolic_links_are_not_followed(tmp_path):
     """Catches a file overwritten through a link that somebody placed in the status folder."""
-    target, folder = tmp_path / "target", tmp_path / "job"
+    target = tmp_path / "target"
+    folder = tmp_path / "job"
     target.write_text("mine")
     folder.mkdir()
     for name in (status.STATUS_FILE, status.LOG_FILE, status.CANCEL_FILE):
@@ -217,11 +221,21 @@ def test_symbolic_links_are_not_followed(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "", "{", "[]", "null", '{"state": "dancing"}', '{"state": 3}', '{"progress": "half"}',
-        '{"progress": NaN}', '{"progress": 2}', '{"error": ["a"]}', '{"figures": []}',
-        '{"figures": {"n": "many"}}', '{"surprise": 1}'
+        "",
+        "{",
+        "[]",
+        "null",
+        '{"state": "dancing"}',
+        '{"state": 3}',
+        '{"progress": "half"}',
+        '{"progress": NaN}',
+        '{"progress": 2}',
+        '{"error": ["a"]}',
+        '{"figures": []}',
+        '{"figures": {"n": "many"}}',
+        '{"surprise": 1}',
     ],
-)  # fmt: skip
+)
 def test_damaged_status_is_ignored(tmp_path, text):
     """Catches an exception in Blender's timer for a truncated or foreign status.json."""
     (tmp_path / status.STATUS_FILE).write_text(text)
@@ -231,7 +245,9 @@ def test_damaged_status_is_ignored(tmp_path, text):
 
 def test_status_round_trip(tmp_path, monkeypatch):
     """Catches a field lost between worker and panel, NaN in it, and a status at every step."""
-    figures, machine, now = {"psnr": 30.5}, platform.node(), 100.0
+    figures = {"psnr": 30.5}
+    machine = platform.node()
+    now = 100.0
     expected = WorkerStatus("working", 0.25, "training", "enough", "", "", figures, machine, 0.25)
     monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))
     with status.status_writer(tmp_path) as writer:

@@ -89,7 +89,8 @@ def slices_of(plan: Plan, name: str) -> list[Benchmark]:
 def write_report(slices: Sequence[Benchmark], out: Path) -> str:
     """Write report.txt, benchmark.json, benchmark.csv and benchmark.png of what is finished so far
     into a folder; returns the report."""
-    first, names = slices[0], list(variants_of(slices[0]))
+    first = slices[0]
+    names = list(variants_of(slices[0]))
     found = [outcome_of(name, one.seed, one.out / name) for name in names for one in slices]
     outcomes = [outcome for outcome in found if outcome is not None]
     curves = mean_curves(outcomes)

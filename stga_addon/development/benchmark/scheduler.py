@@ -49,7 +49,8 @@ class BenchmarkRun:
         """Raise StgaError where the folder holds another run."""
         if not has_run(self.out):
             return
-        run, asked = read_run(self.out), self.request
+        run = read_run(self.out)
+        asked = self.request
         before = run.capture, run.flame, run.principal_point, without_choices(run.settings)
         if before != (asked.capture, asked.flame, asked.principal_point, asked.settings):
             raise StgaError(
@@ -96,7 +97,8 @@ class _Worker:
     """The process that trains one run (`worker`)."""
 
     def __init__(self, run: BenchmarkRun) -> None:
-        self.name, self.error = run.out.name, ""
+        self.name = run.out.name
+        self.error = ""
         self._run = run
         self._process: subprocess.Popen[str] | None = None
         self._ready = False

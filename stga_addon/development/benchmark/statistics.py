@@ -143,7 +143,8 @@ def pareto_front(curves: Mapping[str, MeanCurve]) -> list[tuple[str, float, floa
             for c in curves.values()
         ]
     )
-    best, names = heights.argmax(0), list(curves)
+    best = heights.argmax(0)
+    names = list(curves)
     spans: list[tuple[str, float, float]] = []
     for second, winner, is_higher in zip(
         seconds.tolist(), best.tolist(), _exceeds_earlier(heights.max(0)), strict=True

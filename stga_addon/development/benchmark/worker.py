@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 WARM_UP_S = 1.0
 """Seconds of training before the run, not counted: caches fill and the processor's clock rises."""
-FIT_EXPOSURE, THREADS = "--fit-exposure", "--threads"
+FIT_EXPOSURE = "--fit-exposure"
+THREADS = "--threads"
 QUALITY = "quality.json"
 """Metrics of the finished avatar on all views of "val" and "test"; the run is finished when the
 file exists."""
@@ -41,7 +42,8 @@ class Turns:
     """
 
     def __init__(self, requests: IO[str], replies: IO[str]) -> None:
-        self._requests, self._replies = requests, replies
+        self._requests = requests
+        self._replies = replies
         self._until = 0.0
         self.stopped = False
 

@@ -26,15 +26,20 @@ from .capture import CAPTURE
 from .person import Person, make_person
 from .studio import Studio
 
-CAMERAS, HELD_OUT = 9, 4
+CAMERAS = 9
+HELD_OUT = 4
 """On an arc in front of the head; the middle one is `val`."""
-WIDTH, HEIGHT = 320, 400
+WIDTH = 320
+HEIGHT = 400
 FOCAL = 3.7
 """In image widths."""
-ARC_DEG, ELEVATIONS_DEG = 70.0, (8.0, -9.0)
-DISTANCE_M, AIM_M = 1.1, (0.0, -0.002, 0.0)
+ARC_DEG = 70.0
+ELEVATIONS_DEG = (8.0, -9.0)
+DISTANCE_M = 1.1
+AIM_M = (0.0, -0.002, 0.0)
 SAMPLES = 10
-WEBP_QUALITY, WEBP_ALPHA_QUALITY = 93, 90
+WEBP_QUALITY = 93
+WEBP_ALPHA_QUALITY = 90
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,11 @@ TRAIN_ACTS = (
     ),
     Act(
         {
-            "browInnerUp": 0.9, "browOuterUp": 0.8, "eyeWide": 0.6, "jawOpen": 0.5, "eyeBlink": 0,
+            "browInnerUp": 0.9,
+            "browOuterUp": 0.8,
+            "eyeWide": 0.6,
+            "jawOpen": 0.5,
+            "eyeBlink": 0,
             "mouthSmile": 0,
         },
         neck=(0, -4),
@@ -70,16 +79,21 @@ TRAIN_ACTS = (
     Act({"eyeBlink": 1.0, "mouthPucker": 0.8, "mouthSmile": 0}, turn=(-3, 2)),
     Act(
         {"browDown": 0.8, "noseSneer": 0.5, "mouthFrown": 0.5, "mouthSmile": 0},
-        neck=(-6, 0), gaze=(13, 0),
+        neck=(-6, 0),
+        gaze=(13, 0),
     ),
     Act(
         {
-            "mouthSmile": 0.7, "mouthUpperUp": 0.5, "mouthLowerDown": 0.45, "jawOpen": 0.12,
+            "mouthSmile": 0.7,
+            "mouthUpperUp": 0.5,
+            "mouthLowerDown": 0.45,
+            "jawOpen": 0.12,
             "cheekSquint": 0.5,
         },
-        neck=(4, 2), gaze=(-12, 3),
+        neck=(4, 2),
+        gaze=(-12, 3),
     ),
-)  # fmt: skip
+)
 TEST_ACTS = (
     Act(
         {"mouthSmile": 0.8, "jawOpen": 0.3, "browOuterUp": 0.5, "cheekSquint": 0.4},

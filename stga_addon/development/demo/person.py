@@ -27,15 +27,22 @@ from ..bundled_head import (
 )
 
 SURFACES = ("skin", "mouth", "gums", "teeth", "eyes")
-IDENTITY_SEED, IDENTITIES, IDENTITY_DEVIATION = 14, 40, 0.68
-EYES_IDENTITY, EYES = 10, -0.3
+IDENTITY_SEED = 14
+IDENTITIES = 40
+IDENTITY_DEVIATION = 0.68
+EYES_IDENTITY = 10
+EYES = -0.3
 """Component, and its coefficient, with which the lids close over the eyes."""
 SEED = 7
 # Linear RGB.
-SKIN_COLOR, LIP_COLOR = np.array([0.66, 0.41, 0.305]), np.array([0.48, 0.17, 0.155])
-FLUSH, SHADOW = np.array([1.04, 0.72, 0.70]), np.array([0.84, 0.70, 0.68])
-MOUTH_COLOR, GUM_COLOR = np.array([0.30, 0.075, 0.07]), np.array([0.42, 0.12, 0.11])
-TOOTH_COLOR, SCALP_COLOR = np.array([0.80, 0.75, 0.66]), np.array([0.06, 0.038, 0.025])
+SKIN_COLOR = np.array([0.66, 0.41, 0.305])
+LIP_COLOR = np.array([0.48, 0.17, 0.155])
+FLUSH = np.array([1.04, 0.72, 0.70])
+SHADOW = np.array([0.84, 0.70, 0.68])
+MOUTH_COLOR = np.array([0.30, 0.075, 0.07])
+GUM_COLOR = np.array([0.42, 0.12, 0.11])
+TOOTH_COLOR = np.array([0.80, 0.75, 0.66])
+SCALP_COLOR = np.array([0.06, 0.038, 0.025])
 PARTS = (
     ("skin", SKIN),
     ("mouth", MOUTH_INSIDE),
@@ -44,8 +51,12 @@ PARTS = (
     ("eyes", LEFT_EYEBALL),
     ("eyes", RIGHT_EYEBALL),
 )
-LIP_LINE_CM, LIP_HALF_WIDTH_CM, UPPER_LIP_CM, LOWER_LIP_CM = -3.35, 2.35, 0.98, 1.28
-NECKLINE_CM, NECKLINE_SLOPE = -10.6, 0.30
+LIP_LINE_CM = -3.35
+LIP_HALF_WIDTH_CM = 2.35
+UPPER_LIP_CM = 0.98
+LOWER_LIP_CM = 1.28
+NECKLINE_CM = -10.6
+NECKLINE_SLOPE = 0.30
 """Height above which there is no cloth, on the axis of the head, and by how much it falls to the
 front."""
 HEAD_AXIS_Z_CM = -1.0
@@ -56,7 +67,8 @@ HAIRLINE = (
 """(degrees from straight ahead, centimeters above the eyes)"""
 BROW_HEIGHTS_CM = 1.95, 2.6, 2.1
 REDNESS = 0.5
-LID_EDGE_CM, LID_HALF_WIDTH_CM = 0.1, 1.15
+LID_EDGE_CM = 0.1
+LID_HALF_WIDTH_CM = 1.15
 HAIRS_PER_CLUMP = 30
 POINTS_PER_HAIR = 9
 
@@ -189,7 +201,8 @@ class _Paint:
         eye = at[slice(*LEFT_EYEBALL)]
         self.eye_at = (eye.min(0) + eye.max(0)) / 2
         self.eye_radius = float(np.ptp(eye[:, 1]) / 2)
-        across, above = abs(at[:, 0]), at[:, 1] - LIP_LINE_CM
+        across = abs(at[:, 0])
+        above = at[:, 1] - LIP_LINE_CM
         bow = np.clip(1 - (across / LIP_HALF_WIDTH_CM) ** 2, 0, 1) ** 0.6
         upper = UPPER_LIP_CM * bow - 0.13 * np.exp(-((across / 0.35) ** 2))
         height = np.where(above > 0, upper, LOWER_LIP_CM * bow)
@@ -411,16 +424,20 @@ def _all_strands(paint: _Paint, neutral: np.ndarray) -> tuple[Strands, ...]:
     hair = _Growth(
         combed,
         lambda root: 0.022 + 0.048 * top(root),
-        rise=(44, -24), disorder=0.14, lift=lambda root: 0.25 + 0.75 * top(root), clump=0.75,
+        rise=(44, -24),
+        disorder=0.14,
+        lift=lambda root: 0.25 + 0.75 * top(root),
+        clump=0.75,
         clearance=0.005,
-    )  # fmt: skip
+    )
     brow = _Growth(
         lambda root, normal: np.stack(
             [np.sign(root[:, 0]), 0.75 - 0.22 * (abs(root[:, 0]) - 1.2), 0 * root[:, 0]], 1
         ),
         lambda root: np.full(len(root), 0.008),
-        rise=(24, 4), disorder=0.15,
-    )  # fmt: skip
+        rise=(24, 4),
+        disorder=0.15,
+    )
     return (
         strands("hair", paint.hair, 19000, hair, 0.00013, 0.66),
         strands("brows", paint.brows, 700, brow, 0.00007, 0.75),

@@ -199,7 +199,8 @@ def selection_picture(
 
     mesh (V, 3) drives the avatar; selected (F,) bool.
     """
-    splats, gray = avatar.splats, ~selected[avatar.splats.face]
+    splats = avatar.splats
+    gray = ~selected[avatar.splats.face]
     sh = splats.sh.copy()
     luminance = 0.5 + SH_C0 * sh[:, 0] @ np.array([0.299, 0.587, 0.114], np.float32)
     sh[gray] = 0

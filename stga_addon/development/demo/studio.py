@@ -33,8 +33,11 @@ SOFT_BOXES = (
 )
 BOX_DISTANCE_M = 1.3
 AMBIENT = 0.30
-MAX_BOUNCES, NOISE_THRESHOLD = 4, 0.03
-CLOTH_M, COLLAR_CM, CLOTH_COLOR = 0.0035, 1.5, (0.045, 0.12, 0.13)
+MAX_BOUNCES = 4
+NOISE_THRESHOLD = 0.03
+CLOTH_M = 0.0035
+COLLAR_CM = 1.5
+CLOTH_COLOR = (0.045, 0.12, 0.13)
 STRAND_TIP = 0.35
 """Of a hair's radius at its root."""
 
@@ -55,7 +58,8 @@ class Studio:
         self.cloth = bpy.data.objects.new("cloth", _cloth(person))
         self.cloth.modifiers.new("smooth", "SUBSURF").render_levels = 1
         thickness = self.cloth.modifiers.new("thickness", "DISPLACE")
-        thickness.strength, thickness.mid_level = CLOTH_M, 0.0
+        thickness.strength = CLOTH_M
+        thickness.mid_level = 0.0
         self.hair = [
             bpy.data.objects.new(strands.name, _curves(strands)) for strands in person.strands
         ]
@@ -78,10 +82,8 @@ class Studio:
         with TemporaryDirectory() as folder:
             self.scene.render.filepath = path = str(Path(folder) / "view.png")
             for view in cameras:
-                self.scene.render.resolution_x, self.scene.render.resolution_y = (
-                    view.width,
-                    view.height,
-                )
+                self.scene.render.resolution_x = view.width
+                self.scene.render.resolution_y = view.height
                 set_intrinsics(self.camera.data, view)
                 self.camera.matrix_world = Matrix(view.camera_to_world_gl.tolist())
                 with _silent():
@@ -109,14 +111,16 @@ def _scene(samples: int) -> Any:
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     scene.cycles.device = "CPU"
-    scene.cycles.samples, scene.cycles.max_bounces = samples, MAX_BOUNCES
+    scene.cycles.samples = samples
+    scene.cycles.max_bounces = MAX_BOUNCES
     scene.cycles.use_denoising = True
     scene.cycles.adaptive_threshold = NOISE_THRESHOLD
     scene.cycles_curves.shape = "RIBBONS"
     scene.render.use_persistent_data = True
     scene.render.film_transparent = True
     scene.render.resolution_percentage = 100
-    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGBA"
     scene.view_settings.view_transform = "Standard"
     scene.world = bpy.data.worlds.new("studio")
     background = enable_nodes(scene.world).nodes["Background"]
@@ -127,7 +131,8 @@ def _scene(samples: int) -> Any:
 
 def _soft_box(scene: Any, azimuth: float, elevation: float, watts: float, size: float) -> None:
     light = bpy.data.lights.new("soft box", "AREA")
-    light.energy, light.size = watts, size
+    light.energy = watts
+    light.size = size
     box = bpy.data.objects.new("soft box", light)
     scene.collection.objects.link(box)
     # A light shines along its own -z: turn +z to look from the subject at the box, and step back.
@@ -163,7 +168,8 @@ def _curves(strands: Strands) -> Any:
     radius = curves.attributes.get("radius") or curves.attributes.new("radius", "FLOAT", "POINT")
     taper = strands.radius_m * np.linspace(1, STRAND_TIP, points)
     radius.data.foreach_set("value", flat_floats(np.tile(taper, count)))
-    melanin, redness = strands.melanin, strands.redness
+    melanin = strands.melanin
+    redness = strands.redness
 
     def shader(nodes: Nodes) -> Any:
         inputs = {
@@ -229,7 +235,8 @@ def _eye(nodes: Nodes) -> Any:
     for place, color in EYE_COLORS[:-2]:
         elements.new(place).color = (*color, 1)
     for element, (place, color) in zip((elements[0], elements[-1]), EYE_COLORS[-2:], strict=True):
-        element.position, element.color = place, (*color, 1)
+        element.position = place
+        element.color = (*color, 1)
     around = nodes.math("ARCTAN2", y, x)
     fibers = nodes.combine(
         nodes.math("COSINE", around),

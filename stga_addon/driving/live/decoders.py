@@ -40,7 +40,8 @@ def decode_live_link_face(data: bytes) -> FacePacket | None:
     shapes. Without a face, the packet ends before the count, or counts 0. Source: Unreal Engine's
     AppleARKitFaceSupport.
     """
-    texts, at = [], 1
+    texts = []
+    at = 1
     try:
         for _ in range(2):
             (length,) = struct.unpack_from(">i", data, at)
@@ -163,7 +164,8 @@ def decode_vmc(data: bytes, before: Received) -> tuple[FacePacket | None, Receiv
         return None
     if not any(address.startswith("/VMC/") for address, _ in found):
         return None
-    known, packet = before, None
+    known = before
+    packet = None
     for address, values in found:  # of malformed messages nothing is taken
         numbers = [float(value) for value in values if _is_number(value)]
         match address, values:

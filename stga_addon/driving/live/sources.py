@@ -48,20 +48,27 @@ def _single(decode: Callable[[bytes], FacePacket | None]) -> Callable[[bytes, An
 
 SOURCES = {
     "live_link_face": Source(
-        "Live Link Face", 11111, _single(decode_live_link_face),
+        "Live Link Face",
+        11111,
+        _single(decode_live_link_face),
         hint="Choose the mode Live Link (ARKit) in the app; its MetaHuman Animator mode sends no "
         "such weights",
     ),
     "facial_mocap": Source(
-        "iFacialMocap", 49983, _single(read_performance.parse_packet), read_performance.REQUEST,
+        "iFacialMocap",
+        49983,
+        _single(read_performance.parse_packet),
+        read_performance.REQUEST,
         "A request is sent to the phone, which answers until it is closed",
     ),
     "vmc": Source(
-        "VMC (OSC)", 39539, lambda data, known: decode_vmc(data, known or Received()),
+        "VMC (OSC)",
+        39539,
+        lambda data, known: decode_vmc(data, known or Received()),
         hint="The sender must send ARKit's shapes (\"perfect sync\"); VRM's own expressions are "
         "left out",
     ),
-}  # fmt: skip
+}
 
 
 LOOPBACK = "127.0.0.1"
@@ -78,7 +85,8 @@ class Receiver:
     ) -> None:
         """Listen on `address` and `port` (0: the usual one); phone: whom a source with a request
         asks. Raises StgaError for no address, or a port that cannot be opened."""
-        self.source, self.port = source, port or source.port
+        self.source = source
+        self.port = port or source.port
         self.phone = str(checked_address("phone's address", phone)) if source.request else ""
         where = checked_address("address to listen on", address)
         self._asked = float("-inf")
@@ -137,7 +145,9 @@ RESTART_S = 1.0
 """A clock set back by more is a source that started anew; by less, a packet that came late."""
 PAUSE_S = 2.0  # Longer gaps are pauses of the source, not lost packets
 GAP = 1.5  # Packets farther apart than this many usual steps have lost some between them
-STEPS, ARRIVALS = 31, 240  # Steps of the source's clock, and arrivals, that are remembered
+# Steps of the source's clock, and arrivals, that are remembered
+STEPS = 31
+ARRIVALS = 240
 RATE_WINDOW_S = 2.0
 
 
@@ -301,7 +311,9 @@ class Recording:
         """Take a packet that arrived at `now`, up to as many as a performance may have."""
         time = now
         if self._packets:
-            before, last, step = self._times[-1], self._packets[-1], now - self._arrived
+            before = self._times[-1]
+            last = self._packets[-1]
+            step = now - self._arrived
             if packet.time is not None:
                 own = -1.0 if last.time is None else packet.time - last.time
                 leads = before + own > now + MAX_LEAD_S

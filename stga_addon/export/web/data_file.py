@@ -23,7 +23,8 @@ from ..playback import Playback
 from ..spz import smallest_three
 
 MAGIC = b"STGA"
-FORMAT, VERSION = "stga-web", 4
+FORMAT = "stga-web"
+VERSION = 4
 MAX_PLANES = 4
 MAX_STEPS = 1 << 31
 """Largest number of steps from zero: what four planes hold."""
@@ -56,9 +57,11 @@ def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, 
         if not (np.abs(steps) < MAX_STEPS).all():
             limit = MAX_STEPS * step
             raise ValueError(f"{name} holds a value that is not finite, or beyond {limit:g}")
-        integers, entry = steps.astype(np.int64), {"type": "fixed", "step": step}
+        integers = steps.astype(np.int64)
+        entry = {"type": "fixed", "step": step}
     elif array.dtype.kind in "iub":
-        integers, entry = array.astype(np.int64), {"type": "integer"}
+        integers = array.astype(np.int64)
+        entry = {"type": "integer"}
     else:
         floats = np.ascontiguousarray(array, "<f4")
         if not np.isfinite(floats).all():
@@ -117,7 +120,8 @@ def flame_rig(sequence: FlameSequence) -> WebRig:
     person = with_identity(sequence)
     model = person.model
     motion = motion_arrays(person)
-    expressions, coefficients = np.moveaxis(model.shapedirs, 2, 0), motion["expr"]
+    expressions = np.moveaxis(model.shapedirs, 2, 0)
+    coefficients = motion["expr"]
     if motion["dynamic_offset"].any():
         shapes, factors = principal_shapes(motion["dynamic_offset"])
         expressions = np.concatenate([expressions, shapes])
@@ -149,7 +153,8 @@ def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
     if not len(meshes):
         raise ValueError("there is no posed mesh")
     stack = np.asarray(meshes, np.float64)
-    weights, translations = np.ones(stack.shape[1]), stack.mean(1)
+    weights = np.ones(stack.shape[1])
+    translations = stack.mean(1)
     rotations = np.stack([weighted_procrustes(stack[0], mesh, weights)[0] for mesh in stack])
     aligned = np.einsum("tba,tvb->tva", rotations, stack - translations[:, None])
     base = aligned.mean(0)
@@ -176,7 +181,8 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flat = offsets.reshape(len(offsets), -1)
     _, directions = np.linalg.eigh(flat @ flat.T)
     directions = directions[:, ::-1]  # largest first
-    shapes, rest = [], flat.copy()
+    shapes = []
+    rest = flat.copy()
     for column in directions.T:
         if np.linalg.norm(rest.reshape(-1, 3), axis=1).max() <= BAKE_TOLERANCE_M:
             break
@@ -188,7 +194,8 @@ def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return basis, coefficients / largest
 
 
-POSITION_STEP_M, MOVED_STEP_M = 4e-6, 0.25e-6
+POSITION_STEP_M = 4e-6
+MOVED_STEP_M = 0.25e-6
 """Of splats, and of how far a driven offset moves them with a unit of its signal."""
 OFFSET_STEP = 2.0**-12
 """Of other driven offsets. Signals are at most 2 in each of three components: half a step of each
@@ -221,7 +228,8 @@ they leave a picture of large random splats 55 dB PSNR at least (tests/export/we
 IRRADIANCE_STEPS = 65535
 """Steps to the largest irradiance of the capture, whose level is any."""
 
-MIN_SLIDER_RANGE, SLIDER_HEADROOM = 1.0, 1.5
+MIN_SLIDER_RANGE = 1.0
+SLIDER_HEADROOM = 1.5
 """Sliders reach beyond the motion by this factor, and to ±1 at least."""
 
 
@@ -234,7 +242,8 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
     surface = avatar.splats.face if relighter is None else relighter.face
     # equal triangles side by side, which gzip likes
     order = np.lexsort((surface, avatar.splats.face))
-    splats, faces = avatar.splats.rows(order), len(avatar.faces)
+    splats = avatar.splats.rows(order)
+    faces = len(avatar.faces)
     arrays = _splat_arrays(splats) | {
         "faces": avatar.faces,
         "neutral": avatar.neutral,
@@ -264,7 +273,8 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         if rig.expression_names:  # they are ARKit's shapes, whose sliders these are
             header["sliders"] = []
     if relighter is not None:
-        light, lashes = relighter.light, relighter.lashes
+        light = relighter.light
+        lashes = relighter.lashes
         by_vertex = "transfer", "occlusion", "irradiance", "roughness"
         arrays |= {f"light_{name}": getattr(light, name) for name in by_vertex}
         steps["light_irradiance"] = float(light.irradiance.max(initial=1e-6)) / IRRADIANCE_STEPS

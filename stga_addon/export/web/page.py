@@ -20,7 +20,8 @@ from ..playback import Playback
 from .data_file import baked_rig, data_file, flame_rig
 
 PLAYER = Path(__file__).parent / "player"
-ELEMENT, PAGE = "stga-avatar.js", "page.js"
+ELEMENT = "stga-avatar.js"
+PAGE = "page.js"
 """Modules of the custom element, and of the page around it."""
 IMPORT = re.compile(r"^import\b[^;]*?'\./([\w-]+\.js)';\n", re.MULTILINE)
 EXPORT = re.compile(r"^export (?=class|function|const|async)", re.MULTILINE)
@@ -67,7 +68,8 @@ def page(title: str, notice: str, data: bytes) -> str:
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 
-BYTES_PER_SPLAT, BYTES_PER_COEFFICIENT = 20, 0.75
+BYTES_PER_SPLAT = 20
+BYTES_PER_COEFFICIENT = 0.75
 """About what a splat, and a coefficient of its color, takes in a page."""
 BUNDLED_NOTICE = (
     "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
@@ -79,9 +81,12 @@ MESH_NOTICE = f"Contains the triangles and the posed meshes of a FLAME head{FLAM
 
 
 def write_web(
-    path: Path, avatar: Avatar, playback: Playback, meshes: Iterable[tuple[int, np.ndarray]] = (),
+    path: Path,
+    avatar: Avatar,
+    playback: Playback,
+    meshes: Iterable[tuple[int, np.ndarray]] = (),
     sequence: FlameSequence | None = None,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
     the files.
 

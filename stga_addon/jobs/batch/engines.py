@@ -49,7 +49,8 @@ class LocalEngine(Engine):
 
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
-            folder, threads = job.request_folder, job.resources.threads or None
+            folder = job.request_folder
+            threads = job.resources.threads or None
             arguments = worker_arguments(folder, threads, resume=True)
             self._jobs[job.name] = job, start_worker(folder, self._python, arguments)
 
@@ -98,11 +99,12 @@ def _slurm(address: str) -> Engine:
 
 ENGINES: dict[str, tuple[str, Callable[[str], Engine]]] = {
     "local": (
-        "this machine, as many jobs as its processors and memory allow", lambda _: LocalEngine()
+        "this machine, as many jobs as its processors and memory allow",
+        lambda _: LocalEngine(),
     ),
     "ray": ("a Ray cluster at --address, or one started here", _ray),
     "slurm": ("a SLURM cluster, as arrays of sbatch", _slurm),
-}  # fmt: skip
+}
 """Name -> what the command line says of it, and what makes it with --address."""
 
 

@@ -87,7 +87,9 @@ def _line(name: str, found: os.stat_result) -> str:
 
 
 LOCK = "batch.lock"
-JOB_FILE, FORMAT, VERSION = "job.json", "stga-job", 1
+JOB_FILE = "job.json"
+FORMAT = "stga-job"
+VERSION = 1
 
 
 @contextmanager
@@ -152,12 +154,15 @@ def prepare(job: Job, digest: str, forecast_s: float) -> Path | None:
     """Make the job's folder ready for a worker, which continues what an earlier one began; returns
     where another request's files were moved. Raises StgaError for a running worker, and files of
     others."""
-    record, moved = read_record(job), None
+    record = read_record(job)
+    moved = None
     if record is not None and record.digest != digest:
         prepare_status_folder(job.request_folder)  # raises while a worker is running
-        kept, name = job.folder.parent / REPLACED, job.folder.name
+        kept = job.folder.parent / REPLACED
+        name = job.folder.name
         names = (name if n == 1 else f"{name}_{n}" for n in count(1))
-        moved, record = next(kept / name for name in names if not (kept / name).exists()), None
+        moved = next(kept / name for name in names if not (kept / name).exists())
+        record = None
         with naming(job.folder, f"moved to {moved}"):
             kept.mkdir(exist_ok=True)
             job.folder.rename(moved)

@@ -108,7 +108,8 @@ def _holds_path(hint: Any) -> bool:
 
 def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
     """Field -> the paths that a request reads, of those that are given."""
-    kind, found = type(request), dict[str, tuple[Path, ...]]()
+    kind = type(request)
+    found = dict[str, tuple[Path, ...]]()
     for name in kind.__dataclass_fields__:
         value = getattr(request, name)
         if value is not None and name != output_field(kind) and is_path(kind, name, value):
@@ -220,7 +221,8 @@ def _slug(text: str) -> str:
 def make_plan(values: Mapping[str, Any], base: Path, source: str) -> Plan:
     """The plan of a TOML file's values, paths relative to `base`; raises as `read_plan` does."""
     _require_keys(source, values, PLAN_KEYS)
-    out, tables = values.get("out"), values.get("job")
+    out = values.get("out")
+    tables = values.get("job")
     if not isinstance(out, str) or not out:
         raise StgaError(f"{source}: out: expected the batch's folder as a text, got {shorten(out)}")
     if not isinstance(tables, dict) or not tables:
@@ -258,7 +260,8 @@ def _job(source: str, name: str, table: Any, base: Path, out: Path, shared: Reso
     if kind is None:
         problem = f"expected one of {', '.join(kinds)}, got {shorten(table.get('request'))}"
         raise StgaError(f"{where}: request: {problem}")
-    after, minutes = table.get("after", []), table.get("minutes")
+    after = table.get("after", [])
+    minutes = table.get("minutes")
     if not isinstance(after, list) or not all(isinstance(other, str) for other in after):
         raise StgaError(f"{where}: after: expected a list of job names, got {shorten(after)}")
     if minutes is not None and (not isinstance(minutes, int | float) or not minutes > 0):
@@ -293,7 +296,8 @@ def _request(
     if "settings" in kind.__dataclass_fields__:
         values["settings"] = _training_settings(where, values.get("settings", {}))
     for spec in fields(kind):
-        value, name = values.get(spec.name), spec.name
+        value = values.get(spec.name)
+        name = spec.name
         if spec.default_factory is not MISSING and isinstance(value, dict | None):
             values[name] = {**to_json(spec.default_factory()), **(value or {})}
         elif value is None and spec.default is MISSING:
@@ -341,9 +345,11 @@ def _tuples(value: Any) -> Any:
 
 def _with_inputs(source: str, jobs: Sequence[Job]) -> Iterator[Job]:
     """The jobs, each also after those whose folders it reads. StgaError for missing inputs."""
-    by_name, by_folder = {job.name: job for job in jobs}, {job.folder: job for job in jobs}
+    by_name = {job.name: job for job in jobs}
+    by_folder = {job.folder: job for job in jobs}
     for job in jobs:
-        where, after = f"{source}: [job.{job.name}]", list(job.after)
+        where = f"{source}: [job.{job.name}]"
+        after = list(job.after)
         unknown = next((other for other in after if other not in by_name), None)
         if unknown is not None:
             raise StgaError(f"{where}: after: '{shorten(unknown)[1:-1]}' is not a job of the plan")

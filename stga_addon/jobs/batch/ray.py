@@ -21,7 +21,8 @@ from .plan import Ended, Engine, Job, job_command
 
 MAX_WAITING = 1000  # Tasks that are submitted at once: more wait here, not in Ray's memory
 NODE_RETRIES = 5  # How often Ray begins a task again elsewhere whose machine has gone
-TOKEN_MODE, TOKEN = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN"
+TOKEN_MODE = "RAY_AUTH_MODE"
+TOKEN = "RAY_AUTH_TOKEN"
 """Environment variables by which only who has the token may use a cluster (Ray 2.52)."""
 
 
@@ -61,7 +62,8 @@ class RayEngine(Engine):
     def submit(self, jobs: Sequence[Job]) -> None:
         for job in jobs:
             needs = job.resources
-            memory, gpus = needs.memory_gb * 1e9, int(needs.gpu)
+            memory = needs.memory_gb * 1e9
+            gpus = int(needs.gpu)
             options = {"num_cpus": needs.threads or 1, "num_gpus": gpus, "memory": memory}
             task = self._task.options(name=job.name, **options)
             log = str(job.request_folder / LOG_FILE)
@@ -134,8 +136,12 @@ def _task(python_variable: str) -> Callable[[list[str], str, str], int]:
         end_with_this = None if prctl is None else lambda: prctl(1, signal.SIGKILL)
         with open(log, "ab") as out:
             return subprocess.call(
-                command, env=variables, stdin=subprocess.DEVNULL, stdout=out, stderr=out,
+                command,
+                env=variables,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
                 preexec_fn=end_with_this,
-            )  # fmt: skip
+            )
 
     return run_command

@@ -28,15 +28,18 @@ if TYPE_CHECKING:
 
 MAX_LIVE_ROWS = 20  # Jobs that the live table shows: the running ones, then those that failed
 BAR_WIDTH = 20
-CLEAR_LINE, UP = "\x1b[2K", "\x1b[{}A"
+CLEAR_LINE = "\x1b[2K"
+UP = "\x1b[{}A"
 
 
 class LiveTable:
     """Shows a batch: on a terminal a table that is drawn over, else a line for each event."""
 
     def __init__(self, stream: TextIO, width: int = 100) -> None:
-        self._stream, self._width = stream, width
-        self._is_terminal, self._drawn = stream.isatty(), 0
+        self._stream = stream
+        self._width = width
+        self._is_terminal = stream.isatty()
+        self._drawn = 0
 
     def __call__(self, batch: Batch) -> None:
         if not self._is_terminal:
@@ -79,7 +82,8 @@ def summary_line(batch: Batch) -> str:
     parts = [f"{done} of {len(entries)} jobs finished"]
     for state in (JobState.RUNNING, JobState.FAILED, JobState.BLOCKED, JobState.CANCELLED):
         parts += [f"{counts[state]} {state}"] if counts[state] else []
-    line, left = ", ".join(parts), [entry for entry in entries if not entry.state.is_over]
+    line = ", ".join(parts)
+    left = [entry for entry in entries if not entry.state.is_over]
     known = [entry.left_s for entry in left if entry.left_s is not None]
     if not any(known):
         return line
@@ -109,7 +113,8 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
     """What --dry-run prints: each job, its state, its forecast, and the sum."""
     rows = []
     for entry in batch.entries.values():
-        job, needs = entry.job, entry.job.resources
+        job = entry.job
+        needs = entry.job.resources
         plural = "" if needs.threads == 1 else "s"
         machine = f"{needs.threads} thread{plural}, {needs.memory_gb:g} GB" + ", GPU" * needs.gpu
         time = format_duration(entry.forecast_s) if entry.forecast_s else "?"
@@ -135,7 +140,10 @@ def plan_lines(batch: Batch, cores: int) -> list[str]:
 
 
 REPORT = "report.html"
-MAX_CURVES, MAX_PICTURES, MAX_FAILURES, MAX_ROWS = 24, 24, 50, 2000
+MAX_CURVES = 24
+MAX_PICTURES = 24
+MAX_FAILURES = 50
+MAX_ROWS = 2000
 """Limits of the report; of more curves and pictures, evenly spread ones by PSNR are shown."""
 PICTURE_HEIGHT_PX = 240
 JPEG_QUALITY = 85
@@ -171,7 +179,8 @@ def write_report(batch: Batch) -> Path:
         folder = entry.job.folder
         if entry.state.is_done and has_run(folder):
             with suppress(StgaError):
-                metrics, figures = read_metrics(folder), dict[str, Any]()
+                metrics = read_metrics(folder)
+                figures = dict[str, Any]()
                 lines = [line for line in metrics if "psnr" in line]
                 with suppress(StgaError):
                     target = read_run(folder).settings.target_psnr
@@ -210,9 +219,11 @@ def _forecast_error(entry: Entry) -> float | None:
 
 
 def _failures(batch: Batch) -> str:
-    failed, parts = batch.failures, []
+    failed = batch.failures
+    parts = []
     for entry in failed[:MAX_FAILURES]:
-        name, error = html.escape(entry.job.name), html.escape(entry.error or entry.state)
+        name = html.escape(entry.job.name)
+        error = html.escape(entry.error or entry.state)
         parts.append(f'<p><b>{name}</b>: <span class="failed">{error}</span></p>')
         log = log_lines(entry.job.request_folder, LOG_LINES)
         if log and entry.state == JobState.FAILED:
@@ -276,7 +287,8 @@ def _held_out_pair(run: Path) -> "Image.Image | None":
     views = choose_evaluation_views(capture)
     if not views:
         return None
-    avatar, view = read_avatar(run / AVATAR), views[0]
+    avatar = read_avatar(run / AVATAR)
+    view = views[0]
     red, green, blue = (round(255 * level) for level in avatar.background)
     mesh = capture.mesh(view.timestep)
     rendered = to_uint8(render_avatar(avatar, mesh, view.camera, avatar.background))
@@ -290,8 +302,10 @@ def _table(batch: Batch, runs: Iterable[Run]) -> str:
     rows = [_cells("th", heads, numbers)]
     entries = list(batch.entries.values())
     for entry in entries[:MAX_ROWS]:
-        off, known = _forecast_error(entry), figures.get(entry.job.name, {})
-        name, kind = entry.job.name, type(entry.job.request).__name__
+        off = _forecast_error(entry)
+        known = figures.get(entry.job.name, {})
+        name = entry.job.name
+        kind = type(entry.job.request).__name__
         found = (
             format_duration(entry.seconds) if entry.seconds else "",
             format_duration(entry.forecast_s) if entry.forecast_s else "",

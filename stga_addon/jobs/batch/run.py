@@ -78,7 +78,8 @@ class Batch:
 
     def __init__(self, plan: Plan) -> None:
         """Find out what is finished already. Raises StgaError where an input cannot be read."""
-        self.plan, digests = plan, job_digests(plan)
+        self.plan = plan
+        digests = job_digests(plan)
         self.entries = {job.name: Entry(job, digests[job.name]) for job in plan.jobs}
         for entry in self.entries.values():
             kept = all(self.entries[other].state.is_done for other in entry.job.after)
@@ -86,7 +87,8 @@ class Batch:
             if record is not None:
                 entry.state = JobState.KEPT
                 entry.status = read_status(entry.job.request_folder) or entry.status
-                entry.seconds, entry.forecast_s = record.seconds, record.forecast_s
+                entry.seconds = record.seconds
+                entry.forecast_s = record.forecast_s
                 entry.machine = record.machine or entry.status.machine
 
     @property
@@ -105,11 +107,18 @@ class BatchRun:
     """
 
     def __init__(
-        self, batch: Batch, engine: Engine, lease: SoftFileLease, show: Callable[[Batch], None],
+        self,
+        batch: Batch,
+        engine: Engine,
+        lease: SoftFileLease,
+        show: Callable[[Batch], None],
         say: Say,
-    ) -> None:  # fmt: skip
-        self._batch, self._engine, self._lease = batch, engine, lease
-        self._show, self._say = show, say
+    ) -> None:
+        self._batch = batch
+        self._engine = engine
+        self._lease = lease
+        self._show = show
+        self._say = say
         self._entries = batch.entries
         self._shown_s = 0.0
 
@@ -177,7 +186,8 @@ class BatchRun:
     def _begin(self) -> bool:
         """Submit what can start; whether there was something."""
         fitting: list[Entry] = []
-        misses, takes_all = 0, self._engine.takes_all
+        misses = 0
+        takes_all = self._engine.takes_all
         for name, entry in self._entries.items():  # each after those that it comes after
             if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not takes_all):
                 break
@@ -208,7 +218,8 @@ class BatchRun:
                 self._over(entry, JobState.FAILED, str(error))
             return
         for entry in entries:
-            entry.state, entry.status = JobState.RUNNING, WorkerStatus()
+            entry.state = JobState.RUNNING
+            entry.status = WorkerStatus()
 
     def _collect(self, retry: bool = True) -> bool:
         """Take note of what has ended; whether something has."""
@@ -217,7 +228,8 @@ class BatchRun:
         for name, entry in self._entries.items() if ended else ():
             if name not in ended:
                 continue
-            end, state = ended[name], ended[name].snapshot.state
+            end = ended[name]
+            state = ended[name].snapshot.state
             entry.status = end.snapshot.status
             entry.machine = entry.machine or entry.status.machine
             record = read_record(entry.job)
@@ -244,7 +256,8 @@ class BatchRun:
 
     def _over(self, entry: Entry, state: JobState, error: str = "") -> None:
         """Take note of a job's end."""
-        entry.state, entry.error = state, error
+        entry.state = state
+        entry.error = error
         self._say(f"{entry.job.name}: {state}" + (f": {error}" if error else ""))
 
     def _look(self, now: bool = False) -> None:
@@ -285,7 +298,8 @@ def set_forecasts(batch: Batch) -> None:
     for entry in entries:
         if entry.state.is_over:
             continue
-        alike, expected = taken.get(type(entry.job.request), []), stated[entry.job.name]
+        alike = taken.get(type(entry.job.request), [])
+        expected = stated[entry.job.name]
         factors = [seconds / before for seconds, before in alike if before]
         if expected is not None:
             entry.forecast_s = expected * median(factors) if factors else expected

@@ -29,7 +29,8 @@ ON_MACHINE = ("RUNNING", "COMPLETING", "CONFIGURING", "STAGE_OUT")
 GRACE_S = 10.0
 """Seconds after its submission in which a job that squeue does not list yet is not gone."""
 MAX_SILENCE_S = 600.0  # How long squeue may fail before the batch ends; its jobs go on
-FOLDER, SUBMITTED = "slurm", "submitted.json"
+FOLDER = "slurm"
+SUBMITTED = "submitted.json"
 
 
 @dataclass
@@ -82,7 +83,8 @@ class SlurmEngine(Engine):
         return str(self._names.get(job.name, ""))
 
     def _submit_array(self, jobs: Sequence[Job]) -> None:
-        kind, needs = kind_name(type(jobs[0].request)), jobs[0].resources
+        kind = kind_name(type(jobs[0].request))
+        needs = jobs[0].resources
         script = jobs[0].folder.parent / FOLDER / f"{kind}-{time.time_ns()}.sh"
         with replacing(script) as partial:
             packages = shlex.quote(str(PACKAGES_FOLDER))
@@ -96,12 +98,18 @@ class SlurmEngine(Engine):
         names = (self._jobs[other].name for other in others)
         waits = sorted({_array(name) for name in names if name})
         command = [
-            "sbatch", "--parsable", "--requeue", "--output=/dev/null", f"--job-name=stga-{kind}",
-            f"--array=0-{len(jobs) - 1}", f"--cpus-per-task={needs.threads or 1}",
-            f"--mem={round(1000 * needs.memory_gb)}M", *(["--gres=gpu:1"] if needs.gpu else []),
+            "sbatch",
+            "--parsable",
+            "--requeue",
+            "--output=/dev/null",
+            f"--job-name=stga-{kind}",
+            f"--array=0-{len(jobs) - 1}",
+            f"--cpus-per-task={needs.threads or 1}",
+            f"--mem={round(1000 * needs.memory_gb)}M",
+            *(["--gres=gpu:1"] if needs.gpu else []),
             *([f"--dependency=afterany:{':'.join(waits)}"] if waits else []),
             str(script),
-        ]  # fmt: skip
+        ]
         array = _call(command).strip().partition(";")[0]
         for index, job in enumerate(jobs):
             self._jobs[job.name] = _Submitted(job, f"{array}_{index}", time.monotonic())
@@ -131,7 +139,8 @@ class SlurmEngine(Engine):
     def ended(self) -> Mapping[str, Ended]:
         if not self._ask():
             return {}
-        states, found = self._states or {}, {}
+        states = self._states or {}
+        found = {}
         for name, one in list(self._jobs.items()):
             if one.name in states:
                 continue
@@ -168,7 +177,8 @@ def _in_arrays(jobs: Sequence[Job]) -> list[list[Job]]:
     arrays: dict[tuple[int, str, Resources, int], list[Job]] = {}
     for job in jobs:
         step[job.name] = 1 + max((step[other] for other in job.after if other in step), default=0)
-        key, number = (step[job.name], kind_name(type(job.request)), job.resources), 0
+        key = (step[job.name], kind_name(type(job.request)), job.resources)
+        number = 0
         while len(arrays.setdefault((*key, number), [])) == MAX_ARRAY:
             number += 1
         arrays[*key, number].append(job)

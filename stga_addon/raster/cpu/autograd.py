@@ -12,9 +12,13 @@ from .rasterize import frames_in_camera, render_backward, render_forward
 
 
 def render_differentiable(
-    splats: Parameters, camera: Camera, frames: FaceFrames = WORLD, face: np.ndarray | None = None,
-    degree: int = 3, antialiased: bool = False,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    splats: Parameters,
+    camera: Camera,
+    frames: FaceFrames = WORLD,
+    face: np.ndarray | None = None,
+    degree: int = 3,
+    antialiased: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Differentiable rendering of float32 torch tensors.
 
     Without frames and face the splats are world-space ones. Returns rgb (3, H, W) premultiplied on
@@ -31,14 +35,23 @@ def render_differentiable(
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, camera_frames: CameraFrames, face: np.ndarray, degree: int, depth_as_color: bool,
-        antialiased: bool, *tensors: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+        ctx: Any,
+        camera_frames: CameraFrames,
+        face: np.ndarray,
+        degree: int,
+        depth_as_color: bool,
+        antialiased: bool,
+        *tensors: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         splats = Parameters(*(t.detach().contiguous().numpy() for t in tensors))
         rendering = render_forward(
-            splats, face, camera_frames, degree, depth_as_color=depth_as_color,
+            splats,
+            face,
+            camera_frames,
+            degree,
+            depth_as_color=depth_as_color,
             antialiased=antialiased,
-        )  # fmt: skip
+        )
         ctx.saved = camera_frames, face, splats, rendering
         return torch.from_numpy(rendering.image), torch.from_numpy(rendering.transmittance)
 
@@ -46,6 +59,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx: Any, v_image: torch.Tensor, v_transmittance: torch.Tensor) -> Any:
         camera_frames, face, splats, rendering = ctx.saved
         gradients = Parameters(*(np.zeros_like(a) for a in splats if a is not None))
-        v_rgb, v_t = v_image.contiguous().numpy(), v_transmittance.contiguous().numpy()
+        v_rgb = v_image.contiguous().numpy()
+        v_t = v_transmittance.contiguous().numpy()
         render_backward(rendering, splats, face, camera_frames, v_rgb, gradients, v_t)
         return *[None] * 5, *(torch.from_numpy(g) for g in gradients if g is not None)

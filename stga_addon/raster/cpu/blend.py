@@ -23,7 +23,9 @@ from .elementary import prefetch
 from .layout import PIXELS, PROJECTED, TILE
 from .threads import parallel, pieces
 
-ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+ZERO = np.float32(0.0)
+HALF = np.float32(0.5)
+ONE = np.float32(1.0)
 MAX_ALPHA = np.float32(0.999)
 MIN_ALPHA = np.float32(1 / 255)
 MIN_TRANSMITTANCE = np.float32(1e-4)
@@ -41,7 +43,9 @@ BLOCKS = BLOCKS_ALONG * BLOCKS_ALONG
 # slower). The first values are the transmittance: in the forward pass negative once the pixel has
 # stopped.
 SUM_RED, SUM_GREEN, SUM_BLUE, LAST, X, Y, BEHIND = (np.uint64(n * PIXELS) for n in range(1, 8))
-V_RED, V_GREEN, V_BLUE = SUM_RED, SUM_GREEN, SUM_BLUE
+V_RED = SUM_RED
+V_GREEN = SUM_GREEN
+V_BLUE = SUM_BLUE
 PAIRS_PER_GROUP = 8
 """Splats whose blocks are listed together; after each group, the forward pass looks again which
 blocks are not yet behind something opaque."""
@@ -123,7 +127,8 @@ def outline(mean_x, mean_y, precision_x, shear, precision_y, extent_y):
     chord = precision_y * extent_y * extent_y * shrink
     # Slack, so that rounding (of differences of squares above all) does not lose a pixel.
     slack = np.float32(0.01) + np.float32(1e-3) * math.sqrt(chord) + np.float32(1e-6) * extent_y
-    lean, rate = shear * extent_y, precision_x * shear * shrink
+    lean = shear * extent_y
+    rate = precision_x * shear * shrink
     cut = precision_x * precision_y * shrink * shrink
     return mean_x - HALF, mean_y - HALF, extent_y, lean, rate, chord, cut, slack
 
@@ -141,7 +146,8 @@ def rows_within(outline, left, width, rows):
     low = left - mean_x
     high = low + width - ONE
     nearest = min(max(ZERO, low), high)
-    top, bottom = min(max(-lean, low), high), min(max(lean, low), high)
+    top = min(max(-lean, low), high)
+    bottom = min(max(lean, low), high)
     up = rate * top - math.sqrt(max(ZERO, chord - cut * top * top)) - slack
     down = rate * bottom + math.sqrt(max(ZERO, chord - cut * bottom * bottom)) + slack
     first = np.ceil(max(ZERO, mean_y + max(up, -extent_y)))
@@ -153,16 +159,23 @@ def rows_within(outline, left, width, rows):
 @part_jit
 def _find_blocks(count, batch):
     """Which blocks of the tile a batch's splats reach, a bit each."""
-    rows, side, one = np.float32(TILE), np.float32(SIDE), np.int32(1)
+    rows = np.float32(TILE)
+    side = np.float32(SIDE)
+    one = np.int32(1)
     for q in range(np.uint64(count)):
         ellipse = outline(
-            batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_PRECISION_X + q],
-            batch[AT_SHEAR + q], batch[AT_PRECISION_Y + q], batch[AT_EXTENT_Y + q],
-        )  # fmt: skip
+            batch[AT_MEAN_X + q],
+            batch[AT_MEAN_Y + q],
+            batch[AT_PRECISION_X + q],
+            batch[AT_SHEAR + q],
+            batch[AT_PRECISION_Y + q],
+            batch[AT_EXTENT_Y + q],
+        )
         bits = np.int32(0)
         for column in range(BLOCKS_ALONG):
             first, past = rows_within(ellipse, np.float32(column * SIDE), side, rows)
-            low, high = np.int32(np.floor(first / side)), np.int32(np.ceil(past / side))
+            low = np.int32(np.floor(first / side))
+            high = np.int32(np.ceil(past / side))
             reached = np.int32(
                 max(np.int32(0), np.int32(np.int32(one << high) - np.int32(one << low)))
             )
@@ -175,7 +188,8 @@ def _blocks_alive(s):
     """The blocks of the tile in which a pixel has not stopped, a bit each."""
     found = np.uint16(0)
     for block in range(BLOCKS):
-        begin, bits = np.uint64(block * BLOCK_PIXELS), np.int32(-1)
+        begin = np.uint64(block * BLOCK_PIXELS)
+        bits = np.int32(-1)
         for p in range(np.uint64(BLOCK_PIXELS)):
             bits &= np.float32(s[begin + p]).view(np.int32)
         found |= np.uint16(bits >= 0) << np.uint16(block)  # not all sign bits are set
@@ -226,8 +240,12 @@ def _falloff(count, listed, batch, keeps_offsets, s):
     more registers than AVX2 has."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
-        mean_x, mean_y, shear = batch[AT_MEAN_X + q], batch[AT_MEAN_Y + q], batch[AT_SHEAR + q]
-        qx, qy, opacity = batch[AT_RATE_X + q], batch[AT_RATE_Y + q], batch[AT_OPACITY + q]
+        mean_x = batch[AT_MEAN_X + q]
+        mean_y = batch[AT_MEAN_Y + q]
+        shear = batch[AT_SHEAR + q]
+        qx = batch[AT_RATE_X + q]
+        qy = batch[AT_RATE_Y + q]
+        opacity = batch[AT_OPACITY + q]
         for p in range(np.uint64(BLOCK_PIXELS)):
             dy = s[Y + first + p] - mean_y
             dx = s[X + first + p] - mean_x - shear * dy
@@ -244,7 +262,9 @@ def _blend(count, listed, before, batch, s):
     one."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
-        red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+        red = batch[AT_RED + q]
+        green = batch[AT_GREEN + q]
+        blue = batch[AT_BLUE + q]
         order = np.float32(before + np.int64(q) + 1).view(np.int32)
         for k in range(np.uint64(BLOCK_PIXELS)):
             p = first + k
@@ -279,12 +299,18 @@ def _begin_tile(s, needed):
 @part_jit
 def _store_empty_tile(left, top, background, blended):
     """Write the pixels of a tile without splats."""
-    image, transmittance, last = blended.image, blended.transmittance, blended.last
+    image = blended.image
+    transmittance = blended.transmittance
+    last = blended.last
     height, width = last.shape
-    red, green, blue = background[0], background[1], background[2]
+    red = background[0]
+    green = background[1]
+    blue = background[2]
     for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
         for x in range(np.uint64(left), np.uint64(min(left + TILE, width))):
-            image[0, y, x], image[1, y, x], image[2, y, x] = red, green, blue
+            image[0, y, x] = red
+            image[1, y, x] = green
+            image[2, y, x] = blue
             transmittance[y, x] = np.float32(1.0)
             last[y, x] = 0
 
@@ -292,13 +318,16 @@ def _store_empty_tile(left, top, background, blended):
 @part_jit
 def _store_tile(s, left, top, background, blended):
     """Write the pixels of a tile that are in the image."""
-    image, transmittance, last = blended.image, blended.transmittance, blended.last
+    image = blended.image
+    transmittance = blended.transmittance
+    last = blended.last
     height, width = last.shape
     for y in range(np.uint64(top), np.uint64(min(top + TILE, height))):
         for x0 in range(left, min(left + TILE, width), SIDE):
             first = _pixel(x0 - left, np.int64(y) - top)
             for column in range(np.uint64(SIDE)):
-                p, x = first + column, np.uint64(x0) + column
+                p = first + column
+                x = np.uint64(x0) + column
                 if x >= np.uint64(width):
                     break
                 t = abs(s[p])
@@ -317,17 +346,22 @@ def blend_forward(work, tiles, tiles_x, tile_blocks, lists, projection, backgrou
     that are needed, see `find_needed_blocks`; pixels of the others are undefined. background (3,):
     composited behind the splats.
     """
-    start, pair_splat, projected = lists.start, lists.pair_splat, projection.columns
+    start = lists.start
+    pair_splat = lists.pair_splat
+    projected = projection.columns
     extent_y = projection.extent_y
     pair_blocks = blended.pair_blocks
-    s, batch = np.empty(FORWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
+    s = np.empty(FORWARD_SIZE, np.float32)
+    batch = np.empty(BATCH_SIZE, np.float32)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
     for first_tile, past_tile in pieces(work):
         for k in range(first_tile, past_tile):
             tile = tiles[k]
-            left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-            begin, end = start[tile], start[tile + 1]
+            left = (tile % tiles_x) * TILE
+            top = (tile // tiles_x) * TILE
+            begin = start[tile]
+            end = start[tile + 1]
             if begin == end:
                 _store_empty_tile(left, top, background, blended)
                 continue
@@ -341,7 +375,8 @@ def blend_forward(work, tiles, tiles_x, tile_blocks, lists, projection, backgrou
                 _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
                 for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
                     prefetch(extent_y, np.uint64(pair_splat[j]))
-                x0, y0 = np.float32(left), np.float32(top)
+                x0 = np.float32(left)
+                y0 = np.float32(top)
                 _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
                 for q in range(np.uint64(count)):
                     i = np.uint64(pair_splat[np.uint64(batch_begin) + q])
@@ -376,17 +411,22 @@ def _unblend(count, listed, before, batch, s):
     splat's color to s[PART_RED], s[PART_GREEN] and s[PART_BLUE]."""
     for n in range(np.uint64(count)):
         q, first, at = _listed(listed, n)
-        red, green, blue = batch[AT_RED + q], batch[AT_GREEN + q], batch[AT_BLUE + q]
+        red = batch[AT_RED + q]
+        green = batch[AT_GREEN + q]
+        blue = batch[AT_BLUE + q]
         order = np.float32(before + np.int64(q) + 1)
         for k in range(np.uint64(BLOCK_PIXELS)):
-            p, own = first + k, at + k
+            p = first + k
+            own = at + k
             raw = s[ALPHA + own]
             a = min(MAX_ALPHA, raw)
             a = a if (a >= MIN_ALPHA) & (order <= s[LAST + p]) else np.float32(0.0)
             ra = np.float32(1.0) / (np.float32(1.0) - a)
             t = s[p] * ra
             weight = a * t
-            v_red, v_green, v_blue = s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p]
+            v_red = s[V_RED + p]
+            v_green = s[V_GREEN + p]
+            v_blue = s[V_BLUE + p]
             along = red * v_red + green * v_green + blue * v_blue
             v_a = t * along - ra * s[BEHIND + p]
             s[p] = t
@@ -405,8 +445,11 @@ def _sum_gradient(first, past, s, sums):
     gradient times 1, dx, dy, dx², dx·dy and dy², and of the color's gradients."""
     g0 = gx = gy = gxx = gxy = gyy = red = green = blue = np.float32(0.0)
     for p in range(first, past):
-        dx, dy, g = s[DX + p], s[DY + p], s[V_POWER + p]
-        g_dx, g_dy = g * dx, g * dy
+        dx = s[DX + p]
+        dy = s[DY + p]
+        g = s[V_POWER + p]
+        g_dx = g * dx
+        g_dy = g * dy
         g0 += g
         gx += g_dx
         gy += g_dy
@@ -416,14 +459,22 @@ def _sum_gradient(first, past, s, sums):
         red += s[PART_RED + p]
         green += s[PART_GREEN + p]
         blue += s[PART_BLUE + p]
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = g0, gx, gy, gxx, gxy, gyy
-    sums[6], sums[7], sums[8] = red, green, blue
+    sums[0] = g0
+    sums[1] = gx
+    sums[2] = gy
+    sums[3] = gxx
+    sums[4] = gxy
+    sums[5] = gyy
+    sums[6] = red
+    sums[7] = green
+    sums[8] = blue
 
 
 @part_jit
 def _store_pair(grads, j, q, batch, sums):
     """Write the gradient of pair j, splat q of a batch, from the sums of `_sum_gradient`."""
-    precision_x, precision_y = batch[AT_PRECISION_X + q], batch[AT_PRECISION_Y + q]
+    precision_x = batch[AT_PRECISION_X + q]
+    precision_y = batch[AT_PRECISION_Y + q]
     shear = batch[AT_SHEAR + q]
     grads[j, layout.MEAN_X] = precision_x * sums[1]
     grads[j, layout.MEAN_Y] = precision_y * sums[2] - shear * precision_x * sums[1]
@@ -431,14 +482,17 @@ def _store_pair(grads, j, q, batch, sums):
     grads[j, layout.SHEAR] = precision_x * sums[4]
     grads[j, layout.PRECISION_Y] = np.float32(-0.5) * sums[5]
     grads[j, layout.OPACITY] = sums[0] / batch[AT_OPACITY + q]
-    grads[j, layout.RED], grads[j, layout.GREEN], grads[j, layout.BLUE] = sums[6], sums[7], sums[8]
+    grads[j, layout.RED] = sums[6]
+    grads[j, layout.GREEN] = sums[7]
+    grads[j, layout.BLUE] = sums[8]
 
 
 @part_jit
 def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
     """Copy what the backward pass needs of a tile's pixels. Returns the deepest of their last
     pairs, counted from 1."""
-    transmittance, last = blended.transmittance, blended.last
+    transmittance = blended.transmittance
+    last = blended.last
     height, width = last.shape
     if left + TILE > width or top + TILE > height:  # pixels outside the image
         for p in range(np.uint64(PIXELS)):
@@ -451,15 +505,20 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
         for x0 in range(left, min(left + TILE, width), SIDE):
             first = _pixel(x0 - left, np.int64(y) - top)
             for column in range(np.uint64(SIDE)):
-                p, x = first + column, np.uint64(x0) + column
+                p = first + column
+                x = np.uint64(x0) + column
                 if x >= np.uint64(width):
                     break
                 t = transmittance[y, x]
                 s[p] = t
-                vr, vg, vb = v_image[0, y, x], v_image[1, y, x], v_image[2, y, x]
+                vr = v_image[0, y, x]
+                vg = v_image[1, y, x]
+                vb = v_image[2, y, x]
                 behind = background[0] * vr + background[1] * vg + background[2] * vb
                 s[BEHIND + p] = t * (behind + v_transmittance[y, x])
-                s[V_RED + p], s[V_GREEN + p], s[V_BLUE + p] = vr, vg, vb
+                s[V_RED + p] = vr
+                s[V_GREEN + p] = vg
+                s[V_BLUE + p] = vb
                 s[LAST + p] = np.float32(last[y, x])
                 deepest = max(deepest, last[y, x])
     return np.int64(deepest)
@@ -467,9 +526,18 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
 
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
 def blend_backward(
-    work, tiles, tiles_x, lists, blended, wanted, projected, background, v_image, v_transmittance,
+    work,
+    tiles,
+    tiles_x,
+    lists,
+    blended,
+    wanted,
+    projected,
+    background,
+    v_image,
+    v_transmittance,
     pair_gradients,
-):  # fmt: skip
+):
     """Write the gradient of every wanted (tile, splat) pair of the listed tiles to pair_gradients
     (P, PROJECTED).
 
@@ -478,15 +546,20 @@ def blend_backward(
     background and of the transmittance. Each pair has a row of its own, so that the sum over a
     splat's pairs has one order whatever the threads do.
     """
-    start, pair_splat, pair_blocks = lists.start, lists.pair_splat, blended.pair_blocks
-    s, batch = np.empty(BACKWARD_SIZE, np.float32), np.empty(BATCH_SIZE, np.float32)
-    sums, places = np.empty(PROJECTED, np.float32), np.empty(PAIRS_PER_GROUP + 1, np.uint64)
+    start = lists.start
+    pair_splat = lists.pair_splat
+    pair_blocks = blended.pair_blocks
+    s = np.empty(BACKWARD_SIZE, np.float32)
+    batch = np.empty(BATCH_SIZE, np.float32)
+    sums = np.empty(PROJECTED, np.float32)
+    places = np.empty(PAIRS_PER_GROUP + 1, np.uint64)
     listed = np.empty(LISTED + BLOCKS, np.uint16)
     _set_coordinates(s)
     for first_tile, past_tile in pieces(work):
         for k in range(first_tile, past_tile):
             tile = tiles[k]
-            left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+            left = (tile % tiles_x) * TILE
+            top = (tile // tiles_x) * TILE
             begin = start[tile]
             if begin == start[tile + 1]:
                 continue
@@ -503,7 +576,8 @@ def blend_backward(
                 count = batch_end - batch_begin
                 before = max(nearest, batch_begin - BATCH_PAIRS)
                 _prefetch_batch(pair_splat, before, batch_begin, projected)
-                x0, y0 = np.float32(left), np.float32(top)
+                x0 = np.float32(left)
+                y0 = np.float32(top)
                 _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)

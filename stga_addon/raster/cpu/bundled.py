@@ -23,7 +23,8 @@ PACKAGE = "stga_addon"
 of Blender they have other names, and other kernels."""
 BUNDLE = Path(__file__).with_name("compiled")
 """Folder of Numba's cache files; only in an edition that brings them."""
-PROCESSOR, MACHINES = "x86-64-v3", ("x86_64", "AMD64")
+PROCESSOR = "x86-64-v3"
+MACHINES = ("x86_64", "AMD64")
 """LLVM's name of the processor that they are compiled for, and what `platform.machine` calls its
 kind."""
 NEEDED_FEATURES = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")

@@ -19,26 +19,35 @@ def compose(
     layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
 ) -> ComposedImage:
     """Render layers with a camera; one layer gives the pixels of `render`."""
-    buffers, begin = rasterize.BufferPool(), 0
+    buffers = rasterize.BufferPool()
+    begin = 0
     tiles_x, tiles_y = rasterize.tile_grid(camera.width, camera.height)
     projection = rasterize.new_projection(sum(len(layer.splats) for layer in layers), buffers)
     everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
     for layer in layers:
-        splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
+        splats = layer.splats
+        rows = slice(begin, begin + len(layer.splats))
         parameters = Parameters(
             *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
         )
         project_forward(
-            np.arange(len(splats)), everywhere, parameters, splats.face,
-            layer_frames(layer, camera), splats.sh_degree, False, layer.antialiased,
+            np.arange(len(splats)),
+            everywhere,
+            parameters,
+            splats.face,
+            layer_frames(layer, camera),
+            splats.sh_degree,
+            False,
+            layer.antialiased,
             Projection(*(array[rows] for array in projection)),
-        )  # fmt: skip
+        )
         begin = rows.stop
     whole = whole_tiles(tiles_x * tiles_y)
     lists, tiles = rasterize.sort_into_tiles(projection, tiles_x, whole, buffers)
     blended = rasterize.new_image(camera.width, camera.height, lists, buffers)
     blend_forward(tiles, tiles_x, whole, lists, projection, rasterize.BLACK_BACKGROUND, blended)
-    rgb, alpha = blended.image, 1 - blended.transmittance
+    rgb = blended.image
+    alpha = 1 - blended.transmittance
     if not with_depth:
         return ComposedImage(rgb, alpha, None)
     projection.columns[:, RED] = projection.depth

@@ -20,19 +20,26 @@ PADDING_PX = 8
 """Zeros before and after each row: WINDOW_RADIUS_PX are needed, and with eight, rows begin where
 vectors do."""
 RING_ROWS = 2 * WINDOW_RADIUS_PX + 1
-C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
+C1 = np.float32(0.01**2)
+C2 = np.float32(0.03**2)
 _window = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1) / 1.5) ** 2)
 W0, W1, W2, W3, W4, W5 = (np.float32(w) for w in (_window / _window.sum())[: WINDOW_RADIUS_PX + 1])
-ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
+TWO = np.float32(2.0)
 N1, N2, N3, N4, N5, N6, N7, N8, N9, N10 = (np.uint64(n) for n in range(1, 11))
 
 
 @inline_jit
 def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
     return (
-        W0 * (a[i0] + a[i10]) + W1 * (a[i1] + a[i9]) + W2 * (a[i2] + a[i8])
-        + W3 * (a[i3] + a[i7]) + W4 * (a[i4] + a[i6]) + W5 * a[i5]
-    )  # fmt: skip
+        W0 * (a[i0] + a[i10])
+        + W1 * (a[i1] + a[i9])
+        + W2 * (a[i2] + a[i8])
+        + W3 * (a[i3] + a[i7])
+        + W4 * (a[i4] + a[i6])
+        + W5 * a[i5]
+    )
 
 
 @part_jit
@@ -42,9 +49,19 @@ def _blur_row(source, offset, out, at, count):
     for x in range(np.uint64(count)):
         i = np.uint64(offset + PADDING_PX - WINDOW_RADIUS_PX) + x
         out[np.uint64(at) + x] = _blur(
-            source, i, i + N1, i + N2, i + N3, i + N4, i + N5, i + N6, i + N7, i + N8, i + N9,
+            source,
+            i,
+            i + N1,
+            i + N2,
+            i + N3,
+            i + N4,
+            i + N5,
+            i + N6,
+            i + N7,
+            i + N8,
+            i + N9,
             i + N10,
-        )  # fmt: skip
+        )
 
 
 @part_jit
@@ -64,9 +81,19 @@ def _blur_column(ring, plane, stride, row, out, at, count):
     r10 = np.uint64((base + (row + 5) % RING_ROWS) * stride)
     for x in range(np.uint64(count)):
         out[np.uint64(at) + x] = _blur(
-            ring, r0 + x, r1 + x, r2 + x, r3 + x, r4 + x, r5 + x, r6 + x, r7 + x, r8 + x, r9 + x,
+            ring,
+            r0 + x,
+            r1 + x,
+            r2 + x,
+            r3 + x,
+            r4 + x,
+            r5 + x,
+            r6 + x,
+            r7 + x,
+            r8 + x,
+            r9 + x,
             r10 + x,
-        )  # fmt: skip
+        )
 
 
 @inline_jit
@@ -75,15 +102,20 @@ def _similarity_row(moments, stride, padded, similarity, slopes):
     four blurred values to `slopes`. Both others hold one value behind the other, `stride` apart;
     slopes from PADDING_PX on."""
     for n in range(np.uint64(padded)):
-        mx, my = moments[n], moments[np.uint64(stride) + n]
-        squares, product = moments[np.uint64(2 * stride) + n], moments[np.uint64(3 * stride) + n]
-        mxy, mm = mx * my, mx * mx + my * my
+        mx = moments[n]
+        my = moments[np.uint64(stride) + n]
+        squares = moments[np.uint64(2 * stride) + n]
+        product = moments[np.uint64(3 * stride) + n]
+        mxy = mx * my
+        mm = mx * mx + my * my
         # Differences of blurred squares: in bright, flat images rounding makes the variances
         # negative and the covariance larger than their mean, which it can never be.
         variance = max(ZERO, squares - mm)
         covariance = min(variance, max(-variance, TWO * (product - mxy)))
-        over_d, over_e = ONE / (mm + C1), ONE / (variance + C2)
-        luminance, structure = (TWO * mxy + C1) * over_d, (covariance + C2) * over_e
+        over_d = ONE / (mm + C1)
+        over_e = ONE / (variance + C2)
+        luminance = (TWO * mxy + C1) * over_d
+        structure = (covariance + C2) * over_e
         ssim = luminance * structure
         # ∂SSIM/∂mean, ∂/∂(sum of squares), ∂/∂product, holding the other blurred values fixed
         by_product = TWO * luminance * over_e
@@ -116,9 +148,19 @@ def _sum_row(values, first, past):
 
 @inline_jit
 def _gradient_row(
-    image, target_row, keep, blurred, stride, left, first, past, ssim_weight, scale, gradient,
+    image,
+    target_row,
+    keep,
+    blurred,
+    stride,
+    left,
+    first,
+    past,
+    ssim_weight,
+    scale,
+    gradient,
     differences,
-):  # fmt: skip
+):
     """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and
     |image − target|.
 
@@ -126,7 +168,8 @@ def _gradient_row(
     blurred slopes, `stride` apart; differences: from `first` to `past`.
     """
     for n in range(np.uint64(first), np.uint64(past)):
-        x, y = image[np.uint64(left) + n], target_row[np.uint64(keep) + n]
+        x = image[np.uint64(left) + n]
+        y = target_row[np.uint64(keep) + n]
         sign = ONE if x > y else (-ONE if x < y else ZERO)
         differences[n] = abs(x - y)
         slope = (
@@ -148,18 +191,24 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
     |difference| and Σ SSIM over a row's pixels, by channel. By row, the sums do not depend on how
     an image is cut into bands.
     """
-    height, width = image.shape[1], image.shape[2]
+    height = image.shape[1]
+    width = image.shape[2]
     for first_job, past_job in pieces(work):
         # one channel of one rectangle: row by row, the gradient ten rows behind
         for job in range(first_job, past_job):
-            r, c = job // 3, job % 3
-            x0, y0, x1, y1 = rectangles[r, 0], rectangles[r, 1], rectangles[r, 2], rectangles[r, 3]
+            r = job // 3
+            c = job % 3
+            x0 = rectangles[r, 0]
+            y0 = rectangles[r, 1]
+            x1 = rectangles[r, 2]
+            y1 = rectangles[r, 3]
             first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
             for before in range(r):
                 first_sum += rectangles[before, 3] - rectangles[before, 1]
             # Columns [left, right) hold everything that matters; each row buffer is padded by
             # PADDING_PX zeros.
-            left, right = max(0, x0 - LOSS_REACH_PX), min(width, x1 + LOSS_REACH_PX)
+            left = max(0, x0 - LOSS_REACH_PX)
+            right = min(width, x1 + LOSS_REACH_PX)
             span = right - left
             # Blurs go beyond the span, where nothing reads.
             padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX
@@ -172,7 +221,8 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
             slopes = np.zeros(3 * stride, np.float32)
             second = np.zeros(3 * RING_ROWS * stride, np.float32)
             blurred = np.zeros(3 * stride, np.float32)
-            similarities, differences = np.empty(padded, np.float32), np.empty(padded, np.float32)
+            similarities = np.empty(padded, np.float32)
+            differences = np.empty(padded, np.float32)
             for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
                 # 1. horizontal blur of this row's four values
                 inside = 0 <= row < height
@@ -182,7 +232,8 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                         value = target[np.uint64(row), np.uint64(left) + n, np.uint64(c)]
                         target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
                     for n in range(np.uint64(span)):
-                        x, y = image[c, row, np.uint64(left) + n], target_row[np.uint64(keep) + n]
+                        x = image[c, row, np.uint64(left) + n]
+                        y = target_row[np.uint64(keep) + n]
                         source[np.uint64(PADDING_PX) + n] = x
                         source[np.uint64(stride + PADDING_PX) + n] = y
                         source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
@@ -223,9 +274,19 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                     _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
                 keep = (out % RING_ROWS) * stride
                 _gradient_row(
-                    image[c, out], target_row, keep, blurred, stride, left, x0 - left, x1 - left,
-                    ssim_weight, scale, gradient[c, out], differences,
-                )  # fmt: skip
+                    image[c, out],
+                    target_row,
+                    keep,
+                    blurred,
+                    stride,
+                    left,
+                    x0 - left,
+                    x1 - left,
+                    ssim_weight,
+                    scale,
+                    gradient[c, out],
+                    differences,
+                )
                 sums[0, c, first_sum + out] = _sum_row(differences, x0 - left, x1 - left)
 
 

@@ -9,7 +9,8 @@ from . import jit, part_jit
 from .elementary import exponential
 from .threads import parallel, pieces
 
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
 ROWS_PER_BLOCK = 256
 """Rows that a thread steps at a time."""
 ROWS_PER_SUM = 1024
@@ -64,10 +65,15 @@ def adam_rows(work, rows, steps, parameters, options):
     row whose gradient is not finite, or beyond MAX_GRADIENT, keeps that parameter, its moments and
     its average. All parameters at once: every further parallel loop waits for its slowest thread.
     """
-    log1, log2 = math.log(options.beta1), math.log(options.beta2)
-    correct1, correct2 = np.empty(ROWS_PER_BLOCK, np.float32), np.empty(ROWS_PER_BLOCK, np.float32)
+    log1 = math.log(options.beta1)
+    log2 = math.log(options.beta2)
+    correct1 = np.empty(ROWS_PER_BLOCK, np.float32)
+    correct2 = np.empty(ROWS_PER_BLOCK, np.float32)
     ema_shares = np.empty(ROWS_PER_BLOCK, np.float32)
-    latest, first, second, share = np.int32(-1), ZERO, ZERO, ZERO
+    latest = np.int32(-1)
+    first = ZERO
+    second = ZERO
+    share = ZERO
     for begin, end in pieces(work):
         for n in range(begin, end):
             steps[rows[n]] += 1
@@ -77,7 +83,9 @@ def adam_rows(work, rows, steps, parameters, options):
                 first = np.float32(1.0 / (1.0 - (1.0 - options.ahead) * math.exp(count * log1)))
                 second = np.float32(1.0 / math.sqrt(1.0 - math.exp(count * log2)))
                 share = np.float32(max(np.float64(options.ema_share), 4.0 / (count + 3.0)))
-            correct1[n - begin], correct2[n - begin], ema_shares[n - begin] = first, second, share
+            correct1[n - begin] = first
+            correct2[n - begin] = second
+            ema_shares[n - begin] = share
         for p in range(len(parameters)):
             _adam_block(rows[begin:end], parameters[p], correct1, correct2, ema_shares, options)
 
@@ -96,7 +104,9 @@ def _adam_block(rows, parameter, correct1, correct2, ema_shares, options):
             invalid += ZERO if abs(gradient[i, c]) < MAX_GRADIENT else ONE
         if invalid != ZERO:
             continue
-        scale1, scale2, share = correct1[n], correct2[n], ema_shares[n]
+        scale1 = correct1[n]
+        scale2 = correct2[n]
+        share = ema_shares[n]
         for c in range(width):
             g = gradient[i, c]
             m = beta1 * first[i, c] + (ONE - beta1) * g
@@ -159,10 +169,20 @@ def add_frame_gradients(rows, face, xyz, rotation, v_xyz, v_rotation, v_log_scal
     for n in range(len(rows)):
         i = rows[n]
         f = face[i]
-        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        fx, fy, fz = v_xyz[i, 0], v_xyz[i, 1], v_xyz[i, 2]
-        q0, q1, q2, q3 = rotation[i, 0], rotation[i, 1], rotation[i, 2], rotation[i, 3]
-        v0, v1, v2, v3 = v_rotation[i, 0], v_rotation[i, 1], v_rotation[i, 2], v_rotation[i, 3]
+        x = np.float64(xyz[i, 0])
+        y = np.float64(xyz[i, 1])
+        z = np.float64(xyz[i, 2])
+        fx = v_xyz[i, 0]
+        fy = v_xyz[i, 1]
+        fz = v_xyz[i, 2]
+        q0 = rotation[i, 0]
+        q1 = rotation[i, 1]
+        q2 = rotation[i, 2]
+        q3 = rotation[i, 3]
+        v0 = v_rotation[i, 0]
+        v1 = v_rotation[i, 1]
+        v2 = v_rotation[i, 2]
+        v3 = v_rotation[i, 3]
         total[f, 0] += fx
         total[f, 1] += fy
         total[f, 2] += fz
@@ -175,9 +195,14 @@ def add_frame_gradients(rows, face, xyz, rotation, v_xyz, v_rotation, v_log_scal
 
 
 def scale_limit(
-    rows: np.ndarray, log_scale: np.ndarray, face: np.ndarray, unbound: np.ndarray,
-    limits: np.ndarray, weight: float, gradient: np.ndarray,
-) -> float:  # fmt: skip
+    rows: np.ndarray,
+    log_scale: np.ndarray,
+    face: np.ndarray,
+    unbound: np.ndarray,
+    limits: np.ndarray,
+    weight: float,
+    gradient: np.ndarray,
+) -> float:
     """weight · ‖ReLU(scale − limit)‖₂ over the listed rows; its gradient is added to gradient (N,
     3).
 
@@ -200,7 +225,8 @@ def sum_excess_scale(work, sums, rows, log_scale, face, unbound, limits):
     scales = np.empty(3 * ROWS_PER_SUM, np.float32)
     for first_sum, past_sum in pieces(work):
         for k in range(first_sum, past_sum):
-            begin, count = k * ROWS_PER_SUM, min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
+            begin = k * ROWS_PER_SUM
+            count = min(len(rows) - k * ROWS_PER_SUM, ROWS_PER_SUM)
             for n in range(np.uint64(count)):
                 i = np.uint64(rows[np.uint64(begin) + n])
                 for c in range(np.uint64(3)):

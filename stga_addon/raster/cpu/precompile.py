@@ -60,17 +60,27 @@ def compile_rendering() -> None:
 def compile_gradients() -> None:
     """Compile `render_backward` with the types of real training; nothing has to be rendered
     before."""
-    none, by_splat, tile = np.zeros(0, np.int32), np.zeros(2, np.int32), np.zeros(1, np.int32)
+    none = np.zeros(0, np.int32)
+    by_splat = np.zeros(2, np.int32)
+    tile = np.zeros(1, np.int32)
     lists = TileLists(
         np.arange(2, dtype=np.int32), by_splat, by_splat, none, np.zeros(2, np.int64), none
     )
-    buffers, (splats, face, frames) = rasterize.BufferPool(), _two_splats()
+    buffers = rasterize.BufferPool()
+    (splats, face, frames) = _two_splats()
     output = rasterize.RenderOutput(
-        rasterize.new_image(SIZE, SIZE, lists, buffers), rasterize.new_projection(2, buffers),
-        lists, tile, tile_blocks=np.zeros(1, np.uint16), focus=np.ones(2, bool),
-        touched=np.ones((1, 1), bool), background=rasterize.BLACK_BACKGROUND, degree=3,
-        depth_as_color=False, antialiased=False,
-    )  # fmt: skip
+        rasterize.new_image(SIZE, SIZE, lists, buffers),
+        rasterize.new_projection(2, buffers),
+        lists,
+        tile,
+        tile_blocks=np.zeros(1, np.uint16),
+        focus=np.ones(2, bool),
+        touched=np.ones((1, 1), bool),
+        background=rasterize.BLACK_BACKGROUND,
+        degree=3,
+        depth_as_color=False,
+        antialiased=False,
+    )
     v_image = np.zeros((3, SIZE, SIZE), np.float32)
     rasterize.render_backward(output, splats, face, frames, v_image, splats)
 
@@ -80,6 +90,8 @@ def _two_splats() -> tuple[Parameters, np.ndarray, CameraFrames]:
     would be contiguous, which is another type to Numba."""
     shapes = (2, 3), (2, 4), (2, 3), (2,), (2, 16, 3)
     splats = Parameters(*(np.zeros(shape, np.float32) for shape in shapes))
-    splats.xyz[:, 2], splats.rotation[:, 0], splats.log_scale[:] = (1, 2), 1, -3
+    splats.xyz[:, 2] = (1, 2)
+    splats.rotation[:, 0] = 1
+    splats.log_scale[:] = -3
     frames = rasterize.frames_in_camera(WORLD, Camera(SIZE, SIZE, 16.0, 16.0, 8.0, 8.0, np.eye(4)))
     return splats, np.zeros(2, np.int32), frames

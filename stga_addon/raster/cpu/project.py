@@ -31,7 +31,9 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
     for begin, end in pieces(work):
         for f in range(begin, end):
             for r in range(3):
-                t0, t1, t2 = turn[r, 0], turn[r, 1], turn[r, 2]
+                t0 = turn[r, 0]
+                t1 = turn[r, 1]
+                t2 = turn[r, 2]
                 camera_origin[f, r] = (
                     t0 * origin[f, 0] + t1 * origin[f, 1] + t2 * origin[f, 2] + shift[r]
                 )
@@ -43,23 +45,38 @@ def compose_frames(work, origin, rotation, scale, turn, shift, camera_origin, ca
 @part_jit
 def _load(rows, splats, face, frames, b):
     """Copy the listed splats (at most BLOCK_SPLATS) and their frames to the block `b`."""
-    xyz, rotation, log_scale = splats.xyz, splats.rotation, splats.log_scale
+    xyz = splats.xyz
+    rotation = splats.rotation
+    log_scale = splats.log_scale
     opacity = splats.opacity
-    origin, m = frames.origin, frames.matrix
+    origin = frames.origin
+    m = frames.matrix
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         f = np.uint64(face[i])
-        b[block.M00 + q], b[block.M01 + q], b[block.M02 + q] = m[f, 0, 0], m[f, 0, 1], m[f, 0, 2]
-        b[block.M10 + q], b[block.M11 + q], b[block.M12 + q] = m[f, 1, 0], m[f, 1, 1], m[f, 1, 2]
-        b[block.M20 + q], b[block.M21 + q], b[block.M22 + q] = m[f, 2, 0], m[f, 2, 1], m[f, 2, 2]
-        b[block.ORIGIN_X + q], b[block.ORIGIN_Y + q] = origin[f, 0], origin[f, 1]
+        b[block.M00 + q] = m[f, 0, 0]
+        b[block.M01 + q] = m[f, 0, 1]
+        b[block.M02 + q] = m[f, 0, 2]
+        b[block.M10 + q] = m[f, 1, 0]
+        b[block.M11 + q] = m[f, 1, 1]
+        b[block.M12 + q] = m[f, 1, 2]
+        b[block.M20 + q] = m[f, 2, 0]
+        b[block.M21 + q] = m[f, 2, 1]
+        b[block.M22 + q] = m[f, 2, 2]
+        b[block.ORIGIN_X + q] = origin[f, 0]
+        b[block.ORIGIN_Y + q] = origin[f, 1]
         b[block.ORIGIN_Z + q] = origin[f, 2]
-        b[block.LOCAL_X + q], b[block.LOCAL_Y + q] = xyz[i, 0], xyz[i, 1]
+        b[block.LOCAL_X + q] = xyz[i, 0]
+        b[block.LOCAL_Y + q] = xyz[i, 1]
         b[block.LOCAL_Z + q] = xyz[i, 2]
-        b[block.RAW_0 + q], b[block.RAW_1 + q] = rotation[i, 0], rotation[i, 1]
-        b[block.RAW_2 + q], b[block.RAW_3 + q] = rotation[i, 2], rotation[i, 3]
-        b[block.LOG_0 + q], b[block.LOG_1 + q] = log_scale[i, 0], log_scale[i, 1]
-        b[block.LOG_2 + q], b[block.LOGIT + q] = log_scale[i, 2], opacity[i]
+        b[block.RAW_0 + q] = rotation[i, 0]
+        b[block.RAW_1 + q] = rotation[i, 1]
+        b[block.RAW_2 + q] = rotation[i, 2]
+        b[block.RAW_3 + q] = rotation[i, 3]
+        b[block.LOG_0 + q] = log_scale[i, 0]
+        b[block.LOG_1 + q] = log_scale[i, 1]
+        b[block.LOG_2 + q] = log_scale[i, 2]
+        b[block.LOGIT + q] = opacity[i]
 
 
 @part_jit
@@ -99,13 +116,21 @@ def _shrink_bounds(covered, x0, y0, x1, y1):
 def _tan_limits(intrinsics, size):
     """Bounds of x/z and y/z in the projection's Jacobian: the image plus 0.3 of its half field of
     view."""
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    width, height, margin = np.float32(size[0]), np.float32(size[1]), np.float32(0.3)
-    half_x, half_y = HALF * width / fx, HALF * height / fy
+    fx = intrinsics[0]
+    fy = intrinsics[1]
+    cx = intrinsics[2]
+    cy = intrinsics[3]
+    width = np.float32(size[0])
+    height = np.float32(size[1])
+    margin = np.float32(0.3)
+    half_x = HALF * width / fx
+    half_y = HALF * height / fy
     return (
-        -cx / fx - margin * half_x, (width - cx) / fx + margin * half_x,
-        -cy / fy - margin * half_y, (height - cy) / fy + margin * half_y,
-    )  # fmt: skip
+        -cx / fx - margin * half_x,
+        (width - cx) / fx + margin * half_x,
+        -cy / fy - margin * half_y,
+        (height - cy) / fy + margin * half_y,
+    )
 
 
 @part_jit
@@ -124,23 +149,29 @@ def _list_seen(rows, covered, rect, b, seen):
     """
     count = np.uint64(0)
     for q in range(np.uint64(len(rows))):
-        i, outside = np.uint64(rows[q]), np.int32(min(ZERO, b[block.SEEN + q]))
-        x0, y0 = _bound(b, block.X0, q), _bound(b, block.Y0, q)
-        x1, y1 = _bound(b, block.X1, q), _bound(b, block.Y1, q)
+        i = np.uint64(rows[q])
+        outside = np.int32(min(ZERO, b[block.SEEN + q]))
+        x0 = _bound(b, block.X0, q)
+        y0 = _bound(b, block.Y0, q)
+        x1 = _bound(b, block.X1, q)
+        y1 = _bound(b, block.Y1, q)
         found = _count_rendered(covered, x0, y0, x1, y1)
         rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = outside
         seen[count] = q
         count += np.uint64(found > 0)
         if found > 0 and found < (x1 - x0) * (y1 - y0):
             x0, y0, x1, y1 = _shrink_bounds(covered, x0, y0, x1, y1)
-            b[block.X0 + q], b[block.Y0 + q], b[block.X1 + q], b[block.Y1 + q] = x0, y0, x1, y1
+            b[block.X0 + q] = x0
+            b[block.Y0 + q] = y0
+            b[block.X1 + q] = x1
+            b[block.Y1 + q] = y1
     return count
 
 
 @parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
 def project_forward(
     work, rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
-):  # fmt: skip
+):
     """Write the listed rows of `projection`; the tuples are those of `layout.py`.
 
     rows (M,): the splats to project. covered (tiles_y + 1, tiles_x + 1) int32: how many tiles above
@@ -151,13 +182,18 @@ def project_forward(
     a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
     mode).
     """
-    sh, by_face = splats.sh, frames.color
-    projected, depth, extent_y = projection.columns, projection.depth, projection.extent_y
+    sh = splats.sh
+    by_face = frames.color
+    projected = projection.columns
+    depth = projection.depth
+    extent_y = projection.extent_y
     rect = projection.rect
-    tiles_x, tiles_y = (frames.size[0] + TILE - 1) // TILE, (frames.size[1] + TILE - 1) // TILE
+    tiles_x = (frames.size[0] + TILE - 1) // TILE
+    tiles_y = (frames.size[1] + TILE - 1) // TILE
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))
-    b, seen = np.zeros(block.FORWARD_SIZE, np.float32), np.empty(BLOCK_SPLATS, np.uint64)
+    b = np.zeros(block.FORWARD_SIZE, np.float32)
+    seen = np.empty(BLOCK_SPLATS, np.uint64)
     for begin, end in pieces(work):
         for first in range(begin, end, BLOCK_SPLATS):
             some = rows[first : min(end, first + BLOCK_SPLATS)]
@@ -176,46 +212,69 @@ def project_forward(
                 red, green, blue = _color(b, q, i, coefficients, sh)
                 if by_face.shape[1] > 0:
                     f = np.uint64(face[i])
-                    red, green, blue = (
-                        red + by_face[f, 0], green + by_face[f, 1], blue + by_face[f, 2]
-                    )  # fmt: skip
+                    red = red + by_face[f, 0]
+                    green = green + by_face[f, 1]
+                    blue = blue + by_face[f, 2]
                 # Before the cut at zero, which would turn NaN and −∞ into black.
                 if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
                     rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
                     continue
-                red, green, blue = max(ZERO, red), max(ZERO, green), max(ZERO, blue)
+                red = max(ZERO, red)
+                green = max(ZERO, green)
+                blue = max(ZERO, blue)
                 z = b[block.CAMERA_Z + q]
                 if depth_as_color:
-                    red, green, blue = z, ZERO, ZERO
-                rect[i, 0], rect[i, 1] = np.int32(b[block.X0 + q]), np.int32(b[block.Y0 + q])
-                rect[i, 2], rect[i, 3] = np.int32(b[block.X1 + q]), np.int32(b[block.Y1 + q])
-                depth[i], extent_y[i] = z, b[block.EXTENT_Y + q]
+                    red = z
+                    green = ZERO
+                    blue = ZERO
+                rect[i, 0] = np.int32(b[block.X0 + q])
+                rect[i, 1] = np.int32(b[block.Y0 + q])
+                rect[i, 2] = np.int32(b[block.X1 + q])
+                rect[i, 3] = np.int32(b[block.Y1 + q])
+                depth[i] = z
+                extent_y[i] = b[block.EXTENT_Y + q]
                 projected[i, MEAN_X] = b[block.MEAN_X + q]
                 projected[i, MEAN_Y] = b[block.MEAN_Y + q]
                 projected[i, PRECISION_X] = b[block.PRECISION_X + q]
                 projected[i, SHEAR] = b[block.SHEAR + q]
                 projected[i, PRECISION_Y] = b[block.PRECISION_Y + q]
                 projected[i, OPACITY] = b[block.OPACITY + q]
-                projected[i, RED], projected[i, GREEN], projected[i, BLUE] = red, green, blue
+                projected[i, RED] = red
+                projected[i, GREEN] = green
+                projected[i, BLUE] = blue
 
 
 @part_jit
 def _sum_pairs(rows, lists, pair_gradients, b):
     """Sum the gradients of each listed splat's pairs to the block: a short loop asks memory for
     many of them at once."""
-    first_pair, pairs, splat_pairs = lists.first_pair, lists.pairs, lists.splat_pairs
+    first_pair = lists.first_pair
+    pairs = lists.pairs
+    splat_pairs = lists.splat_pairs
     grads = pair_gradients
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
         g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = ZERO
         for k in range(first_pair[i], first_pair[i] + pairs[i]):
             j = np.uint64(splat_pairs[np.uint64(k)])
-            g0, g1, g2 = g0 + grads[j, 0], g1 + grads[j, 1], g2 + grads[j, 2]
-            g3, g4, g5 = g3 + grads[j, 3], g4 + grads[j, 4], g5 + grads[j, 5]
-            g6, g7, g8 = g6 + grads[j, 6], g7 + grads[j, 7], g8 + grads[j, 8]
-        b[block.G_MEAN_X + q], b[block.G_MEAN_Y + q], b[block.G_PRECISION_X + q] = g0, g1, g2
-        b[block.G_SHEAR + q], b[block.G_PRECISION_Y + q], b[block.G_OPACITY + q] = g3, g4, g5
-        b[block.G_RED + q], b[block.G_GREEN + q], b[block.G_BLUE + q] = g6, g7, g8
+            g0 = g0 + grads[j, 0]
+            g1 = g1 + grads[j, 1]
+            g2 = g2 + grads[j, 2]
+            g3 = g3 + grads[j, 3]
+            g4 = g4 + grads[j, 4]
+            g5 = g5 + grads[j, 5]
+            g6 = g6 + grads[j, 6]
+            g7 = g7 + grads[j, 7]
+            g8 = g8 + grads[j, 8]
+        b[block.G_MEAN_X + q] = g0
+        b[block.G_MEAN_Y + q] = g1
+        b[block.G_PRECISION_X + q] = g2
+        b[block.G_SHEAR + q] = g3
+        b[block.G_PRECISION_Y + q] = g4
+        b[block.G_OPACITY + q] = g5
+        b[block.G_RED + q] = g6
+        b[block.G_GREEN + q] = g7
+        b[block.G_BLUE + q] = g8
 
 
 @part_jit
@@ -237,10 +296,13 @@ def _load_projected(rows, projected, b):
 def _color_gradient(b, q, i, coefficients, sh, v_sh):
     """Write the gradient of splat i's coefficients in use, and the weights of the harmonics to the
     block at q."""
-    red, green, blue = b[block.G_RED + q], b[block.G_GREEN + q], b[block.G_BLUE + q]
+    red = b[block.G_RED + q]
+    green = b[block.G_GREEN + q]
+    blue = b[block.G_BLUE + q]
     for k in range(coefficients):
         harmonic = b[block.B0 + k * COLUMN + q]
-        v_sh[i, k, 0], v_sh[i, k, 1] = harmonic * red, harmonic * green
+        v_sh[i, k, 0] = harmonic * red
+        v_sh[i, k, 1] = harmonic * green
         v_sh[i, k, 2] = harmonic * blue
         b[block.W0 + k * COLUMN + q] = red * sh[i, k, 0] + green * sh[i, k, 1] + blue * sh[i, k, 2]
     for k in range(coefficients, np.uint64(block.BASIS_SIZE)):
@@ -250,23 +312,42 @@ def _color_gradient(b, q, i, coefficients, sh, v_sh):
 @part_jit
 def _store_gradient(rows, b, gradients, screen_gradient):
     """Copy the gradients of the listed splats' geometry from the block."""
-    xyz, rotation, log_scale = gradients.xyz, gradients.rotation, gradients.log_scale
+    xyz = gradients.xyz
+    rotation = gradients.rotation
+    log_scale = gradients.log_scale
     opacity = gradients.opacity
     for q in range(np.uint64(len(rows))):
         i = np.uint64(rows[q])
-        xyz[i, 0], xyz[i, 1] = b[block.V_LOCAL_X + q], b[block.V_LOCAL_Y + q]
-        xyz[i, 2], opacity[i] = b[block.V_LOCAL_Z + q], b[block.V_LOGIT + q]
-        rotation[i, 0], rotation[i, 1] = b[block.V_RAW_0 + q], b[block.V_RAW_1 + q]
-        rotation[i, 2], rotation[i, 3] = b[block.V_RAW_2 + q], b[block.V_RAW_3 + q]
-        log_scale[i, 0], log_scale[i, 1] = b[block.V_LOG_0 + q], b[block.V_LOG_1 + q]
-        log_scale[i, 2], screen_gradient[i] = b[block.V_LOG_2 + q], b[block.V_SCREEN + q]
+        xyz[i, 0] = b[block.V_LOCAL_X + q]
+        xyz[i, 1] = b[block.V_LOCAL_Y + q]
+        xyz[i, 2] = b[block.V_LOCAL_Z + q]
+        opacity[i] = b[block.V_LOGIT + q]
+        rotation[i, 0] = b[block.V_RAW_0 + q]
+        rotation[i, 1] = b[block.V_RAW_1 + q]
+        rotation[i, 2] = b[block.V_RAW_2 + q]
+        rotation[i, 3] = b[block.V_RAW_3 + q]
+        log_scale[i, 0] = b[block.V_LOG_0 + q]
+        log_scale[i, 1] = b[block.V_LOG_1 + q]
+        log_scale[i, 2] = b[block.V_LOG_2 + q]
+        screen_gradient[i] = b[block.V_SCREEN + q]
 
 
 @parallel(lambda visible, *_: len(visible), piece=SPLATS_PER_PIECE)
 def project_backward(
-    work, visible, splats, face, frames, degree, depth_as_color, antialiased,
-    projected, lists, pair_gradients, gradients, screen_gradient,
-):  # fmt: skip
+    work,
+    visible,
+    splats,
+    face,
+    frames,
+    degree,
+    depth_as_color,
+    antialiased,
+    projected,
+    lists,
+    pair_gradients,
+    gradients,
+    screen_gradient,
+):
     """Write the gradient of each listed splat to its row of `gradients`; the counterpart of
     `project_forward`.
 
@@ -275,7 +356,8 @@ def project_backward(
     pair_gradients (P, PROJECTED). Writes screen_gradient (N,) too: the length of the gradient with
     respect to the projected center in units of half the image, for density control.
     """
-    sh, v_sh = splats.sh, gradients.sh
+    sh = splats.sh
+    v_sh = gradients.sh
     half_size = HALF * np.float32(frames.size[0]), HALF * np.float32(frames.size[1])
     limits = _tan_limits(frames.intrinsics, frames.size)
     coefficients = np.uint64((degree + 1) * (degree + 1))

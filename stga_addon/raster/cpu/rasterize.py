@@ -96,10 +96,17 @@ def frames_in_camera(frames: FaceFrames, camera: Camera) -> CameraFrames:
 
 
 def render_forward(
-    splats: Parameters, face: np.ndarray, frames: CameraFrames, degree: int,
-    background: np.ndarray = BLACK_BACKGROUND, focus: np.ndarray | None = None, reach: int = 0,
-    depth_as_color: bool = False, antialiased: bool = False, buffers: BufferPool | None = None,
-) -> RenderOutput:  # fmt: skip
+    splats: Parameters,
+    face: np.ndarray,
+    frames: CameraFrames,
+    degree: int,
+    background: np.ndarray = BLACK_BACKGROUND,
+    focus: np.ndarray | None = None,
+    reach: int = 0,
+    depth_as_color: bool = False,
+    antialiased: bool = False,
+    buffers: BufferPool | None = None,
+) -> RenderOutput:
     """Render N embedded splats over a background color (3,).
 
     splats: numpy arrays; face (N,) int32; degree: of the spherical harmonics used.
@@ -139,16 +146,30 @@ def render_forward(
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_blocks, lists, projection, background, blended)
     return RenderOutput(
-        blended, projection, lists, tiles, tile_blocks, focus, touched, background, degree,
-        depth_as_color, antialiased,
-    )  # fmt: skip
+        blended,
+        projection,
+        lists,
+        tiles,
+        tile_blocks,
+        focus,
+        touched,
+        background,
+        degree,
+        depth_as_color,
+        antialiased,
+    )
 
 
 def render_backward(
-    output: RenderOutput, splats: Parameters, face: np.ndarray, frames: CameraFrames,
-    v_image: np.ndarray, gradients: Parameters, v_transmittance: np.ndarray | None = None,
+    output: RenderOutput,
+    splats: Parameters,
+    face: np.ndarray,
+    frames: CameraFrames,
+    v_image: np.ndarray,
+    gradients: Parameters,
+    v_transmittance: np.ndarray | None = None,
     buffers: BufferPool | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of a scalar with respect to the splats, from its gradient with respect to the image.
 
     v_image (3, H, W); v_transmittance (H, W), zero if None. Overwrites those rows of `gradients`
@@ -157,14 +178,18 @@ def render_backward(
     screen_gradient (N,): for those rows, the length of the gradient with respect to the projected
     center in units of half the image.
     """
-    n, buffers = len(splats.xyz), buffers or BufferPool()
+    n = len(splats.xyz)
+    buffers = buffers or BufferPool()
     tiles_x, _ = tile_grid(*frames.size)
-    lists, columns = output.lists, output.projection.columns
-    tiles, rows = output.tiles, lists.visible
+    lists = output.lists
+    columns = output.projection.columns
+    tiles = output.tiles
+    rows = lists.visible
     wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
     if output.focus is not None:
         wanted = output.focus
-        tiles, rows = tiles[output.touched.ravel()[tiles]], tiling.listed_rows(rows, wanted)
+        tiles = tiles[output.touched.ravel()[tiles]]
+        rows = tiling.listed_rows(rows, wanted)
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
@@ -173,13 +198,31 @@ def render_backward(
             "v_transmittance", shape, lambda *shape: np.zeros(shape, np.float32)
         )
     blend_backward(
-        tiles, tiles_x, lists, output.blended, wanted, columns, output.background, v_image,
-        np.ascontiguousarray(v_transmittance), pair_gradients,
-    )  # fmt: skip
+        tiles,
+        tiles_x,
+        lists,
+        output.blended,
+        wanted,
+        columns,
+        output.background,
+        v_image,
+        np.ascontiguousarray(v_transmittance),
+        pair_gradients,
+    )
     project_backward(
-        rows, splats, face, frames, output.degree, output.depth_as_color, output.antialiased,
-        columns, lists, pair_gradients, gradients, screen_gradient,
-    )  # fmt: skip
+        rows,
+        splats,
+        face,
+        frames,
+        output.degree,
+        output.depth_as_color,
+        output.antialiased,
+        columns,
+        lists,
+        pair_gradients,
+        gradients,
+        screen_gradient,
+    )
     return rows, screen_gradient
 
 
@@ -246,11 +289,13 @@ def sort_by_depth(
     depth_bits = projection.depth.view(np.uint32)
     tiling.list_visible(projection.rect, depth_bits, found, keys, pairs, first_pair, parts, counts)
     least, greatest = tiling.sum_parts(parts, counts)
-    splats, total = int(parts[-1, tiling.SPLATS]), int(parts[-1, tiling.PAIRS])
+    splats = int(parts[-1, tiling.SPLATS])
+    total = int(parts[-1, tiling.PAIRS])
     visible = visible[:splats]
     tiling.move_visible(parts, found, keys, counts, first_pair, visible, moved_keys, order)
     keys, moved_keys = moved_keys[:splats], keys[:splats]
-    order, moved = order[:splats], moved[:splats]
+    order = order[:splats]
+    moved = moved[:splats]
     counts = counts[: tiling.parts_of(splats)]
     for shift in range(tiling.RADIX_BITS, greatest.bit_length(), tiling.RADIX_BITS):
         digit = np.uint32(least), np.uint32(shift)

@@ -10,9 +10,21 @@ from .threads import parallel, pieces
 ZERO, EIGHTH, HALF, ONE, TWO, PI = (
     np.float32(value) for value in (0.0, 0.125, 0.5, 1.0, 2.0, np.pi)
 )
-SUN, POINT, SPOT, AREA = 0, 1, 2, 3
-KIND, POSITION, DIRECTION, COLOR, CONE, FADE = 0, 1, 4, 7, 10, 11
-MAP, DIFFUSE, SPECULAR, WIDTH, COLUMNS = 12, 13, 14, 15, 16
+SUN = 0
+POINT = 1
+SPOT = 2
+AREA = 3
+KIND = 0
+POSITION = 1
+DIRECTION = 4
+COLOR = 7
+CONE = 10
+FADE = 11
+MAP = 12
+DIFFUSE = 13
+SPECULAR = 14
+WIDTH = 15
+COLUMNS = 16
 """Columns of a table of lights (L, COLUMNS) float32: kind; position (3); direction in which it
 shines (3); color (3), irradiance of a sun, else intensity in W/sr towards what faces it; cosine of
 half a spot's cone, and how far above the cosine has risen where the spot no longer fades; row of
@@ -51,22 +63,40 @@ def add_lights(
     """
     for begin, end in pieces(work):
         for n in range(begin, end):
-            px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-            nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
-            vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
+            px = points[n, 0]
+            py = points[n, 1]
+            pz = points[n, 2]
+            nx = normals[n, 0]
+            ny = normals[n, 1]
+            nz = normals[n, 2]
+            vx = eye[0] - px
+            vy = eye[1] - py
+            vz = eye[2] - pz
             scale = ONE / math.sqrt(max(vx * vx + vy * vy + vz * vz, np.float32(1e-20)))
-            vx, vy, vz = vx * scale, vy * scale, vz * scale
+            vx = vx * scale
+            vy = vy * scale
+            vz = vz * scale
             toward_eye = max(nx * vx + ny * vy + nz * vz, MIN_FACING)
             alpha = roughness[n] * roughness[n]
             for s in range(len(lights)):
                 light = lights[s]
-                kind, row = int(light[KIND]), int(light[MAP])
-                dx, dy, dz, strength, width = -light[4], -light[5], -light[6], ONE, light[WIDTH]
+                kind = int(light[KIND])
+                row = int(light[MAP])
+                dx = -light[4]
+                dy = -light[5]
+                dz = -light[6]
+                strength = ONE
+                width = light[WIDTH]
                 if kind != SUN:
-                    dx, dy, dz = light[1] - px, light[2] - py, light[3] - pz
+                    dx = light[1] - px
+                    dy = light[2] - py
+                    dz = light[3] - pz
                     square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
                     away = ONE / math.sqrt(square)
-                    dx, dy, dz, strength = dx * away, dy * away, dz * away, ONE / square
+                    dx = dx * away
+                    dy = dy * away
+                    dz = dz * away
+                    strength = ONE / square
                     width = width * away
                     along = -(dx * light[4] + dy * light[5] + dz * light[6])
                     if kind == AREA:
@@ -81,7 +111,9 @@ def add_lights(
                     continue
                 gloss = ZERO
                 if alpha > ZERO and light[SPECULAR] > ZERO:
-                    hx, hy, hz = dx + vx, dy + vy, dz + vz
+                    hx = dx + vx
+                    hy = dy + vy
+                    hz = dz + vz
                     scale = ONE / math.sqrt(max(hx * hx + hy * hy + hz * hz, np.float32(1e-12)))
                     half = min(max((nx * hx + ny * hy + nz * hz) * scale, ZERO), ONE)
                     fresnel_cosine = min(max((vx * hx + vy * hy + vz * hz) * scale, ZERO), ONE)

@@ -7,7 +7,9 @@ import numpy as np
 from . import jit
 from .threads import parallel, pieces
 
-ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
+HALF = np.float32(0.5)
 
 
 @jit
@@ -21,25 +23,40 @@ def add_depths(points, faces, depth):
     size = len(depth)
     centers = np.arange(size).astype(np.float32) + HALF
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = points[a, 0], points[a, 1], points[a, 2]
-        bx, by, bz = points[b, 0] - ax, points[b, 1] - ay, points[b, 2] - az
-        cx, cy, cz = points[c, 0] - ax, points[c, 1] - ay, points[c, 2] - az
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
+        ax = points[a, 0]
+        ay = points[a, 1]
+        az = points[a, 2]
+        bx = points[b, 0] - ax
+        by = points[b, 1] - ay
+        bz = points[b, 2] - az
+        cx = points[c, 0] - ax
+        cy = points[c, 1] - ay
+        cz = points[c, 2] - az
         area = bx * cy - by * cx
         if not (abs(area) > np.float32(1e-12)):
             continue
-        low_x, high_x = ax + min(ZERO, bx, cx), ax + max(ZERO, bx, cx)
-        low_y, high_y = ay + min(ZERO, by, cy), ay + max(ZERO, by, cy)
+        low_x = ax + min(ZERO, bx, cx)
+        high_x = ax + max(ZERO, bx, cx)
+        low_y = ay + min(ZERO, by, cy)
+        high_y = ay + max(ZERO, by, cy)
         if high_x < ZERO or high_y < ZERO or low_x > size or low_y > size:
             continue
-        x0, x1 = max(0, math.ceil(low_x - HALF)), min(size - 1, math.floor(high_x - HALF))
-        y0, y1 = max(0, math.ceil(low_y - HALF)), min(size - 1, math.floor(high_y - HALF))
+        x0 = max(0, math.ceil(low_x - HALF))
+        x1 = min(size - 1, math.floor(high_x - HALF))
+        y0 = max(0, math.ceil(low_y - HALF))
+        y1 = min(size - 1, math.floor(high_y - HALF))
         inverse = ONE / area
         for y in range(y0, y1 + 1):
-            dy, row, across = np.float32(y) + HALF - ay, depth[y, x0 : x1 + 1], centers[x0 : x1 + 1]
+            dy = np.float32(y) + HALF - ay
+            row = depth[y, x0 : x1 + 1]
+            across = centers[x0 : x1 + 1]
             for x in range(len(row)):
                 dx = across[x] - ax
-                u, v = (dx * cy - dy * cx) * inverse, (bx * dy - by * dx) * inverse
+                u = (dx * cy - dy * cx) * inverse
+                v = (bx * dy - by * dx) * inverse
                 z = az + u * bz + v * cz
                 is_nearer = (u >= ZERO) & (v >= ZERO) & (u + v <= ONE) & (z < row[x])
                 row[x] = z if is_nearer else row[x]
@@ -54,18 +71,23 @@ def lit_shares(work, depth, points, bias, step, lit):
     step: texels between the 3 × 3 places that are looked up bilinearly around a point; 0: one
     place.
     """
-    size, reach = len(depth), 1 if step > 0 else 0
+    size = len(depth)
+    reach = 1 if step > 0 else 0
     for begin, end in pieces(work):
         for n in range(begin, end):
-            found, z = ZERO, points[n, 2] - bias[n]
+            found = ZERO
+            z = points[n, 2] - bias[n]
             for across in range(-reach, reach + 1):
                 for down in range(-reach, reach + 1):
                     x = points[n, 0] - HALF + np.float32(across) * step
                     y = points[n, 1] - HALF + np.float32(down) * step
-                    left, top = math.floor(x), math.floor(y)
-                    right_share, lower_share = x - np.float32(left), y - np.float32(top)
+                    left = math.floor(x)
+                    top = math.floor(y)
+                    right_share = x - np.float32(left)
+                    lower_share = y - np.float32(top)
                     for k in range(4):
-                        column, row = int(left) + (k & 1), int(top) + (k >> 1)
+                        column = int(left) + (k & 1)
+                        row = int(top) + (k >> 1)
                         outside = column < 0 or row < 0 or column >= size or row >= size
                         if outside or z <= depth[row, column]:
                             weight = right_share if k & 1 else ONE - right_share

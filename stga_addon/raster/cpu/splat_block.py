@@ -65,10 +65,16 @@ BACKWARD_SIZE = 103 * BLOCK_SPLATS
 def _rotation(q0, q1, q2, q3):
     """Rotation matrix entries of a unit quaternion wxyz."""
     return (
-        ONE - TWO * (q2 * q2 + q3 * q3), TWO * (q1 * q2 - q0 * q3), TWO * (q1 * q3 + q0 * q2),
-        TWO * (q1 * q2 + q0 * q3), ONE - TWO * (q1 * q1 + q3 * q3), TWO * (q2 * q3 - q0 * q1),
-        TWO * (q1 * q3 - q0 * q2), TWO * (q2 * q3 + q0 * q1), ONE - TWO * (q1 * q1 + q2 * q2),
-    )  # fmt: skip
+        ONE - TWO * (q2 * q2 + q3 * q3),
+        TWO * (q1 * q2 - q0 * q3),
+        TWO * (q1 * q3 + q0 * q2),
+        TWO * (q1 * q2 + q0 * q3),
+        ONE - TWO * (q1 * q1 + q3 * q3),
+        TWO * (q2 * q3 - q0 * q1),
+        TWO * (q1 * q3 - q0 * q2),
+        TWO * (q2 * q3 + q0 * q1),
+        ONE - TWO * (q1 * q1 + q2 * q2),
+    )
 
 
 @inline_jit
@@ -80,12 +86,18 @@ def _unit(b, q):
     first scaled by a power of two. 1 / norm only serves the gradient, whose square must stay in
     range too: it ends at 1e12.
     """
-    q0, q1, q2, q3 = b[RAW_0 + q], b[RAW_1 + q], b[RAW_2 + q], b[RAW_3 + q]
+    q0 = b[RAW_0 + q]
+    q1 = b[RAW_1 + q]
+    q2 = b[RAW_2 + q]
+    q3 = b[RAW_3 + q]
     size = abs(q0) + abs(q1) + abs(q2) + abs(q3)
-    up, down = QUATERNION_LIFT, ONE / QUATERNION_LIFT
+    up = QUATERNION_LIFT
+    down = ONE / QUATERNION_LIFT
     lift = up if size < np.float32(1e-12) else (down if size > np.float32(1e12) else ONE)
     q0 = ONE if size == ZERO else q0 * lift
-    q1, q2, q3 = q1 * lift, q2 * lift, q3 * lift
+    q1 = q1 * lift
+    q2 = q2 * lift
+    q3 = q3 * lift
     rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     per_norm = ZERO if size == ZERO else min(rn * lift, np.float32(1e12))
     return q0 * rn, q1 * rn, q2 * rn, q3 * rn, per_norm
@@ -94,7 +106,9 @@ def _unit(b, q):
 @inline_jit
 def _camera_point(b, q):
     """The splat in camera space."""
-    x, y, z = b[LOCAL_X + q], b[LOCAL_Y + q], b[LOCAL_Z + q]
+    x = b[LOCAL_X + q]
+    y = b[LOCAL_Y + q]
+    z = b[LOCAL_Z + q]
     return (
         b[M00 + q] * x + b[M01 + q] * y + b[M02 + q] * z + b[ORIGIN_X + q],
         b[M10 + q] * x + b[M11 + q] * y + b[M12 + q] * z + b[ORIGIN_Y + q],
@@ -109,11 +123,17 @@ def _pixels_per_local(b, q, jx, jy, tx, ty):
 
     jx, jy: focal lengths over depth; tx, ty: x and y over depth.
     """
-    m20, m21, m22 = b[M20 + q], b[M21 + q], b[M22 + q]
+    m20 = b[M20 + q]
+    m21 = b[M21 + q]
+    m22 = b[M22 + q]
     return (
-        jx * (b[M00 + q] - tx * m20), jx * (b[M01 + q] - tx * m21), jx * (b[M02 + q] - tx * m22),
-        jy * (b[M10 + q] - ty * m20), jy * (b[M11 + q] - ty * m21), jy * (b[M12 + q] - ty * m22),
-    )  # fmt: skip
+        jx * (b[M00 + q] - tx * m20),
+        jx * (b[M01 + q] - tx * m21),
+        jx * (b[M02 + q] - tx * m22),
+        jy * (b[M10 + q] - ty * m20),
+        jy * (b[M11 + q] - ty * m21),
+        jy * (b[M12 + q] - ty * m22),
+    )
 
 
 @inline_jit
@@ -132,32 +152,53 @@ def project_geometry(b, intrinsics, limits):
     intrinsics (4,): fl_x, fl_y, cx, cy. limits (4,): lowest and highest x / z and y / z in the
     projection's Jacobian.
     """
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
+    fx = intrinsics[0]
+    fy = intrinsics[1]
+    cx = intrinsics[2]
+    cy = intrinsics[3]
+    low_x = limits[0]
+    high_x = limits[1]
+    low_y = limits[2]
+    high_y = limits[3]
     for q in range(np.uint64(BLOCK_SPLATS)):
         x, y, z = _camera_point(b, q)
         rz = ONE / z
-        tx, ty = min(high_x, max(low_x, x * rz)), min(high_y, max(low_y, y * rz))
+        tx = min(high_x, max(low_x, x * rz))
+        ty = min(high_y, max(low_y, y * rz))
         q0, q1, q2, q3, _ = _unit(b, q)
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
         u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, fx * rz, fy * rz, tx, ty)
-        s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
+        s0 = exponential(b[LOG_0 + q])
+        s1 = exponential(b[LOG_1 + q])
+        s2 = exponential(b[LOG_2 + q])
         w00, w01, w02 = _row_times_matrix(
             u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
         )
         w10, w11, w12 = _row_times_matrix(
             u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
         )
-        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
+        a00 = w00 * s0
+        a01 = w01 * s1
+        a02 = w02 * s2
+        a10 = w10 * s0
+        a11 = w11 * s1
+        a12 = w12 * s2
         xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
         yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
         # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or
         # below.
-        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        m01 = a00 * a11 - a01 * a10
+        m02 = a00 * a12 - a02 * a10
+        m12 = a01 * a12 - a02 * a11
         sharp = m01 * m01 + m02 * m02 + m12 * m12
-        b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q] = x, y, z
-        b[MEAN_X + q], b[MEAN_Y + q] = fx * x * rz + cx, fy * y * rz + cy
-        b[XX + q], b[XY + q], b[YY + q] = xx, a00 * a10 + a01 * a11 + a02 * a12, yy
+        b[CAMERA_X + q] = x
+        b[CAMERA_Y + q] = y
+        b[CAMERA_Z + q] = z
+        b[MEAN_X + q] = fx * x * rz + cx
+        b[MEAN_Y + q] = fy * y * rz + cy
+        b[XX + q] = xx
+        b[XY + q] = a00 * a10 + a01 * a11 + a02 * a12
+        b[YY + q] = yy
         b[DETERMINANT + q] = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2)
         b[SHARP + q] = sharp
         b[OPACITY + q] = ONE / (ONE + exponential(-b[LOGIT + q]))
@@ -176,11 +217,15 @@ def project_bounds(b, tiles_x, tiles_y):
     float32."""
     size = np.float32(TILE)
     for q in range(np.uint64(BLOCK_SPLATS)):
-        mean_x, mean_y, det = b[MEAN_X + q], b[MEAN_Y + q], b[DETERMINANT + q]
+        mean_x = b[MEAN_X + q]
+        mean_y = b[MEAN_Y + q]
+        det = b[DETERMINANT + q]
         opacity = b[OPACITY + q]
         reach = TWO * logarithm(np.float32(255.0) * opacity)
-        yy, infinite = b[YY + q], np.float32(np.inf)
-        ex, ey = math.sqrt(reach * b[XX + q]), math.sqrt(reach * yy)
+        yy = b[YY + q]
+        infinite = np.float32(np.inf)
+        ex = math.sqrt(reach * b[XX + q])
+        ey = math.sqrt(reach * yy)
         b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q] = yy / det, b[XY + q] / yy, ONE / yy
         b[EXTENT_Y + q] = ey
         b[X0 + q] = min(tiles_x, max(ZERO, np.floor((mean_x - ex) / size)))
@@ -196,20 +241,35 @@ def project_bounds(b, tiles_x, tiles_y):
 @inline_jit
 def basis(x, y, z):
     """The 16 real spherical harmonics of the unit direction (x, y, z)."""
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     return (
-        C0, -C1 * y, C1 * z, -C1 * x,
-        C2 * x * y, -C2 * y * z, C3 * (TWO * zz - xx - yy), -C2 * x * z, C4 * (xx - yy),
-        -C5 * y * (THREE * xx - yy), C6 * x * y * z, -C7 * y * (FOUR * zz - xx - yy),
-        C8 * z * (TWO * zz - THREE * xx - THREE * yy), -C7 * x * (FOUR * zz - xx - yy),
-        C9 * z * (xx - yy), -C5 * x * (xx - THREE * yy),
-    )  # fmt: skip
+        C0,
+        -C1 * y,
+        C1 * z,
+        -C1 * x,
+        C2 * x * y,
+        -C2 * y * z,
+        C3 * (TWO * zz - xx - yy),
+        -C2 * x * z,
+        C4 * (xx - yy),
+        -C5 * y * (THREE * xx - yy),
+        C6 * x * y * z,
+        -C7 * y * (FOUR * zz - xx - yy),
+        C8 * z * (TWO * zz - THREE * xx - THREE * yy),
+        -C7 * x * (FOUR * zz - xx - yy),
+        C9 * z * (xx - yy),
+        -C5 * x * (xx - THREE * yy),
+    )
 
 
 @inline_jit
 def basis_gradient(x, y, z, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12, w13, w14, w15):
     """Gradient with respect to (x, y, z) of the sum of the harmonics 1 to 15 with these weights."""
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     gx = -C1 * w3 + C2 * (y * w4 - z * w7) - TWO * C3 * x * w6 + TWO * C4 * x * w8
     gx += -C5 * SIX * x * y * w9 + C6 * y * z * w10 + C7 * TWO * x * y * w11
     gx += -C8 * SIX * x * z * w12 - C7 * (FOUR * zz - THREE * xx - yy) * w13
@@ -228,20 +288,45 @@ def basis_gradient(x, y, z, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12, w
 def compute_harmonics(b, to_world):
     """Write TOWARD_X to PER_DISTANCE and B0 to B15; to_world (3, 3): rotation from camera to world
     space."""
-    t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
-    t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
-    t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]
+    t00 = to_world[0, 0]
+    t01 = to_world[0, 1]
+    t02 = to_world[0, 2]
+    t10 = to_world[1, 0]
+    t11 = to_world[1, 1]
+    t12 = to_world[1, 2]
+    t20 = to_world[2, 0]
+    t21 = to_world[2, 1]
+    t22 = to_world[2, 2]
     for q in range(np.uint64(BLOCK_SPLATS)):
-        x, y, z = b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q]
+        x = b[CAMERA_X + q]
+        y = b[CAMERA_Y + q]
+        z = b[CAMERA_Z + q]
         rd = ONE / math.sqrt(x * x + y * y + z * z)
-        dx, dy = (t00 * x + t01 * y + t02 * z) * rd, (t10 * x + t11 * y + t12 * z) * rd
+        dx = (t00 * x + t01 * y + t02 * z) * rd
+        dy = (t10 * x + t11 * y + t12 * z) * rd
         dz = (t20 * x + t21 * y + t22 * z) * rd
-        b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q] = dx, dy, dz, rd
+        b[TOWARD_X + q] = dx
+        b[TOWARD_Y + q] = dy
+        b[TOWARD_Z + q] = dz
+        b[PER_DISTANCE + q] = rd
         (
-            b[B0 + q], b[B1 + q], b[B2 + q], b[B3 + q], b[B4 + q], b[B5 + q], b[B6 + q],
-            b[B7 + q], b[B8 + q], b[B9 + q], b[B10 + q], b[B11 + q], b[B12 + q], b[B13 + q],
-            b[B14 + q], b[B15 + q],
-        ) = basis(dx, dy, dz)  # fmt: skip
+            b[B0 + q],
+            b[B1 + q],
+            b[B2 + q],
+            b[B3 + q],
+            b[B4 + q],
+            b[B5 + q],
+            b[B6 + q],
+            b[B7 + q],
+            b[B8 + q],
+            b[B9 + q],
+            b[B10 + q],
+            b[B11 + q],
+            b[B12 + q],
+            b[B13 + q],
+            b[B14 + q],
+            b[B15 + q],
+        ) = basis(dx, dy, dz)
 
 
 @inline_jit
@@ -250,17 +335,21 @@ def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
     `compensate_low_pass`."""
     low = LOW_PASS_PX2
     sharp = m01 * m01 + m02 * m02 + m12 * m12
-    xx, yy = a00 * a00 + a01 * a01 + a02 * a02, a10 * a10 + a11 * a11 + a12 * a12
+    xx = a00 * a00 + a01 * a01 + a02 * a02
+    yy = a10 * a10 + a11 * a11 + a12 * a12
     det = sharp + low * (xx + yy + low)
     # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v
     # = 0.
     w = v * low * (xx + yy + low) / (det * max(sharp, np.float32(1e-30)))
     u = -v * low / det
     return (
-        w * (m01 * a11 + m02 * a12) + u * a00, w * (-m01 * a10 + m12 * a12) + u * a01,
-        w * (-m02 * a10 - m12 * a11) + u * a02, w * (-m01 * a01 - m02 * a02) + u * a10,
-        w * (m01 * a00 - m12 * a02) + u * a11, w * (m02 * a00 + m12 * a01) + u * a12,
-    )  # fmt: skip
+        w * (m01 * a11 + m02 * a12) + u * a00,
+        w * (-m01 * a10 + m12 * a12) + u * a01,
+        w * (-m02 * a10 - m12 * a11) + u * a02,
+        w * (-m01 * a01 - m02 * a02) + u * a10,
+        w * (m01 * a00 - m12 * a02) + u * a11,
+        w * (m02 * a00 + m12 * a01) + u * a12,
+    )
 
 
 @inline_jit
@@ -271,36 +360,59 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
     intrinsics, limits: as in `project_geometry`; half_size (2,): of the image, pixels; compensated:
     1 after `compensate_low_pass`, else 0; all float32.
     """
-    fx, fy, half_width, half_height = intrinsics[0], intrinsics[1], half_size[0], half_size[1]
-    low_x, high_x, low_y, high_y = limits[0], limits[1], limits[2], limits[3]
+    fx = intrinsics[0]
+    fy = intrinsics[1]
+    half_width = half_size[0]
+    half_height = half_size[1]
+    low_x = limits[0]
+    high_x = limits[1]
+    low_y = limits[2]
+    high_y = limits[3]
     for q in range(np.uint64(BLOCK_SPLATS)):
-        g_mean_x, g_mean_y, g_opacity = b[G_MEAN_X + q], b[G_MEAN_Y + q], b[G_OPACITY + q]
-        half_x, half_y = half_width * g_mean_x, half_height * g_mean_y
+        g_mean_x = b[G_MEAN_X + q]
+        g_mean_y = b[G_MEAN_Y + q]
+        g_opacity = b[G_OPACITY + q]
+        half_x = half_width * g_mean_x
+        half_y = half_height * g_mean_y
         b[V_SCREEN + q] = math.sqrt(half_x * half_x + half_y * half_y)
         x, y, z = _camera_point(b, q)
         rz = ONE / z
-        slope_x, slope_y = x * rz, y * rz
-        tx, ty = min(high_x, max(low_x, slope_x)), min(high_y, max(low_y, slope_y))
+        slope_x = x * rz
+        slope_y = y * rz
+        tx = min(high_x, max(low_x, slope_x))
+        ty = min(high_y, max(low_y, slope_y))
         q0, q1, q2, q3, rn = _unit(b, q)
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
-        jx, jy = fx * rz, fy * rz
+        jx = fx * rz
+        jy = fy * rz
         u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, jx, jy, tx, ty)
-        s0, s1, s2 = exponential(b[LOG_0 + q]), exponential(b[LOG_1 + q]), exponential(b[LOG_2 + q])
+        s0 = exponential(b[LOG_0 + q])
+        s1 = exponential(b[LOG_1 + q])
+        s2 = exponential(b[LOG_2 + q])
         w00, w01, w02 = _row_times_matrix(
             u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
         )
         w10, w11, w12 = _row_times_matrix(
             u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
         )
-        a00, a01, a02, a10, a11, a12 = w00 * s0, w01 * s1, w02 * s2, w10 * s0, w11 * s1, w12 * s2
+        a00 = w00 * s0
+        a01 = w01 * s1
+        a02 = w02 * s2
+        a10 = w10 * s0
+        a11 = w11 * s1
+        a12 = w12 * s2
 
         # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0
         # − shear·a1, ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy:
         # the gradient with respect to a0 is v0, that with respect to a1 is −shear·v0 + v1. The
         # residual, and every product of −shear·v0 with something of row 1, is taken together with
         # row 0, because the two cancel for long splats.
-        precision_x, shear, inverse_yy = b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q]
-        m01, m02, m12 = a00 * a11 - a01 * a10, a00 * a12 - a02 * a10, a01 * a12 - a02 * a11
+        precision_x = b[PRECISION_X + q]
+        shear = b[SHEAR + q]
+        inverse_yy = b[PRECISION_Y + q]
+        m01 = a00 * a11 - a01 * a10
+        m02 = a00 * a12 - a02 * a10
+        m12 = a01 * a12 - a02 * a11
         e0 = inverse_yy * (LOW_PASS_PX2 * a00 + a11 * m01 + a12 * m02)
         e1 = inverse_yy * (LOW_PASS_PX2 * a01 - a10 * m01 + a12 * m12)
         e2 = inverse_yy * (LOW_PASS_PX2 * a02 - a10 * m02 - a11 * m12)
@@ -310,18 +422,37 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
         b00, b01, b02, b10, b11, b12 = _compensation_gradient(
             compensated * g_opacity * b[OPACITY + q], a00, a01, a02, a10, a11, a12, m01, m02, m12
         )
-        v00, v01, v02 = vs * e0 + vk * a10 + b00, vs * e1 + vk * a11 + b01, vs * e2 + vk * a12 + b02
+        v00 = vs * e0 + vk * a10 + b00
+        v01 = vs * e1 + vk * a11 + b01
+        v02 = vs * e2 + vk * a12 + b02
         v10 = vk * e0 + vw * a10 + b10 + shear * b00
         v11 = vk * e1 + vw * a11 + b11 + shear * b01
         v12 = vk * e2 + vw * a12 + b12 + shear * b02
-        by0, by1, by2 = v00 * e0 + v10 * a10, v01 * e1 + v11 * a11, v02 * e2 + v12 * a12
-        b[V_LOG_0 + q], b[V_LOG_1 + q], b[V_LOG_2 + q] = by0, by1, by2
+        by0 = v00 * e0 + v10 * a10
+        by1 = v01 * e1 + v11 * a11
+        by2 = v02 * e2 + v12 * a12
+        b[V_LOG_0 + q] = by0
+        b[V_LOG_1 + q] = by1
+        b[V_LOG_2 + q] = by2
         # A = U·R·diag(s): to R, then through the normalized quaternion.
-        v00, v01, v02, v10, v11, v12 = v00 * s0, v01 * s1, v02 * s2, v10 * s0, v11 * s1, v12 * s2
-        p0, p1, p2 = u00 - shear * u10, u01 - shear * u11, u02 - shear * u12
-        h00, h01, h02 = p0 * v00 + u10 * v10, p0 * v01 + u10 * v11, p0 * v02 + u10 * v12
-        h10, h11, h12 = p1 * v00 + u11 * v10, p1 * v01 + u11 * v11, p1 * v02 + u11 * v12
-        h20, h21, h22 = p2 * v00 + u12 * v10, p2 * v01 + u12 * v11, p2 * v02 + u12 * v12
+        v00 = v00 * s0
+        v01 = v01 * s1
+        v02 = v02 * s2
+        v10 = v10 * s0
+        v11 = v11 * s1
+        v12 = v12 * s2
+        p0 = u00 - shear * u10
+        p1 = u01 - shear * u11
+        p2 = u02 - shear * u12
+        h00 = p0 * v00 + u10 * v10
+        h01 = p0 * v01 + u10 * v11
+        h02 = p0 * v02 + u10 * v12
+        h10 = p1 * v00 + u11 * v10
+        h11 = p1 * v01 + u11 * v11
+        h12 = p1 * v02 + u11 * v12
+        h20 = p2 * v00 + u12 * v10
+        h21 = p2 * v01 + u12 * v11
+        h22 = p2 * v02 + u12 * v12
         vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
         vq1 = TWO * (
             q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22)
@@ -333,24 +464,34 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
             q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11)
         )
         radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
-        b[V_RAW_0 + q], b[V_RAW_1 + q] = (vq0 - radial * q0) * rn, (vq1 - radial * q1) * rn
-        b[V_RAW_2 + q], b[V_RAW_3 + q] = (vq2 - radial * q2) * rn, (vq3 - radial * q3) * rn
+        b[V_RAW_0 + q] = (vq0 - radial * q0) * rn
+        b[V_RAW_1 + q] = (vq1 - radial * q1) * rn
+        b[V_RAW_2 + q] = (vq2 - radial * q2) * rn
+        b[V_RAW_3 + q] = (vq3 - radial * q3) * rn
         # to U, and through it to the camera-space position (the Jacobian depends on it).
-        d00, d01 = v00 * r00 + v01 * r01 + v02 * r02, v00 * r10 + v01 * r11 + v02 * r12
+        d00 = v00 * r00 + v01 * r01 + v02 * r02
+        d01 = v00 * r10 + v01 * r11 + v02 * r12
         d02 = v00 * r20 + v01 * r21 + v02 * r22
-        d10, d11 = v10 * r00 + v11 * r01 + v12 * r02, v10 * r10 + v11 * r11 + v12 * r12
+        d10 = v10 * r00 + v11 * r01 + v12 * r02
+        d11 = v10 * r10 + v11 * r11 + v12 * r12
         d12 = v10 * r20 + v11 * r21 + v12 * r22
-        m20, m21, m22 = b[M20 + q], b[M21 + q], b[M22 + q]
+        m20 = b[M20 + q]
+        m21 = b[M21 + q]
+        m22 = b[M22 + q]
         from_row_0 = d00 * m20 + d01 * m21 + d02 * m22
         vtx = -jx * from_row_0
         vty = -jy * (d10 * m20 + d11 * m21 + d12 * m22 - shear * from_row_0)
         vtx = vtx if tx == slope_x else ZERO
         vty = vty if ty == slope_y else ZERO
-        vtx, vty = vtx + g_mean_x * fx, vty + g_mean_y * fy
-        b[V_CAMERA_X + q], b[V_CAMERA_Y + q] = vtx * rz, vty * rz
+        vtx = vtx + g_mean_x * fx
+        vty = vty + g_mean_y * fy
+        b[V_CAMERA_X + q] = vtx * rz
+        b[V_CAMERA_Y + q] = vty * rz
         # U shrinks with z as the scales do.
         b[V_CAMERA_Z + q] = -rz * (by0 + by1 + by2) - (vtx * slope_x + vty * slope_y) * rz
-        b[CAMERA_X + q], b[CAMERA_Y + q], b[CAMERA_Z + q] = x, y, z
+        b[CAMERA_X + q] = x
+        b[CAMERA_Y + q] = y
+        b[CAMERA_Z + q] = z
         # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
         b[V_LOGIT + q] = g_opacity * b[OPACITY + q] / (ONE + exponential(b[LOGIT + q]))
 
@@ -359,18 +500,44 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
 def differentiate_position(b, to_world):
     """Write V_LOCAL_X to V_LOCAL_Z from V_CAMERA_X to V_CAMERA_Z and the weights W1 to W15 of the
     harmonics."""
-    t00, t01, t02 = to_world[0, 0], to_world[0, 1], to_world[0, 2]
-    t10, t11, t12 = to_world[1, 0], to_world[1, 1], to_world[1, 2]
-    t20, t21, t22 = to_world[2, 0], to_world[2, 1], to_world[2, 2]
+    t00 = to_world[0, 0]
+    t01 = to_world[0, 1]
+    t02 = to_world[0, 2]
+    t10 = to_world[1, 0]
+    t11 = to_world[1, 1]
+    t12 = to_world[1, 2]
+    t20 = to_world[2, 0]
+    t21 = to_world[2, 1]
+    t22 = to_world[2, 2]
     for q in range(np.uint64(BLOCK_SPLATS)):
-        dx, dy, dz, rd = b[TOWARD_X + q], b[TOWARD_Y + q], b[TOWARD_Z + q], b[PER_DISTANCE + q]
+        dx = b[TOWARD_X + q]
+        dy = b[TOWARD_Y + q]
+        dz = b[TOWARD_Z + q]
+        rd = b[PER_DISTANCE + q]
         ex, ey, ez = basis_gradient(
-            dx, dy, dz, b[W1 + q], b[W2 + q], b[W3 + q], b[W4 + q], b[W5 + q], b[W6 + q],
-            b[W7 + q], b[W8 + q], b[W9 + q], b[W10 + q], b[W11 + q], b[W12 + q], b[W13 + q],
-            b[W14 + q], b[W15 + q],
-        )  # fmt: skip
+            dx,
+            dy,
+            dz,
+            b[W1 + q],
+            b[W2 + q],
+            b[W3 + q],
+            b[W4 + q],
+            b[W5 + q],
+            b[W6 + q],
+            b[W7 + q],
+            b[W8 + q],
+            b[W9 + q],
+            b[W10 + q],
+            b[W11 + q],
+            b[W12 + q],
+            b[W13 + q],
+            b[W14 + q],
+            b[W15 + q],
+        )
         along = ex * dx + ey * dy + ez * dz
-        ex, ey, ez = (ex - along * dx) * rd, (ey - along * dy) * rd, (ez - along * dz) * rd
+        ex = (ex - along * dx) * rd
+        ey = (ey - along * dy) * rd
+        ez = (ez - along * dz) * rd
         vx = b[V_CAMERA_X + q] + t00 * ex + t10 * ey + t20 * ez
         vy = b[V_CAMERA_Y + q] + t01 * ex + t11 * ey + t21 * ez
         vz = b[V_CAMERA_Z + q] + t02 * ex + t12 * ey + t22 * ez

@@ -17,7 +17,8 @@ from numba import njit
 from . import jit
 from .elementary import fetch_add
 
-UNITS, PIECE = 1, 2
+UNITS = 1
+PIECE = 2
 """Where a kernel's `work` (3,) int64 holds the number of units and those of a piece; first is the
 next unit."""
 

@@ -39,22 +39,31 @@ def list_visible(work, rect, depth_bits, found, keys, pairs, first_pair, parts, 
     """
     for part, past_part in pieces(work):
         for k in range(part, past_part):
-            row, count, before = counts[k], np.uint64(0), np.int32(0)
+            row = counts[k]
+            count = np.uint64(0)
+            before = np.int32(0)
             row[:] = 0
             begin = np.uint64(k * SPLATS_PER_SORT)
-            least, greatest = np.uint32(0xFFFFFFFF), np.uint32(0)
+            least = np.uint32(0xFFFFFFFF)
+            greatest = np.uint32(0)
             # Without a branch: the processor could not foresee which splats a local iteration sees.
             for i in range(begin, np.uint64(min(len(rect), (k + 1) * SPLATS_PER_SORT))):
-                width, key = rect[i, 2] - rect[i, 0], depth_bits[i]
+                width = rect[i, 2] - rect[i, 0]
+                key = depth_bits[i]
                 seen = width > 0
-                found[begin + count], keys[begin + count] = i, key
-                pairs[i], first_pair[i] = width * (rect[i, 3] - rect[i, 1]), before
-                count, before = count + np.uint64(seen), np.int32(before + pairs[i])
+                found[begin + count] = i
+                keys[begin + count] = key
+                pairs[i] = width * (rect[i, 3] - rect[i, 1])
+                first_pair[i] = before
+                count = count + np.uint64(seen)
+                before = np.int32(before + pairs[i])
                 row[_digit(key, np.uint32(0), np.uint32(0))] += seen
                 least = min(least, key if seen else least)
                 greatest = max(greatest, key if seen else greatest)
-            parts[k, SPLATS], parts[k, PAIRS] = count, before
-            parts[k, LEAST], parts[k, GREATEST] = least, greatest
+            parts[k, SPLATS] = count
+            parts[k, PAIRS] = before
+            parts[k, LEAST] = least
+            parts[k, GREATEST] = greatest
 
 
 def parts_of(splats: int) -> int:
@@ -70,14 +79,22 @@ def sum_parts(parts, counts):
     Returns what all keys are counted from, of lowest digit 0, so that a key's lowest digit is its
     own, and the greatest of the keys counted from there.
     """
-    splats, pairs, least, greatest = 0, 0, 0xFFFFFFFF, 0
+    splats = 0
+    pairs = 0
+    least = 0xFFFFFFFF
+    greatest = 0
     last = len(parts) - 1
     for k in range(last):
-        count, before = parts[k, SPLATS], parts[k, PAIRS]
-        parts[k, SPLATS], parts[k, PAIRS] = splats, pairs
-        splats, pairs = splats + count, pairs + before
-        least, greatest = min(least, parts[k, LEAST]), max(greatest, parts[k, GREATEST])
-    parts[last, SPLATS], parts[last, PAIRS] = splats, pairs
+        count = parts[k, SPLATS]
+        before = parts[k, PAIRS]
+        parts[k, SPLATS] = splats
+        parts[k, PAIRS] = pairs
+        splats = splats + count
+        pairs = pairs + before
+        least = min(least, parts[k, LEAST])
+        greatest = max(greatest, parts[k, GREATEST])
+    parts[last, SPLATS] = splats
+    parts[last, PAIRS] = pairs
     sum_counts(counts)
     least = least // DIGITS * DIGITS
     return least, max(0, greatest - least)
@@ -116,16 +133,19 @@ def move_visible(work, parts, found, keys, place, first_pair, visible, moved_key
     """
     for part, past_part in pieces(work):
         for k in range(part, past_part):
-            row, begin = place[k], np.uint64(k * SPLATS_PER_SORT)
+            row = place[k]
+            begin = np.uint64(k * SPLATS_PER_SORT)
             first = np.uint64(parts[k, SPLATS])
             before = np.int32(parts[k, PAIRS])
             for n in range(np.uint64(parts[k + 1, SPLATS] - parts[k, SPLATS])):
-                i, key = found[begin + n], keys[begin + n]
+                i = found[begin + n]
+                key = keys[begin + n]
                 visible[first + n] = i
                 first_pair[np.uint64(i)] += before
                 digit = _digit(key, np.uint32(0), np.uint32(0))
                 at = np.uint64(row[digit])
-                moved_keys[at], moved[at] = key, i
+                moved_keys[at] = key
+                moved[at] = i
                 row[digit] += 1
 
 
@@ -157,7 +177,8 @@ def move_by_digit(work, place, keys, values, least, shift, moved_keys, moved):
             for n in range(np.uint64(k * SPLATS_PER_SORT), np.uint64(past)):
                 digit = _digit(keys[n], least, shift)
                 at = np.uint64(row[digit])
-                moved_keys[at], moved[at] = keys[n], values[n]
+                moved_keys[at] = keys[n]
+                moved[at] = values[n]
                 row[digit] += 1
 
 
@@ -176,7 +197,8 @@ def _prefetch_rect(rect, order, n, past):
 @inline_jit
 def _tiles_of(rect, i, tiles_x):
     """The first tile of splat i, how many it has in a row of tiles, and how many in all."""
-    width, height = np.uint64(rect[i, 2] - rect[i, 0]), np.uint64(rect[i, 3] - rect[i, 1])
+    width = np.uint64(rect[i, 2] - rect[i, 0])
+    height = np.uint64(rect[i, 3] - rect[i, 1])
     return np.uint64(rect[i, 1] * tiles_x + rect[i, 0]), width, width * height
 
 
@@ -185,7 +207,8 @@ def _next_tile(tile, column, width, tiles_x):
     """The splat's tile after `tile`, its column-th in the row, and its column. One loop over all of
     them, without a branch at the end of a row, is a fourth faster than two: the processor cannot
     foresee where short loops end."""
-    is_last, one = column == width, np.uint64(1)
+    is_last = column == width
+    one = np.uint64(1)
     step = np.uint64(tiles_x) - width + one if is_last else one
     return tile + step, one if is_last else column + one
 
@@ -220,7 +243,8 @@ def arrange_tiles(counts, tile_blocks):
     are rendered.
     """
     start = sum_counts(counts)
-    tiles, count = np.empty(len(tile_blocks), np.int32), 0
+    tiles = np.empty(len(tile_blocks), np.int32)
+    count = 0
     for tile in range(len(tile_blocks)):
         tiles[count] = tile
         count += tile_blocks[tile] != 0
@@ -232,7 +256,8 @@ def heaviest_first(tiles, start):
     """Reorder tiles (T,) int32 in runs of neighbors, those of the most pairs first, RUN_BUCKETS
     kinds of them: what is left at the end is short."""
     runs = len(tiles) // RUN_TILES
-    pairs, places = np.zeros(runs, np.int64), np.zeros(RUN_BUCKETS + 1, np.int64)
+    pairs = np.zeros(runs, np.int64)
+    places = np.zeros(RUN_BUCKETS + 1, np.int64)
     most = 1
     for n in range(runs * RUN_TILES):
         pairs[n // RUN_TILES] += start[tiles[n] + 1] - start[tiles[n]]
@@ -267,7 +292,8 @@ def fill_pairs(work, rect, order, tiles_x, place, first_pair, splat_pairs, pair_
                 _prefetch_rect(rect, order, n, past)
                 i = np.uint64(order[n])
                 tile, width, total = _tiles_of(rect, i, tiles_x)
-                first, column = np.uint64(first_pair[i]), np.uint64(1)
+                first = np.uint64(first_pair[i])
+                column = np.uint64(1)
                 for found in range(first, first + total):
                     at = row[tile]
                     row[tile] = at + 1
@@ -310,7 +336,8 @@ def _sum_boxes(count):
 @jit
 def split_splats(focus):
     """The splats (M,) int64 that are in focus (N,) bool, and the others."""
-    inside, outside = np.empty(len(focus), np.int64), np.empty(len(focus), np.int64)
+    inside = np.empty(len(focus), np.int64)
+    outside = np.empty(len(focus), np.int64)
     found = 0
     for i in range(np.uint64(len(focus))):
         inside[found] = outside[i - np.uint64(found)] = i
@@ -321,7 +348,8 @@ def split_splats(focus):
 @jit
 def listed_rows(rows, wanted):
     """Those of the rows (M,) int32 that are wanted (N,) bool."""
-    found, count = np.empty(len(rows), np.int32), 0
+    found = np.empty(len(rows), np.int32)
+    count = 0
     for n in range(np.uint64(len(rows))):
         found[count] = rows[n]
         count += wanted[np.uint64(rows[n])]
@@ -344,9 +372,13 @@ def find_needed_blocks(projection, splats, reach, tiles_x, tiles_y):
     Returns touched (tiles_y, tiles_x) bool, the tiles that they reach; `sum_tiles` of those with a
     needed block; and tile_blocks (tiles,) uint16: a bit each, in the order of `blend.BLOCKS`.
     """
-    projected, extent_y, rect = projection.columns, projection.extent_y, projection.rect
-    side, slack = np.float32(SIDE), np.float32(1e-4)
-    columns, rows = BLOCKS_ALONG * tiles_x, BLOCKS_ALONG * tiles_y
+    projected = projection.columns
+    extent_y = projection.extent_y
+    rect = projection.rect
+    side = np.float32(SIDE)
+    slack = np.float32(1e-4)
+    columns = BLOCKS_ALONG * tiles_x
+    rows = BLOCKS_ALONG * tiles_y
     near = np.zeros((rows + 1, columns + 1), np.int32)
     reached = np.zeros((tiles_y + 1, tiles_x + 1), np.int32)
     for n in range(len(splats)):
@@ -354,12 +386,15 @@ def find_needed_blocks(projection, splats, reach, tiles_x, tiles_y):
         if rect[i, 2] <= rect[i, 0]:
             continue
         _add_box(reached, rect[i, 0], rect[i, 1], rect[i, 2], rect[i, 3])
-        x, y, ey = projected[i, MEAN_X], projected[i, MEAN_Y], extent_y[i]
+        x = projected[i, MEAN_X]
+        y = projected[i, MEAN_Y]
+        ey = extent_y[i]
         shear = projected[i, SHEAR]
         ex = ey * math.sqrt(projected[i, PRECISION_Y] / projected[i, PRECISION_X] + shear * shear)
         ex = ex + slack * ex + reach + np.float32(0.5)
         ey = ey + slack * ey + reach + np.float32(0.5)
-        x0, x1 = _cell(x - ex, side, columns), _cell(x + ex + side, side, columns)
+        x0 = _cell(x - ex, side, columns)
+        x1 = _cell(x + ex + side, side, columns)
         _add_box(near, x0, _cell(y - ey, side, rows), x1, _cell(y + ey + side, side, rows))
     _sum_boxes(reached)
     _sum_boxes(near)
@@ -386,10 +421,12 @@ def box_groups(tiles: np.ndarray, most_rows: int) -> np.ndarray:
     numbers, _ = ndimage.label(tiles, np.ones((3, 3)))
     boxes = []
     for number, (rows, _) in enumerate(ndimage.find_objects(numbers), 1):
-        first, count = rows.start, rows.stop - rows.start
+        first = rows.start
+        count = rows.stop - rows.start
         bands = -(-count // most_rows)
         for band in range(bands):
-            y0, y1 = first + count * band // bands, first + count * (band + 1) // bands
+            y0 = first + count * band // bands
+            y1 = first + count * (band + 1) // bands
             columns = np.flatnonzero((numbers[y0:y1] == number).any(0))
             boxes.append((columns[0], y0, columns[-1] + 1, y1))
     boxes.sort(key=lambda box: (box[0] - box[2]) * (box[3] - box[1]))

@@ -42,7 +42,8 @@ def adapters() -> dict[str, Any]:
 
 
 def _preference(adapter: Any) -> tuple[int, bool]:
-    kinds, info = ("DiscreteGPU", "IntegratedGPU", "CPU"), adapter.info
+    kinds = ("DiscreteGPU", "IntegratedGPU", "CPU")
+    info = adapter.info
     rank = kinds.index(info["adapter_type"]) if info["adapter_type"] in kinds else 1
     return rank, info["backend_type"] == "D3D12"
 

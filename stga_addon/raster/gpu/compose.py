@@ -47,7 +47,8 @@ def _compose(
 ) -> ComposedImage:
     """Each layer has its own view of the same camera, and all share the tables of projected
     splats."""
-    device, given = rasterizer.device, list[tuple[PosedSplats, SplatTable, CameraFrames, Tables]]()
+    device = rasterizer.device
+    given = list[tuple[PosedSplats, SplatTable, CameraFrames, Tables]]()
     for n, layer in enumerate(layers):
         frames = layer_frames(layer, camera)
         parameters = Parameters(*(getattr(layer.splats, name) for name in Parameters._fields))
@@ -63,9 +64,11 @@ def _compose(
         first = 0
         for n, (layer, table, frames, tables) in enumerate(given):
             options = ViewOptions(
-                camera, layer.splats.sh_degree, depth_as_color=depth_as_color,
+                camera,
+                layer.splats.sh_degree,
+                depth_as_color=depth_as_color,
                 antialiased=layer.antialiased,
-            )  # fmt: skip
+            )
             view = rasterizer.upload_view(table, options, frames.to_world, first, f"view {n}")
             work.dispatch("project.forward", table.count, tables | {"view": view})
             first += table.count

@@ -229,7 +229,8 @@ class Recording:
     ) -> None:
         """Run `Device.kernel` by at least so many threads or workgroups; tables: as in
         `Device.bind`."""
-        kernel, groups = self.device.kernel(name, **constants), threads
+        kernel = self.device.kernel(name, **constants)
+        groups = threads
         if isinstance(groups, int):
             # `thread_number` in WGSL numbers the threads
             groups = self.device.groups_of(-(-groups // WORKGROUP))
@@ -372,7 +373,9 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, str]]:
     between dispatches.
     """
     code = re.sub("//.*", "", "\n".join([prelude_wgsl(), _source("common"), _source(file)]))
-    bodies, reached, left = dict(_FUNCTION.findall(code)), set[str](), {entry}
+    bodies = dict(_FUNCTION.findall(code))
+    reached = set[str]()
+    left = {entry}
     while left:
         reached |= left
         called = {name for each in left for name in re.findall(r"\w+(?=\()", bodies[each])}
@@ -388,11 +391,14 @@ def _linked(file: str, entry: str) -> tuple[str, dict[str, str]]:
             return ""
         binding = f"@group(0) @binding({len(tables)})"
         if kind == "uniform":
-            access, tables[name] = "uniform", "uniform"
+            access = "uniform"
+            tables[name] = "uniform"
         elif name in assigned:
-            access, tables[name] = "storage, read_write", "storage"
+            access = "storage, read_write"
+            tables[name] = "storage"
         else:
-            access, tables[name] = "storage, read", "read-only-storage"
+            access = "storage, read"
+            tables[name] = "read-only-storage"
         return f"{binding} var<{access}> {name}{rest}"
 
     code = _TABLE.sub(declare, code)

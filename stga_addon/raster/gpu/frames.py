@@ -32,7 +32,8 @@ class SmoothedStrain:
         returns its table (F, 3)."""
         averaged = strain_from_rest
         for n in range(AVERAGING_ROUNDS):
-            smoothed, averaged = averaged, self._rounds[n % 2]
+            smoothed = averaged
+            averaged = self._rounds[n % 2]
             tables = {"neighbors": self._neighbors, "smoothed": smoothed, "averaged": averaged}
             work.dispatch("frames.smooth_strain", self._count, tables)
         return averaged
@@ -45,20 +46,27 @@ class Embedding:
     """
 
     def __init__(
-        self, device: Device, neutral: np.ndarray, faces: np.ndarray, convention: str,
+        self,
+        device: Device,
+        neutral: np.ndarray,
+        faces: np.ndarray,
+        convention: str,
         basis: StrainBasis | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """neutral (V, 3), faces (F, 3); convention as in `face_frames`; basis: where splats follow
         the deformation."""
         if convention not in embedding.CONVENTIONS:
             known = embedding.CONVENTIONS
             raise ValueError(f"embedding convention {convention!r} is not one of {known}")
         self._smoothed = None if basis is None else SmoothedStrain(device, basis)
-        self._device, self._count, self._area_scales = device, len(faces), convention == "stga"
+        self._device = device
+        self._count = len(faces)
+        self._area_scales = convention == "stga"
         area = embedding.face_areas(neutral, faces)
         # zero only where the float64 is
         area[area > 0] = np.maximum(area[area > 0], np.finfo(np.float32).tiny)
-        rows, touching = np.zeros(0, np.float32), np.zeros(0, np.uint32)
+        rows = np.zeros(0, np.float32)
+        touching = np.zeros(0, np.uint32)
         if basis is not None:
             parts = basis.gram, basis.to_tensor, basis.to_plane, basis.normal.T, basis.range
             flat = [part.reshape(len(faces), -1) for part in parts]
@@ -87,11 +95,15 @@ class Embedding:
         parts[:, :3] = local
         parts[:, 3:] = local - parts[:, :3]
         self._device.upload("vertices", parts)
-        turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+        turn = camera.world_to_camera[:3, :3]
+        shift = camera.world_to_camera[:3, 3]
         self._device.uniform(
-            "Pose", rows=np.c_[turn, turn @ center + shift], triangles=self._count,
-            follows=self._smoothed is not None, area_scales=self._area_scales,
-        )  # fmt: skip
+            "Pose",
+            rows=np.c_[turn, turn @ center + shift],
+            triangles=self._count,
+            follows=self._smoothed is not None,
+            area_scales=self._area_scales,
+        )
 
     def compose(self, work: Recording, coefficients: Mapping[str, Any]) -> Any:
         """Record the frames of the mesh that was uploaded last; returns their table.

@@ -19,12 +19,24 @@ MAX_GROUPS = 65535
 DIGIT_BITS = 11
 SORT_BLOCK = 2048
 """Keys that a workgroup sorts."""
-SORT_GROUPS, PAIR_GROUPS, PAIRS, NEEDED, OVERFLOWED, COUNTS = 0, 3, 6, 7, 8, 9
+SORT_GROUPS = 0
+PAIR_GROUPS = 3
+PAIRS = 6
+NEEDED = 7
+OVERFLOWED = 8
+COUNTS = 9
 """Words of `counts`: workgroups to sort the pairs and to visit each; pairs in the lists, found, and
 1 if they did not fit since the host last cleared it."""
-XYZ, ROTATION, LOG_SCALE, OPACITY_LOGIT, SH = 0, 3, 7, 10, 11
+XYZ = 0
+ROTATION = 3
+LOG_SCALE = 7
+OPACITY_LOGIT = 10
+SH = 11
 """Columns of a splat."""
-FRAME_ORIGIN, FRAME_MATRIX, FRAME_COLOR, FRAME_STRIDE = 0, 3, 12, 15
+FRAME_ORIGIN = 0
+FRAME_MATRIX = 3
+FRAME_COLOR = 12
+FRAME_STRIDE = 15
 """Columns of a triangle's frame."""
 
 UNIFORMS = {
@@ -132,7 +144,8 @@ def split_rows(rows: np.ndarray, coefficients: int) -> Parameters:
 
 def prelude_wgsl() -> str:
     """The structs and every constant that Python and WGSL share."""
-    kinds, lines = {"f": "f32", "u": "u32"}, list[str]()
+    kinds = {"f": "f32", "u": "u32"}
+    lines = list[str]()
     for struct, record in UNIFORMS.items():
         lines.append(f"struct {struct} {{")
         for name in record.names or ():

@@ -25,17 +25,18 @@ RATES = (*Parameters._fields, "sh_rest", "strain_color")
 
 
 def upload_target(
-    device: Device, target: np.ndarray, ssim_weight: float, mask: np.ndarray | None = None,
+    device: Device,
+    target: np.ndarray,
+    ssim_weight: float,
+    mask: np.ndarray | None = None,
     change: Any = (0, 0, 0),
-) -> None:  # fmt: skip
+) -> None:
     """Send the target (H, W, 3) uint8 of the next image, and how it is compared.
 
     mask (H, W) uint8: the foreground's coverage; where it leaves the background free, the target's
     color is changed by `change` (3,) in 0…255.
     """
-    device.uniform(
-        "Loss", change=(*change, 0), ssim_weight=ssim_weight, masked=mask is not None
-    )  # fmt: skip
+    device.uniform("Loss", change=(*change, 0), ssim_weight=ssim_weight, masked=mask is not None)
     device.upload("image_target", target)
     if mask is not None:
         device.upload("mask", mask)
@@ -50,8 +51,10 @@ def image_loss(
     be rendered LOSS_REACH_PX around them. Returns the gradient (3, H, W), undefined in other tiles,
     and the loss (1,), which is computed if `whole`: every tile is touched.
     """
-    buffer, (columns, rows) = work.device.buffer, tile_grid(width, height)
-    v_image, result = buffer("v_image", 3 * width * height), buffer("result", 1)
+    buffer = work.device.buffer
+    (columns, rows) = tile_grid(width, height)
+    v_image = buffer("v_image", 3 * width * height)
+    result = buffer("result", 1)
     buffer("mask", 0)
     buffer("tile_sums", 6 * columns * rows)
     work.dispatch("image_loss.gradient", (columns, rows, 3), given)
@@ -79,9 +82,13 @@ class OptimizerTables(NamedTuple):
 
 
 def upload_step(
-    device: Device, rates: Mapping[str, float], options: AdamOptions,
-    weights: tuple[float, float, float], statistics: bool, triangles: int = 0,
-) -> None:  # fmt: skip
+    device: Device,
+    rates: Mapping[str, float],
+    options: AdamOptions,
+    weights: tuple[float, float, float],
+    statistics: bool,
+    triangles: int = 0,
+) -> None:
     """Send the numbers of the next step.
 
     rates by name; weights: of the limits of scale, distance and, divided by the number of
@@ -90,11 +97,17 @@ def upload_step(
     """
     scale_weight, distance_weight, opacity_weight = weights
     device.uniform(
-        "Step", rates=np.reshape([*(rates[name] for name in RATES), 0], (2, 4)),
-        **options._asdict(), log_beta1=math.log(options.beta1), log_beta2=math.log(options.beta2),
-        scale_weight=scale_weight, distance_weight=distance_weight, opacity_weight=opacity_weight,
-        statistics=statistics, triangles=triangles,
-    )  # fmt: skip
+        "Step",
+        rates=np.reshape([*(rates[name] for name in RATES), 0], (2, 4)),
+        **options._asdict(),
+        log_beta1=math.log(options.beta1),
+        log_beta2=math.log(options.beta2),
+        scale_weight=scale_weight,
+        distance_weight=distance_weight,
+        opacity_weight=opacity_weight,
+        statistics=statistics,
+        triangles=triangles,
+    )
 
 
 def optimize(
@@ -106,7 +119,8 @@ def optimize(
     limited: whether a limit of scale or distance has a weight. given: view, splats, face, wanted,
     gradients, which are changed by those of the limits, and screen, of `Rasterizer.backward`.
     """
-    buffer, all_tables = work.device.buffer, given | tables._asdict()
+    buffer = work.device.buffer
+    all_tables = given | tables._asdict()
     buffer("corrections", 4 * count)
     buffer("norms", 2)
     buffer("excess", 4 * -(-count // WORKGROUP) if limited else 0)
@@ -146,9 +160,12 @@ def splats_by_triangle(face: np.ndarray, triangles: int) -> np.ndarray:
 
 
 def step_offsets(
-    work: Recording, triangles: int, offsets: Mapping[str, OffsetTables],
-    signals: Mapping[str, Any], **given: Any,
-) -> None:  # fmt: skip
+    work: Recording,
+    triangles: int,
+    offsets: Mapping[str, OffsetTables],
+    signals: Mapping[str, Any],
+    **given: Any,
+) -> None:
     """Record a step of the triangles that have a wanted splat, with the numbers of `upload_step`.
 
     signals: of `Embedding`. given: view, wanted, and the splats' gradients, without those of the

@@ -20,7 +20,8 @@ from .layout import COUNTS, DIGIT_BITS, SORT_BLOCK, WORKGROUP
 
 INITIAL_PAIR_CAPACITY = 1 << 18
 """Pairs that a rasterizer has room for at first: 14 MB."""
-DEPTH_BITS, MAX_TILE_BITS = 32, 22
+DEPTH_BITS = 32
+MAX_TILE_BITS = 22
 Tables = dict[str, Any]
 
 
@@ -71,9 +72,14 @@ class Rasterizer:
         self.capacity = INITIAL_PAIR_CAPACITY
 
     def forward(
-        self, work: Recording, splats: SplatTable, frames: Any, options: ViewOptions, view: Any,
+        self,
+        work: Recording,
+        splats: SplatTable,
+        frames: Any,
+        options: ViewOptions,
+        view: Any,
         focus: Any = None,
-    ) -> Tables:  # fmt: skip
+    ) -> Tables:
         """Record a rendering; view: of `upload_view`; focus (N,): see `mark_focus`, if
         `options.focused`.
 
@@ -96,7 +102,9 @@ class Rasterizer:
         everything that follows is dispatched indirectly.
         """
         columns, rows = tile_grid(camera.width, camera.height)
-        tiles, room, buffer = columns * rows, self.capacity, self.device.buffer
+        tiles = columns * rows
+        room = self.capacity
+        buffer = self.device.buffer
         counts = counts_buffer(self.device)
         words = {"touched": tiles, "rendered": tiles, "wanted": count, "slots": 2 * count}
         words |= {"tile_range": 2 * tiles, "slot_tile": room, "slot_splat": room}
@@ -112,16 +120,23 @@ class Rasterizer:
         work.dispatch("tiles.count_pairs", count, tables)
         work.dispatch("tiles.add_pairs", (1, 1, 1), tables)
         work.dispatch("tiles.fill_pairs", count, tables)
-        keys, bits = tables["slot_tile"], tiles.bit_length()
+        keys = tables["slot_tile"]
+        bits = tiles.bit_length()
         by_tile = sort_keys(work, keys, room, bits, view, of_pairs=True)
         tables["pair_tile"], tables["pair_slot"] = by_tile
         work.dispatch("tiles.find_ranges", (counts, 4 * layout.PAIR_GROUPS), tables)
         return blend(work, camera, tables)
 
     def backward(
-        self, work: Recording, rendering: Tables, splats: SplatTable, camera: Camera, v_image: Any,
-        gradients: Any, v_transmittance: Any = None,
-    ) -> Any:  # fmt: skip
+        self,
+        work: Recording,
+        rendering: Tables,
+        splats: SplatTable,
+        camera: Camera,
+        v_image: Any,
+        gradients: Any,
+        v_transmittance: Any = None,
+    ) -> Any:
         """Record the gradient of a scalar with respect to the splats, from that with respect to the
         image.
 
@@ -153,9 +168,13 @@ class Rasterizer:
         self.device.upload("counts", np.zeros(COUNTS, np.uint32), "indirect")
 
     def upload_view(
-        self, splats: SplatTable, options: ViewOptions, to_world: np.ndarray | None = None,
-        first: int = 0, name: str = "view",
-    ) -> Any:  # fmt: skip
+        self,
+        splats: SplatTable,
+        options: ViewOptions,
+        to_world: np.ndarray | None = None,
+        first: int = 0,
+        name: str = "view",
+    ) -> Any:
         """Send the uniform of that name for the next rendering.
 
         to_world (3, 3): from the camera to the space of the harmonics' directions, where that is
@@ -165,14 +184,28 @@ class Rasterizer:
         to_world = camera.world_to_camera[:3, :3].T if to_world is None else to_world
         columns, rows = tile_grid(camera.width, camera.height)
         return self.device.uniform(
-            "View", name, to_world=np.c_[to_world, np.zeros(3)],
-            background=(*options.background, 0), fl_x=camera.fl_x, fl_y=camera.fl_y, cx=camera.cx,
-            cy=camera.cy, width=camera.width, height=camera.height, tiles_x=columns, tiles_y=rows,
-            splats=splats.count, coefficients=splats.coefficients,
-            degree=options.degree, depth_as_color=options.depth_as_color,
-            antialiased=options.antialiased, focused=options.focused,
-            ring=-(-options.reach // TILE), capacity=self.capacity, first=first,
-        )  # fmt: skip
+            "View",
+            name,
+            to_world=np.c_[to_world, np.zeros(3)],
+            background=(*options.background, 0),
+            fl_x=camera.fl_x,
+            fl_y=camera.fl_y,
+            cx=camera.cx,
+            cy=camera.cy,
+            width=camera.width,
+            height=camera.height,
+            tiles_x=columns,
+            tiles_y=rows,
+            splats=splats.count,
+            coefficients=splats.coefficients,
+            degree=options.degree,
+            depth_as_color=options.depth_as_color,
+            antialiased=options.antialiased,
+            focused=options.focused,
+            ring=-(-options.reach // TILE),
+            capacity=self.capacity,
+            first=first,
+        )
 
 
 def upload_splats(
@@ -226,11 +259,15 @@ def sort_keys(
     There are as many keys as splats, or as pairs, and room for so many. Returns buffers of the
     sorted keys and of their numbers before; `keys` may be overwritten.
     """
-    counts, buffer, blocks = counts_buffer(work.device), work.device.buffer, -(-room // SORT_BLOCK)
+    counts = counts_buffer(work.device)
+    buffer = work.device.buffer
+    blocks = -(-room // SORT_BLOCK)
     groups: Groups = (counts, 4 * layout.SORT_GROUPS) if of_pairs else (blocks, 1, 1)
     buffer("block_digits", blocks << DIGIT_BITS)
     buffer("digit_totals", 1 << DIGIT_BITS)
-    name, values = "pair" if of_pairs else "splat", counts  # the first pass reads no values
+    # the first pass reads no values
+    name = "pair" if of_pairs else "splat"
+    values = counts
     # The gradients of the pairs are written when the sorted tiles have been read.
     first = "pair_gradients" if of_pairs else "splat_keys"
     targets = [(buffer(first, room), buffer(f"{name}_numbers", room))]
@@ -238,9 +275,12 @@ def sort_keys(
         targets.append((keys, buffer(f"{name}_numbers 2", room)))
     for n, constants in enumerate(sort_passes(bits, of_pairs)):
         tables = {
-            "view": view, "keys": keys, "values": values,
-            "sorted_keys": targets[n % 2][0], "sorted_values": targets[n % 2][1],
-        }  # fmt: skip
+            "view": view,
+            "keys": keys,
+            "values": values,
+            "sorted_keys": targets[n % 2][0],
+            "sorted_values": targets[n % 2][1],
+        }
         work.dispatch("sort.count", groups, tables, **constants)
         work.dispatch("sort.place", 1 << DIGIT_BITS, tables, **constants)
         work.dispatch("sort.scatter", groups, tables, **constants)
@@ -257,7 +297,8 @@ def sort_passes(bits: int, of_pairs: bool) -> list[dict[str, Any]]:
 def blend(work: Recording, camera: Camera, tables: Tables) -> Tables:
     """Record the blending of the rendered tiles; image and pixels, which are added to the tables,
     are undefined in others."""
-    area, (columns, rows) = camera.width * camera.height, tile_grid(camera.width, camera.height)
+    area = camera.width * camera.height
+    (columns, rows) = tile_grid(camera.width, camera.height)
     buffer = work.device.buffer
     tables |= {"image": buffer("image", 3 * area), "pixels": buffer("pixels", 2 * area)}
     work.dispatch("blend.forward", Device.groups_of(columns * rows), tables)

@@ -45,7 +45,8 @@ def try_device(device: Device) -> Trial:
     """Render a cloud of splats and differentiate a random sum of its colors, on the device and on
     the CPU."""
     count, size = SOFTWARE_SIZE if device.is_software else SIZE
-    random, middle = np.random.default_rng(0), size / 2
+    random = np.random.default_rng(0)
+    middle = size / 2
     values = (
         random.normal(size=(count, 3)) * 0.4 + (0, 0, 2),
         random.normal(size=(count, 4)),
@@ -55,17 +56,22 @@ def try_device(device: Device) -> Trial:
     )
     splats = Parameters(*(value.astype(np.float32) for value in values))
     camera = Camera(size, size, 1.25 * size, 1.25 * size, middle, middle, np.eye(4))
-    face, frames = np.zeros(count, np.int32), frames_in_camera(WORLD, camera)
+    face = np.zeros(count, np.int32)
+    frames = frames_in_camera(WORLD, camera)
     v_image = np.random.default_rng(1).normal(size=(3, size, size)).astype(np.float32)
-    gradients, buffers = Parameters(*map(np.zeros_like, splats)), BufferPool()
+    gradients = Parameters(*map(np.zeros_like, splats))
+    buffers = BufferPool()
 
     def on_cpu() -> None:
         output = render_forward(splats, face, frames, DEGREE, buffers=buffers)
         render_backward(output, splats, face, frames, v_image, gradients, buffers=buffers)
 
-    rasterizer, table = Rasterizer(device), upload_splats(device, splats, face)
-    on_device, cotangents = upload_frames(device, frames), device.upload("v_image", v_image)
-    found, options = device.buffer("gradients", count * table.stride), ViewOptions(camera, DEGREE)
+    rasterizer = Rasterizer(device)
+    table = upload_splats(device, splats, face)
+    on_device = upload_frames(device, frames)
+    cotangents = device.upload("v_image", v_image)
+    found = device.buffer("gradients", count * table.stride)
+    options = ViewOptions(camera, DEGREE)
 
     def on_gpu() -> None:
         view = rasterizer.upload_view(table, options)
@@ -74,19 +80,22 @@ def try_device(device: Device) -> Trial:
             rasterizer.backward(work, rendering, table, camera, cotangents, found)
 
     on_cpu()
-    cpu_s, expected = _seconds_of(on_cpu, lambda: True, 1), splat_rows(gradients)
+    cpu_s = _seconds_of(on_cpu, lambda: True, 1)
+    expected = splat_rows(gradients)
     on_gpu()
     while not rasterizer.pairs_fit():
         on_gpu()
     device_s = _seconds_of(on_gpu, rasterizer.pairs_fit, 4)
-    lengths, got = np.linalg.norm(expected, axis=0), device.read(found, (count, table.stride))
+    lengths = np.linalg.norm(expected, axis=0)
+    got = device.read(found, (count, table.stride))
     errors = np.linalg.norm(got - expected, axis=0)[lengths > 0] / lengths[lengths > 0]
     return Trial(float(errors.max()), device_s, cpu_s)
 
 
 def _seconds_of(once: Callable[[], None], wait: Callable[[], bool], ahead: int) -> float:
     """Of one image; ahead: how many the host may be ahead of the device, as in training."""
-    count, began = 0, perf_counter()
+    count = 0
+    began = perf_counter()
     while not count or perf_counter() - began < SECONDS:
         for _ in range(ahead):
             once()

@@ -14,7 +14,8 @@ from . import splat_attributes as stored
 from .node_builder import NodeGroup, Nodes
 
 # Temporary attributes on the head's faces.
-_FRAME_ORIGIN, _FRAME_ROTATION = "stga_frame_origin", "stga_frame_rotation"
+_FRAME_ORIGIN = "stga_frame_origin"
+_FRAME_ROTATION = "stga_frame_rotation"
 _FRAME_SIZE = "stga_frame_size"
 
 
@@ -23,7 +24,8 @@ def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
     # Sampling a stored attribute is fast; sampling a field would evaluate it once per splat.
     p0, p1, p2 = nodes.triangle_corners()
     origin = nodes.scale(nodes.sum(p0, p1, p2), 1 / 3)
-    edge, side = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    edge = nodes.vector("SUBTRACT", p1, p0)
+    side = nodes.vector("SUBTRACT", p2, p0)
     if convention == "stga":  # axes [n(p0−o), ·, normal], o being the centroid
         # p0 − origin from the edges: exactly zero where the corners coincide, which a difference
         # to a rounded mean is not.
@@ -45,7 +47,8 @@ def _stored_frames(convention: str, nodes: Nodes, mesh: Any) -> Any:
 def _in_space(nodes: Nodes, frame: Callable[..., Any], vector: Any, convention: str) -> Any:
     """A vector of a frame's own axes and unit in object space, the frame's rotation and its scale.
     frame: name and data type -> the frame's attribute."""
-    scale, turn = frame(_FRAME_SIZE, "FLOAT"), frame(_FRAME_ROTATION, "QUATERNION")
+    scale = frame(_FRAME_SIZE, "FLOAT")
+    turn = frame(_FRAME_ROTATION, "QUATERNION")
     if convention == "stga":  # by the triangle's area, and that of the neutral one
         neutral = nodes.attribute(stored.NEUTRAL_AREA, "FLOAT")
         ratio = nodes.math("SQRT", nodes.math("DIVIDE", scale, neutral))
@@ -127,11 +130,13 @@ FACE_COLOR = "stga_face_color"  # sRGB, added to the colors of a triangle's spla
 
 def _deformed(nodes: Nodes, posed: Any, neutral: Any) -> Any:
     """The neutral mesh at the posed vertices, with deformation tensors (`avatar.strain`)."""
-    position, index = nodes.out("GeometryNodeInputPosition"), nodes.out("GeometryNodeInputIndex")
+    position = nodes.out("GeometryNodeInputPosition")
+    index = nodes.out("GeometryNodeInputIndex")
     moved = nodes.sample(posed, position, index, "FLOAT_VECTOR", "POINT")
     mesh = nodes.out("GeometryNodeSetPosition", {"Geometry": neutral, "Position": moved})
     p0, p1, p2 = nodes.triangle_corners()
-    e1, e2 = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
+    e1 = nodes.vector("SUBTRACT", p1, p0)
+    e2 = nodes.vector("SUBTRACT", p2, p0)
     products = (nodes.vector("DOT_PRODUCT", a, b) for a, b in ((e1, e1), (e1, e2), (e2, e2)))
     rest = nodes.attribute(stored.GRAM)
     change = nodes.vector("SUBTRACT", nodes.combine(*products), rest)
@@ -183,7 +188,8 @@ def _with_normal_change(nodes: Nodes, mesh: Any) -> Any:
     """The mesh from DEFORMED with the change of triangles' unit normals in object axes stored."""
     p0, p1, p2 = nodes.triangle_corners()
     edges = nodes.vector("SUBTRACT", p1, p0), nodes.vector("SUBTRACT", p2, p0)
-    normal, rest = nodes.vector("CROSS_PRODUCT", *edges), nodes.attribute(stored.NEUTRAL_NORMAL)
+    normal = nodes.vector("CROSS_PRODUCT", *edges)
+    rest = nodes.attribute(stored.NEUTRAL_NORMAL)
     length = nodes.vector("LENGTH", normal)
     has_area = nodes.compare("GREATER_EQUAL", length, MIN_SQUARED_NORMAL**0.5)
     unit = nodes.switch("VECTOR", has_area, (0, 0, 0), nodes.vector("NORMALIZE", normal))
@@ -218,7 +224,8 @@ def driven(name: str, convention: str) -> NodeGroup:
         offset = OFFSETS[name]
         signal = nodes.components(nodes.attribute(_SIGNAL.format(offset.signal)))
         names = [stored.DRIVEN_OFFSET.format(name, index) for index in range(len(signal))]
-        target, change = FACE_COLOR, _weighted(nodes, names, signal)
+        target = FACE_COLOR
+        change = _weighted(nodes, names, signal)
         if offset.target == SCALE:
             log_scale, _, _ = nodes.components(change)
             if convention == "stga":  # whose size is an area

@@ -12,7 +12,8 @@ from ... import __version__
 from ..compat import enable_nodes
 
 VERSION = "stga_version"  # property of our trees
-_COLUMN_WIDTH, _ROW_HEIGHT = 220.0, 200.0
+_COLUMN_WIDTH = 220.0
+_ROW_HEIGHT = 200.0
 
 
 def new_tree(name: str) -> bpy.types.NodeTree:
@@ -99,7 +100,8 @@ class Nodes:
     def finish(self, kind: str, inputs: Mapping[str, Any]) -> None:
         """Add the tree's output node and arrange all nodes in columns, by links to it."""
         sources = defaultdict[str, list[str]](list)
-        columns, waiting = dict[str, int](), [(self.add(kind, inputs).name, 0)]
+        columns = dict[str, int]()
+        waiting = [(self.add(kind, inputs).name, 0)]
         for link in self.tree.links:
             sources[link.to_node.name].append(link.from_node.name)
         while waiting:
@@ -107,7 +109,8 @@ class Nodes:
             if columns.get(name, -1) < column:
                 columns[name] = column
                 waiting += [(source, column + 1) for source in sources[name]]
-        rows, locations = Counter[int](), list[float]()
+        rows = Counter[int]()
+        locations = list[float]()
         for node in self.tree.nodes:
             column = columns.get(node.name, 0)
             locations += (-_COLUMN_WIDTH * column, -_ROW_HEIGHT * rows[column])
@@ -166,7 +169,8 @@ class Nodes:
         return [socket for socket in node.outputs if socket.enabled]
 
     def store(self, mesh: Any, name: str, value: Any, data_type: str, domain: str = "POINT") -> Any:
-        inputs, kind = {"Geometry": mesh, "Name": name, "Value": value}, {"data_type": data_type}
+        inputs = {"Geometry": mesh, "Name": name, "Value": value}
+        kind = {"data_type": data_type}
         return self.out("GeometryNodeStoreNamedAttribute", inputs, domain=domain, **kind)
 
     def sample(self, mesh: Any, value: Any, index: Any, kind: str, domain: str = "FACE") -> Any:
@@ -180,7 +184,8 @@ class Nodes:
 
     def triangle_corners(self) -> list[bpy.types.NodeSocket]:
         """Positions of each face's three corners, in the order of its vertices."""
-        position, found = self.out("GeometryNodeInputPosition"), []
+        position = self.out("GeometryNodeInputPosition")
+        found = []
         kind = {"data_type": "FLOAT_VECTOR", "domain": "POINT"}
         for number in range(3):
             corner = self.out("GeometryNodeCornersOfFace", {"Sort Index": number})

@@ -29,13 +29,16 @@ SH = "stga_sh_{}"  # sRGB coefficients, by index
 FACE = "stga_face"
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
-WORLD_ROTATION, WORLD_SCALE = "rotation", "scale"
+WORLD_ROTATION = "rotation"
+WORLD_SCALE = "scale"
 """As posed by the nodes, by the names that Blender's native splats have."""
 
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz
 # and xy yz zx.
 TENSOR_HALVES = ("stga_strain_squares", "stga_strain_products")
-GRAM, TENSOR, PLANE = "stga_gram", "stga_tensor_{}_{}", "stga_plane_{}_{}"
+GRAM = "stga_gram"
+TENSOR = "stga_tensor_{}_{}"
+PLANE = "stga_plane_{}_{}"
 NEUTRAL_NORMAL = "stga_neutral_normal"
 STRAIN_RANGE = "stga_strain_lowest", "stga_strain_highest"
 NORMAL_RANGE = "stga_normal_lowest", "stga_normal_highest"
@@ -64,7 +67,8 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     neutral: Attributes = {}  # what nodes need to have splats follow the deformation
     if avatar.follows_strain:
         basis = strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)
-        neutral[GRAM], neutral[NEUTRAL_NORMAL] = _vector(basis.gram), _vector(basis.normal.T)
+        neutral[GRAM] = _vector(basis.gram)
+        neutral[NEUTRAL_NORMAL] = _vector(basis.normal.T)
         neutral[NEUTRAL_AREA] = _number(areas)
         ends = basis.range.reshape(-1, 4, 3).swapaxes(0, 1)
         neutral |= {name: _vector(end) for name, end in zip(_RANGE, ends, strict=True)}
@@ -129,7 +133,8 @@ def write_attributes(mesh: Any, attributes: Attributes, domain: str) -> None:
 
 def read_splats(mesh: Any) -> Splats:
     """The splats in a splat object's mesh, with unit rotations, all bound to their triangles."""
-    count, sh = len(mesh.vertices), list[np.ndarray]()
+    count = len(mesh.vertices)
+    sh = list[np.ndarray]()
     while (name := SH.format(len(sh))) in mesh.attributes:
         sh.append(read_attribute(mesh, name))
     opacity = read_attribute(mesh, OPACITY).astype(np.float64)

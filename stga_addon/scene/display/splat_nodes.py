@@ -42,7 +42,8 @@ def _srgb_to_linear(nodes: Nodes, srgb: Any) -> Any:
     linear = []
     for value in nodes.components(clamped):
         base = nodes.math("DIVIDE", nodes.math("ADD", value, 0.055), 1.055)
-        line, power = nodes.math("DIVIDE", value, 12.92), nodes.math("POWER", base, 2.4)
+        line = nodes.math("DIVIDE", value, 12.92)
+        power = nodes.math("POWER", base, 2.4)
         is_bright = nodes.compare("GREATER_THAN", value, 0.04045)
         linear.append(nodes.switch("FLOAT", is_bright, line, power))
     return nodes.combine(*linear)
@@ -63,7 +64,9 @@ class _Formula:
     """Arithmetic of numbers and sockets, whose nodes are made once its socket is asked for."""
 
     def __init__(self, nodes: Nodes, operation: str = "", *values: Any) -> None:
-        self._nodes, self._operation, self._values = nodes, operation, values
+        self._nodes = nodes
+        self._operation = operation
+        self._values = values
 
     @cached_property
     def socket(self) -> Any:
@@ -84,7 +87,8 @@ def _band(degree: int, nodes: Nodes, direction: Any) -> Any:
     axes = _Formula(nodes), _Formula(nodes), _Formula(nodes)
     for axis, component in zip(axes, nodes.components(direction), strict=True):
         axis.socket = component
-    total, terms = (0, 0, 0), harmonics(*axes)
+    total = (0, 0, 0)
+    terms = harmonics(*axes)
     for index in range(degree**2, (degree + 1) ** 2):
         coefficient = nodes.attribute(stored.SH.format(index))
         total = nodes.vector("MULTIPLY_ADD", coefficient, terms[index].socket, total)
@@ -153,9 +157,11 @@ def _squared_distance(nodes: Nodes, point: Any, direction: Any) -> Any:
 def _emission(nodes: Nodes, attribute_type: str, density: Any) -> Any:
     """Light of the color and opacity that the splat nodes stored on points ("GEOMETRY") or
     instances ("INSTANCER"), times the density."""
-    color, opacity = nodes.add("ShaderNodeAttribute"), nodes.add("ShaderNodeAttribute")
+    color = nodes.add("ShaderNodeAttribute")
+    opacity = nodes.add("ShaderNodeAttribute")
     color.attribute_type = opacity.attribute_type = attribute_type
-    color.attribute_name, opacity.attribute_name = DISPLAY_COLOR, stored.OPACITY
+    color.attribute_name = DISPLAY_COLOR
+    opacity.attribute_name = stored.OPACITY
     shaders = [nodes.out("ShaderNodeBsdfTransparent")]
     shaders.append(nodes.out("ShaderNodeEmission", {"Color": color.outputs["Color"]}))
     alpha = nodes.math("MULTIPLY", opacity.outputs["Fac"], density)
@@ -244,9 +250,15 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
 
 
 def _native(
-    degree: int, nodes: Nodes, splats: Any, visible: Any, size: Any, color: Any,
-    view_dependent: Any, gray: Any,
-) -> bpy.types.NodeSocket:  # fmt: skip
+    degree: int,
+    nodes: Nodes,
+    splats: Any,
+    visible: Any,
+    size: Any,
+    color: Any,
+    view_dependent: Any,
+    gray: Any,
+) -> bpy.types.NodeSocket:
     """Points with what native splats are drawn from, harmonics in the object's axes. color:
     constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
@@ -376,12 +388,14 @@ def _add_interface(tree: bpy.types.NodeTree, embedded: bool, degree: int) -> Non
 def _build(nodes: Nodes, options: TreeOptions) -> None:
     inputs = nodes.add("NodeGroupInput").outputs
     splats = inputs["Geometry"]
-    opacity, threshold = nodes.attribute(stored.OPACITY, "FLOAT"), inputs[OPACITY_THRESHOLD]
+    opacity = nodes.attribute(stored.OPACITY, "FLOAT")
+    threshold = inputs[OPACITY_THRESHOLD]
     opaque = nodes.compare("GREATER_EQUAL", opacity, threshold)
     # Above 0 so that 0 % shows nothing, up to 100 so that 100 % shows all.
     random = nodes.out("FunctionNodeRandomValue", {"Min": 1e-6, "Max": 100.0}, data_type="FLOAT")
     visible = nodes.logic("AND", opaque, nodes.compare("LESS_EQUAL", random, inputs[PERCENTAGE]))
-    added, gray = None, False
+    added = None
+    gray = False
     if options.convention is None:
         splats = nodes.group(PLACED[None], splats)
         color = _color(nodes, inputs, None, options.degree)

@@ -52,7 +52,8 @@ def show_avatar(
     """Make a splat object that follows the evaluated mesh of the object `head`, which has the
     avatar's triangles, else StgaError. prepared: `avatar_attributes` of the avatar."""
     check_head(avatar, head)
-    prepared, title = prepared or avatar_attributes(avatar), name or f"{head.name} splats"
+    prepared = prepared or avatar_attributes(avatar)
+    title = name or f"{head.name} splats"
     local = [each for each in head.users_collection if each.library is None]
     collection = [*local, bpy.context.scene.collection][0]  # the scene's where all are linked
     splat_object = _splat_object(title, collection, _tree_options(avatar))
@@ -108,7 +109,8 @@ def update_splats(splat_object: Any, prepared: SplatAttributes) -> None:
 
 def store_light(splat_object: Any, avatar: Avatar) -> bool:
     """Give the object the light of the same avatar; False where it shows another one."""
-    neutral, count = _stored_neutral(splat_object), len(splat_object.data.vertices)
+    neutral = _stored_neutral(splat_object)
+    count = len(splat_object.data.vertices)
     if neutral is None or not has_triangles(neutral, avatar.faces) or count != len(avatar.splats):
         return False
     stored.write_light(neutral, avatar.light)

@@ -22,7 +22,8 @@ LAYER_TEXELS = 5
 MAX_INDEX = 1 << 24
 """float32, in which the shader reads indices, holds whole numbers up to here exactly."""
 
-MAX_SHORT_KEY, MAX_LONG_KEY = (1 << 16) - 1, (1 << 24) - (1 << 8)
+MAX_SHORT_KEY = (1 << 16) - 1
+MAX_LONG_KEY = (1 << 24) - (1 << 8)
 """Largest sort keys: of 16 bits, and of 24, as many as float32 has, less what rounding may add."""
 MAX_RELATIVE_STEP = 1e-5
 """Largest step of depth between short keys as a share of the nearest depth: 5 µm at 0.5 m."""
@@ -49,10 +50,12 @@ class StaticSplats:
         centers = np.empty((count, 4), np.float32)
         self.face = np.empty(count, np.intp)
         axes = np.empty((count, 3, 4), np.float32)
-        colors, self.rows = [], np.empty((len(layers), 4), np.float32)
+        colors = []
+        self.rows = np.empty((len(layers), 4), np.float32)
         begin = first_face = first_color = 0
         for index, layer in enumerate(layers):
-            splats, rows = layer.splats, slice(begin, begin + len(layer.splats))
+            splats = layer.splats
+            rows = slice(begin, begin + len(layer.splats))
             centers[rows, :3] = splats.xyz
             self.face[rows] = splats.face + first_face
             deviation = np.exp(splats.log_scale.astype(np.float64))[:, None]
@@ -60,10 +63,12 @@ class StaticSplats:
             axes[rows, :, :3] = np.swapaxes(turns * deviation, 1, 2)
             with np.errstate(over="ignore"):
                 axes[rows, 0, 3] = splats.opacities()
-            axes[rows, 1, 3], axes[rows, 2, 3] = random_percentage(len(splats)), index
+            axes[rows, 1, 3] = random_percentage(len(splats))
+            axes[rows, 2, 3] = index
             colors.append(np.pad(splats.sh, ((0, 0), (0, 0), (0, 1))).reshape(-1, 4))
             self.rows[index] = first_color, begin, splats.sh.shape[1], splats.sh_degree
-            begin, first_face = rows.stop, first_face + len(layer.frames.origin)
+            begin = rows.stop
+            first_face = first_face + len(layer.frames.origin)
             first_color += len(colors[-1])
         if max(first_color, 3 * count, 5 * first_face) > MAX_INDEX:
             raise StgaError(f"{count} splats are too many to display as trained; choose Points")
@@ -107,7 +112,8 @@ def posed_frames(
     is_relit = any(layer.relit is not None for layer in layers)
     texels = np.zeros((5 if is_relit else 4, count, 4), np.float32)
     depth_rows = np.empty((4, count), np.float32)
-    begin, base = 0, 0.0
+    begin = 0
+    base = 0.0
     for layer, block in zip(layers, blocks, strict=True):
         to_camera = view.camera.world_to_camera @ layer.to_world
         rows = slice(begin, begin + len(layer.frames.origin))
@@ -136,7 +142,9 @@ def drawing_order(
         np.take(row, static.face, out=product, mode="clip")  # row by row, which is fastest
         product *= coordinate
         depth += product
-    near, far, chosen = view.near - frames.base, view.far - frames.base, None
+    near = view.near - frames.base
+    far = view.far - frames.base
+    chosen = None
     if not (len(depth) and depth.min() >= near and depth.max() <= far):
         chosen = np.flatnonzero((depth >= near) & (depth <= far))
         depth = depth[chosen]
@@ -179,7 +187,10 @@ def table(static: StaticSplats, layers: Sequence[SceneLayer], view: View) -> np.
     return texels
 
 
-SURFACE_TEXELS, VERTEX_TEXELS, LIGHT_TEXELS, MAP_TEXELS = 4, 3, 4, 4
+SURFACE_TEXELS = 4
+VERTEX_TEXELS = 3
+LIGHT_TEXELS = 4
+MAP_TEXELS = 4
 """Of a splat, of a vertex, of a point that stands for a light, and of a shadow map."""
 RELIT_TEXELS = 14
 """Of a layer: share and factor of color; roughness, specular, first light and number of lights;
@@ -190,14 +201,18 @@ MAX_MAPS = 16
 
 def surface(layers: Sequence[SceneLayer]) -> np.ndarray:
     """(N · SURFACE_TEXELS, 4): constants of all splats; 0 for those that are not relit."""
-    parts, first = [], 0
+    parts = []
+    first = 0
     for layer in layers:
         texels = np.zeros((len(layer.splats), SURFACE_TEXELS, 4), np.float32)
         if layer.relit is not None:
             relighter = layer.relit.relighter
-            texels[:, 0, :3], texels[:, 0, 3] = relighter.diffuse_color, relighter.roughness
-            texels[:, 1, :3], texels[:, 1, 3] = relighter.irradiance, relighter.occlusion
-            texels[:, 2, :3], texels[:, 3, :3] = relighter.corners + first, relighter.weights
+            texels[:, 0, :3] = relighter.diffuse_color
+            texels[:, 0, 3] = relighter.roughness
+            texels[:, 1, :3] = relighter.irradiance
+            texels[:, 1, 3] = relighter.occlusion
+            texels[:, 2, :3] = relighter.corners + first
+            texels[:, 3, :3] = relighter.weights
             first += len(relighter.avatar.neutral)
         parts.append(texels.reshape(-1, 4))
     return np.concatenate(parts)
@@ -223,38 +238,47 @@ def relit_scene(layers: Sequence[SceneLayer]) -> RelitScene:
     """Pack poses and light of all layers; a share of 0: not relit. Lights beyond MAX_MAPS throw no
     shadow."""
     head = np.zeros((len(layers), RELIT_TEXELS, 4), np.float32)
-    vertices, maps = [np.zeros((0, 4), np.float32)], list[ShadowView]()
-    points, map_rows = list[np.ndarray](), list[np.ndarray]()
+    vertices = [np.zeros((0, 4), np.float32)]
+    maps = list[ShadowView]()
+    points = list[np.ndarray]()
+    map_rows = list[np.ndarray]()
     for block, layer in zip(head, layers, strict=True):
         if layer.relit is None:
             continue
-        lighting, relighter, mesh = layer.relit.lighting, layer.relit.relighter, layer.relit.mesh
+        lighting = layer.relit.lighting
+        relighter = layer.relit.relighter
+        mesh = layer.relit.mesh
         distant, kept = relighter.distant_in_head(mesh, lighting)
         texels = np.zeros((len(mesh), VERTEX_TEXELS, 4), np.float32)
-        texels[:, 0, :3], texels[:, 1, :3] = mesh, _normals(mesh, relighter.avatar.faces)
+        texels[:, 0, :3] = mesh
+        texels[:, 1, :3] = _normals(mesh, relighter.avatar.faces)
         arriving = np.maximum(relighter.light.transfer @ distant, 0)
         texels[:, 2, :3] = arriving[:, :3] + relighter.bounce.light(arriving[:, 3:])
         vertices.append(texels.reshape(-1, 4))
         block[0, 0] = lighting.mix if lighting.mode == "mix" else 1
         block[0, 1:] = 2**lighting.exposure / np.asarray(lighting.white)
-        first, bounds = head.size // 4 + LIGHT_TEXELS * sum(map(len, points)), head_bounds(mesh)
+        first = head.size // 4 + LIGHT_TEXELS * sum(map(len, points))
+        bounds = head_bounds(mesh)
         casters = *layer.relit.casters, *relighter.lash_casters(mesh, lighting)
         meshes = (mesh, relighter.avatar.faces), *((one.vertices, one.faces) for one in casters)
         count = 0
         for light in lighting.lights:
             number = -1
             if lighting.shadows and light.casts_shadow and len(maps) < MAX_MAPS:
-                view, number = light_view(bounds, light), len(maps)
+                view = light_view(bounds, light)
+                number = len(maps)
                 maps.append(ShadowView(view, meshes))
                 # The map's rows to the light's axes; scale, whether parallel, meters of a texel.
                 row = np.zeros((MAP_TEXELS, 4), np.float32)
-                row[:3, :3], row[:3, 3] = view.axes.T, -(view.origin @ view.axes)
+                row[:3, :3] = view.axes.T
+                row[:3, 3] = -(view.origin @ view.axes)
                 row[3] = view.scale, view.is_parallel, view.texel_m, 0
                 map_rows.append(row)
             points.append(light_rows(light, bounds.center, number))
             count += len(points[-1])
         block[1] = max(lighting.roughness, 0.05), lighting.specular, first, count
-        block[2, 3], block[3, :3] = relighter.light.damping, relighter.typical_albedo
+        block[2, 3] = relighter.light.damping
+        block[3, :3] = relighter.typical_albedo
         block[4:13, :3] = GLOSSY[:, None] * lighting.world
         block[13] = *kept.gain, kept.share
     head[:, 3, 3] = head.size // 4 + LIGHT_TEXELS * sum(map(len, points))

@@ -33,10 +33,14 @@ def has_gpu_context() -> bool:
         ctypes.CDLL("libGL.so.1")
     except OSError:
         return False
-    pointer, count, device = ctypes.c_void_p, ctypes.c_int(), ctypes.c_void_p()
-    egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = pointer, [pointer]
+    pointer = ctypes.c_void_p
+    count = ctypes.c_int()
+    device = ctypes.c_void_p()
+    egl.eglGetDisplay.restype = pointer
+    egl.eglGetDisplay.argtypes = [pointer]
     egl.eglInitialize.argtypes = [pointer, pointer, pointer]
-    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = pointer, [ctypes.c_char_p]
+    egl.eglGetProcAddress.restype = pointer
+    egl.eglGetProcAddress.argtypes = [ctypes.c_char_p]
     if egl.eglInitialize(egl.eglGetDisplay(None), None, None):
         return True
     names = b"eglQueryDevicesEXT", b"eglGetPlatformDisplayEXT"
@@ -72,10 +76,12 @@ class RelitTextures:
         """The textures by name, for a camera at eye (3,); before a framebuffer is bound."""
         relighters = tuple((id(x.splats), x.relit and id(x.relit.relighter)) for x in layers)
         if relighters != self._surface_of:
-            self.textures["surface"], self._surface_of = texture(surface(layers)), relighters
+            self.textures["surface"] = texture(surface(layers))
+            self._surface_of = relighters
         known = [layer.relit for layer in self._layers]
         if self._scene is None or known != [layer.relit for layer in layers]:
-            self._scene, self._layers = relit_scene(layers), tuple(layers)
+            self._scene = relit_scene(layers)
+            self._layers = tuple(layers)
             self.textures["vertices"] = texture(self._scene.vertices)
             self.textures["shadows"] = self._draw_maps(self._scene.maps)
         self.textures["lights"] = texture(with_eye(self._scene, layers, eye))
@@ -91,7 +97,9 @@ class RelitTextures:
             # a framebuffer does not keep its textures alive
             self._atlas = rows, depths, target, tested
         _, depths, target, _ = self._atlas
-        known, self._batches, shader = self._batches, {}, self._shader
+        known = self._batches
+        self._batches = {}
+        shader = self._shader
         with target.bind():
             target.clear(color=(shaders.NOTHING, 0.0, 0.0, 0.0), depth=1.0)
             gpu.state.depth_test_set("LESS_EQUAL")
@@ -99,7 +107,8 @@ class RelitTextures:
             gpu.state.blend_set("NONE")
             gpu.state.face_culling_set("NONE")
             for index, (view, meshes) in enumerate(maps):
-                x, y = MAP_SIZE * (index % MAP_COLUMNS), MAP_SIZE * (index // MAP_COLUMNS)
+                x = MAP_SIZE * (index % MAP_COLUMNS)
+                y = MAP_SIZE * (index // MAP_COLUMNS)
                 gpu.state.viewport_set(x, y, MAP_SIZE, MAP_SIZE)
                 shader.bind()
                 for name, axis in zip(("row_x", "row_y", "row_z"), view.axes.T, strict=True):
@@ -132,7 +141,8 @@ def _triangles(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 NO_BONES = np.zeros((0, 2, 4), np.float32)
 MAX_SHAPES = 256  # bones looked for in each pixel; those of a larger rig are covered by splats
-WIDTH_SHARE, MARGIN_PX = 0.15, 6.0
+WIDTH_SHARE = 0.15
+MARGIN_PX = 6.0
 """Half the width of a bone as a share of its length, and what is added for outlines."""
 
 
@@ -148,7 +158,8 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
     for rig, bone in ((each, bone) for each in rigs for bone in each.pose.bones):
         if bone.bone.hide or getattr(bone, "hide", False):
             continue
-        matrix, size = rig.matrix_world, rig.matrix_world.median_scale
+        matrix = rig.matrix_world
+        size = rig.matrix_world.median_scale
         shape = bone.custom_shape if rig.data.show_bone_custom_shapes else None
         if shape is None:
             radius = size * bone.length * WIDTH_SHARE
@@ -166,7 +177,8 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
     radius = np.array([bone[2] for bone in found[:MAX_SHAPES]])
     clip = ends @ np.array(region.perspective_matrix, np.float64).T
     before = (clip[..., 3] > 0).all(1)  # the camera; a bone with an end behind it is left out
-    clip, radius = clip[before], radius[before]
+    clip = clip[before]
+    radius = radius[before]
     half = np.array([width, height]) / 2
     shapes = np.zeros((len(clip), 2, 4), np.float32)
     shapes[:, 0] = ((clip[..., :2] / clip[..., 3:] + 1) * half).reshape(-1, 4)
@@ -176,7 +188,9 @@ def front_bones(space: Any, region: Any, width: int, height: int) -> np.ndarray:
 
 
 CLEAR = (0.0, 0.0, 0.0, 0.0)
-OUTSIDE, NEAR_BONES, BEHIND = 0, 1, 2
+OUTSIDE = 0
+NEAR_BONES = 1
+BEHIND = 2
 """Parts of what `SplatRenderer.composite` draws, as `composite_shader` numbers them."""
 COMPACT = "RGBA16F"  # format of the color target, beside EXACT
 DEPTH_FORMAT = "RG32F"
@@ -193,8 +207,10 @@ class SplatRenderer:
         self._splat_shader = shaders.splat_shader()
         self._composite_shader = shaders.composite_shader()
         self._relit: tuple[RelitTextures, Any] | None = None
-        self._screen, self._splat_rectangles = _rectangles(1), _rectangles(shaders.BLOCK_SPLATS)
-        self._color_format, self._short_keys = color_format, short_keys
+        self._screen = _rectangles(1)
+        self._splat_rectangles = _rectangles(shaders.BLOCK_SPLATS)
+        self._color_format = color_format
+        self._short_keys = short_keys
         self._static: StaticSplats | None = None
         self._static_textures: dict[str, Any] = {}
         self._layers: Sequence[SceneLayer] = ()
@@ -232,16 +248,22 @@ class SplatRenderer:
 
     def read(self) -> ComposedImage:
         """What was drawn last, in memory."""
-        color, depth = _pixels(self._color, 4)[::-1], _pixels(self._depth, 2)[::-1]
+        color = _pixels(self._color, 4)[::-1]
+        depth = _pixels(self._depth, 2)[::-1]
         alpha = np.ascontiguousarray(color[..., 3])
         rgb = np.ascontiguousarray(color[..., :3].transpose(2, 0, 1))
         return ComposedImage(rgb, alpha, depth[..., 0] / np.maximum(alpha, 1e-30))
 
     def composite(
-        self, corner: tuple[int, int], to_depth: tuple[float, ...],
-        behind: tuple[float, ...] | None = None, test_depth: bool = True,
-        bones: np.ndarray = NO_BONES, scene: Any = None, has_background: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        corner: tuple[int, int],
+        to_depth: tuple[float, ...],
+        behind: tuple[float, ...] | None = None,
+        test_depth: bool = True,
+        bones: np.ndarray = NO_BONES,
+        scene: Any = None,
+        has_background: bool = False,
+    ) -> None:
         """Put what was drawn last into the active framebuffer, which blends linearly and has the
         scene's depth.
 
@@ -294,7 +316,9 @@ class SplatRenderer:
             self._projected = dict(zip(PROJECTED_TEXTURES, made, strict=True))
             self._projected_target = gpu.types.GPUFrameBuffer(color_slots=tuple(made))
         self._layers = layers  # keeps the splats alive by whose identity `static_key` knows them
-        static, known, self._blocks = self._static, self._blocks, {}
+        static = self._static
+        known = self._blocks
+        self._blocks = {}
         for each in (layer.frames for layer in layers):  # computed again only where they are new
             self._blocks[id(each)] = known.get(id(each)) or (each, packing.frame_block(each))
         blocks = [self._blocks[id(layer.frames)][1] for layer in layers]
@@ -302,10 +326,12 @@ class SplatRenderer:
         order = packing.drawing_order(static, frames, view, self._short_keys)
         if not len(order):
             return 0
-        shader, relit = self._projection_shader, dict[str, Any]()
+        shader = self._projection_shader
+        relit = dict[str, Any]()
         if any(layer.relit is not None for layer in layers):
             self._relit = self._relit or (RelitTextures(), shaders.projection_shader(relit=True))
-            relit, shader = self._relit[0].update(layers, view.camera.position), self._relit[1]
+            relit = self._relit[0].update(layers, view.camera.position)
+            shader = self._relit[1]
         textures = self._static_textures | relit
         textures["orders"] = texture(order[:, None], "R32F")
         textures["frames"] = texture(frames.texels.reshape(-1, 4))

@@ -186,16 +186,22 @@ def shadow_map_shader() -> Any:
     lens: scale to device coordinates, whether parallel, least depth in perspective."""
     # In perspective, depth itself is interpolated as it should be: linear in space.
     rows = dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4")
-    outputs, passed = {"depth_out": "FLOAT"}, {"distance_out": ("smooth", "FLOAT")}
+    outputs = {"depth_out": "FLOAT"}
+    passed = {"distance_out": ("smooth", "FLOAT")}
     position = "VEC3", "position"
     return _shader(_MAP_VERTEX, _MAP_FRAGMENT, outputs, rows, (), "", passed, position)
 
 
 def _shader(
-    vertex: str, fragment: str, outputs: Mapping[str, str], constants: Mapping[str, str],
-    samplers: Sequence[str], defines: str, passed: Mapping[str, tuple[str, str]] | None = None,
+    vertex: str,
+    fragment: str,
+    outputs: Mapping[str, str],
+    constants: Mapping[str, str],
+    samplers: Sequence[str],
+    defines: str,
+    passed: Mapping[str, tuple[str, str]] | None = None,
     attribute: tuple[str, str] = ("VEC2", "corner"),
-) -> Any:  # fmt: skip
+) -> Any:
     """passed: name -> qualifier and type; attribute: of vertices, by default rectangles' at ±1."""
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(defines)
@@ -385,7 +391,8 @@ void main()
 def projection_shader(relit: bool = False) -> Any:
     """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`;
     others become 0. relit: for layers of which at least one is lit by the scene."""
-    defines, functions = _DEFINES, _HARMONICS
+    defines = _DEFINES
+    functions = _HARMONICS
     samplers: tuple[str, ...] = PACKED_TEXTURES
     if relit:
         defines += RELIT_DEFINES

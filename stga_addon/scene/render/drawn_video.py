@@ -26,7 +26,9 @@ class DrawnVideo:
     def __init__(
         self, folder: Path, output: Path, background: tuple[float, float, float] | None
     ) -> None:
-        self._folder, self._output, self._background = folder, output, background
+        self._folder = folder
+        self._output = output
+        self._background = background
         self._images: list[Path] = []
 
     def add(self, layers: Sequence[SceneLayer], camera: Camera) -> None:
@@ -56,20 +58,25 @@ class DrawnVideo:
         bpy.data.images.remove(size)
         video = self._folder / "video.mp4"
         scene = bpy.data.scenes.new("STGA video")
-        render, settings = scene.render, scene.render.image_settings
+        render = scene.render
+        settings = scene.render.image_settings
         try:
             strips = sequencer_strips(scene)
             strip = strips.new_image("images", str(self._images[0]), 1, 1)
             for image in self._images[1:]:
                 strip.elements.append(image.name)
-            scene.frame_start, scene.frame_end = 1, len(self._images)
+            scene.frame_start = 1
+            scene.frame_end = len(self._images)
             # even, as the format needs
-            render.resolution_x, render.resolution_y = width + width % 2, height + height % 2
+            render.resolution_x = width + width % 2
+            render.resolution_y = height + height % 2
             render.resolution_percentage = 100
             set_frames_per_second(scene, fps)
-            render.use_sequencer, render.use_file_extension = True, True
+            render.use_sequencer = True
+            render.use_file_extension = True
             choose_format(settings, "VIDEO", "FFMPEG")
-            render.ffmpeg.format, render.ffmpeg.codec = "MPEG4", "H264"
+            render.ffmpeg.format = "MPEG4"
+            render.ffmpeg.codec = "H264"
             render.ffmpeg.constant_rate_factor = "HIGH"
             scene.view_settings.view_transform = "Standard"
             render.filepath = str(video)

@@ -32,7 +32,9 @@ from .viewport_display import ENGINE, is_drawn_by_engine, region_view
 
 MAX_RENDER_TIME_S = 0.05
 """Time an image of a moving view may take; its resolution is adapted to that."""
-INITIAL_SCALE, MIN_SCALE = 0.5, 1 / 8  # fractions of the viewport's width and height in pixels
+# fractions of the viewport's width and height in pixels
+INITIAL_SCALE = 0.5
+MIN_SCALE = 1 / 8
 POLL_INTERVAL_S = 1 / 60
 
 
@@ -56,10 +58,12 @@ class ViewportRenderer:
     float32. image: the last one, or None; error: why the last request failed, else empty."""
 
     def __init__(self, render: Callable[[RenderRequest, float], np.ndarray]) -> None:
-        self._render, self._lock = render, threading.Lock()
+        self._render = render
+        self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._request: RenderRequest | None = None
-        self._moving_scale, self._has_update = INITIAL_SCALE, False
+        self._moving_scale = INITIAL_SCALE
+        self._has_update = False
         self.image: np.ndarray | None = None
         self.error = ""
 
@@ -90,7 +94,8 @@ class ViewportRenderer:
     def take_update(self) -> bool:
         """Whether `image` or `error` has changed since the last call."""
         with self._lock:
-            had_update, self._has_update = self._has_update, False
+            had_update = self._has_update
+            self._has_update = False
         return had_update
 
     def _run(self) -> None:
@@ -98,17 +103,20 @@ class ViewportRenderer:
         scale = 0.0
         while True:
             with self._lock:
-                last, request = request, self._request
+                last = request
+                request = self._request
                 if request is None or (request is last and scale == 1):
                     self._thread = None
                     return
                 scale = 1.0 if request is last else self._moving_scale
             begin = time.perf_counter()
             try:
-                self.image, self.error = self._render(request, scale), ""
+                self.image = self._render(request, scale)
+                self.error = ""
             except Exception as error:  # shown in the viewport: it would end the thread unseen
                 kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "
-                self.error, scale = f"{kind}{error}", 1.0
+                self.error = f"{kind}{error}"
+                scale = 1.0
             elapsed_s = time.perf_counter() - begin
             if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
                 factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
@@ -142,7 +150,8 @@ def _poll() -> float | None:
     """Redraw what has changed; seconds until the next call, None once no thread runs."""
     for renderer, known in list(_active.items()):
         # before the update is taken, so that the last one is not missed
-        is_busy, engine = renderer.is_busy(), known()
+        is_busy = renderer.is_busy()
+        engine = known()
         try:
             if engine is not None and renderer.take_update():
                 engine.tag_redraw()
@@ -160,7 +169,8 @@ class Rasterizer:
     (`find_device`) the main thread looks up, for render threads."""
 
     def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str]) -> None:
-        self._find_python, self._find_device = find_python, find_device
+        self._find_python = find_python
+        self._find_device = find_device
         self._python: str | StgaError = ""
         self._device = "auto"
         self.client = RenderClient(self.python, lambda: self._device)
@@ -191,11 +201,14 @@ class EngineViewport:
             image = rasterizer.client.compose(request.layers, request.camera.scaled(scale))
             return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
 
-        self._rasterizer, self.renderer, self.error = rasterizer, ViewportRenderer(render), ""
+        self._rasterizer = rasterizer
+        self.renderer = ViewportRenderer(render)
+        self.error = ""
         self._uploaded: np.ndarray | None = None
         self._texture: Any = None
         self._gpu: SplatRenderer | None = None
-        self._gpu_failed, self._cache = False, SplatCache()
+        self._gpu_failed = False
+        self._cache = SplatCache()
         self._layers: list[SceneLayer] | None = None
         self._posed: list[PosedSplats] = []
         self._posed_for = b""
@@ -225,14 +238,17 @@ class EngineViewport:
                 self._gpu.composite((x, y), to_depth, None if color is None else srgb(color))
         except Exception:  # from then on, the rasterizer renders
             traceback.print_exc()
-            self._gpu, self._gpu_failed, self._layers = None, True, None
+            self._gpu = None
+            self._gpu_failed = True
+            self._layers = None
         return not self._gpu_failed
 
     def request_image(self, context: Any, depsgraph: Any) -> bool:
         """Request an image of the current view; whether it differs from the last one requested."""
         region = context.region
         if not self._update_layers(context, depsgraph):
-            self.renderer.error, self.renderer.image = self.error, None
+            self.renderer.error = self.error
+            self.renderer.image = None
             return False
         camera = viewport_camera(context.region_data, region.width, region.height)
         # Posed again for another camera where highlights depend on it.
@@ -257,7 +273,9 @@ class EngineViewport:
             except StgaError as error:
                 self.error = str(error)
                 return False
-            self._posed, self._posed_for, self.error = [], b"", ""
+            self._posed = []
+            self._posed_for = b""
+            self.error = ""
         return True
 
     def draw_image(self, image: np.ndarray, width: int, height: int) -> None:
@@ -297,7 +315,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     def render(self, depsgraph: Any) -> None:
         # x, y, width, height in pixels of the render region, from below, rounded as by Blender
-        message, border = "", (0, 0, self.resolution_x, self.resolution_y)
+        message = ""
+        border = (0, 0, self.resolution_x, self.resolution_y)
         r = depsgraph.scene.render
         if r.use_border:
             edges = [r.border_min_x, r.border_min_y, r.border_max_x, r.border_max_y]
@@ -307,7 +326,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         try:
             passes = self._render(depsgraph, border)
         except Exception as error:  # raised, it would not stop Blender from saving an empty image
-            passes, message = {}, str(error)
+            passes = {}
+            message = str(error)
             if not isinstance(error, StgaError):
                 traceback.print_exc()
                 message = f"Unexpected error ({type(error).__name__}: {error}); see the console"
@@ -325,7 +345,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     def _render(self, depsgraph: Any, border: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
         """Values (H, W, channels) of each pass, top row first."""
-        scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
+        scene = depsgraph.scene
+        size = (self.resolution_x, self.resolution_y)
         camera_object = scene.camera.evaluated_get(depsgraph) if scene.camera else None
         camera = render_camera(camera_object, depsgraph, *size, border)
         layers = visible_layers(depsgraph, SplatCache())
@@ -352,7 +373,8 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         self._viewport.update(depsgraph)
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
-        viewport, region = self._viewport, context.region
+        viewport = self._viewport
+        region = context.region
         renderer = viewport.renderer
         if viewport.draw(context, depsgraph):
             self.update_stats("", viewport.error)

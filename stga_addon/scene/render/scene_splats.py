@@ -48,7 +48,8 @@ class SplatCache:
         if key not in self._stored:
             current = {_key(mesh) for mesh in bpy.data.meshes}
             self._keep(lambda known: known in current)
-            is_avatar, mesh = tags.CONVENTION in splat_object, splat_object.data
+            is_avatar = tags.CONVENTION in splat_object
+            mesh = splat_object.data
             self._stored[key] = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
         return self._stored[key]
 
@@ -72,9 +73,11 @@ def _key(mesh: Any) -> tuple[Any, ...]:
 
 
 def visible_layers(
-    depsgraph: Any, cache: SplatCache, view: Any = None,
+    depsgraph: Any,
+    cache: SplatCache,
+    view: Any = None,
     is_wanted: Callable[[Any], bool] = lambda splat_object: True,
-) -> list[SceneLayer]:  # fmt: skip
+) -> list[SceneLayer]:
     """The splats of each visible object at the depsgraph's frame. view: the SpaceView3D to draw,
     None for a final image. Raises StgaError where a head is gone or has other triangles."""
     visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]
@@ -85,7 +88,8 @@ def visible_layers(
     for each, matrix in shown:
         if each.get(tags.KIND) != tags.SPLATS or not is_wanted(each):
             continue
-        stored, to_world = cache.get(each), np.array(matrix, np.float64)
+        stored = cache.get(each)
+        to_world = np.array(matrix, np.float64)
         # From the evaluated object: its settings may be animated.
         settings = display_settings(splat_modifier(each.evaluated_get(depsgraph)))
         if isinstance(stored, Splats):
@@ -151,7 +155,8 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
     if scene.camera is None:
         raise StgaError("The scene has no camera, from which highlights are seen")
     camera = scene.camera.evaluated_get(depsgraph).matrix_world
-    eye, relit = layers[0].eye_in_avatar(np.array(camera)[:3, 3]), layers[0].relit
+    eye = layers[0].eye_in_avatar(np.array(camera)[:3, 3])
+    relit = layers[0].relit
     color = relit.relighter.radiance(relit.mesh, eye, relit.lighting, relit.casters)
     values = flat_floats(with_alpha(np.maximum(color, 0)))
     write_attributes(splat_object.data, {RELIT_COLOR: ("FLOAT_COLOR", "color", values)}, "POINT")
@@ -162,7 +167,9 @@ def relight_frame(splat_object: Any, scene: Any) -> None:
 def level_exposure(cache: SplatCache) -> float | None:
     """Stops at which the scene's light makes its avatars as bright as recorded; None without
     light."""
-    depsgraph, recorded, lit = bpy.context.evaluated_depsgraph_get(), 0.0, 0.0
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    recorded = 0.0
+    lit = 0.0
     for layer in visible_layers(depsgraph, cache):
         if (relit := layer.relit) is not None:
             eye = relit.mesh.mean(0) + np.array((0.0, 0.0, 1.0))

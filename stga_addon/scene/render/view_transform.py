@@ -17,9 +17,15 @@ from ..light import world_light
 
 DATA_VIEWS = ("Raw", "False Color", "Log", "Filmic Log")
 """View transforms that show data instead of colors; they are left alone."""
-GRID, INVERSE_GRID = 41, 25  # samples along an axis of the table measured, and of its inverse
-DARKEST, BRIGHTEST = -14.0, 6.0  # range of the scene-linear samples, in log2; the first sample is 0
-INVERSE_STEPS, MAX_STEP, DAMPING = 15, 4, 1e-3
+# samples along an axis of the table measured, and of its inverse
+GRID = 41
+INVERSE_GRID = 25
+# range of the scene-linear samples, in log2; the first sample is 0
+DARKEST = -14.0
+BRIGHTEST = 6.0
+INVERSE_STEPS = 15
+MAX_STEP = 4
+DAMPING = 1e-3
 """Of finding a color of the inverse; steps in samples, damped where colors hardly change."""
 CHUNK = 1 << 16  # pixels converted at a time, which bounds the memory
 MAIN_THREAD_TIMEOUT_S = 10.0
@@ -33,7 +39,8 @@ class InverseView:
     whose red, green and blue are `axis` (G,)."""
 
     def __init__(self, axis: np.ndarray, shown: np.ndarray) -> None:
-        self._axis, self._shown = axis, shown
+        self._axis = axis
+        self._shown = shown
         nodes = np.linspace(0, 1, INVERSE_GRID) ** 2  # denser in the dark
         target = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), -1).reshape(-1, 3)
         # Places in samples that show `target` best, by damped Gauss-Newton steps.
@@ -156,7 +163,8 @@ def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
             with suppress(TypeError):  # there is no such one for this display
                 setattr(copy.view_settings, name, getattr(scene.view_settings, name))
         choose_format(settings, "IMAGE", "PNG")
-        settings.color_mode, settings.color_depth = "RGB", "16"
+        settings.color_mode = "RGB"
+        settings.color_depth = "16"
         copy.render.dither_intensity = 0
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "shown.png"
@@ -172,18 +180,23 @@ def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
 
 
 def combined(
-    rgb: np.ndarray, alpha: np.ndarray, background: tuple[float, ...] | None,
+    rgb: np.ndarray,
+    alpha: np.ndarray,
+    background: tuple[float, ...] | None,
     view: InverseView | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W),
     alpha (H, W). Splats are blended in sRGB, so `background`, scene-linear (3,), is added as the
     sRGB that it is shown as; None: transparent, colors as if they covered their pixels. view: None
     where the view transform shows sRGB as it is."""
     to_linear = srgb_to_linear if view is None else view.to_linear
-    image, covered = np.zeros((*alpha.shape, 4), np.float32), alpha > 0
-    color, share = rgb[:, covered].T, alpha[covered][:, None]
+    image = np.zeros((*alpha.shape, 4), np.float32)
+    covered = alpha > 0
+    color = rgb[:, covered].T
+    share = alpha[covered][:, None]
     if background is None:
-        image[covered, :3], image[..., 3] = to_linear(color / share) * share, alpha
+        image[covered, :3] = to_linear(color / share) * share
+        image[..., 3] = alpha
     else:
         linear = np.array(background, np.float32)
         behind = linear_to_srgb(np.clip(linear, 0, 1)) if view is None else view.show(linear)

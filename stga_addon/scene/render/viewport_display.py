@@ -35,7 +35,8 @@ class GpuDisplay:
         self._scene_target: Any = None
         self._renderer: SplatRenderer | None = None
         self.cache = SplatCache()
-        self.problem, self.failed = "", False
+        self.problem = ""
+        self.failed = False
 
     def start(self) -> None:
         """Draw from now on; without a window there is nothing to draw in."""
@@ -53,7 +54,9 @@ class GpuDisplay:
 
     def forget(self) -> None:
         """Free what belongs to the open file."""
-        self._renderer, self._scene_target, self.cache = None, None, SplatCache()
+        self._renderer = None
+        self._scene_target = None
+        self.cache = SplatCache()
         self.problem = self.problem if self.failed else ""
 
     def _before(self) -> None:
@@ -82,7 +85,8 @@ class GpuDisplay:
         if is_drawn_by_engine(context):
             return
         # and nothing else, although its depth buffer has other displays of splats
-        space, everything = context.space_data, is_engine_view(context)
+        space = context.space_data
+        everything = is_engine_view(context)
         layers = visible_layers(
             context.evaluated_depsgraph_get(),
             self.cache,
@@ -149,7 +153,10 @@ def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float
     # A view that is not in perspective is drawn from this far behind Blender's camera.
     pose = np.linalg.inv(np.array(region.view_matrix, np.float64))
     back = float((camera.world_to_camera @ pose[:, 3])[2])
-    a, b, c, d = matrix[2, 3], -matrix[2, 2], matrix[3, 3], -matrix[3, 2]
+    a = matrix[2, 3]
+    b = -matrix[2, 2]
+    c = matrix[3, 3]
+    d = -matrix[3, 2]
     near, far = (back + (a - c * end) / (d * end - b) for end in (-1.0, 1.0))
     planes = np.array(region.clip_planes, np.float64) if region.use_clip_planes else None
     to_depth = (a - b * back, b, c - d * back, d)
@@ -160,7 +167,8 @@ def expected_background(context: Any) -> tuple[tuple[float, ...] | None, bool]:
     """sRGB color that the viewport shows behind everything, None where that is not one color; and
     whether it draws that itself. Splats are blended in sRGB, viewports blend linearly: soft edges
     are right over what is known to be behind them."""
-    shading, scene = context.space_data.shading, context.scene
+    shading = context.space_data.shading
+    scene = context.scene
     theme = context.preferences.themes[0].view_3d.space.gradients
     if shading.type in ("SOLID", "WIREFRAME"):
         source = shading.background_type

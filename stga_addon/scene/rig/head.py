@@ -149,7 +149,8 @@ def add_rig(
     modifiers = (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig)
     modifier = next(modifiers, None) or head.modifiers.new(rig.name, "ARMATURE")
     modifier.object = rig
-    modifier.use_vertex_groups, modifier.use_bone_envelopes = True, False
+    modifier.use_vertex_groups = True
+    modifier.use_bone_envelopes = False
     modifier.use_deform_preserve_volume = False
     _draw_at_skin(rig, basis, model.weights, joint_positions(model, basis))
     head.pop(keyframes.ARKIT_MAP, None)  # of shape keys that an earlier import had
@@ -160,10 +161,13 @@ def add_rig(
     corrected = np.array(correctives == "all") | (joint_angles(frames) > MIN_JOINT_ANGLE_DEG)
     # Nine per joint, each driven by one entry of the joint's rotation minus identity.
     for feature in range(model.posedirs.shape[2]):
-        joint, row, column = 1 + feature // 9, feature % 9 // 3, feature % 3
+        joint = 1 + feature // 9
+        row = feature % 9 // 3
+        column = feature % 3
         if not corrected[joint] or not model.posedirs[:, :, feature].any():
             continue
-        name, path = f"pose_{JOINTS[joint]}_{row}{column}", rotation_path(JOINTS[joint])
+        name = f"pose_{JOINTS[joint]}_{row}{column}"
+        path = rotation_path(JOINTS[joint])
         _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
         expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
         rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
@@ -227,13 +231,16 @@ def _place_armature(
         for link in [name] if last == name else [keyframes.parent_bone(name), name, last]:
             edited = armature.edit_bones.new(link)
             # Along +Y without roll, its rest orientation is the identity: its rotation is FLAME's.
-            edited.head, edited.tail, edited.roll = (x, y, z), (x, y + BONE_LENGTH, z), 0.0
+            edited.head = (x, y, z)
+            edited.tail = (x, y + BONE_LENGTH, z)
+            edited.roll = 0.0
             edited.parent = armature.edit_bones[above] if above else None
             above = link
     bpy.ops.object.mode_set(mode="OBJECT")
     layer.objects.active = active
     bpy.data.objects.remove(temporary)
-    visible, hidden = armature.collections.new("Joints"), armature.collections.new("Helpers")
+    visible = armature.collections.new("Joints")
+    hidden = armature.collections.new("Helpers")
     hidden.is_visible = False
     for made in armature.bones:
         (visible if made.name in JOINTS else hidden).assign(made)
@@ -244,7 +251,8 @@ def _place_armature(
         bone.matrix_basis = Matrix()
     for joint, name in enumerate(JOINTS):
         bone = rig.pose.bones[name]
-        bone.rotation_mode, bone.lock_location = "QUATERNION", [joint > 0] * 3
+        bone.rotation_mode = "QUATERNION"
+        bone.lock_location = [joint > 0] * 3
         for earlier in (keyframes.sum_property(name), keyframes.offset_property(name)):
             rig.pop(earlier, None)
     return rig
@@ -262,12 +270,14 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
         shape = bpy.data.objects.new(BONE_SHAPE, mesh)  # in no collection
         shape.hide_viewport = shape.hide_render = True  # but in one where the head is appended
     for name in ("jaw", "left_eye", "right_eye"):
-        joint, bone = JOINTS.index(name), rig.pose.bones[name]
+        joint = JOINTS.index(name)
+        bone = rig.pose.bones[name]
         moved = basis[weights[:, joint] > 0.5] - joints[joint]
         rig.data.bones[name].hide = not len(moved)  # a jaw that a shape moves
         if len(moved):
             tip = Vector(moved[(moved[:, 2] - np.abs(moved[:, 0])).argmax()])
-            bone.custom_shape, bone.use_custom_shape_bone_size = shape, False
+            bone.custom_shape = shape
+            bone.use_custom_shape_bone_size = False
             bone.custom_shape_scale_xyz = (tip.length,) * 3
             bone.custom_shape_rotation_euler = tip.to_track_quat("Y", "Z").to_euler()
 
@@ -275,7 +285,8 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
 def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:
     key = head.shape_key_add(name=name, from_mix=False)
     key.points.foreach_set("co", flat_floats(vertices))
-    key.slider_min, key.slider_max = -limit, limit
+    key.slider_min = -limit
+    key.slider_max = limit
     key.value = 0.0  # a key made from a script starts at 1
 
 
@@ -300,7 +311,8 @@ def _drive_joint(
         for axis, terms in enumerate(_significant_terms(directions))
         for start in range(0, len(terms), len(VARIABLES))
     ]
-    sums, offset = keyframes.sum_property(joint), keyframes.offset_property(joint)
+    sums = keyframes.sum_property(joint)
+    offset = keyframes.offset_property(joint)
     if parts:
         rig[sums] = [0.0] * len(parts)
     summands: list[list[str]] = [[], [], []]
@@ -316,6 +328,7 @@ def _drive_joint(
         if paths:
             variables = dict(zip(VARIABLES, ((rig, path) for path in paths), strict=False))
             total = "+".join(variables)
-            moved, deform = keyframes.parent_bone(joint), keyframes.deform_bone(joint)
+            moved = keyframes.parent_bone(joint)
+            deform = keyframes.deform_bone(joint)
             add_driver(rig, location_path(moved), axis, total, variables)
             add_driver(rig, location_path(deform), axis, f"-({total})", variables)

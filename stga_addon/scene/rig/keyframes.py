@@ -22,7 +22,9 @@ from ..objects import Warn, log_warning
 
 IDENTITY_SLIDERS = 10
 # Prefixes of shape keys; the number after one is the component, or the timestep.
-EXPRESSION_KEY, IDENTITY_KEY, OFFSET_KEY = "expr_", "identity_", "offset_t"
+EXPRESSION_KEY = "expr_"
+IDENTITY_KEY = "identity_"
+OFFSET_KEY = "offset_t"
 EXPRESSION_NAMES = "stga_expressions"
 """Property of a head whose expressions have ARKit's names: these, separated by commas."""
 # The joints that each part of a motion (`flame.motion.PARTS`) rotates.
@@ -30,11 +32,14 @@ EYES = ("left_eye", "right_eye")
 PART_JOINTS = {"jaw": ("jaw",), "eyes": EYES, "neck": ("neck",), "head": ("root",)}
 offset_key = f"{OFFSET_KEY}{{:05d}}".format
 # The hidden bones of a displaced joint: that moves its bone, and that its vertices follow.
-parent_bone, deform_bone = "{}_joint".format, "{}_deform".format
+parent_bone = "{}_joint".format
+deform_bone = "{}_deform".format
 # Properties of the rig: partial sums of a displacement by sliders, and that by tracked offsets.
-sum_property, offset_property = "stga_{}_sums".format, "stga_{}_offset".format
+sum_property = "stga_{}_sums".format
+offset_property = "stga_{}_offset".format
 # Data paths of a property, of bones, and of a shape key.
-property_path, key_value_path = '["{}"]'.format, 'key_blocks["{}"].value'.format
+property_path = '["{}"]'.format
+key_value_path = 'key_blocks["{}"].value'.format
 rotation_path = 'pose.bones["{}"].rotation_quaternion'.format
 location_path = 'pose.bones["{}"].location'.format
 
@@ -90,9 +95,13 @@ MAX_SLIDER = 10.0  # the widest range that Blender allows a shape key's value: -
 
 
 def key_motion(
-    head: Any, rig: Any, at: np.ndarray, frames: Sequence[FlameFrame],
-    parts: Sequence[str] = tuple(PARTS), warn: Warn = log_warning,
-) -> None:  # fmt: skip
+    head: Any,
+    rig: Any,
+    at: np.ndarray,
+    frames: Sequence[FlameFrame],
+    parts: Sequence[str] = tuple(PARTS),
+    warn: Warn = log_warning,
+) -> None:
     """Add keyframes of the parts of `frames` to the actions of rig and shape keys. at: the Blender
     frame of each, ascending. A slider that never moves gets one keyframe."""
     if "expression" in parts:
@@ -176,7 +185,8 @@ def key_current_pose(head: Any, rig: Any, frame: int) -> None:
     rig.pose.bones["root"].keyframe_insert("location", frame=frame)
     for curve in action_curves(head.data.shape_keys):
         name = curve.data_path.partition('"')[2].partition('"')[0]
-        value, before = head.data.shape_keys.key_blocks[name].value, curve.evaluate(frame)
+        value = head.data.shape_keys.key_blocks[name].value
+        before = curve.evaluate(frame)
         is_expression = name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
         if not is_expression or abs(value - before) < UNCHANGED:
             continue
@@ -206,7 +216,8 @@ def head_shapes(sequence: FlameSequence, found: HeadMap) -> tuple[np.ndarray, np
     frames = found.frames(Performance(np.arange(len(weights)), weights, np.zeros(3), 1.0))
     person = partial(flame_forward, sequence.model, sequence.shape)
     meshes = np.stack([person(frame, sequence.static_offset) for frame in frames])
-    alone, pairs = meshes[1 : 1 + COUNT] - meshes[0], meshes[1 + COUNT :] - meshes[0]
+    alone = meshes[1 : 1 + COUNT] - meshes[0]
+    pairs = meshes[1 + COUNT :] - meshes[0]
     pairs = pairs - alone[PRODUCTS] - alone[JAW_OPEN]
     pairs[PRODUCTS == JAW_OPEN] = 0
     return alone, pairs
@@ -247,9 +258,13 @@ def shape_key_names(head: Any) -> dict[int, str]:
 
 
 def apply_weights(
-    owner: Any, paths: dict[int, str], weights: np.ndarray, start: int, name: str,
+    owner: Any,
+    paths: dict[int, str],
+    weights: np.ndarray,
+    start: int,
+    name: str,
     as_strip: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """Animate the values at `paths` (column -> data path) of `owner` by weights (T, 52), a row per
     frame from `start` on, and keep the previous animation as `motion.apply_motion` does. Raises
     StgaError as `check_keyable` does."""

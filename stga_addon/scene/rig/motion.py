@@ -27,11 +27,16 @@ MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sam
 
 
 def apply_motion(
-    head: Any, frames: Sequence[FlameFrame], start: int, name: str,
-    parts: Sequence[str] = tuple(PARTS), as_strip: bool = False, warn: Warn = log_warning,
+    head: Any,
+    frames: Sequence[FlameFrame],
+    start: int,
+    name: str,
+    parts: Sequence[str] = tuple(PARTS),
+    as_strip: bool = False,
+    warn: Warn = log_warning,
     tracked: tuple[FlameSequence, Sequence[float]] | None = None,
     weights: np.ndarray | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
     The previous animation is kept: the new action is a copy of it in which the parts are replaced,
     or a strip in the NLA editor, with effect only where it lasts. tracked: the sequence that the
@@ -53,7 +58,8 @@ def apply_motion(
         replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
         for each in frames
     ]
-    keys, has_expression = head.data.shape_keys, "expression" in parts
+    keys = head.data.shape_keys
+    has_expression = "expression" in parts
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
     owners += [keys] if has_expression else []
@@ -82,7 +88,8 @@ def sample_motion(
     `warn` reports where FLAME's parameters do not reproduce the mesh in the scene. Raises StgaError
     where the head has no rig."""
     frames: list[FlameFrame] = []
-    shape, largest_error = sequence.shape.copy(), 0.0
+    shape = sequence.shape.copy()
+    largest_error = 0.0
     for _ in iterate_frames(numbers):
         frame = sample_pose(head, sequence.model)
         if not frames:
@@ -110,7 +117,8 @@ def sample_pose(head: Any, model: FlameModel) -> FlameFrame:
     for name, parent in zip(JOINTS, model.parents.tolist(), strict=True):
         above = rotations[JOINTS[parent]].transposed() if parent >= 0 else Matrix.Identity(3)
         vectors[name] = to_axis_angle(np.array((above @ rotations[name]).to_quaternion()))
-    root, above = bones["root"], bones.get(keyframes.parent_bone("root"))
+    root = bones["root"]
+    above = bones.get(keyframes.parent_bone("root"))
     rest = root.bone.head_local if above is None else above.matrix.translation
     offsets = [
         value * (key_points(key) - key_points(key.relative_key))
@@ -160,7 +168,8 @@ class LivePose:
 
     def __init__(self, head: Any, rig: Any) -> None:
         """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
-        self._head, self._rig = head.name, None if rig is None else rig.name
+        self._head = head.name
+        self._rig = None if rig is None else rig.name
         self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
         self._sliders = np.empty(len(keys), np.float32)
@@ -253,7 +262,8 @@ def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
         bone: to_axis_angle(np.array(rig.pose.bones[bone].rotation_quaternion))
         for bone in ("jaw", "left_eye", "right_eye")
     }
-    expr, zero = _expression(head, len(trained.middle["face"]), turns), np.zeros(3)
+    expr = _expression(head, len(trained.middle["face"]), turns)
+    zero = np.zeros(3)
     eyes = np.concatenate([turns["left_eye"], turns["right_eye"]])
     frame = FlameFrame(expr, zero, zero, turns["jaw"], zero, eyes)
     return {part: float(values[0]) for part, values in outside([frame], trained).items()}

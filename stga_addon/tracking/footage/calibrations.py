@@ -70,7 +70,8 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
     """Shots of a calibration file or folder, and a sentence about cameras that it lists without a
     pose. image_size: size of the images of a label, which RealityCapture does not write. Raises
     StgaError that names file and field."""
-    suffix, without_pose = path.suffix.lower(), list[str]()
+    suffix = path.suffix.lower()
+    without_pose = list[str]()
     if isdir(path) and (splits := transforms_files(path)):
         shots = [shot for name in splits for shot in read_nerfstudio(name)]
     elif isdir(path) and (colmap := find_colmap(path)):
@@ -95,7 +96,8 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
         raise StgaError(f"{path}: has no camera with a pose")
     if not without_pose:
         return shots, ()
-    names, more = ", ".join(without_pose[:NAMES_IN_WARNING]), len(without_pose) - NAMES_IN_WARNING
+    names = ", ".join(without_pose[:NAMES_IN_WARNING])
+    more = len(without_pose) - NAMES_IN_WARNING
     rest = f" and {more} more" if more > 0 else ""
     return shots, (f"{path}: left out cameras without a pose: {names}{rest}",)
 
@@ -107,15 +109,19 @@ def read_nerfstudio(path: Path) -> list[Shot]:
     """Entries of a transforms file; `file_path` is the label. Raises StgaError. Their `cy` means
     what VHAP's does where frames have `timestep_index`, else what OpenCV's does
     (`read_transforms`)."""
-    frames, shots = read_transforms(path, "opencv"), []
+    frames = read_transforms(path, "opencv")
+    shots = []
     is_vhap = any(frame.record.has("timestep_index") for frame in frames)
     is_timed = is_vhap or any(frame.record.has("keyframe") for frame in frames)
     for frame in frames:
-        view, record, name = frame.view, frame.record, frame.camera_id
+        view = frame.view
+        record = frame.record
+        name = frame.camera_id
         camera = with_principal_point(view.camera, frame.principal, "vhap" if is_vhap else "opencv")
         if name is None and record.has("camera_index"):
             name = f"{view.camera_index:02d}"
-        timestep, mask = view.timestep if is_timed else None, view.mask
+        timestep = view.timestep if is_timed else None
+        mask = view.mask
         mask = mask or record.path_of("mask_path")  # nerfstudio's
         fps = record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None
         keeps_world = record.values.get("world") == "keep"
@@ -127,7 +133,8 @@ def read_nerfstudio(path: Path) -> list[Shot]:
 def _lens(record: Record) -> Lens:
     """The lens of a frame."""
     usual = "OPENCV_FISHEYE" if record.values.get("is_fisheye") else "OPENCV"
-    model, known = record.values.get("camera_model") or usual, PERSPECTIVE_MODELS + FISHEYE_MODELS
+    model = record.values.get("camera_model") or usual
+    known = PERSPECTIVE_MODELS + FISHEYE_MODELS
     if model not in known:
         one = f"{shorten(model)} is not one of {', '.join(known)}"
         raise StgaError(f"{record.where('camera_model')}: {one}")
@@ -158,14 +165,16 @@ def read_metashape(path: Path) -> Found:
     file, sensor or camera."""
     root = read_xml(path)
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-    cameras, shots = list(root.iter("camera")), []
+    cameras = list(root.iter("camera"))
+    shots = []
     aligned = [camera for camera in cameras if camera.find("transform") is not None]
     components = {camera.get("component_id") for camera in aligned}
     if len(components) > 1:
         parts = f"its cameras are in {len(components)} components"
         raise StgaError(f"{path}: {parts}; expected one alignment of all")
     for camera in aligned:
-        label, number = camera.get("label") or "", camera.get("sensor_id")
+        label = camera.get("label") or ""
+        number = camera.get("sensor_id")
         where = f"{path}: camera {shorten(label)}"
         if number not in sensors:
             raise StgaError(f"{where}: sensor_id {shorten(number)} is no sensor of the file")
@@ -229,7 +238,8 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
     """One shot a line, labelled with the image's name. Columns: name, x, y, alt, heading, pitch,
     roll (degrees), f (35 mm film), and, where they are there, px, py (shares of the longer side),
     k1 to k4, t1, t2. Raises StgaError that names file and line."""
-    lines, rows = csv.reader(io.StringIO(read_text(path))), []
+    lines = csv.reader(io.StringIO(read_text(path)))
+    rows = []
     try:
         rows = [(lines.line_num, line) for line in lines if line]
     except csv.Error as error:
@@ -254,7 +264,8 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
         turns = axis_angle_matrices(np.array([[0, 0, -heading], [pitch, 0, 0], [0, roll, 0]]))
         rotation = GL_TO_CV[:3, :3] @ (turns[0] @ turns[1] @ turns[2]).T
         position = np.array([values[name] for name in ("x", "y", "alt")])
-        size, scale = image_size(label), max(image_size(label))
+        size = image_size(label)
+        scale = max(image_size(label))
         focal = values["f"] / FILM_WIDTH_MM * scale
         cx, cy = (values.get(name, 0.0) * scale for name in ("px", "py"))
         center = size[0] / 2 + cx, size[1] / 2 + cy
@@ -267,7 +278,8 @@ def read_realitycapture_csv(path: Path, image_size: ImageSize) -> list[Shot]:
 def read_realitycapture_xmp(paths: Iterable[Path], image_size: ImageSize) -> Found:
     """One shot an XMP file with a pose, labelled with its name; and the names of those without.
     Raises StgaError that names file and field."""
-    shots, without_pose = [], []
+    shots = []
+    without_pose = []
     for path in sorted(paths):
         fields: dict[str, str] = {}  # as attributes or as elements, by the version
         for element in read_xml(path).iter():
@@ -298,12 +310,14 @@ def _xmp_shot(path: Path, fields: dict[str, str], size: tuple[int, int]) -> Shot
         raise StgaError(f"{path}: {unknown}; {advice}")
     if "FocalLength35mm" not in fields:
         raise StgaError(f"{path}: xcr:FocalLength35mm is missing")
-    scale, share = max(size), values("FocalLength35mm", "")[0] / FILM_WIDTH_MM
+    scale = max(size)
+    share = values("FocalLength35mm", "")[0] / FILM_WIDTH_MM
     lens = _realitycapture_lens(coefficients, values("Skew", "0")[0] / share if share else 0.0)
     focal = share * scale, share * scale * values("AspectRatio", "1")[0]
     cx, cy = (values(f"PrincipalPoint{axis}", "0")[0] * scale for axis in "UV")
     rotation = np.array(values("Rotation", "", 9)).reshape(3, 3)  # world to camera, OpenCV axes
-    position, center = np.array(values("Position", "", 3)), (size[0] / 2 + cx, size[1] / 2 + cy)
+    position = np.array(values("Position", "", 3))
+    center = (size[0] / 2 + cx, size[1] / 2 + cy)
     camera = pinhole(size, focal, center, rotation, position, str(path))
     return Shot(path.stem, camera, lens, str(path))
 

@@ -25,15 +25,19 @@ LENSES: dict[str, tuple[int, int, int, Callable[..., Lens]]] = {
     "OPENCV": (4, 2, 4, lambda k1, k2, *p: Lens(radial=(k1, k2), tangential=p)),
     "OPENCV_FISHEYE": (5, 2, 4, lambda *k: Lens("fisheye", radial=k)),
     "FULL_OPENCV": (
-        6, 2, 8, lambda k1, k2, p1, p2, k3, *k: Lens(
-            radial=(k1, k2, k3), rational=k, tangential=(p1, p2)
-        ),
+        6,
+        2,
+        8,
+        lambda k1, k2, p1, p2, k3, *k: Lens(radial=(k1, k2, k3), rational=k, tangential=(p1, p2)),
     ),
     "FOV": (7, 2, 1, lambda omega: Lens("field of view", parameter=omega)),
     "SIMPLE_RADIAL_FISHEYE": (8, 1, 1, lambda k: Lens("fisheye", radial=(k,))),
     "RADIAL_FISHEYE": (9, 1, 2, lambda *k: Lens("fisheye", radial=k)),
     "THIN_PRISM_FISHEYE": (
-        10, 2, 8, lambda k1, k2, p1, p2, k3, k4, sx1, sy1: Lens(
+        10,
+        2,
+        8,
+        lambda k1, k2, p1, p2, k3, k4, sx1, sy1: Lens(
             "fisheye", radial=(k1, k2, k3, k4), tangential=(p1, p2), prism=(sx1, 0.0, sy1, 0.0)
         ),
     ),
@@ -41,7 +45,7 @@ LENSES: dict[str, tuple[int, int, int, Callable[..., Lens]]] = {
     "DIVISION": (13, 2, 1, lambda k: Lens("division", parameter=k)),
     "SIMPLE_FISHEYE": (14, 1, 0, lambda: Lens("fisheye")),
     "FISHEYE": (15, 2, 0, lambda: Lens("fisheye")),
-}  # fmt: skip
+}
 """Model -> its number in binary files, numbers of its focal lengths (of both axes, or of each) and
 of its distortion coefficients, and the lens that these make."""
 
@@ -60,10 +64,13 @@ def read_colmap(folder: Path) -> list[Shot]:
     if suffix is None:
         expected = "expected cameras.bin and images.bin, or .txt"
         raise StgaError(f"{folder}: is no COLMAP model; {expected}")
-    cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    cameras_file = folder / f"cameras{suffix}"
+    images_file = folder / f"images{suffix}"
     text = _text_cameras, _text_images
     read_cameras, read_images = text if suffix == ".txt" else (_binary_cameras, _binary_images)
-    cameras, images, shots = dict(read_cameras(cameras_file)), read_images(images_file), []
+    cameras = dict(read_cameras(cameras_file))
+    images = read_images(images_file)
+    shots = []
     for name, pose, camera in sorted(images, key=lambda image: natural_order(image[0])):
         where = f"{images_file}: image {shorten(name)}"
         if camera not in cameras:
@@ -108,7 +115,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 def _text_cameras(path: Path) -> Iterator[_Camera]:
     """Lines `number model width height parameters…`."""
     for number, line in _lines(path):
-        words, where = line.split(), f"{path}: line {number}"
+        words = line.split()
+        where = f"{path}: line {number}"
         if not words:
             continue
         if len(words) < 5:
@@ -122,7 +130,8 @@ def _text_images(path: Path) -> Iterator[_Image]:
     """Two lines an image: `number qw qx qy qz tx ty tz camera name`, then its points."""
     lines = _lines(path)
     for number, line in lines:
-        words, where = line.split(maxsplit=9), f"{path}: line {number}"
+        words = line.split(maxsplit=9)
+        where = f"{path}: line {number}"
         if not words:
             continue
         if len(words) < 10:
@@ -145,7 +154,9 @@ class _Cursor:
     """Position in the bytes of a file; reads little-endian values one after another."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.offset = path, read_bytes(path), 0
+        self.path = path
+        self.data = read_bytes(path)
+        self.offset = 0
 
     def unpack(self, layout: str) -> tuple[float, ...]:
         start = self.offset
@@ -158,7 +169,8 @@ class _Cursor:
         self.offset += size
 
     def name(self) -> str:
-        start, end = self.offset, self.data.find(b"\0", self.offset)
+        start = self.offset
+        end = self.data.find(b"\0", self.offset)
         self.advance((end if end >= 0 else len(self.data)) + 1 - start)
         name = self.data[start:end]
         return name.decode("utf-8", errors="replace")  # where it is not, no image has that name

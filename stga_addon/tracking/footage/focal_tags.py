@@ -14,9 +14,15 @@ from ...capture.images import FORMATS
 
 FULL_FRAME_DIAGONAL_MM = 43.27
 """Of 36 x 24 mm; equivalent lengths have one angle of view over the diagonal (CIPA DCG-001)."""
-MIN_EQUIVALENT_MM, MAX_EQUIVALENT_MM = 5.0, 2000.0
-EXIF, EQUIVALENT, FOCAL, PER_UNIT, UNIT = 0x8769, 0xA405, 0x920A, 0xA20E, 0xA210
-WIDTH, HEIGHT = 0xA002, 0xA003
+MIN_EQUIVALENT_MM = 5.0
+MAX_EQUIVALENT_MM = 2000.0
+EXIF = 0x8769
+EQUIVALENT = 0xA405
+FOCAL = 0x920A
+PER_UNIT = 0xA20E
+UNIT = 0xA210
+WIDTH = 0xA002
+HEIGHT = 0xA003
 """Tags of EXIF 2.32: the directory, FocalLengthIn35mmFilm, FocalLength, FocalPlaneXResolution and
 its unit; and the size of the picture as taken."""
 UNITS_MM = {2: 25.4, 3: 10.0}
@@ -25,7 +31,8 @@ MAX_ASPECT_DIFFERENCE = 0.01
 EQUIVALENT_KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 VALUE_FORMATS = {21: ">i", 22: ">I", 23: ">f", 24: ">d", 67: ">i", 77: ">I"}
 """Well-known types of QuickTime's metadata, but for text."""
-MAX_BOXES, MAX_MOVIE_BYTES = 1000, 1 << 26
+MAX_BOXES = 1000
+MAX_MOVIE_BYTES = 1 << 26
 
 
 def photo_focal(path: Path, width: int, height: int) -> float | None:
@@ -33,7 +40,8 @@ def photo_focal(path: Path, width: int, height: int) -> float | None:
     try:
         with Image.open(path, formats=FORMATS) as image:
             tags = image.getexif().get_ifd(EXIF)
-        equivalent, focal = float(tags.get(EQUIVALENT) or 0), float(tags.get(FOCAL) or 0)
+        equivalent = float(tags.get(EQUIVALENT) or 0)
+        focal = float(tags.get(FOCAL) or 0)
         taken = sorted((float(tags.get(WIDTH) or width), float(tags.get(HEIGHT) or height)))
         shown = sorted((float(width), float(height)))
         if abs(taken[0] * shown[1] / (taken[1] * shown[0]) - 1) > MAX_ASPECT_DIFFERENCE:
@@ -77,7 +85,8 @@ def _boxes(data: bytes | mmap.mmap, start: int = 0) -> Iterator[tuple[bytes, int
         size, kind = struct.unpack_from(">I4s", data, start)
         head = 8
         if size == 1:  # a long one
-            (size,), head = struct.unpack_from(">Q", data, start + 8), 16
+            (size,) = struct.unpack_from(">Q", data, start + 8)
+            head = 16
         if size < head:
             return
         yield kind, start + head, start + size
@@ -97,7 +106,9 @@ def _equivalent(data: bytes) -> float | None:
             number = struct.pack(">I", keys.index(EQUIVALENT_KEY) + 1)
             entries = parts.get(b"ilst", b"")
             for item in (entries[f:e] for k, f, e in _boxes(entries) if k == number):
-                form, value = struct.unpack_from(">I", item, 8)[0], item[16:]  # of its box "data"
+                # of its box "data"
+                form = struct.unpack_from(">I", item, 8)[0]
+                value = item[16:]
                 if form in VALUE_FORMATS:
                     return float(struct.unpack_from(VALUE_FORMATS[form], value)[0])
                 text = re.match(rb"[0-9.]+", value)

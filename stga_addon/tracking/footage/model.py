@@ -99,7 +99,8 @@ class FootageCamera:
     def mask(self, timestep: int) -> np.ndarray | None:
         """The undistorted mask (H, W) uint8, 255 inside; None without. Raises as `image`."""
         if timestep in self.mattes:
-            name, matte = self.name, self.mattes[timestep]
+            name = self.name
+            matte = self.mattes[timestep]
             return read_mask(View(timestep, 0, self.camera, name, Path(name), matte))
         mask = self.frames.mask(timestep)
         return None if mask is None else self._undistorted(mask)

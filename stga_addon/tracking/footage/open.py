@@ -35,9 +35,12 @@ USUAL_VIEW_DEG = 65.0
 
 
 def open_footage(
-    path: Path, cameras: Path | None = None, frames: FrameRange = ALL_FRAMES,
-    focal: float | None = None, mattes: Path | None = None,
-) -> Footage:  # fmt: skip
+    path: Path,
+    cameras: Path | None = None,
+    frames: FrameRange = ALL_FRAMES,
+    focal: float | None = None,
+    mattes: Path | None = None,
+) -> Footage:
     """Open footage: cameras and file names now, frames when they are asked for.
 
     path     folder with an image, a folder of images or a video for each camera; or one video
@@ -108,7 +111,8 @@ def _masked(
     camera: FootageCamera, recorded: Sources, given: Sources, single: bool
 ) -> FootageCamera:
     """The camera with masks of a folder. single: it needs no folder of its own."""
-    frames, masks = camera.frames, {}
+    frames = camera.frames
+    masks = {}
     files = [*(given.folders.get("", []) if single else ()), *given.folders.get(camera.name, [])]
     by_number = {frame_number(path): path for path in files}
     for timestep in camera.timesteps:
@@ -130,9 +134,11 @@ def _masked(
 
 
 def _rig(
-    sources: Sources, shots: Mapping[str, Shot], sequences: Mapping[str, Sequence],
+    sources: Sources,
+    shots: Mapping[str, Shot],
+    sequences: Mapping[str, Sequence],
     frames: FrameRange,
-) -> Footage:  # fmt: skip
+) -> Footage:
     videos = [own for own in sequences.values() if isinstance(own, Video)]
     warnings = [warning for video in videos for warning in video.warnings]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
@@ -141,7 +147,8 @@ def _rig(
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
-    width, height = shot.camera.width, shot.camera.height
+    width = shot.camera.width
+    height = shot.camera.height
     for path, size in frames.sizes():
         if size != (width, height):
             expected = f"but {shot.where} has {width} x {height}"
@@ -152,20 +159,25 @@ def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
 
 def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) -> Footage:
     """Footage of one camera without a calibration; its world is the camera's, y up."""
-    names, root = sorted({*sources.videos, *sources.folders}), sources.root
+    names = sorted({*sources.videos, *sources.folders})
+    root = sources.root
     if len(names) != 1:
         found = f"{len(names)} cameras" if names else "neither images nor videos"
         expected = f"expected {EXPECTED}, or one camera"
         raise StgaError(f"{root}: has {found} and no calibration; {expected}")
-    sequence, known = open_sequence(sequence_files(sources, names[0])), "given"
+    sequence = open_sequence(sequence_files(sources, names[0]))
+    known = "given"
     width, height = sequence_size(sequence)
     if focal is None:
         if isinstance(sequence, Video):
-            focal, known = video_focal(sequence.path, width, height), "file"
+            focal = video_focal(sequence.path, width, height)
+            known = "file"
         else:
-            focal, known = photo_focal(sequence[0], width, height), "file"
+            focal = photo_focal(sequence[0], width, height)
+            known = "file"
     if focal is None:
-        focal, known = usual_focal(width, height), "usual"
+        focal = usual_focal(width, height)
+        known = "usual"
     if focal < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {focal:g}")
     camera = camera_from_gl(np.eye(4), width, height, focal, focal, width / 2, height / 2)
@@ -185,7 +197,8 @@ def usual_focal(width: int, height: int) -> float:
 def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
     """Shots with their image, after which they are named, and which shows the only timestep; no two
     of the same pose: the images of a camera that stands still are a sequence."""
-    found, poses = [], dict[bytes, Shot]()
+    found = []
+    poses = dict[bytes, Shot]()
     for shot in shots:
         other = poses.setdefault(_pose(shot), shot)
         if other is not shot:

@@ -16,7 +16,9 @@ from .shots import Shot
 from .sources import Sources, frame_number
 from .video import Video, VideoFrames, opened_video, read_video
 
-SOUND_RATE_HZ, SOUND_HOP = 16000, 32  # Sound is compared by its loudness every 2 ms
+# Sound is compared by its loudness every 2 ms
+SOUND_RATE_HZ = 16000
+SOUND_HOP = 32
 MIN_OVERLAP_S = 1.0  # Shared time below which two recordings are not compared
 MOTION_SIZE = 32  # Pixels of an image's sides, in which motion is measured
 MIN_CORRELATION = 0.2  # Correlation below which nothing is shared
@@ -67,9 +69,11 @@ def sequence_size(sequence: Sequence) -> tuple[int, int]:
 
 
 def synchronized(
-    sequences: Mapping[str, Sequence], shots: Mapping[str, Shot], sources: Sources,
+    sequences: Mapping[str, Sequence],
+    shots: Mapping[str, Shot],
+    sources: Sources,
     frames: FrameRange,
-) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:  # fmt: skip
+) -> tuple[dict[str, Frames], float | None, tuple[str, ...]]:
     """Frames of each camera, those of the videos a second (None where none says a plausible
     number), and a sentence for each clock that was compared.
 
@@ -77,7 +81,8 @@ def synchronized(
     no frame are left out. Raises StgaError where a camera has fewer frames than another, lacks one
     in between, is of another size or has another rate, and where clocks cannot be compared.
     """
-    fps, sentences = _frames_per_second(sequences), tuple[str, ...]()
+    fps = _frames_per_second(sequences)
+    sentences = tuple[str, ...]()
     if frames.sync != "none":
         videos = {name: own for name, own in sequences.items() if isinstance(own, Video)}
         if len(videos) < max(2, len(sequences)) or fps is None:
@@ -88,7 +93,8 @@ def synchronized(
     unknown = set(frames.offsets) - set(sequences)
     if unknown:
         raise StgaError(f"Offset for camera {min(unknown)}: expected one of {', '.join(sequences)}")
-    recorded, offsets = {}, {name: frames.offsets.get(name, 0) for name in sequences}
+    recorded = {}
+    offsets = {name: frames.offsets.get(name, 0) for name in sequences}
     for name, own in sequences.items():  # timestep -> number of the frame, the first of several
         shown = own.timesteps if isinstance(own, Video) else range(len(own))
         pairs = reversed(list(enumerate(shown)))
@@ -105,7 +111,8 @@ def synchronized(
         if isinstance(own, Video):
             result[name] = VideoFrames(own, numbers)
             continue
-        views, shot = {}, shots[name]
+        views = {}
+        shot = shots[name]
         for t, number in numbers.items():
             mask = sources.mask_of(own[number])
             views[t] = View(t, 0, shot.camera, shot.label, own[number], mask)
@@ -184,7 +191,8 @@ def clock_offsets(
     first, *others = videos
     reference, start = read(videos[first])
     rate = SOUND_RATE_HZ / SOUND_HOP if by == "sound" else fps
-    offsets, sentences = {first: 0}, []
+    offsets = {first: 0}
+    sentences = []
     for name in others:
         signal, begins = read(videos[name])
         lag, correlation, distinction = best_lag(reference, signal, rate)
@@ -213,9 +221,11 @@ def best_lag(reference: np.ndarray, signal: np.ndarray, rate: float) -> tuple[in
         """Σ a[t] b[t + lag] for each lag, from −(N − 1) on."""
         return np.fft.irfft(np.fft.rfft(a[::-1], size) * np.fft.rfft(b, size), size)
 
-    one, other = np.ones(len(reference)), np.ones(len(signal))
+    one = np.ones(len(reference))
+    other = np.ones(len(signal))
     count = np.maximum(np.round(sums(one, other)), 1)
-    mean, means = sums(reference, other) / count, sums(one, signal) / count
+    mean = sums(reference, other) / count
+    means = sums(one, signal) / count
     shared = sums(reference, signal) / count - mean * means
     spread = sums(reference**2, other) / count - mean**2
     spread = spread * (sums(one, signal**2) / count - means**2)
@@ -235,7 +245,8 @@ def _loudness(video: Video) -> tuple[np.ndarray, float]:
     with opened_video(video.path) as container:
         if not container.streams.audio:
             raise StgaError(f"{video.path}: has no sound; expected it for --sync sound")
-        stream, pictures = container.streams.audio[0], container.streams.video[0]
+        stream = container.streams.audio[0]
+        pictures = container.streams.video[0]
         resampler = AudioResampler(format="flt", layout="mono", rate=SOUND_RATE_HZ)
         parts: list[np.ndarray] = [np.zeros(0, np.float32)]
         begin = None
@@ -254,7 +265,8 @@ def _motion(video: Video) -> tuple[np.ndarray, float]:
     from PIL import Image
 
     frames = VideoFrames(video, dict(enumerate(range(len(video.times)))))
-    changes, last = [0.0], None
+    changes = [0.0]
+    last = None
     for number in frames.timesteps:
         image = Image.fromarray(frames.image(number)).convert("L")
         gray = np.asarray(image.resize((MOTION_SIZE,) * 2, Image.Resampling.BOX), np.float64)

@@ -17,7 +17,8 @@ from ...files import read_bytes
 
 MIN_RADIUS = 1e-9
 """Below it, an angle and its tangent are the same number; and parameters have no effect."""
-ZOOM_RANGE, ZOOM_STEPS = (0.5, 2.0), 30
+ZOOM_RANGE = (0.5, 2.0)
+ZOOM_STEPS = 30
 """Of the pinhole's focal length over the lens's: a fisheye's rim leaves few pixels inside."""
 BORDER_POINTS = 33
 """Points along a side of the image at which it is checked that all of it was recorded."""
@@ -63,7 +64,9 @@ class Lens:
         square = x * x + y * y
         factor = np.polyval((*self.radial[::-1], 1.0), square)
         factor = factor / np.polyval((*self.rational[::-1], 1.0), square)
-        (p1, p2), (s1, s2, s3, s4), (b1, b2) = self.tangential, self.prism, self.affine
+        (p1, p2) = self.tangential
+        (s1, s2, s3, s4) = self.prism
+        (b1, b2) = self.affine
         u = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x) + square * (s1 + s2 * square)
         v = y * factor + p1 * (square + 2 * y * y) + 2 * p2 * x * y + square * (s3 + s4 * square)
         return np.stack([u + b1 * u + b2 * v, v], axis=-1)
@@ -124,7 +127,8 @@ def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | Non
 def _is_inside(recorded: Camera, lens: Lens, zoom: float) -> bool:
     """Whether the pinhole's border was recorded, and the lens spreads all rays to it outward."""
     width, height, *intrinsics = _intrinsics(recorded)
-    focal, center = intrinsics[:2], intrinsics[2:]
+    focal = intrinsics[:2]
+    center = intrinsics[2:]
     along = np.linspace(0, 1, BORDER_POINTS)
     edge = np.concatenate([np.stack([along, side], axis=1) for side in (0 * along, 0 * along + 1)])
     pixels = np.concatenate([edge, edge[:, ::-1]]) * [width, height]
@@ -219,30 +223,44 @@ def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[
 
 
 def pinhole(
-    size: tuple[float, float], focal: tuple[float, float], center: tuple[float, float],
-    rotation: np.ndarray, position: np.ndarray, where: str,
-) -> Camera:  # fmt: skip
+    size: tuple[float, float],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    rotation: np.ndarray,
+    position: np.ndarray,
+    where: str,
+) -> Camera:
     """Camera of a calibration. size, focal, center: (x, y) in pixels, the center from the top-left
     corner. rotation (3, 3) from world to OpenCV's camera axes; position (3,) of the camera in the
     calibration's world, whose unit is free. Raises StgaError, beginning with `where`, for a size,
     focal length, principal point or pose that no camera has."""
-    (width, height), (fl_x, fl_y), (cx, cy), limit = size, focal, center, MAX_FOCAL_PIXELS
+    (width, height) = size
+    (fl_x, fl_y) = focal
+    (cx, cy) = center
+    limit = MAX_FOCAL_PIXELS
     bounded = np.abs(rotation).max() <= 1 + ROTATION_TOLERANCE  # else, products overflow
     skewed = np.abs(rotation @ rotation.T - np.eye(3)).max() if bounded else np.inf
     for fits, expected in (
         (is_image_size(width, height), f"an image size in pixels, not {width:g} x {height:g}"),
-        (all(1 <= value <= limit for value in focal),
-         f"a focal length of 1 to 1e7 pixels, not {fl_x:g}, {fl_y:g}"),
-        (all(abs(value) <= limit for value in center),  # nor NaN
-         f"a principal point within {limit:g} pixels, not {cx:g}, {cy:g}"),
-        ((np.abs(position) <= MAX_POSITION).all(),
-         f"a camera within {MAX_POSITION:g} units of the origin"),
+        (
+            all(1 <= value <= limit for value in focal),
+            f"a focal length of 1 to 1e7 pixels, not {fl_x:g}, {fl_y:g}",
+        ),
+        (
+            all(abs(value) <= limit for value in center),  # nor NaN
+            f"a principal point within {limit:g} pixels, not {cx:g}, {cy:g}",
+        ),
+        (
+            (np.abs(position) <= MAX_POSITION).all(),
+            f"a camera within {MAX_POSITION:g} units of the origin",
+        ),
         (skewed <= ROTATION_TOLERANCE, "a rotation without scale or shear"),
-    ):  # fmt: skip
+    ):
         if not fits:
             raise StgaError(f"{where}: expected {expected}")
     if np.linalg.det(rotation) < 0:
         raise StgaError(f"{where}: its axes are mirrored; expected a right-handed rotation")
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    pose[:3, :3] = rotation
+    pose[:3, 3] = -rotation @ position
     return Camera(int(width), int(height), fl_x, fl_y, cx, cy, pose)

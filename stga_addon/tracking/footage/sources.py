@@ -14,7 +14,8 @@ CONTAINERS = ("images", "frames", "videos", "input")
 """Folders that gather those of the cameras; their names are no part of a camera's."""
 MASK_FOLDERS = ("masks", "fg_masks")
 PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
-MAX_DEPTH, MAX_FILES = 4, 1_000_000
+MAX_DEPTH = 4
+MAX_FILES = 1_000_000
 
 
 def is_video(path: Path) -> bool:
@@ -47,13 +48,15 @@ class Sources:
 
     def mask_of(self, image: Path) -> Path | None:
         """The mask with the same path below one of `MASK_FOLDERS`."""
-        key, name = self.name_of(image), _without_container(image.relative_to(self.root).as_posix())
+        key = self.name_of(image)
+        name = _without_container(image.relative_to(self.root).as_posix())
         return next(iter(self.masks.get(key) or self.masks.get(name, [])), None)
 
 
 def find_sources(root: Path) -> Sources:
     """List the visible files, four levels deep. Raises StgaError for over a million files."""
-    sources, count = Sources(root), 0
+    sources = Sources(root)
+    count = 0
     for folder, names, files in os.walk(root):
         depth = len(Path(folder).relative_to(root).parts)
         names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
@@ -63,7 +66,8 @@ def find_sources(root: Path) -> Sources:
             raise StgaError(f"{root}: holds {many}")
         visible = (name for name in files if not name.startswith("."))
         for path in (Path(folder, name) for name in sorted(visible, key=natural_order)):
-            key, suffix = sources.name_of(path), path.suffix.lower()
+            key = sources.name_of(path)
+            suffix = path.suffix.lower()
             first, _, rest = path.relative_to(root).as_posix().partition("/")
             name = rest.rpartition(".")[0]
             if suffix in VIDEO_SUFFIXES:
@@ -110,7 +114,8 @@ def still_image(sources: Sources, label: str, where: str) -> Path:
 
 def sequence_files(sources: Sources, name: str) -> Path | list[Path]:
     """The video of a camera, or its images in order. Raises StgaError for both, or two videos."""
-    videos, images = sources.videos.get(name, []), sources.folders.get(name, [])
+    videos = sources.videos.get(name, [])
+    images = sources.folders.get(name, [])
     if len(videos) > 1 or (videos and images):
         other = videos[1] if len(videos) > 1 else images[0].parent
         both = f"{videos[0]} and {other} are both named {shorten(name)}"

@@ -70,7 +70,8 @@ def read_video(path: Path) -> Video:
         stream = container.streams.video[0]
         if times[left_out : left_out + len(first)] != first:
             stream.thread_type = "AUTO"
-            times, left_out = [frame.pts for frame in _decoded_frames(container)], 0
+            times = [frame.pts for frame in _decoded_frames(container)]
+            left_out = 0
         exact = _is_of(container, SEEKABLE_CONTAINERS) or stream.codec_context.codec.intra_only
         seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
@@ -98,7 +99,9 @@ class VideoFrames:
     def __init__(
         self, video: Video, numbers: Mapping[int, int], masks: Mapping[int, View] | None = None
     ) -> None:
-        self.video, self.numbers, self.masks = video, numbers, masks
+        self.video = video
+        self.numbers = numbers
+        self.masks = masks
         self._container: Any = None
         self._decoder: Iterator[Any] | None = None
         self._decoded = -1
@@ -152,16 +155,20 @@ class VideoFrames:
         """Release the decoder; the next frame opens it again."""
         if self._container is not None:
             self._container.close()
-        self._container, self._decoder, self._decoded = None, None, -1
+        self._container = None
+        self._decoder = None
+        self._decoded = -1
 
     def _frame(self, number: int) -> Any:
         """The frame, decoded on from the last one, from a key frame before it, or from the
         beginning. Raises ValueError where the decoder gives no frame of that time."""
         from av.error import InvalidDataError
 
-        failure, times = None, self.video.times
+        failure = None
+        times = self.video.times
         for decoder in self._decoders(number):
-            self._decoder, frame = decoder, None
+            self._decoder = decoder
+            frame = None
             try:
                 if self.video.seekable:
                     later = (f for f in decoder if f.pts is not None and f.pts >= times[number])
@@ -242,7 +249,8 @@ def _packet_times(path: Path) -> tuple[list[int], bool]:
         timed = timed and _is_of(container, TIMED_CONTAINERS)
         if not (timed or stream.codec_context.codec.intra_only):
             return [], False
-        packets, is_cut_off = [], False
+        packets = []
+        is_cut_off = False
         for packet in container.demux(stream):
             is_cut_off = _is_cut_off(container, packet)
             if is_cut_off:
@@ -262,7 +270,8 @@ def _decoded_frames(container: Any) -> Iterator[Any]:
     """All frames; the first packets of a transport stream may not be decodable."""
     from av.error import InvalidDataError
 
-    stream, may_fail = container.streams.video[0], _is_of(container, ("mpegts",))
+    stream = container.streams.video[0]
+    may_fail = _is_of(container, ("mpegts",))
     for packet in container.demux(stream):
         if _is_cut_off(container, packet):
             yield from stream.decode(None)  # what the decoder still holds
@@ -333,7 +342,8 @@ def _pixels(frame: Any) -> np.ndarray:
     codes = int(frame.color_primaries), int(frame.color_trc)
     deep = not is_srgb(*codes)  # 8 bits of HDR are too few for its dark colors
     rgb = frame.reformat(format="rgb48le" if deep else "rgb24", src_colorspace=matrix).to_ndarray()
-    pixels, data = to_srgb(rgb, *codes) if deep else rgb, frame.side_data.get("DISPLAYMATRIX")
+    pixels = to_srgb(rgb, *codes) if deep else rgb
+    data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return np.ascontiguousarray(pixels)
     # Row vector (x, y) of a stored pixel times the matrix (2, 2), y down, is where it is shown.
@@ -342,7 +352,8 @@ def _pixels(frame: Any) -> np.ndarray:
     if not np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]:
         return np.ascontiguousarray(pixels)
     if turn[0, 0] == 0:  # the stored x becomes y
-        pixels, turn = pixels.swapaxes(0, 1), turn[::-1]
+        pixels = pixels.swapaxes(0, 1)
+        turn = turn[::-1]
     columns, rows = turn.diagonal().astype(int).tolist()
     return np.ascontiguousarray(pixels[::rows, ::columns])
 

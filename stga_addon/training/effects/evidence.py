@@ -123,7 +123,8 @@ def stable_colors(color: np.ndarray) -> np.ndarray:
 
 def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
     """Gains (S, 3) of views against their camera's mean, from color (S, K, 3), NaN if unseen."""
-    known, gain = ~np.isnan(color), np.ones((len(color), 3))
+    known = ~np.isnan(color)
+    gain = np.ones((len(color), 3))
     prior = CAMERA_PRIOR_SAMPLES * TYPICAL_LEVEL**2
     _, row = np.unique(samples.camera, return_inverse=True)
     for _ in range(CAMERA_FIT_ITERATIONS):
@@ -144,7 +145,8 @@ def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:
         others = np.flatnonzero((samples.camera == camera) & (samples.timestep != timestep))
         others = others[np.argsort(samples.timestep[others])]
         if len(others):
-            known, columns = samples.timestep[others], gain[others].T
+            known = samples.timestep[others]
+            columns = gain[others].T
             predicted[row] = [np.interp(timestep, known, column) for column in columns]
     other = color[:, ~half]
     return _agreement(other, other / predicted[:, None])
@@ -165,7 +167,8 @@ def consecutive_folds(timestep: np.ndarray) -> list[Fold]:
     """FOLDS folds of consecutive timesteps (S,), without those that leave nothing to fit. A model
     is not fitted to the timesteps beside them either, in which slow changes are alike."""
     timesteps, order = np.unique(timestep, return_inverse=True)
-    count, folds = min(FOLDS, len(timesteps)), []
+    count = min(FOLDS, len(timesteps))
+    folds = []
     for fold in range(count):
         held = order * count // len(timesteps) == fold
         fitted = (order < order[held].min() - 1) | (order > order[held].max() + 1)
@@ -188,7 +191,8 @@ def linear_evidence(
     views that are held out are clipped to the range, with its margin, of those that the model was
     fitted to, as an avatar's strain is.
     """
-    before, after = [], []
+    before = []
+    after = []
     for held, fitted in folds:
         # ridge regression by triangle: mean color (K, 3), NaN without a sample, mean features (K,
         # D) and slopes (K, D, 3)
@@ -198,11 +202,13 @@ def linear_evidence(
         center = np.where(seen, features[fitted], 0).sum(0) / np.maximum(count, 1)
         x = np.where(seen, features[fitted] - center, 0)
         y = np.where(seen, color[fitted] - mean, 0)
-        inner, size = np.einsum("skd,ske->kde", x, x), x.shape[2]
+        inner = np.einsum("skd,ske->kde", x, x)
+        size = x.shape[2]
         weight = RIDGE_WEIGHT * np.einsum("kdd->", inner) / max(float(count.sum()) * size, 1.0)
         inner += max(weight, 1e-12) * np.eye(size)
         slope = np.linalg.solve(inner, np.einsum("skd,skc->kdc", x, y))
-        error, given = color[held] - mean, features[held]
+        error = color[held] - mean
+        given = features[held]
         if rest is not None:
             lowest, highest = range_with_margin(rest, features[fitted]).swapaxes(0, 1)
             given = np.clip(given, lowest, highest)

@@ -27,7 +27,9 @@ class CaptureFacts:
     trained with; cameras, timesteps: how many there are to train on."""
 
     def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
-        self.capture, self.settings, self.device = capture, settings, device
+        self.capture = capture
+        self.settings = settings
+        self.device = device
         self.views = capture.views["train"]
         self.cameras = len({view.camera_index for view in self.views})
         self.timesteps = len({view.timestep for view in self.views})
@@ -101,7 +103,8 @@ class CaptureFacts:
         known = ~np.isnan(self.samples.background_spread)
         if np.isnan(self.samples.foreground).any() or not known.any():
             return None
-        within, backgrounds = self.samples.background_spread[known], self.samples.background[known]
+        within = self.samples.background_spread[known]
+        backgrounds = self.samples.background[known]
         return float(max(within.max(), abs(backgrounds - backgrounds.mean(0)).max()))
 
     @property
@@ -142,7 +145,8 @@ class CaptureFacts:
         """How far the lips part at most, beyond their distance in the neutral mesh."""
         assert self.capture.flame is not None
         upper, lower = lip_pairs(self.capture.flame.model)
-        pose, zero_pose = self.sampled.expression_mesh, self.settings.selection.zero_pose
+        pose = self.sampled.expression_mesh
+        zero_pose = self.settings.selection.zero_pose
         meshes = [self.capture.neutral, *(pose(t, zero_pose) for t in self.sampled_timesteps)]
         gaps = [float(np.linalg.norm(mesh[upper] - mesh[lower], axis=1).max()) for mesh in meshes]
         return 1000 * (max(gaps) - gaps[0])

@@ -54,7 +54,8 @@ MIN_UNCOVERED_SHARE = 0.003
 """Share of the foreground that the mesh does not cover, from which splats are added for it."""
 MIN_PIXELS_PER_SPLAT = 0.5
 """90th percentile over triangles, below which further splats have no detail to show."""
-MIN_LIP_GAP_MM, MIN_JAW_ANGLE_DEG = 1.5, 3.0
+MIN_LIP_GAP_MM = 1.5
+MIN_JAW_ANGLE_DEG = 3.0
 """Teeth are visible when the lips part, or the jaw opens, by more than this."""
 MAX_OUTSIDE_SHARE = 0.001
 """Share of the mesh outside of the masks above which the tracking is inaccurate."""
@@ -93,9 +94,11 @@ def view_color(facts: CaptureFacts) -> Verdict:
 def exposure(facts: CaptureFacts) -> Verdict:
     if facts.cameras == 1 and facts.timesteps == 1:
         return Verdict(False, "a single image has no other to differ from", fixed=True)
-    colors, samples = facts.camera_colors, facts.samples
+    colors = facts.camera_colors
+    samples = facts.samples
     table = np.column_stack([colors.camera, colors.gain, colors.offset])
-    found, drift = camera_evidence(samples, facts.stable_colors).gain, facts.drifts.gain
+    found = camera_evidence(samples, facts.stable_colors).gain
+    drift = facts.drifts.gain
     reason = f"{facts.cameras} cameras show the same colors {found:.1f} of 255 levels apart"
     if drift >= MIN_EXPOSURE_LEVELS or facts.cameras == 1:
         own = table[np.searchsorted(colors.camera, samples.camera)]
@@ -127,7 +130,8 @@ def background(facts: CaptureFacts) -> Verdict:
         count = f"{unmasked} of {len(samples.white)} sampled images have no mask"
         reason = f"{count}, and show more than white behind the head: {MESH_AS_MASK}"
         return Verdict(True, reason, changes={"backdrop": "mesh"})
-    spread, every = facts.backdrop_spread, "every image has a mask"
+    spread = facts.backdrop_spread
+    every = "every image has a mask"
     if spread is None:
         reason = "not every image has a mask or transparency that shows where the head ends"
         return Verdict(False, reason, fixed=True)
@@ -175,10 +179,12 @@ def density(facts: CaptureFacts) -> Verdict:
 def selection(facts: CaptureFacts) -> Verdict:
     threshold = 1000 * facts.settings.selection.threshold
     if facts.selected_share == 0:
-        count, total = len(facts.sampled_timesteps), len(facts.capture.timesteps)
+        count = len(facts.sampled_timesteps)
+        total = len(facts.capture.timesteps)
         reason = f"no triangle moves by more than {threshold:g} mm in any of {count} frames"
         return Verdict(False, reason, fixed=count == total)
-    share, asked = f"{facts.selected_share:.0%}", facts.settings.strategy == "selective"
+    share = f"{facts.selected_share:.0%}"
+    asked = facts.settings.strategy == "selective"
     reason = f"a frame moves {share} of the triangles by more than {threshold:g} mm"
     return Verdict(asked, reason + ("" if asked else ", but training all of them measured best"))
 
@@ -194,7 +200,8 @@ def strain(facts: CaptureFacts) -> Verdict:
     left_out = facts.strain_dependence
     gains = {f"left-out {kind}": found.decibels for kind, found in left_out.items()}
     figures = " and ".join(f"{gain:+.2f} dB in {kind}" for kind, gain in gains.items())
-    reason, least = f"colors that follow deformation bring {figures}", MIN_STRAIN_GAIN_DB
+    reason = f"colors that follow deformation bring {figures}"
+    least = MIN_STRAIN_GAIN_DB
     if is_tracked(facts.capture.root):
         least = MIN_TRACKED_STRAIN_GAIN_DB
         reason += "; a training gains more than they show of a capture by `stga track`"
@@ -227,7 +234,8 @@ def world(facts: CaptureFacts) -> Verdict:
     first: dict[int, Camera] = {}
     moving = set()
     for view in facts.views:
-        known, own = first.setdefault(view.camera_index, view.camera), view.camera
+        known = first.setdefault(view.camera_index, view.camera)
+        own = view.camera
         pairs = [(getattr(known, name), getattr(own, name)) for name in names]
         if known is not own and not all(np.allclose(*pair, atol=1e-6) for pair in pairs):
             moving.add(view.camera_index)
@@ -239,7 +247,8 @@ def world(facts: CaptureFacts) -> Verdict:
 def teeth(facts: CaptureFacts) -> Verdict | None:
     if not facts.has_teeth:
         return None
-    jaw, lips = facts.joint_angle(2), facts.lip_gap_mm
+    jaw = facts.joint_angle(2)
+    lips = facts.lip_gap_mm
     reason = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
     return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
 
@@ -290,15 +299,27 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
 
 
 RULES: dict[str, Rule] = {
-    "view-color": view_color, "exposure": exposure, "antialiasing": antialiasing,
-    "background": background, "hull-points": hull_points, "depth-limits": depth_limits,
-    "density": density, "selection": selection,
-    "strain-color": strain, "normal-color": normal_color, "strain-position": strain,
-    "relight": relight, "world": world, "teeth": teeth, "torso": torso,
-    "neck": partial(turning, joints=[1]), "jaw": partial(turning, joints=[2]),
-    "eyes": partial(turning, joints=[3, 4]), "dynamic-offsets": dynamic_offsets,
+    "view-color": view_color,
+    "exposure": exposure,
+    "antialiasing": antialiasing,
+    "background": background,
+    "hull-points": hull_points,
+    "depth-limits": depth_limits,
+    "density": density,
+    "selection": selection,
+    "strain-color": strain,
+    "normal-color": normal_color,
+    "strain-position": strain,
+    "relight": relight,
+    "world": world,
+    "teeth": teeth,
+    "torso": torso,
+    "neck": partial(turning, joints=[1]),
+    "jaw": partial(turning, joints=[2]),
+    "eyes": partial(turning, joints=[3, 4]),
+    "dynamic-offsets": dynamic_offsets,
     "tracking": tracking,
-}  # fmt: skip
+}
 """Effect -> its rule."""
 Plan = tuple[EffectDecision, ...]
 
@@ -315,10 +336,13 @@ def plan_effects(
     """
     if settings.effects is None or not capture.views.get("train"):
         return settings, ()
-    facts, choices = CaptureFacts(capture, settings, device), settings.effects
-    decided, plan = settings, []
+    facts = CaptureFacts(capture, settings, device)
+    choices = settings.effects
+    decided = settings
+    plan = []
     for effect in EFFECTS.values():
-        choice, verdict = choices.get(effect.name, "auto"), RULES[effect.name](facts)
+        choice = choices.get(effect.name, "auto")
+        verdict = RULES[effect.name](facts)
         flag = f"--effect {effect.name}={choice}"
         if verdict is None:
             if choice == "on":
@@ -340,7 +364,8 @@ def add_effects(
 ) -> tuple[TrainingSettings, Plan]:
     """Settings and plan with the effects that may be `added_later` where the capture, of all takes,
     calls for them and the run that is continued went without. A user's choice stays."""
-    facts, plan = CaptureFacts(capture, settings), {each.effect: each for each in before}
+    facts = CaptureFacts(capture, settings)
+    plan = {each.effect: each for each in before}
     for effect in EFFECTS.values():
         decision = plan.get(effect.name)
         if not effect.added_later or decision is None or decision.on:

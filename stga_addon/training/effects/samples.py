@@ -71,7 +71,9 @@ def sample_views(views: Sequence[View], seed: int = 0) -> list[View]:
     used = dict.fromkeys((view.camera_index for view in views), 0)
     every = sorted({view.timestep for view in views})
     timesteps = evenly_spread(every, max(MAX_TIMESTEPS, MAX_VIEWS // len(used)))
-    rng, chosen, count = np.random.default_rng(seed), list[View](), max(MAX_VIEWS, len(used))
+    rng = np.random.default_rng(seed)
+    chosen = list[View]()
+    count = max(MAX_VIEWS, len(used))
     left = {t: [view for view in views if view.timestep == t] for t in timesteps}
     while len(chosen) < count and any(left.values()):
         for timestep in rng.permutation(timesteps).tolist():
@@ -91,7 +93,8 @@ def take_samples(capture: Capture, seed: int = 0) -> Samples:
     rng = np.random.default_rng(seed)
     count = len(capture.faces)
     faces = np.sort(rng.permutation(count)[:MAX_FACES])
-    neutral, triangles = capture.neutral, capture.faces
+    neutral = capture.neutral
+    triangles = capture.faces
     basis = strain_basis(neutral, triangles, trained_range(count))
     posed = {
         timestep: face_frames(capture.mesh(timestep), triangles, neutral, strain=basis)
@@ -118,11 +121,14 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     """One view's row of every array of `Samples` that depends on the image."""
     scale = SAMPLED_HEIGHT_PIXELS / view.camera.height
     small, image, mask = read_view(view, scale if scale < 2 / 3 else 1.0)
-    camera, mesh = small.camera, np.asarray(capture.mesh(view.timestep))
+    camera = small.camera
+    mesh = np.asarray(capture.mesh(view.timestep))
     corners, depth = camera.project(mesh)
-    depths, (p0, p1, p2) = depth[capture.faces].mean(1), mesh[capture.faces].swapaxes(0, 1)
+    depths = depth[capture.faces].mean(1)
+    (p0, p1, p2) = mesh[capture.faces].swapaxes(0, 1)
     # cosine between each triangle's normal and its direction to the camera
-    normal, to_camera = np.cross(p1 - p0, p2 - p0), camera.position - (p0 + p1 + p2) / 3
+    normal = np.cross(p1 - p0, p2 - p0)
+    to_camera = camera.position - (p0 + p1 + p2) / 3
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
     towards = np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30)
     # (H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
@@ -134,22 +140,26 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     draw = ImageDraw.Draw(picture)
     for face, polygon in zip(drawn.tolist(), polygons, strict=True):
         draw.polygon(polygon, fill=face)
-    nearest, triangles = np.asarray(picture), corners[capture.faces[faces]]
+    nearest = np.asarray(picture)
+    triangles = corners[capture.faces[faces]]
     center = triangles.mean(1)
     x, y = np.round(center - 0.5).astype(int).T
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    x = np.where(inside, x, 0)
+    y = np.where(inside, y, 0)
     in_front = np.where(nearest[y, x] >= 0, depths[nearest[y, x]], np.inf)
     seen = inside & (towards[faces] > MIN_FACING_COSINE)
     seen &= depths[faces] < in_front * (1 + DEPTH_TOLERANCE_SHARE)
     if mask is not None:
         seen &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)[y, x]
-    smooth, at = uniform_filter(image.astype(np.float32), (3, 3, 0)), center.T[::-1] - 0.5
+    smooth = uniform_filter(image.astype(np.float32), (3, 3, 0))
+    at = center.T[::-1] - 0.5
     colors = [map_coordinates(smooth[..., c], at, order=1, mode="nearest") for c in range(3)]
     direction = mesh[capture.faces[faces]].mean(1) - camera.position
     distance = np.linalg.norm(direction, axis=1, keepdims=True)
     area = view.camera.width * view.camera.height / (camera.width * camera.height)
-    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    a = triangles[:, 1] - triangles[:, 0]
+    b = triangles[:, 2] - triangles[:, 0]
     head = float(np.median(depth))
     pixels = area * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
     covered = nearest >= 0
@@ -172,7 +182,8 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     parts = {"foreground": foreground, "uncovered": uncovered, "mesh": covered, "outside": outside}
     row |= {name: np.array(area * part.sum()) for name, part in parts.items()}
     beside = binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)
-    clear, spread = image[beside].astype(np.float64), np.nan
+    clear = image[beside].astype(np.float64)
+    spread = np.nan
     if len(clear):
         row["background"] = clear.mean(0)
         spread = np.sqrt(((clear - row["background"]) ** 2).mean())

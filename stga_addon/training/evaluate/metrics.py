@@ -86,7 +86,8 @@ def read_evaluation_view(
     Raises StgaError if a file cannot be read.
     """
     red, green, blue = (round(255 * level) for level in background)
-    target, mask = read_image(view, (red, green, blue)), read_mask(view)
+    target = read_image(view, (red, green, blue))
+    mask = read_mask(view)
     target, mask = without_backdrop(capture, view, target, mask, backdrop, background)
     target.setflags(write=False)  # as in training: Numba would compile again for writable arrays
     selection = select_capture(replace(capture, timesteps=(view.timestep,)), SelectionOptions())
@@ -118,7 +119,8 @@ def visible_pixels(capture: Capture, view: View, faces: np.ndarray) -> np.ndarra
 def known_exposure(rows: Sequence[Sequence[float]], training_views: Iterable[View]) -> ViewExposure:
     """Exposure of the training cameras' views by the rows of `TrainingSettings.exposure`; a camera
     that they do not list was trained as it is."""
-    trained, listed = {view.camera_index for view in training_views}, view_exposure(rows)
+    trained = {view.camera_index for view in training_views}
+    listed = view_exposure(rows)
 
     def exposure(view: View) -> np.ndarray | None:
         found = listed(view)
@@ -155,7 +157,8 @@ def match_exposure(
     """
     head = np.ones(image.shape[1:], bool) if head is None else head
     fitted = head if fitted is None else fitted
-    x, y = image[:, fitted].astype(np.float64), target[fitted].T.astype(np.float64) / 255
+    x = image[:, fitted].astype(np.float64)
+    y = target[fitted].T.astype(np.float64) / 255
     if not x.size:
         return image
     found = fit_lines(x, y, np.full(2, PRIOR_SHARE * x.shape[1])[:, None])
@@ -204,22 +207,28 @@ def evaluate(
     they are.
     """
     scores: dict[str, list[tuple[float, float, float]]] = {"": []}
-    differences, unmatched, fitted = [], [], False
+    differences = []
+    unmatched = []
+    fitted = False
     for evaluation_view in evaluation_views:
         target = evaluation_view.target
         image = np.clip(render(evaluation_view.view), 0, 1)
         if exposure is not None:
-            head, interior = evaluation_view.regions.get("mask"), evaluation_view.interior
-            known, plain = exposure(evaluation_view.view), image
+            head = evaluation_view.regions.get("mask")
+            interior = evaluation_view.interior
+            known = exposure(evaluation_view.view)
+            plain = image
             if known is None:
-                image, fitted = match_exposure(image, target, head, interior), True
+                image = match_exposure(image, target, head, interior)
+                fitted = True
             else:
                 image = plain = with_exposure(image, known, head)
             unmatched.append(psnr(plain, target))
         differences.append(detail_difference(image, target, evaluation_view.interior))
         parts: dict[str, np.ndarray | None] = {"": None, **evaluation_view.regions}
         for region, where in parts.items():
-            found, group = _scores(image, target, perceptual, where), evaluation_view.group
+            found = _scores(image, target, perceptual, where)
+            group = evaluation_view.group
             for name in dict.fromkeys((region, "_".join(filter(None, (region, group))))):
                 scores.setdefault(name, []).append(found)
     means = {}
@@ -241,11 +250,13 @@ def evaluate_avatar(
 ) -> Quality:
     """Quality of an avatar on all views of a split, read one at a time; matched: whether to apply
     the exposure of each view, None: where the avatar was trained so."""
-    rows, exposure = avatar.settings.get("exposure") or (), None
+    rows = avatar.settings.get("exposure") or ()
+    exposure = None
     backdrop = str(avatar.settings.get("backdrop", "plain"))
     if rows if matched is None else matched:
         exposure = known_exposure(rows, capture.views.get("train", ()))
-    background, views = avatar.background, capture.views[split]
+    background = avatar.background
+    views = capture.views[split]
     read = (read_evaluation_view(capture, view, background, backdrop) for view in views)
 
     def render(view: View) -> np.ndarray:
@@ -294,7 +305,8 @@ def _scores(
 ) -> tuple[float, float, float]:
     """PSNR, SSIM and LPIPS (NaN if not measured) of the image, or of the region `where` (H, W): the
     pixels outside are replaced by the target's, and SSIM is scaled to a mean over the region."""
-    psnr_db, shown = psnr(image, target, where), target.transpose(2, 0, 1).astype(np.float32) / 255
+    psnr_db = psnr(image, target, where)
+    shown = target.transpose(2, 0, 1).astype(np.float32) / 255
     share = 1.0 if where is None else float(where.mean())
     if where is not None:
         image = np.where(where, image, shown)
@@ -352,8 +364,11 @@ def triangle_residuals(
 ) -> Residuals:
     """Residuals of the avatar in the views; prepare: as in training; scale: size of the images
     compared. A pixel's error is divided among its splats by their blending weights."""
-    splats, count, buffers = avatar.splats, len(avatar.faces), BufferPool()
-    total, background = Residuals(*np.zeros((2, count))), np.array(avatar.background, np.float32)
+    splats = avatar.splats
+    count = len(avatar.faces)
+    buffers = BufferPool()
+    total = Residuals(*np.zeros((2, count)))
+    background = np.array(avatar.background, np.float32)
     colored = Parameters(
         *(np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
     )
@@ -369,9 +384,12 @@ def triangle_residuals(
         mesh = np.asarray(capture.mesh(view.timestep))
         frames = frames_in_camera(avatar.frames(mesh), scaled.camera)
         render = partial(
-            render_forward, face=splats.face, background=background,
-            antialiased=avatar.antialiased, buffers=buffers,
-        )  # fmt: skip
+            render_forward,
+            face=splats.face,
+            background=background,
+            antialiased=avatar.antialiased,
+            buffers=buffers,
+        )
         image = render(colored, frames=frames, degree=splats.sh_degree).image
         shown = target.transpose(2, 0, 1).astype(np.float32) / 255
         difference = np.abs(np.clip(image, 0, 1) - shown).mean(0)

@@ -70,11 +70,14 @@ def step_offsets(
     """
     if not state.driven_offsets:
         return
-    face, gradients = state.face, state.gradients
+    face = state.face
+    gradients = state.gradients
     count = len(next(iter(state.driven_offsets.values())).steps)
     trained = np.zeros(count, bool)
     trained[face[rows]] = True
-    listed, totals = np.flatnonzero(trained).astype(np.int32), dict[str, np.ndarray]()  # by target
+    # by target
+    listed = np.flatnonzero(trained).astype(np.int32)
+    totals = dict[str, np.ndarray]()
     for name, own in state.driven_offsets.items():
         offset = OFFSETS[name]
         if offset.target not in totals:
@@ -87,7 +90,8 @@ def step_offsets(
                 sum_by_triangle(rows, face, by_splat.reshape(len(face), -1), total)
         arrays = (own.value, np.empty_like(own.value), own.first, own.second, own.average)
         tables = [array.reshape(count, -1) for array in arrays]
-        total, gradient = totals[offset.target], tables[1]
+        total = totals[offset.target]
+        gradient = tables[1]
         per_unit = np.float32(1 / SH_C0 if offset.target == COLOR else 1)
         offset_gradient(listed, signal(offset.signal), total, per_unit, gradient)
         rate = np.full(gradient.shape[1], offset.rate_share * rates[offset.rate], np.float32)

@@ -49,21 +49,28 @@ from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
 from .state import state_of_avatar
 
-RENDERINGS, RENDERINGS_AGAIN = 7, 3
+RENDERINGS = 7
+RENDERINGS_AGAIN = 3
 """Of each view of a timestep, at first and once it was tracked so already: more hardly help."""
-MAX_VIEWS, MAX_HEIGHT_PX = 4, 400
+MAX_VIEWS = 4
+MAX_HEIGHT_PX = 400
 """Cameras, spread over the rig, whose images are compared; larger images are shrunk."""
-PYRAMID_PX, PYRAMID_RENDERINGS = (50, 100, 200), 20
+PYRAMID_PX = (50, 100, 200)
+PYRAMID_RENDERINGS = 20
 """Heights of the images in which the first timestep of another recording is tracked before, as a
 pattern on clothes leads astray by more than its width, and renderings in each."""
 ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
-POINTS, MIN_COSINE, MESH_IMAGE_SIDE_PX = 6000, 0.15, 160
+POINTS = 6000
+MIN_COSINE = 0.15
+MESH_IMAGE_SIDE_PX = 160
 """Points of the surface; of the angle between normal and camera, below which one does not count;
 larger side of the images of the mesh, by which hidden ones, the head's pixels and light are
 known."""
-EXPRESSION_SIGMA, JOINT_SIGMA_RAD, TRANSLATION_SIGMA_M = 0.3, 0.2, 0.02
+EXPRESSION_SIGMA = 0.3
+JOINT_SIGMA_RAD = 0.2
+TRANSLATION_SIGMA_M = 0.02
 SCALE_SIGMA = 0.02
 """Standard deviations of a timestep's parameters from those that it starts with."""
 LEAST_GAIN = 1e-3
@@ -121,7 +128,8 @@ class RefinedTracking:
         self.sequence = capture.flame
         frames = map(self.sequence.frame, self.sequence.timesteps)
         self.tracked = np.stack([frame.parameters for frame in frames])
-        self.parameters, self.rounds = np.pad(self.tracked, ((0, 0), (0, SHIFT_SIZE))), 0
+        self.parameters = np.pad(self.tracked, ((0, 0), (0, SHIFT_SIZE)))
+        self.rounds = 0
         self._row = {timestep: row for row, timestep in enumerate(self.sequence.timesteps)}
         self._source = lru_cache(CACHED_TIMESTEPS)(self.sequence.frame)
         self._person = replace(with_identity(self.sequence), frame=self.frame)
@@ -133,7 +141,8 @@ class RefinedTracking:
         return not np.array_equal(self.parameters[:, :-SHIFT_SIZE], self.tracked)
 
     def frame(self, timestep: int) -> FlameFrame:
-        values, source = self.parameters[self._row[timestep]], self._source(timestep)
+        values = self.parameters[self._row[timestep]]
+        source = self._source(timestep)
         offset = torso_offset(self._torso, values[-SHIFT_SIZE:], source.dynamic_offset)
         return frame_of(values[:-SHIFT_SIZE], offset)
 
@@ -178,8 +187,10 @@ def track_by_avatar(
     has led. Raises StgaError where the capture has no parameters or is of another head, and
     Cancelled.
     """
-    tracker, found = _Tracker(avatar, settings, capture, is_far, scales, shading, is_again), []
-    chosen, begin = list(capture.timesteps if timesteps is None else timesteps), perf_counter()
+    tracker = _Tracker(avatar, settings, capture, is_far, scales, shading, is_again)
+    found = []
+    chosen = list(capture.timesteps if timesteps is None else timesteps)
+    begin = perf_counter()
     number = 0
     while number < len(chosen):
         if report(number, len(chosen)):
@@ -192,7 +203,8 @@ def track_by_avatar(
     values, information, misfit = map(np.stack, zip(*found, strict=True))
     added = np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
     shift, scale = np.split(values[:, added], [SHIFT_SIZE], axis=1)
-    rows, scale = np.delete(values, added, axis=1), 1 + scale.ravel()
+    rows = np.delete(values, added, axis=1)
+    scale = 1 + scale.ravel()
     known = information.astype(np.float32)
     return AvatarTracking(tuple(chosen), rows, misfit, shift, scale, known)
 
@@ -201,7 +213,8 @@ def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> Arra
     """Where a camera sees a mesh, (H, W) bool, and the surface's unit normals there (H, W, 3);
     shown: `rasterize` of the mesh."""
     triangles, share = shown
-    seen, found = triangles >= 0, np.zeros((*triangles.shape, 3))
+    seen = triangles >= 0
+    found = np.zeros((*triangles.shape, 3))
     corners = vertex_normals(mesh, faces)[faces[triangles[seen]]]
     own = np.einsum("nk,nkc->nc", share[seen], corners)
     found[seen] = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-9)
@@ -235,8 +248,10 @@ class _Tracker:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
         if not np.array_equal(avatar.faces, capture.faces):
             raise StgaError(f"{capture.root}: is of another head than the avatar")
-        self._avatar, self._capture = avatar, capture
-        self._settings, self._sequence = settings, sequence
+        self._avatar = avatar
+        self._capture = capture
+        self._settings = settings
+        self._sequence = sequence
         self._views: dict[int, list[View]] = {}
         for view in (view for views in capture.views.values() for view in views):
             self._views.setdefault(view.timestep, []).append(view)
@@ -247,7 +262,9 @@ class _Tracker:
         # what is sought beside the expressions, as if they were some
         shapes = [person.shapedirs, torso_shapes(person), grown]
         person = replace(person, shapedirs=np.concatenate(shapes, axis=2))
-        self._is_far, self._added, self._shading = is_far, SHIFT_SIZE + scales, shading
+        self._is_far = is_far
+        self._added = SHIFT_SIZE + scales
+        self._shading = shading
         self._is_again = is_again
         self._change: np.ndarray | None = None
         self._shown: list[ArrayPair] = []  # `rasterize` of the timestep's views, as tracked
@@ -275,19 +292,23 @@ class _Tracker:
         views = evenly_spread(self._views.get(timestep, []), MAX_VIEWS)
         if not views:
             return tracked, np.diag(self._precision()), 0.0
-        mesh, faces = self._capture.mesh(timestep), self._capture.faces
+        mesh = self._capture.mesh(timestep)
+        faces = self._capture.faces
         self._shown = [rasterize(mesh, faces, _small(view.camera)) for view in views]
         shots = self._read(views, MAX_HEIGHT_PX)
         renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
         least_gain = LEAST_GAIN
-        found, first = tracked, None
+        found = tracked
+        first = None
         if self._change is not None and not self._is_again:
             starts = tracked, tracked + self._change
             losses = [self._loss(start, timestep, shots) for start in starts]
             best = min((0, 1), key=lambda number: losses[number][0])
-            found, first = starts[best], losses[best]
+            found = starts[best]
+            first = losses[best]
         elif self._is_far:
-            renderings, least_gain = PYRAMID_RENDERINGS, 0.0
+            renderings = PYRAMID_RENDERINGS
+            least_gain = 0.0
             for height in PYRAMID_PX:
                 small = self._read(views, height)
                 found, _ = self._minimize(timestep, small, tracked, found, renderings, least_gain)
@@ -318,7 +339,8 @@ class _Tracker:
         ) -> tuple[float, np.ndarray]:
             values = start + solve_triangular(root, whitened, lower=True, trans=1)
             loss, gradient = known or self._loss(values, timestep, shots)
-            change, excess = values - tracked, self._excess(values)
+            change = values - tracked
+            excess = self._excess(values)
             gradient = gradient + precision * change + excess / solve.WEIGHT_EXCESS_SIGMA**2
             prior = precision @ change**2 + (excess**2).sum() / solve.WEIGHT_EXCESS_SIGMA**2
             return loss + prior / 2, solve_triangular(root, gradient, lower=True)
@@ -338,12 +360,15 @@ class _Tracker:
 
     def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
         self._values = values
-        mesh, missed, count = self._mesh(shots[0][0].timestep), 0, 0
+        mesh = self._mesh(shots[0][0].timestep)
+        missed = 0
+        count = 0
         for (view, image), (triangles, _) in zip(shots, self._shown, strict=True):
             head = _enlarged(triangles >= 0, image) > 0.5
             drawn = render_avatar(self._avatar, mesh, view.camera, self._settings.background)
             away = np.abs(255 * drawn.transpose(1, 2, 0) - image).mean(2)
-            missed, count = missed + int((away[head] > MISS_LEVELS).sum()), count + int(head.sum())
+            missed = missed + int((away[head] > MISS_LEVELS).sum())
+            count = count + int(head.sum())
         return missed / max(count, 1)
 
     def _read(self, views: Sequence[View], height: int) -> list[tuple[View, np.ndarray]]:
@@ -404,7 +429,8 @@ class _Tracker:
     ) -> np.ndarray:
         """(E + 18, E + 18): how parameters change what images show at points of the surface."""
         self._values = values
-        mesh, faces = self._mesh(timestep), self._capture.faces
+        mesh = self._mesh(timestep)
+        faces = self._capture.faces
         at = self._points.on(mesh, faces)
         normals = self._points.on(vertex_normals(mesh, faces), faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)

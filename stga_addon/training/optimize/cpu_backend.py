@@ -27,7 +27,9 @@ BAND_TILES = 4
 @cache
 def _bands(height: int, count: int) -> int:
     """How many bands cost the busiest of `count` threads the fewest rows."""
-    fewest, most, beyond = -(-count // 2), 2 * count, 2 * LOSS_REACH_PX
+    fewest = -(-count // 2)
+    most = 2 * count
+    beyond = 2 * LOSS_REACH_PX
     return min(
         range(fewest, most + 1), key=lambda n: -(-3 * n // count) * (-(-height // n) + beyond)
     )
@@ -79,7 +81,8 @@ class CpuBackend:
 
     def __init__(self, settings: TrainingSettings, frames: FrameStore, state: TrainState) -> None:
         self.state = state
-        self._settings, self._frames = settings, frames
+        self._settings = settings
+        self._frames = frames
         self._scale_limits = frames.scale_limits(settings)
         self._buffers = rasterize.BufferPool()
 
@@ -88,8 +91,12 @@ class CpuBackend:
 
     def step(self, batch: Batch) -> float | None:
         """Forward, backward, optimizer; returns the image loss, None of a local iteration."""
-        state, settings, target = self.state, self._settings, batch.target
-        face, gradients, unbound = state.face, state.gradients, state.unbound
+        state = self.state
+        settings = self._settings
+        target = batch.target
+        face = state.face
+        gradients = state.gradients
+        unbound = state.unbound
         focus = None if batch.selected is None else batch.selected.take(face)
         if batch.mask is not None:
             over = self._buffers.get("target", target.shape, np.uint8)
@@ -98,28 +105,35 @@ class CpuBackend:
             target = over.view()
             target.setflags(write=False)  # like the loader's: Numba compiles for one type only
         rows, screen, loss = self._backward(
-            self._moved_frames(batch.view.timestep), batch.view, target, batch.background,
-            batch.sh_degree, focus,
-        )  # fmt: skip
+            self._moved_frames(batch.view.timestep),
+            batch.view,
+            target,
+            batch.background,
+            batch.sh_degree,
+            focus,
+        )
         options = adam.adam_options(settings, batch.view.camera)
         signals = self._frames.signals(batch.view.timestep)
         # before the limits' gradients are added
         adam.step_offsets(state, rows, signals, batch.rates, options)
         # what keeps splats near what they cover, and unbound ones out of the air
         if settings.scale_weight:
-            log_scale, weight = state.parameters.log_scale, settings.scale_weight
+            log_scale = state.parameters.log_scale
+            weight = settings.scale_weight
             limits = self._scale_limits
             optimizer.scale_limit(
                 rows, log_scale, face, unbound, limits, weight, gradients.log_scale
             )
         if settings.unseen_opacity_weight and state.has_unseen:
-            weight, share = settings.unseen_opacity_weight / len(state), state.unseen_share
+            weight = settings.unseen_opacity_weight / len(state)
+            share = state.unseen_share
             optimizer.opacity_weight(
                 rows, state.parameters.opacity, share, weight, gradients.opacity
             )
         if settings.distance_weight:
             limit = np.float32(settings.distance_limit) * self._frames.units
-            xyz, weight = state.parameters.xyz, settings.distance_weight
+            xyz = state.parameters.xyz
+            weight = settings.distance_weight
             optimizer.distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
         adam.step(state, rows, batch.rates, options, batch.sh_degree)
         if batch.accumulate:
@@ -143,7 +157,9 @@ class CpuBackend:
         focus: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the trained rows' gradients; returns these rows, screen gradients (N,) and loss."""
-        weight, height, width = self._settings.ssim_weight, view.camera.height, view.camera.width
+        weight = self._settings.ssim_weight
+        height = view.camera.height
+        width = view.camera.width
         state = self.state
         rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
         if focus is None:
@@ -154,9 +170,14 @@ class CpuBackend:
         v_image = self._buffers.get("v_image", (3, height, width))
         l1, ssim = image_gradient(rendering.image, target, rectangles, weight, v_image)
         rows, screen = rasterize.render_backward(
-            rendering, state.parameters, state.face, self._frames_in_camera, v_image,
-            state.gradients, buffers=self._buffers,
-        )  # fmt: skip
+            rendering,
+            state.parameters,
+            state.face,
+            self._frames_in_camera,
+            v_image,
+            state.gradients,
+            buffers=self._buffers,
+        )
         loss = (1 - weight) * l1 + weight * (1 - ssim)
         return rows, screen, loss if focus is None else None
 
@@ -167,14 +188,26 @@ class CpuBackend:
         return self._frames.moved(timestep, coefficients)
 
     def _forward(
-        self, splats: Parameters, frames: FaceFrames, view: View, background: np.ndarray,
-        sh_degree: int, focus: np.ndarray | None = None,
-    ) -> rasterize.RenderOutput:  # fmt: skip
+        self,
+        splats: Parameters,
+        frames: FaceFrames,
+        view: View,
+        background: np.ndarray,
+        sh_degree: int,
+        focus: np.ndarray | None = None,
+    ) -> rasterize.RenderOutput:
         self._frames_in_camera = rasterize.frames_in_camera(frames, view.camera)
         return rasterize.render_forward(
-            splats, self.state.face, self._frames_in_camera, sh_degree, background, focus,
-            LOSS_REACH_PX, antialiased=self._settings.antialiased, buffers=self._buffers,
-        )  # fmt: skip
+            splats,
+            self.state.face,
+            self._frames_in_camera,
+            sh_degree,
+            background,
+            focus,
+            LOSS_REACH_PX,
+            antialiased=self._settings.antialiased,
+            buffers=self._buffers,
+        )
 
     def mesh_gradient(
         self,
@@ -185,11 +218,16 @@ class CpuBackend:
     ) -> tuple[float, np.ndarray]:
         """The weighted sum of the image losses of a timestep's views and images, and its gradient
         (V, 3) with respect to the timestep's mesh; nothing is stepped."""
-        store, state, timestep = self._frames, self.state, shots[0][0].timestep
-        frames, splats, face = store.of(timestep), state.parameters, state.face
+        store = self._frames
+        state = self.state
+        timestep = shots[0][0].timestep
+        frames = store.of(timestep)
+        splats = state.parameters
+        face = state.face
         change = {POSITION: np.zeros((len(frames.scale), 3)), SCALE: np.zeros((1, 3))}
         for name, offset in state.driven_offsets.items():
-            target, signal = OFFSETS[name].target, OFFSETS[name].signal
+            target = OFFSETS[name].target
+            signal = OFFSETS[name].signal
             if target in change:
                 more = offset_of(offset.value, store.signals(timestep)(signal))
                 change[target] = change[target] + more
@@ -199,13 +237,15 @@ class CpuBackend:
         splats = splats._replace(xyz=splats.xyz + shift[face])
         scaled = replace(frames, scale=frames.scale * growth[:, 0])
         moved = self._moved_frames(timestep)
-        total, by_frame = 0.0, np.zeros((len(frames.scale), 7))
+        total = 0.0
+        by_frame = np.zeros((len(frames.scale), 7))
         for (view, image), weight in zip(shots, weights, strict=True):
             rows, _, loss = self._backward(moved, view, image, background, sh_degree, None)
             assert loss is not None
             total += weight * loss
             by_frame += weight * frame_gradient(splats, face, state.gradients, rows, scaled)
-        mesh, faces = store.mesh(timestep), store.capture.faces
+        mesh = store.mesh(timestep)
+        faces = store.capture.faces
         return total, frame_backward(mesh, faces, frames, by_frame)
 
 

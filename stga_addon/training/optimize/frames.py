@@ -13,7 +13,8 @@ from ...capture.model import Capture
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 
-CACHE_BYTES, BYTES_PER_TRIANGLE = 256e6, 170
+CACHE_BYTES = 256e6
+BYTES_PER_TRIANGLE = 170
 """Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
 Posing a mesh anew takes a seventh of an iteration."""
 
@@ -43,7 +44,9 @@ class FrameStore:
         """moved_mesh: (V, 3) of a timestep in place of the capture's, which may change, None where
         it is the capture's; limits (F, 2, 6): lowest and highest deformation that is followed;
         None: TRAINED_RANGE."""
-        self.capture, self.convention, self._moved_mesh = capture, convention, moved_mesh
+        self.capture = capture
+        self.convention = convention
+        self._moved_mesh = moved_mesh
         limits = trained_range(len(capture.faces)) if limits is None else limits
         self.strain = strain_basis(capture.neutral, capture.faces, limits) if strain else None
         self.units = np.ones(len(capture.faces), np.float32)
@@ -62,7 +65,8 @@ class FrameStore:
         return np.asarray(np.stack([settings.scale_limit * self.units, unbound]), np.float32)
 
     def of(self, timestep: int) -> FaceFrames:
-        entry, capture = self._latest(timestep), self.capture
+        entry = self._latest(timestep)
+        capture = self.capture
         if entry.frames is None:
             entry.frames = face_frames(
                 entry.mesh, capture.faces, capture.neutral, self.convention, self.strain
@@ -74,7 +78,8 @@ class FrameStore:
 
         def signal(name: str) -> np.ndarray:
             assert self.strain is not None
-            frames, entry = self.of(timestep), self._latest(timestep)
+            frames = self.of(timestep)
+            entry = self._latest(timestep)
             if name not in entry.signals:
                 # Numba compiles for arrays without gaps.
                 entry.signals[name] = np.ascontiguousarray(SIGNALS[name](self.strain, frames))

@@ -48,7 +48,9 @@ class GpuBackend:
         self, device: Device, settings: TrainingSettings, frames: FrameStore, state: TrainState
     ) -> None:
         capture = frames.capture
-        self._settings, self._frames, self.device = settings, frames, device
+        self._settings = settings
+        self._frames = frames
+        self.device = device
         self._rasterizer = rasterize.Rasterizer(device)
         self._embedding = Embedding(
             device, capture.neutral, capture.faces, frames.convention, frames.strain
@@ -69,14 +71,18 @@ class GpuBackend:
     def state(self) -> TrainState:
         """A copy in host memory, after all queued iterations."""
         self._finish_all()
-        count, stride, coefficients = len(self), self._splats.stride, self._splats.coefficients
-        read, buffer = self.device.read, self.device.buffer
+        count = len(self)
+        stride = self._splats.stride
+        coefficients = self._splats.coefficients
+        read = self.device.read
+        buffer = self.device.buffer
         tables = [
             split_rows(read(buffer(name, 0), (count, stride)), coefficients)
             for name in ("splats", *TABLES)
         ]
         history = read(self._tables.history, (count, 3), np.uint32)
-        traits, sums = read(self._tables.traits, (count, 2)), history.view(np.float32)
+        traits = read(self._tables.traits, (count, 2))
+        sums = history.view(np.float32)
         offsets = {}
         for name, each in self._offsets.items():
             shape = self._triangles, 3, 3
@@ -86,10 +92,19 @@ class GpuBackend:
             offsets[name] = OffsetState(value, first, second, average, steps)
         parameters, gradients, *moments, mean = tables
         return TrainState(
-            parameters, gradients, moments[0], moments[1], mean, history[:, 0].astype(np.int32),
-            read(self._splats.face, (count,), np.int32), traits[:, 0] > 0, traits[:, 1].copy(),
-            sums[:, 1].copy(), sums[:, 2].copy(), offsets,
-        )  # fmt: skip
+            parameters,
+            gradients,
+            moments[0],
+            moments[1],
+            mean,
+            history[:, 0].astype(np.int32),
+            read(self._splats.face, (count,), np.int32),
+            traits[:, 0] > 0,
+            traits[:, 1].copy(),
+            sums[:, 1].copy(),
+            sums[:, 2].copy(),
+            offsets,
+        )
 
     @state.setter
     def state(self, state: TrainState) -> None:
@@ -101,12 +116,15 @@ class GpuBackend:
         history = np.stack([state.steps.astype(np.uint32), *sums], axis=1)
         traits = np.stack([state.unbound, state.unseen_share], axis=1, dtype=np.float32)
         self._tables = OptimizerTables(
-            **rows, history=upload("history", history), traits=upload("traits", traits),
+            **rows,
+            history=upload("history", history),
+            traits=upload("traits", traits),
             limits=upload("limits", self._limits.astype(np.float32)),
-        )  # fmt: skip
+        )
         self._splats = rasterize.upload_splats(self.device, state.parameters, state.face)
         by_triangle = optimizer.splats_by_triangle(state.face, self._triangles)
-        splats_of, self._offsets = upload("splats by triangle", by_triangle), {}
+        splats_of = upload("splats by triangle", by_triangle)
+        self._offsets = {}
         for name, offset in state.driven_offsets.items():
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
             self._offsets[name] = OffsetTables._make([*parts, splats_of])
@@ -159,25 +177,34 @@ class GpuBackend:
 
     def _enqueue(self, queued: _Queued) -> None:
         """Submit one iteration."""
-        batch, settings, whole = queued.batch, self._settings, queued.batch.selected is None
+        batch = queued.batch
+        settings = self._settings
+        whole = queued.batch.selected is None
         change = 255 * batch.background - 255 * np.array(settings.background, np.float32)
         upload_target(self.device, batch.target, settings.ssim_weight, batch.mask, change)
         opacity_weight = settings.unseen_opacity_weight / max(len(self), 1)
         optimizer.upload_step(
-            self.device, batch.rates, adam_options(settings, batch.view.camera),
+            self.device,
+            batch.rates,
+            adam_options(settings, batch.view.camera),
             (settings.scale_weight, settings.distance_weight, opacity_weight),
-            statistics=batch.accumulate, triangles=self._triangles,
-        )  # fmt: skip
+            statistics=batch.accumulate,
+            triangles=self._triangles,
+        )
         with self.device.record() as work:
-            splats, camera = self._splats, batch.view.camera
+            splats = self._splats
+            camera = batch.view.camera
             moved = {name: tables.coefficients for name, tables in self._offsets.items()}
             rendering = self._render(
                 work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected
             )
             v_image, loss = image_loss(
-                work, camera.width, camera.height, whole=whole,
+                work,
+                camera.width,
+                camera.height,
+                whole=whole,
                 **{name: rendering[name] for name in ("view", "image", "touched")},
-            )  # fmt: skip
+            )
             screen = self._rasterizer.backward(
                 work, rendering, splats, camera, v_image, self._gradients
             )
@@ -193,9 +220,15 @@ class GpuBackend:
         queued.readback.start()
 
     def _render(
-        self, work: Recording, splats: rasterize.SplatTable, offsets: Mapping[str, Any], view: View,
-        background: np.ndarray, sh_degree: int, selected: np.ndarray | None = None,
-    ) -> rasterize.Tables:  # fmt: skip
+        self,
+        work: Recording,
+        splats: rasterize.SplatTable,
+        offsets: Mapping[str, Any],
+        view: View,
+        background: np.ndarray,
+        sh_degree: int,
+        selected: np.ndarray | None = None,
+    ) -> rasterize.Tables:
         """Record a view of the splats, moved by driven offsets with these coefficients (F, 3, 3) on
         the device.
 
@@ -203,10 +236,13 @@ class GpuBackend:
         """
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
         options = rasterize.ViewOptions(
-            view.camera, sh_degree, background,
-            antialiased=self._settings.antialiased, focused=selected is not None,
+            view.camera,
+            sh_degree,
+            background,
+            antialiased=self._settings.antialiased,
+            focused=selected is not None,
             reach=LOSS_REACH_PX,
-        )  # fmt: skip
+        )
         uniform = self._rasterizer.upload_view(splats, options)
         marked = None if selected is None else self.device.upload("selected", selected)
         focus = None if marked is None else rasterize.mark_focus(work, splats, uniform, marked)

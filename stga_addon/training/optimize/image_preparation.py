@@ -20,14 +20,17 @@ FAR_WEIGHT = 1e-3
 NO_CORRECTION = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
 """Gain and offset by channel."""
 MAX_GAIN = 4.0
-EXPOSURE_PRIOR, EXPOSURE_SCALE, EXPOSURE_ITERATIONS = 1e-3, 0.08, 4
+EXPOSURE_PRIOR = 1e-3
+EXPOSURE_SCALE = 0.08
+EXPOSURE_ITERATIONS = 4
 """Weight of the usual exposure as a share of the pixels, which decides where all have one color;
 and the difference in 0…1 beyond which pixels are outliers."""
 
 
 def image_preparation(capture: Capture, settings: TrainingSettings) -> Preparation | None:
     """Takes away the settings' `backdrop`, inverts their `exposure`; None where nothing changes."""
-    backdrop, background = settings.backdrop, settings.background
+    backdrop = settings.backdrop
+    background = settings.background
     correct = exposure_correction(settings)
     if correct is None and backdrop == "plain":
         return None
@@ -80,8 +83,11 @@ def over_color(image: np.ndarray, mask: np.ndarray, color: Sequence[float]) -> n
         margin = round(3 * BLUR_SHARES[1] * len(image))
         spans = [np.flatnonzero(edge.any(axis=axis)) for axis in (1, 0)]
         box = tuple(slice(max(0, int(s[0]) - margin), int(s[-1]) + margin + 1) for s in spans)
-        part, share, clear = image[box].astype(np.float32), cover[box], mask[box] == 0
-        total, weight = np.zeros_like(part), np.full_like(share, 1e-12)
+        part = image[box].astype(np.float32)
+        share = cover[box]
+        clear = mask[box] == 0
+        total = np.zeros_like(part)
+        weight = np.full_like(share, 1e-12)
         shown = np.where(clear[..., None], part, 0)
         for blur, importance in zip(BLUR_SHARES, (1.0, FAR_WEIGHT), strict=True):
             sigma = max(1.0, blur * len(image))

@@ -24,7 +24,8 @@ SAMPLED_HEIGHT_PIXELS = 400
 """Images higher than this are shrunk to it: triangles are then two or three pixels wide."""
 MASK_EDGE_PIXELS = 3
 """Along the mask's edge, colors are mixed with the background."""
-MAX_LATER_TIMESTEPS, MAX_LATER_VIEWS = 6, 2
+MAX_LATER_TIMESTEPS = 6
+MAX_LATER_VIEWS = 2
 """Further timesteps that are read, and views of each."""
 MIDDLE_GRAY = 0.5
 MIN_ONE_SIDED_SHARE = 0.05
@@ -51,24 +52,29 @@ SILHOUETTE_TOLERANCE_SHARE = 0.01
 """Error of the tracked silhouette, as a share of the image height."""
 FEW_CAMERAS = 4
 """Up to which a torso's visual hull bulges by centimeters: `TorsoPoints` are better."""
-CONTINUED_SHARE, CONTINUED_OPACITY = 0.4, 3.0
+CONTINUED_SHARE = 0.4
+CONTINUED_OPACITY = 3.0
 """How far a torso is continued beyond the image of a single camera, as a share of the image's
 width; and the logit of these splats' opacity, which may never be trained."""
-SEEN_COPIES, SEEN_SPREAD = 3, 0.5
+SEEN_COPIES = 3
+SEEN_SPREAD = 0.5
 """Splats for each of these points, and standard deviation from it, in voxels."""
 
 
 def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     """The lattice on the neutral mesh and, if the settings say so, hull points of the first
     training timestep (`flat_points` where a single camera shows it)."""
-    convention, degree, views = settings.convention, settings.sh_degree, capture.views["train"]
+    convention = settings.convention
+    degree = settings.sh_degree
+    views = capture.views["train"]
     order = settings.first_lattice_order(len(capture.faces))
     lattice = lattice_splats(capture.neutral, capture.faces, order, degree, convention=convention)
     if not settings.teeth and capture.flame is not None:
         teeth = capture.flame.model.masks.get("teeth", ())
         lattice = lattice.rows(~np.isin(capture.faces, teeth).all(axis=1)[lattice.face])
     lattice.sh[:, 0] = (triangle_colors(capture, views)[lattice.face] - 0.5) / SH_C0
-    parts, first = [lattice], [view for view in views if view.timestep == views[0].timestep]
+    parts = [lattice]
+    first = [view for view in views if view.timestep == views[0].timestep]
     if settings.hull_points and len(first) == 1:
         parts.append(flat_points(capture, first[0], convention, degree, settings.torso))
     elif settings.hull_points:
@@ -83,7 +89,8 @@ def unseen_share(capture: Capture, convention: str, splats: Splats) -> np.ndarra
     0 for bound splats. A hull point outside of most images is held by few masks only, and often in
     the air.
     """
-    share, unbound = np.zeros(len(splats), np.float32), np.flatnonzero(splats.unbound)
+    share = np.zeros(len(splats), np.float32)
+    unbound = np.flatnonzero(splats.unbound)
     if not len(unbound):
         return share
     first = capture.views["train"][0].timestep
@@ -123,26 +130,31 @@ def triangle_colors(capture: Capture, views: Sequence[View]) -> np.ndarray:
     a, b, c = capture.neutral[capture.faces].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if area[hidden].sum() >= MIN_ONE_SIDED_SHARE * area.sum():
-        color[hidden], shown[hidden] = color[mirrored], True
-    centers, others = capture.neutral[capture.faces].mean(1), late if late.any() else shown
+        color[hidden] = color[mirrored]
+        shown[hidden] = True
+    centers = capture.neutral[capture.faces].mean(1)
+    others = late if late.any() else shown
     nearest = np.flatnonzero(others)[cKDTree(centers[others]).query(centers)[1]]
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
     for number in np.unique(part[shown]):
-        members, known = np.flatnonzero(part == number), np.flatnonzero((part == number) & shown)
+        members = np.flatnonzero(part == number)
+        known = np.flatnonzero((part == number) & shown)
         nearest[members] = known[cKDTree(centers[known]).query(centers[members])[1]]
     return np.asarray(color[nearest])
 
 
 def mean_colors(capture: Capture, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """Mean color (F, 3) in 0…1 of each triangle in the views; (F,) bool whether any shows it."""
-    total, count = np.zeros((len(capture.faces), 3)), np.zeros(len(capture.faces))
+    total = np.zeros((len(capture.faces), 3))
+    count = np.zeros(len(capture.faces))
     for view in views:
         small, image, mask = read_view(view, min(1.0, SAMPLED_HEIGHT_PIXELS / view.camera.height))
         triangle, _ = rasterize(capture.mesh(view.timestep), capture.faces, small.camera)
         shown = triangle >= 0
         if mask is not None:
             shown &= binary_erosion(mask > 127, iterations=MASK_EDGE_PIXELS)
-        pixels, found = image[shown], triangle[shown]
+        pixels = image[shown]
+        found = triangle[shown]
         count += np.bincount(found, minlength=len(count))
         for channel in range(3):
             total[:, channel] += np.bincount(found, pixels[:, channel], len(count))
@@ -190,7 +202,8 @@ def hull_points(
         return hull
     rest = hull.rows(~below_neck(capture.flame, views[0].timestep, points[outside]))
     # around the points at which the torso is seen, in its triangles
-    mesh, voxel = capture.mesh(seen.timestep), voxel_size(capture.mesh(seen.timestep))
+    mesh = capture.mesh(seen.timestep)
+    voxel = voxel_size(capture.mesh(seen.timestep))
     spread = np.random.default_rng(0).normal(0, SEEN_SPREAD * voxel, (SEEN_COPIES, *seen.at.shape))
     points = (seen.at + spread).reshape(-1, 3)
     _, among = _nearest_triangle(points, mesh, capture.faces[triangles])
@@ -211,7 +224,8 @@ def flat_points(
     below the neck is continued beyond it, as its border looks, for other timesteps that show more;
     where none does, it stays so.
     """
-    mesh, camera = capture.mesh(view.timestep), view.camera
+    mesh = capture.mesh(view.timestep)
+    camera = view.camera
     voxel = voxel_size(mesh)
     samples = _mesh_samples(mesh, capture.faces)
     pixels, depth = camera.project(samples)
@@ -239,7 +253,8 @@ def flat_points(
         return to_local(splats, frames, face)
     cut = ~pixels_of(points, camera)[2]
     splats.sh[cut, 0] = (read_image(view)[pixel][beside][cut] / 255 - 0.5) / SH_C0
-    splats.log_scale[cut], splats.opacity[cut] = np.log(voxel), CONTINUED_OPACITY
+    splats.log_scale[cut] = np.log(voxel)
+    splats.opacity[cut] = CONTINUED_OPACITY
     below = below_neck(neck, view.timestep, points)
     return to_local(splats, frames, face).rows(~cut | below)
 
@@ -283,7 +298,8 @@ def _hull_surface(
     mesh: np.ndarray, faces: np.ndarray, views: Sequence[View], voxel: float
 ) -> np.ndarray:
     """Grid points (N, 3) on the surface of the visual hull that are visible beside the mesh."""
-    low, high = mesh.min(0), mesh.max(0)
+    low = mesh.min(0)
+    high = mesh.max(0)
     margin = GRID_MARGIN_SHARE * np.linalg.norm(high - low)
     axes = [np.arange(a - margin, b + margin, voxel) for a, b in zip(low, high, strict=True)]
     foreground = [_foreground(view) for view in views]
@@ -293,11 +309,13 @@ def _hull_surface(
     centers = [axis[::BLOCK_VOXELS] + (BLOCK_VOXELS - 1) / 2 * voxel for axis in axes]
     points = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1).reshape(-1, 3)
     radius = np.sqrt(3) / 2 * (BLOCK_VOXELS - 1) * voxel
-    kept, outside = np.ones(len(points), bool), np.zeros(len(points), int)
+    kept = np.ones(len(points), bool)
+    outside = np.zeros(len(points), int)
     for view, mask in zip(views, foreground, strict=True):
         camera = view.camera
         pixels, depth = camera.project(points)
-        before, nearest = depth - radius > MIN_DEPTH_M, np.maximum(depth - radius, MIN_DEPTH_M)
+        before = depth - radius > MIN_DEPTH_M
+        nearest = np.maximum(depth - radius, MIN_DEPTH_M)
         # Over a sphere, x / z differs from the center's by at most radius · |(x, z)| / (z · (z −
         # radius)).
         focal = [camera.fl_x, camera.fl_y]
@@ -322,7 +340,9 @@ def _hull_surface(
         beside = ~_silhouette(mesh, faces, view.camera)
         remaining = np.flatnonzero(inside)
         x, y, seen = pixels_of(points[remaining], view.camera)
-        remaining, x, y = remaining[seen], x[seen], y[seen]
+        remaining = remaining[seen]
+        x = x[seen]
+        y = y[seen]
         visible[remaining] += 1
         exposed[remaining] += beside[y, x]
         inside[remaining] = mask[y, x]
@@ -357,9 +377,14 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
 def _new_splats(points: np.ndarray, voxel: float, sh_degree: int) -> Splats:
     """Gray unbound spheres of one voxel's size at world points (N, 3)."""
     n = len(points)
-    rotation, log_scale = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)), np.log(voxel / 2)
+    rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
+    log_scale = np.log(voxel / 2)
     return Splats(
-        points.astype(np.float32), rotation, np.full((n, 3), log_scale, np.float32),
-        np.zeros(n, np.float32), np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
-        np.zeros(n, np.int32), np.ones(n, bool),
-    )  # fmt: skip
+        points.astype(np.float32),
+        rotation,
+        np.full((n, 3), log_scale, np.float32),
+        np.zeros(n, np.float32),
+        np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32),
+        np.zeros(n, np.int32),
+        np.ones(n, bool),
+    )

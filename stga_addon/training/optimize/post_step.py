@@ -36,13 +36,15 @@ MAX_OUTSIDE_SHARE = 0.5
 """Share of the outlines in whose image a point lies, that it may lie outside of."""
 SIDE_VIEWS = 48
 """Training views that are looked at, spread over all."""
-MIN_COSINE, SOURCE_COSINE = -0.1, 0.5
+MIN_COSINE = -0.1
+SOURCE_COSINE = 0.5
 """Of the angle between a triangle and a camera: below the first, it faces away so far that not even
 its hair stands in the outline; below the second, others do not take its color, which a matte's edge
 may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
-OUTSIDE_CAMERAS, OUTSIDE_DISTANCE = 18, 4.0
+OUTSIDE_CAMERAS = 18
+OUTSIDE_DISTANCE = 4.0
 """Cameras that tell the neutral head's outside from its inside; their distance, in its radius."""
 
 
@@ -69,7 +71,9 @@ def control_density(
     split = np.argsort(-gradient, kind="stable")[:count]
     split = split[gradient[split] > 0]
     kept = keep_rows(state, split)
-    parents, pairs, n = kept.splats(), join(kept, kept), np.arange(len(split))
+    parents = kept.splats()
+    pairs = join(kept, kept)
+    n = np.arange(len(split))
     longest = np.argmax(parents.log_scale, axis=1)
     length = np.exp(parents.log_scale[n, longest])[:, None]
     offset = to_matrices(parents.rotation)[n, :, longest] * length * 0.5
@@ -81,7 +85,8 @@ def control_density(
     sides = [(parents.xyz + side * offset * jitter).astype(np.float32) for side in (-1, 1)]
     halves = joined([replace(parents, xyz=xyz) for xyz in sides])
     children = new_state(halves, pairs.unseen_share)
-    children.second, children.steps = pairs.second, pairs.steps
+    children.second = pairs.second
+    children.steps = pairs.steps
     faint = _sigmoid(state.parameters.opacity) < MIN_OPACITY
     keep = ~prunable(state, faint & within)
     keep[split] = False
@@ -114,7 +119,8 @@ def reset_strays(state: TrainState, limit: np.ndarray, share: float) -> int:
 def prunable(state: TrainState, unwanted: np.ndarray) -> np.ndarray:
     """(N,) bool: the unwanted splats (N,); a triangle that would lose all bound ones keeps the most
     opaque."""
-    face, bound = state.face, np.flatnonzero(~state.unbound)
+    face = state.face
+    bound = np.flatnonzero(~state.unbound)
     order = bound[np.lexsort((-state.parameters.opacity[bound], unwanted[bound], face[bound]))]
     first = np.ones(len(order), bool)
     first[1:] = face[order][1:] != face[order][:-1]
@@ -139,9 +145,11 @@ class Outline:
 
 def read_outlines(capture: Capture, seed: int) -> list[Outline]:
     """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError."""
-    views, outlines = capture.views["train"], []
+    views = capture.views["train"]
+    outlines = []
     for n in np.random.default_rng(seed).permutation(len(views))[:MAX_OUTLINES]:
-        view, mask = views[n], read_mask(views[n])
+        view = views[n]
+        mask = read_mask(views[n])
         if mask is None:
             continue
         camera = view.camera.scaled(min(1.0, MAX_OUTLINE_HEIGHT_PX / view.camera.height))
@@ -169,7 +177,8 @@ def prune_outside(
     for n, outline in enumerate(outlines):
         left = len(outlines) - n  # without those that all of these could not make a stray
         rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
-        face, frame = state.face[rows], frames(outline.timestep)
+        face = state.face[rows]
+        frame = frames(outline.timestep)
         x, y, shown = pixels_of(
             points_to_world(state.parameters.xyz[rows], frame, face), outline.camera
         )
@@ -204,10 +213,12 @@ def unseen_sides(capture: Capture) -> UnseenSides:
     cosine = np.full(len(capture.faces), -1.0)  # with the camera that a triangle faces most
     for view in views:
         a, b, c = np.asarray(capture.mesh(view.timestep))[capture.faces].swapaxes(0, 1)
-        normal, towards = np.cross(b - a, c - a), view.camera.position - (a + b + c) / 3
+        normal = np.cross(b - a, c - a)
+        towards = view.camera.position - (a + b + c) / 3
         length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
         cosine = np.maximum(cosine, (normal * towards).sum(1) / np.maximum(length, 1e-20))
-    outside, (color, shown) = _outside(capture), mean_colors(capture, views)
+    outside = _outside(capture)
+    (color, shown) = mean_colors(capture, views)
     sources = np.flatnonzero(shown & outside & (cosine > SOURCE_COSINE))
     unseen = outside & (cosine < MIN_COSINE)
     if not len(sources):
@@ -231,7 +242,8 @@ def _outside(capture: Capture) -> np.ndarray:
     radius = max(float(np.linalg.norm(neutral - center, axis=1).max()), 1e-9)
     seen = np.zeros(len(capture.faces), bool)
     for number in range(OUTSIDE_CAMERAS):
-        angle, height = 2 * np.pi * number / OUTSIDE_CAMERAS, (-0.5, 0.2, 0.9)[number % 3]
+        angle = 2 * np.pi * number / OUTSIDE_CAMERAS
+        height = (-0.5, 0.2, 0.9)[number % 3]
         eye = center + OUTSIDE_DISTANCE * radius * np.array([np.sin(angle), height, np.cos(angle)])
         camera = look_at(eye, center, 400, 400, focal_length=400 * OUTSIDE_DISTANCE / 2.2)
         triangle, _ = rasterize(neutral, capture.faces, camera)

@@ -59,7 +59,8 @@ def compile_for_cpu() -> None:
 
 def _render() -> None:
     """Forward and backward pass."""
-    state, seen = _two_splats(), frames_in_camera(WORLD, CAMERA)
+    state = _two_splats()
+    seen = frames_in_camera(WORLD, CAMERA)
     rendering = render_forward(state.parameters, state.face, seen, 3, focus=np.ones(2, bool))
     v_image = np.zeros_like(rendering.image)
     render_backward(rendering, state.parameters, state.face, seen, v_image, state.gradients)
@@ -67,14 +68,19 @@ def _render() -> None:
 
 def _step() -> None:
     """Limits, replacement of the background, loss and Adam."""
-    image, target = np.zeros((3, 16, 16), np.float32), np.zeros((16, 16, 3), np.uint8)
-    mask, rows = np.zeros((16, 16), np.uint8), np.arange(2, dtype=np.int32)
+    image = np.zeros((3, 16, 16), np.float32)
+    target = np.zeros((16, 16, 3), np.uint8)
+    mask = np.zeros((16, 16), np.uint8)
+    rows = np.arange(2, dtype=np.int32)
     for loaded in (target, mask):  # read-only arrays are a type of their own
         loaded.setflags(write=False)
-    black, white = np.zeros(3, np.float32), np.ones(3, np.float32)
+    black = np.zeros(3, np.float32)
+    white = np.ones(3, np.float32)
     image_loss.change_background(target, mask, black, white, np.empty_like(target))
     state = _two_splats()
-    face, unbound, gradients = state.face, state.unbound, state.gradients
+    face = state.face
+    unbound = state.unbound
+    gradients = state.gradients
     xyz, _, log_scale, opacity, *_ = state.parameters
     # Smaller than the splats: without an excess, its gradient is not computed.
     limits = np.full((2, 1), 0.01, np.float32)
@@ -84,9 +90,11 @@ def _step() -> None:
     image_gradient(image, target, whole_image(16, 16), 0.2, np.empty_like(image))
     rates = dict.fromkeys((*Parameters._fields, "sh_rest", "strain_color"), 1e-3)
     adam.step(state, rows, rates)
-    screen, total = state.screen_gradient, state.gradient_count
+    screen = state.screen_gradient
+    total = state.gradient_count
     optimizer.add_screen_gradients(rows, np.zeros(2, np.float32), screen, total)
-    state, signal = with_offsets(state, OFFSETS, 2), np.zeros((2, 3), np.float32)
+    state = with_offsets(state, OFFSETS, 2)
+    signal = np.zeros((2, 3), np.float32)
     adam.step_offsets(state, rows, lambda name: signal, rates, adam.PLAIN)
 
 
@@ -94,6 +102,9 @@ def _two_splats() -> TrainState:
     # Two, because a column of a one-row array is contiguous, which is another type to Numba.
     shapes = [(2, 3), (2, 4), (2, 3), (2,), (2, 16, 3)]
     xyz, rotation, log_scale, opacity, sh = (np.zeros(shape, np.float32) for shape in shapes)
-    xyz[:, 2], rotation[:, 0], log_scale[:] = (1, 2), 1, -3
-    face, unbound = np.zeros(2, np.int32), np.zeros(2, bool)
+    xyz[:, 2] = (1, 2)
+    rotation[:, 0] = 1
+    log_scale[:] = -3
+    face = np.zeros(2, np.int32)
+    unbound = np.zeros(2, bool)
     return new_state(Splats(xyz, rotation, log_scale, opacity, sh, face, unbound))

@@ -53,7 +53,8 @@ class OffsetState:
 def new_offset(coefficients: np.ndarray) -> OffsetState:
     """A copy of coefficients (F, 3, 3), with zero moments."""
     value = np.array(coefficients, np.float32)
-    zeros, steps = np.zeros_like(value), np.zeros(len(value), np.int32)
+    zeros = np.zeros_like(value)
+    steps = np.zeros(len(value), np.int32)
     return OffsetState(value, zeros, zeros.copy(), value.copy(), steps)
 
 
@@ -123,11 +124,21 @@ def new_state(splats: Splats, unseen_share: np.ndarray | None = None) -> TrainSt
     share, screen, count = np.zeros((3, len(splats)), np.float32)
     if unseen_share is not None:
         share = unseen_share.astype(np.float32)
-    average, steps = Parameters(*(v.copy() for v in values)), np.zeros(len(splats), np.int32)
+    average = Parameters(*(v.copy() for v in values))
+    steps = np.zeros(len(splats), np.int32)
     return TrainState(
-        Parameters(*values), gradients, first, second, average, steps, splats.face.astype(np.int32),
-        splats.unbound.astype(bool), share, screen, count,
-    )  # fmt: skip
+        Parameters(*values),
+        gradients,
+        first,
+        second,
+        average,
+        steps,
+        splats.face.astype(np.int32),
+        splats.unbound.astype(bool),
+        share,
+        screen,
+        count,
+    )
 
 
 def state_of_avatar(avatar: Avatar) -> TrainState:
@@ -172,7 +183,9 @@ def state_of(arrays: Mapping[str, np.ndarray]) -> TrainState:
     """Rebuild a state from `arrays_of`. Raises KeyError with the name of a missing array."""
     values: dict[str, Any] = {}
     for name in _SPLAT_FIELDS:
-        values[name] = arrays[name] if name in arrays else Parameters(
-            *(arrays[f"{name}/{part}"] for part in Parameters._fields)
-        )  # fmt: skip
+        values[name] = (
+            arrays[name]
+            if name in arrays
+            else Parameters(*(arrays[f"{name}/{part}"] for part in Parameters._fields))
+        )
     return TrainState(**values)

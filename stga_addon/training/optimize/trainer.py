@@ -25,7 +25,8 @@ if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
 
 MAX_REGION_SPLIT_SHARE = 0.1
 """Largest share of a region's splats that is split at a time: a refinement has few rounds."""
-OUTLINE_INTERVAL, SIDE_INTERVAL = 200, 100
+OUTLINE_INTERVAL = 200
+SIDE_INTERVAL = 100
 """Iterations between turns of pruning outside of the masks, and of coloring unseen sides."""
 EXTEND_LOCAL_SHARE = 0.5
 """Of an extension's budget, in which what the new takes need is trained, before all splats."""
@@ -45,7 +46,8 @@ class Strategy:
 
     def __init__(self, settings: TrainingSettings, selection: Mapping[int, np.ndarray]) -> None:
         """selection: timestep -> (F,) bool triangles; continuations train the union."""
-        self._settings, self._selection = settings, selection
+        self._settings = settings
+        self._selection = selection
         continues = settings.strategy in CONTINUATIONS
         self.region = np.any(list(selection.values()), axis=0) if continues else None
         self.refined_region = self.region if settings.strategy == "refine" else None
@@ -59,7 +61,8 @@ class Strategy:
                           from 0
         progress          share of the budget spent
         """
-        settings, region = self._settings, self.region
+        settings = self._settings
+        region = self.region
         if region is not None:
             is_local = progress < EXTEND_LOCAL_SHARE and region.any()
             return region if settings.strategy == "refine" or is_local else None
@@ -94,14 +97,16 @@ class Trainer:
 
         strain_range (F, 2, 6): within which deformation is followed; None: TRAINED_RANGE.
         """
-        self.capture, self.settings = capture, settings
+        self.capture = capture
+        self.settings = settings
         self.strategy = Strategy(settings, selection)
         self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
         moved = {} if self.tracking is None else {"moved_mesh": self.tracking.mesh}
         self.frames = FrameStore(
             capture, settings.convention, settings.follows_strain, limits=strain_range, **moved
         )
-        self.iteration, self.visit = 0, -1
+        self.iteration = 0
+        self.visit = -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
         begins = state is None
@@ -156,16 +161,22 @@ class Trainer:
         self.visit += view.timestep != self.last_timestep
         self.last_timestep = view.timestep
         self.frames.mesh(view.timestep, mesh)
-        background, mask = self._background, mask if settings.random_background else None
+        background = self._background
+        mask = mask if settings.random_background else None
         if mask is not None:
             rng = np.random.default_rng([settings.seed, self.iteration])
             background = rng.random(3, np.float32)
         selected = self.strategy.triangles(self.iteration, self.visit, view.timestep, progress)
         batch = Batch(
-            view, target, mask, background, sh_degree(settings, progress), selected,
+            view,
+            target,
+            mask,
+            background,
+            sh_degree(settings, progress),
+            selected,
             learning_rates(settings.rates, progress),
             accumulate=selected is None or self.strategy.region is not None,
-        )  # fmt: skip
+        )
         loss = self._backend.step(batch)
         self.iteration += 1
         self._post_step(progress)
@@ -177,7 +188,9 @@ class Trainer:
 
     def _post_step(self, progress: float) -> None:
         """Change the splats after an optimizer step, where it is the turn of one of the changes."""
-        settings, region, count = self.settings, self.strategy.region, self.iteration
+        settings = self.settings
+        region = self.strategy.region
+        count = self.iteration
 
         def is_turn(interval: int) -> bool:
             return interval > 0 and count % interval == 0

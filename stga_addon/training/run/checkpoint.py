@@ -30,7 +30,8 @@ from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
 VERSIONS = 3, 4
 """Read; the last is written. In version 3, splats may have strain colors of their own."""
-TRACKING, IDENTITY = "tracking/parameters", "identity"
+TRACKING = "tracking/parameters"
+IDENTITY = "identity"
 STRAIN_RANGE = "strain_range.npz"
 """`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
 OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
@@ -128,7 +129,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
             if names:
                 taken = {name.removeprefix(f"{effect}/"): arrays.pop(name) for name in names}
                 offsets[effect] = found = OffsetState(**taken)
-                whole, tail = found.steps.shape[:1], (STRAIN_COMPONENTS, 3)
+                whole = found.steps.shape[:1]
+                tail = (STRAIN_COMPONENTS, 3)
                 for part, array in taken.items():
                     kind = ("int32", whole) if part == "steps" else ("float32", (*whole, *tail))
                     check_array(path, f"{effect}/{part}", array, *kind)
@@ -179,7 +181,8 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
 
 def _check_state(path: Path, state: TrainState) -> None:
     """Kernels trust shapes and types. Raises StgaError naming the array."""
-    n, tails = len(state), {}
+    n = len(state)
+    tails = {}
     for field, kind in ARRAYS.items():
         size = getattr(state.parameters, field).shape[1] if kind.sizes else 0
         if kind.sizes and size not in kind.sizes:
@@ -196,7 +199,9 @@ def check_fits(
     folder: Path, capture: Capture, settings: TrainingSettings, state: TrainState
 ) -> None:
     """Raise StgaError where a checkpoint's splats do not fit the mesh or the settings."""
-    face, splats, faces = state.face, state.splats(), len(capture.faces)
+    face = state.face
+    splats = state.splats()
+    faces = len(capture.faces)
     text = ""
     if len(face) and not 0 <= int(face.min()) <= int(face.max()) < faces:
         text = f"its splats refer to triangles that {capture.root} does not have"
@@ -231,7 +236,8 @@ def trained_strain_range(
     if parent.strain_range is None:
         return limits
     low, high = (np.stack([seen[:, k], parent.strain_range[:, k]]) for k in range(2))
-    lowest, highest = np.maximum(low.min(0), limits[:, 0]), np.minimum(high.max(0), limits[:, 1])
+    lowest = np.maximum(low.min(0), limits[:, 0])
+    highest = np.minimum(high.max(0), limits[:, 1])
     return np.stack([lowest, highest], axis=1)
 
 
@@ -244,7 +250,8 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     """
     if not run.settings.follows_strain or run.settings.tracking:
         return None
-    path, identity = folder / STRAIN_RANGE, _packed(run.digest)
+    path = folder / STRAIN_RANGE
+    identity = _packed(run.digest)
     if not path.exists():
         limits = trained_strain_range(capture, capture.mesh, run.continuation)
         write_npz(path, {"strain_range": limits, IDENTITY: identity}, compressed=True)

@@ -29,13 +29,16 @@ from .identity import file_digest
 
 START_SHARE = 0.5
 """Share of the run's schedule of learning rates that has passed when its continuation begins."""
-DENSITY_INTERVAL, DENSITY_SPAN = 40, (0.0, 0.6)
+DENSITY_INTERVAL = 40
+DENSITY_SPAN = (0.0, 0.6)
 """Density control of a continuation, whose budget is a tenth of a training's."""
-MIN_RESIDUAL_RATIO, MIN_RESIDUAL_GAIN = 1.5, 0.005
+MIN_RESIDUAL_RATIO = 1.5
+MIN_RESIDUAL_GAIN = 0.005
 """How much larger a triangle's residual in new takes than in old ones calls for training."""
 COMPARED_VIEWS = 36
 """Views of the old takes, and of the new ones, in which residuals are compared."""
-MIN_UNLIKE_RATIO, MIN_UNLIKE_RESIDUAL = 3.0, 0.05
+MIN_UNLIKE_RATIO = 3.0
+MIN_UNLIKE_RESIDUAL = 0.05
 """How much larger than its take's median, and how large, the residual of a strange view is."""
 MIN_GROUP_VIEWS = 4
 """Evaluation views of a group at least, where it has so many."""
@@ -62,9 +65,11 @@ def select_for_takes(
     def residuals(*views: View) -> Residuals:
         return triangle_residuals(avatar, capture, views, prepare, RESIDUAL_SCALE)
 
-    old, by_view = residuals(*old_views), [residuals(view) for view in new_views]
+    old = residuals(*old_views)
+    by_view = [residuals(view) for view in new_views]
     new = reduce(add, by_view)
-    known, now = np.nan_to_num(old.mean()), np.nan_to_num(new.mean())
+    known = np.nan_to_num(old.mean())
+    now = np.nan_to_num(new.mean())
     differs = now > np.maximum(MIN_RESIDUAL_RATIO * known, known + MIN_RESIDUAL_GAIN)
     timesteps = tuple(timestep for timestep in capture.timesteps if continuation.includes(timestep))
     moving = select_capture(replace(capture, timesteps=timesteps), settings.selection)
@@ -173,8 +178,10 @@ def continued_evaluation_views(
         if run.settings.strategy == "extend":
             group = f"take_{1 + sum(take.start <= view.timestep for take in run.takes)}"
         groups.setdefault(group, []).append(view)
-    limit, chosen = max(MIN_GROUP_VIEWS, metrics.MAX_EVALUATION_VIEWS // max(1, len(groups))), []
-    background, backdrop = run.settings.background, run.settings.backdrop
+    limit = max(MIN_GROUP_VIEWS, metrics.MAX_EVALUATION_VIEWS // max(1, len(groups)))
+    chosen = []
+    background = run.settings.background
+    backdrop = run.settings.backdrop
     for name, members in groups.items():
         for view in evenly_spread(members, limit):
             found = metrics.read_evaluation_view(capture, view, background, backdrop)
@@ -238,7 +245,8 @@ def replayed_views(
     for view in views:
         by_timestep.setdefault(view.timestep, []).append(view)
     chosen = distinct_timesteps(capture, sorted(by_timestep))
-    kept, cameras = [], max(1, limit // max(1, len(chosen)))
+    kept = []
+    cameras = max(1, limit // max(1, len(chosen)))
     for turn, timestep in enumerate(chosen):
         members = sorted(by_timestep[timestep], key=lambda view: view.camera_index)
         steps = np.linspace(0, len(members), min(cameras, len(members)), endpoint=False).astype(int)

@@ -30,11 +30,17 @@ from .identity import (
     read_settings,
 )
 
-FORMAT, VERSION = "stga-run", max(LATER_SETTINGS)
+FORMAT = "stga-run"
+VERSION = max(LATER_SETTINGS)
 VERSIONS = range(min(LATER_SETTINGS) - 1, VERSION + 1)
 """Read as well: LATER_SETTINGS are all that it lacks."""
-RUN, AVATAR, CHECKPOINT, SELECTION = "run.json", "avatar.npz", "checkpoint.npz", "selection.npz"
-WORLD_FILE, TRACKING, RESIDUALS = "world.ply", "tracking.npz", "residuals.npz"
+RUN = "run.json"
+AVATAR = "avatar.npz"
+CHECKPOINT = "checkpoint.npz"
+SELECTION = "selection.npz"
+WORLD_FILE = "world.ply"
+TRACKING = "tracking.npz"
+RESIDUALS = "residuals.npz"
 
 
 @dataclass(frozen=True)
@@ -182,7 +188,8 @@ def open_run(
         raise StgaError(f"{folder}: {trained}, not '{principal_point}'")
     flame = run.flame if flame is None else flame.resolve()
     first = open_capture(run.capture if capture is None else capture, flame, run.principal_point)
-    run, takes = replace(run, capture=first.root, flame=flame), [first]
+    run = replace(run, capture=first.root, flame=flame)
+    takes = [first]
     for take in run.takes:
         takes.append(open_capture(take.capture, run.flame, run.principal_point))
         given = identity_of(takes[-1], run.principal_point, run.settings)
@@ -244,7 +251,8 @@ def device_of(run: Run, requested: str = "auto") -> tuple[str, str]:
     """The device to continue a run on, and why: its own, or the first GPU where this machine lacks
     that one, unless `requested` names another (`choose_device`). Raises StgaError where it does not
     work or cannot train this run."""
-    trained_on, has_adapter = run.device, False
+    trained_on = run.device
+    has_adapter = False
     with suppress(StgaError):  # where there is no GPU at all
         named = trained_on.removeprefix(GPU)
         has_adapter = trained_on.startswith(GPU) and named in adapter_names()
@@ -272,7 +280,8 @@ def write_tracking(
     arrays["shape"] = sequence.shape
     if sequence.static_offset is not None:
         arrays["static_offset"] = sequence.static_offset
-    arrays["timesteps"], arrays["tracked"] = np.array(sequence.timesteps), tracked
+    arrays["timesteps"] = np.array(sequence.timesteps)
+    arrays["tracked"] = tracked
     arrays[TORSO_SHIFT] = refined[:, -SHIFT_SIZE:]
     write_npz(folder / TRACKING, arrays, compressed=True)
 
@@ -281,11 +290,14 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
     """The capture with the parameters that the run in `folder` refined, in the timesteps whose
     tracked parameters are those that the run started from: another capture stays unchanged. Raises
     StgaError if the run's file is damaged."""
-    path, sequence = folder / TRACKING, capture.flame
+    path = folder / TRACKING
+    sequence = capture.flame
     if sequence is None or not path.exists():
         return capture
-    motion, arrays = read_motion(path, sequence.model), read_npz(path)
-    count, tracked = len(motion.timesteps), arrays.get("tracked", np.zeros(0))
+    motion = read_motion(path, sequence.model)
+    arrays = read_npz(path)
+    count = len(motion.timesteps)
+    tracked = arrays.get("tracked", np.zeros(0))
     if len(tracked) != count:
         raise StgaError(
             f"{path}: tracked has shape {tracked.shape}, expected {count} timesteps first"

@@ -61,10 +61,17 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
     cameras = {view.camera_index for _, view in views}
     timesteps = {view.timestep for _, view in views}
     images = [
-        (split, view.timestep, view.camera_index, view.name, view.camera.width, view.camera.height,
-         view.mask is not None)
+        (
+            split,
+            view.timestep,
+            view.camera_index,
+            view.name,
+            view.camera.width,
+            view.camera.height,
+            view.mask is not None,
+        )
         for split, view in views
-    ]  # fmt: skip
+    ]
     lenses = [view.camera for _, view in views]
     poses = np.array([lens.world_to_camera for lens in lenses], np.float64).reshape(-1, 16)
     intrinsics = [(lens.fl_x, lens.fl_y, lens.cx, lens.cy) for lens in lenses]
@@ -98,7 +105,8 @@ def earlier_identity(
     identity: RunIdentity, settings: TrainingSettings, version: int
 ) -> RunIdentity:
     """As an earlier format version recorded it; the same for settings that are not of one."""
-    later, known = _settings_since(version), to_json(settings)
+    later = _settings_since(version)
+    known = to_json(settings)
     if version < max(LATER_SETTINGS):
         offsets = [name for name in known["driven_offsets"] if name != "older_strain_color"]
         follows = len(offsets) < len(known["driven_offsets"])

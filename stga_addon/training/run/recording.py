@@ -31,13 +31,15 @@ from ..optimize.image_preparation import EXPOSURE_SCALE, fit_exposure
 from ..settings import TrainingSettings
 from .folder import AVATAR, avatar_version, open_refined, open_run, read_run
 
-EXPOSURE_VIEWS, EXPOSURE_HEIGHT_PX = 24, 160
+EXPOSURE_VIEWS = 24
+EXPOSURE_HEIGHT_PX = 160
 """Views of a camera, spread over the take, that its exposure is fitted to, and their height."""
 CAMERA_WEIGHT = 0.2
 """Of the camera's exposure in that of a view, as a share of the view's pixels."""
 MIN_COVER = 250
 """Of a mask, of 255, from which a pixel shows the person alone."""
-SHADING_PRIOR, SHADING_ITERATIONS = 0.01, 6
+SHADING_PRIOR = 0.01
+SHADING_ITERATIONS = 6
 """Weight of the light that the avatar was trained in, as a share of the pixels."""
 SCALE_TIMESTEPS = 6
 """Spread over the take, that the scale is found from."""
@@ -64,7 +66,8 @@ def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
     head = HeadModel(with_identity(sequence).model, "flame")
     fit = HeadFit(head, sequence.shape, {}, IDENTITY, sequence.static_offset)
-    cameras, stored = list(_cameras(capture).values()), read_run(run)
+    cameras = list(_cameras(capture).values())
+    stored = read_run(run)
     avatar = read_avatar(run / AVATAR)
 
     def draw(mesh: np.ndarray, camera: Camera) -> np.ndarray:
@@ -183,7 +186,8 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     where there are other cameras, or where the images are explained worse then."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
-    cameras, usual = _cameras(capture), _cameras(open_run(run).capture)
+    cameras = _cameras(capture)
+    usual = _cameras(open_run(run).capture)
     if set(cameras) != set(usual):
         return None
     rotations = [
@@ -191,7 +195,8 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
         for index, camera in cameras.items()
     ]
     rotation = Rotation.from_matrix(rotations).mean().as_matrix()
-    avatar, errors = read_avatar(run / AVATAR), []
+    avatar = read_avatar(run / AVATAR)
+    errors = []
     for world in (IDENTITY, replace(IDENTITY, rotation=rotation)):
         missed = []
         for _, pixels in _colors_by_camera(avatar, stored.settings, capture, world):
@@ -244,7 +249,8 @@ def _open(
 
 
 def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Light:
-    rows, lit = [], []
+    rows = []
+    lit = []
     for chosen, pixels in _colors_by_camera(avatar, settings, capture):
         drawn, seen, normals = (np.concatenate(side, 1) for side in zip(*pixels, strict=True))
         usual = fit_exposure(drawn, seen)
@@ -258,7 +264,8 @@ def _light(avatar: Avatar, settings: TrainingSettings, capture: Capture) -> Ligh
 
 def _fit_shading(drawn: np.ndarray, seen: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Harmonics (9, 3) by the normal (3, N) of a factor from colors (3, N) to those seen."""
-    by_normal, usual = basis(normals.T), uniform(1.0)
+    by_normal = basis(normals.T)
+    usual = uniform(1.0)
     found = usual.copy()
     for _ in range(SHADING_ITERATIONS):
         for channel, (x, y) in enumerate(zip(drawn, seen, strict=True)):
@@ -291,7 +298,8 @@ def _head_colors(
     levels = [round(255 * part) for part in settings.background]
     scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
     view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
-    mesh, camera = world.apply(capture.mesh(view.timestep)), world.camera(view.camera)
+    mesh = world.apply(capture.mesh(view.timestep))
+    camera = world.camera(view.camera)
     drawn = render_avatar(avatar, mesh, camera, settings.background)
     shown = rasterize(mesh, capture.faces, camera)
     head, normals = normal_images(mesh, capture.faces, shown)

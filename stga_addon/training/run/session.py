@@ -52,9 +52,11 @@ CHECKPOINT_S = 30.0
 """Seconds of training between checkpoints: what a crash may cost."""
 CHECKPOINT_VARIABLE = "STGA_CHECKPOINT_S"
 """Environment variable that replaces it, for machines that are taken away often."""
-TRACKING_START_SHARE, TRACKING_TIME_SHARE = 0.5, 0.2
+TRACKING_START_SHARE = 0.5
+TRACKING_TIME_SHARE = 0.2
 """Of the budget, after which the avatar tracks its head; what that may take of seconds."""
-LEFT_OUT_INTERVAL, LEFT_OUT_VIEWS = 12, 24
+LEFT_OUT_INTERVAL = 12
+LEFT_OUT_VIEWS = 24
 """Where no camera is held out, every how many timesteps one is left out of that tracking; views
 that say whether it is kept."""
 Selection = Mapping[int, np.ndarray]
@@ -155,7 +157,8 @@ class _Session:
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels")
         precompile_kernels(self.run.device)
-        lines, path = self.evaluator.lines, self.folder / AVATAR
+        lines = self.evaluator.lines
+        path = self.folder / AVATAR
         self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
         if self._is_finished():  # a finished run was resumed
             if not path.exists():
@@ -171,7 +174,8 @@ class _Session:
             self._train()
             if self._is_finished():
                 # the timesteps of other splits, whose splats they do not change
-                tracking, views = self.trainer.tracking, self.capture.views
+                tracking = self.trainer.tracking
+                views = self.capture.views
                 every = {view.timestep for own in views.values() for view in own}
                 unseen = every - {view.timestep for view in views["train"]}
                 if tracking is not None and tracking.has_moved and tracking.rounds == 1 and unseen:
@@ -187,8 +191,11 @@ class _Session:
             raise KeyboardInterrupt
 
     def _train(self) -> None:
-        trainer, tracking = self.trainer, self.trainer.tracking
-        saved, started, first = self.elapsed_s, self.elapsed_s, trainer.iteration
+        trainer = self.trainer
+        tracking = self.trainer.tracking
+        saved = self.elapsed_s
+        started = self.elapsed_s
+        first = trainer.iteration
         interval_s = _asked_interval_s()
         with self._loader() as loader:
             while not self._spent().share >= 1:
@@ -219,7 +226,9 @@ class _Session:
 
     def _loader(self) -> ViewLoader:
         """The views to train from here on."""
-        settings, capture, first = self.run.settings, self.capture, self.trainer.iteration
+        settings = self.run.settings
+        capture = self.capture
+        first = self.trainer.iteration
         red, green, blue = (round(255 * c) for c in settings.background)
         if self.run.continuation is None:
             views = capture.views["train"]
@@ -248,7 +257,8 @@ class _Session:
         left_out = [
             view for view in self.capture.views.get("val", ()) if view.timestep in timesteps
         ]
-        tracked, before = timesteps, tracking.parameters
+        tracked = timesteps
+        before = tracking.parameters
         if not left_out and is_in_order(self.capture.root) is not False:
             between = timesteps[LEFT_OUT_INTERVAL // 2 :: LEFT_OUT_INTERVAL]
             left_out = [view for view in views if view.timestep in between]
@@ -265,7 +275,9 @@ class _Session:
 
     def _squared_error(self, views: Sequence[View]) -> float:
         """Mean over the views, of images as high as the avatar tracks in; never quite 0."""
-        settings, share, errors = self.run.settings, self._spent().share, []
+        settings = self.run.settings
+        share = self._spent().share
+        errors = []
         prepare = image_preparation(self.capture, settings)
         for view in views:
             small, image = read_small(view, MAX_HEIGHT_PX, settings, prepare)
@@ -287,7 +299,8 @@ class _Session:
             told = self._tell(f"Tracking by the avatar: {done} of {total}")
             return told or bool(self.interrupts)
 
-        settings, capture = self.run.settings, tracking.refined(capture)
+        settings = self.run.settings
+        capture = tracking.refined(capture)
         seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
         try:
             found = track_by_avatar(self._avatar(), settings, capture, tracked, seconds, stops)
@@ -299,7 +312,9 @@ class _Session:
 
     def _evaluate(self, perceptual: bool = False) -> None:
         """Evaluate, keep the avatar where that says so, and append a line of metrics."""
-        begin, share, limits = perf_counter(), min(1.0, self._spent().share), None
+        begin = perf_counter()
+        share = min(1.0, self._spent().share)
+        limits = None
         if self.trainer.tracking is not None:
             self._measure_refined_strain()
             limits = self.strain_range
@@ -325,7 +340,8 @@ class _Session:
         self.tracking_gain = {}
 
     def _spent(self) -> Spent:
-        settings, iterations = self.run.settings, self.trainer.iteration
+        settings = self.run.settings
+        iterations = self.trainer.iteration
         if settings.seconds is not None:
             return Spent(self.elapsed_s / settings.seconds, self.elapsed_s, iterations)
         return Spent(iterations / (settings.iterations or 1), self.elapsed_s, iterations)
@@ -335,12 +351,18 @@ class _Session:
 
     def _tell(self, stage: str) -> bool:
         """Report how far the run is; returns whether to stop."""
-        spent, evaluator, last = self._spent(), self.evaluator, [{}, *self.evaluator.lines][-1]
+        spent = self._spent()
+        evaluator = self.evaluator
+        last = [{}, *self.evaluator.lines][-1]
         figures = {
-            "iteration": spent.iterations, "per_second": self.speed, "left_s": spent.left_s,
-            "loss": np.mean(self.losses) if self.losses else None, "psnr": last.get("psnr"),
-            "psnr_unmatched": last.get(UNMATCHED), "splats": len(self.trainer),
-        }  # fmt: skip
+            "iteration": spent.iterations,
+            "per_second": self.speed,
+            "left_s": spent.left_s,
+            "loss": np.mean(self.losses) if self.losses else None,
+            "psnr": last.get("psnr"),
+            "psnr_unmatched": last.get(UNMATCHED),
+            "splats": len(self.trainer),
+        }
 
         def known() -> dict[str, float]:
             values = {**figures, "memory_mb": metrics.peak_memory_mb()}
@@ -357,7 +379,8 @@ class _Session:
     def _avatar(self) -> Avatar:
         if self.strain_range is None:
             self._measure_refined_strain()
-        state, settings = self.trainer.state, self.run.settings
+        state = self.trainer.state
+        settings = self.run.settings
         return Avatar(
             splats=state.splats(averaged=True),
             convention=settings.convention,
@@ -394,23 +417,35 @@ class _Session:
             folders.write_tracking(self.folder, found.sequence, found.parameters, found.tracked)
 
     def _write_checkpoint(self) -> None:
-        trainer, tracking, evaluator = self.trainer, self.trainer.tracking, self.evaluator
+        trainer = self.trainer
+        tracking = self.trainer.tracking
+        evaluator = self.evaluator
         self._require_folder()
         checkpoint = checkpoints.Checkpoint(
-            trainer.state, trainer.iteration, trainer.visit, trainer.last_timestep,
-            trainer.initial_count, self.elapsed_s, evaluator.best_difference, evaluator.count,
-            list(self.losses), None if tracking is None else tracking.parameters,
-            0 if tracking is None else tracking.rounds, self.run.digest,
-        )  # fmt: skip
+            trainer.state,
+            trainer.iteration,
+            trainer.visit,
+            trainer.last_timestep,
+            trainer.initial_count,
+            self.elapsed_s,
+            evaluator.best_difference,
+            evaluator.count,
+            list(self.losses),
+            None if tracking is None else tracking.parameters,
+            0 if tracking is None else tracking.rounds,
+            self.run.digest,
+        )
         checkpoints.write_checkpoint(self.folder, checkpoint)
 
     def _write_residuals(self) -> None:
         """Measure the written avatar's error by triangle, over a few views of all frames."""
-        capture, settings = self.capture, self.run.settings
+        capture = self.capture
+        settings = self.run.settings
         if self.trainer.tracking is not None:
             capture = folders.with_refined_tracking(capture, self.folder)
         views = [view for split in ("train", "val") for view in self.capture.views.get(split, ())]
-        shown, prepare = evenly_spread(views, RESIDUAL_VIEWS), image_preparation(capture, settings)
+        shown = evenly_spread(views, RESIDUAL_VIEWS)
+        prepare = image_preparation(capture, settings)
         avatar = read_avatar(self.folder / AVATAR)
         residuals = triangle_residuals(avatar, capture, shown, prepare, RESIDUAL_SCALE)
         folders.write_residuals(self.folder, residuals.mean())
@@ -421,7 +456,9 @@ def _begin(
 ) -> _Session:
     """Start a new run: select triangles, by the rule or as given, place splats, write its files."""
     report(Progress(stage="Placing splats"))
-    settings, continuation, state = run.settings, run.continuation, None
+    settings = run.settings
+    continuation = run.continuation
+    state = None
     if selection is None:
         selective = settings.strategy == "selective"
         selection = select_capture(capture, settings.selection) if selective else {}
@@ -449,8 +486,11 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     selection = checkpoints.read_selection(folder, len(capture.faces), run.digest)
     checkpoints.check_fits(folder, capture, run.settings, found.state)
     session = _session(capture, folder, run, selection, found.state, report)
-    trainer, tracking, evaluator = session.trainer, session.trainer.tracking, session.evaluator
-    refined, wanted = found.tracking, None
+    trainer = session.trainer
+    tracking = session.trainer.tracking
+    evaluator = session.evaluator
+    refined = found.tracking
+    wanted = None
     if tracking is not None:
         wanted = tracking.parameters.shape
         if refined is not None and refined.shape == tracking.tracked.shape:
@@ -459,14 +499,18 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     if wanted != (None if refined is None else refined.shape):
         text = "its checkpoint's refined tracking does not fit the capture or the settings"
         raise StgaError(f"{folder}: {text}")
-    trainer.iteration, trainer.visit = found.iteration, found.visit
-    trainer.last_timestep, trainer.initial_count = found.last_timestep, found.initial_count
+    trainer.iteration = found.iteration
+    trainer.visit = found.visit
+    trainer.last_timestep = found.last_timestep
+    trainer.initial_count = found.initial_count
     if tracking is not None and refined is not None:
-        tracking.parameters, tracking.rounds = refined, found.rounds
+        tracking.parameters = refined
+        tracking.rounds = found.rounds
     session.elapsed_s = found.elapsed_s
     session.losses.extend(found.losses)
     cut_metrics(folder, found.iteration)
-    evaluator.lines, evaluator.count = read_metrics(folder), found.evaluations
+    evaluator.lines = read_metrics(folder)
+    evaluator.count = found.evaluations
     evaluator.best_difference = found.best_difference
     if not (folder / AVATAR).exists():
         evaluator.best_difference = math.inf  # so that the next evaluation writes one
@@ -477,9 +521,13 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
 
 
 def _session(
-    capture: Capture, folder: Path, run: Run, selection: Selection, state: TrainState | None,
+    capture: Capture,
+    folder: Path,
+    run: Run,
+    selection: Selection,
+    state: TrainState | None,
     report: Report,
-) -> _Session:  # fmt: skip
+) -> _Session:
     settings = run.settings
     if settings.follows_strain:
         report(Progress(stage="Measuring strain"))
@@ -488,7 +536,8 @@ def _session(
     if run.continuation is not None:
         views = continued_evaluation_views(run, capture, trainer.strategy.refined_region)
     else:
-        background, backdrop = settings.background, settings.backdrop
+        background = settings.background
+        backdrop = settings.backdrop
         views = [
             metrics.read_evaluation_view(capture, view, background, backdrop)
             for view in metrics.choose_evaluation_views(capture)

@@ -114,7 +114,8 @@ def test_a_slice_is_stopped_and_goes_on(toy, tmp_path, monkeypatch):
     report = write_report([request], tmp_path)
     for name in VARIANTS:
         assert f"| {name}" in report
-        checkpoint, lines = read_checkpoint(tmp_path / name), read_metrics(tmp_path / name)
+        checkpoint = read_checkpoint(tmp_path / name)
+        lines = read_metrics(tmp_path / name)
         assert checkpoint.elapsed_s >= 2 > kept[name]
         assert [line["iteration"] for line in lines] == sorted(line["iteration"] for line in lines)
         assert read_run(tmp_path / name).settings.seed == 4
@@ -204,7 +205,8 @@ def test_impossible_benchmarks(toy_root, tmp_path, capsys):
 @pytest.mark.slow
 def test_slices_are_jobs_of_a_batch(toy_root, tmp_path, capsys, monkeypatch):
     """Catches seeds that are no jobs, a finished one trained again, and no word of one."""
-    out, options = str(tmp_path / "out"), ["--budget", "1s", "--only", "draft", "--threads", "1"]
+    out = str(tmp_path / "out")
+    options = ["--budget", "1s", "--only", "draft", "--threads", "1"]
     command = ["benchmark", str(toy_root), "--out", out, "--seeds", "2", *options]
     assert main([*command, "--dry-run"]) == 0
     printed = capsys.readouterr().out

@@ -13,7 +13,9 @@ from stga_addon.files import read_json, write_json
 
 bpy = pytest.importorskip("bpy", reason="Blender's module bpy is not installed")
 
-TIMESTEPS, CAMERAS, WIDTH = (0, 1, 7), (2, 3, 4, 5, 6), 96
+TIMESTEPS = (0, 1, 7)
+CAMERAS = (2, 3, 4, 5, 6)
+WIDTH = 96
 
 
 def unpack_few(folder):

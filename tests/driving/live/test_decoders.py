@@ -102,7 +102,8 @@ def test_vmc_with_python_osc():
     """Catches what bytes by hand and decoder get wrong together."""
     message = pytest.importorskip("pythonosc.osc_message_builder")
     bundles = pytest.importorskip("pythonosc.osc_bundle_builder")
-    weights, known = wire.mixed(3), Received()
+    weights = wire.mixed(3)
+    known = Received()
 
     def written(address: str, *values: object) -> object:
         builder = message.OscMessageBuilder(address)

@@ -180,7 +180,8 @@ def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
     """Catches packets that are left out, a take as long as two clocks are apart, and a CSV that
     cannot be read back. Packets arrive two at once, and those around the jump while Blender is
     busy."""
-    stream, recording = Watched(LINK), Recording(1, None)
+    stream = Watched(LINK)
+    recording = Recording(1, None)
     day = 24 * 3600 * 60
     change = {"app restarted": -500_000, "midnight": -day}.get(jump, 79_001 * 60)
     for number in range(60):
@@ -200,7 +201,8 @@ def test_a_recording_goes_on_where_the_clock_jumps(jump, tmp_path):
 @pytest.mark.parametrize("sent", ["every frame", "once"])
 def test_vmc_whose_clock_stands_still(sent):
     """Catches a head that freezes with the sender's clock, and a take of one packet."""
-    stream, recording = Watched(SOURCES["vmc"]), Recording(1, None)
+    stream = Watched(SOURCES["vmc"])
+    recording = Recording(1, None)
     clock = osc_text("/VMC/Ext/T") + osc_text(",f") + struct.pack(">f", 12.5)
     for number in range(60):
         time = [clock] if sent == "every frame" or number == 0 else []

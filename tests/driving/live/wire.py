@@ -10,14 +10,20 @@ from stga_addon.driving.performance import ARKIT_SHAPES
 
 UDP_ORDER = list(ARKIT_SHAPES)
 for pair in ("jaw", "mouth"):
-    left, right = UDP_ORDER.index(f"{pair}Left"), UDP_ORDER.index(f"{pair}Right")
+    left = UDP_ORDER.index(f"{pair}Left")
+    right = UDP_ORDER.index(f"{pair}Right")
     UDP_ORDER[left], UDP_ORDER[right] = UDP_ORDER[right], UDP_ORDER[left]
 
 
 def live_link_face(
-    weights: dict[str, float], frame: int = 0, head: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    subject: str = "phone", device: str = "DEVICE-1", count: int = 61, rate: int = 60,
-) -> bytes:  # fmt: skip
+    weights: dict[str, float],
+    frame: int = 0,
+    head: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    subject: str = "phone",
+    device: str = "DEVICE-1",
+    count: int = 61,
+    rate: int = 60,
+) -> bytes:
     """Version, device and subject, frame and rate, the values; big-endian."""
     values = [weights.get(name, 0.0) for name in UDP_ORDER] + [*head] + [0.0] * 6
     texts = device.encode(), subject.encode()

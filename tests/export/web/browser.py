@@ -11,10 +11,17 @@ from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 FLAGS = (
-    "--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--hide-scrollbars", "--disable-dev-shm-usage", "--disable-background-networking",
-    "--no-first-run", "--force-prefers-reduced-motion", "--remote-debugging-pipe",
-)  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--hide-scrollbars",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--no-first-run",
+    "--force-prefers-reduced-motion",
+    "--remote-debugging-pipe",
+)
 TIMEOUT_S = 120.0
 
 
@@ -34,20 +41,28 @@ class Browser:
         self._in, in_write = os.pipe()
 
         def place() -> None:  # DevTools reads descriptor 3 and writes descriptor 4
-            read, write = os.dup(out_read), os.dup(in_write)
+            read = os.dup(out_read)
+            write = os.dup(in_write)
             os.dup2(read, 3)
             os.dup2(write, 4)
 
         self._process = subprocess.Popen(
             [
-                executable, *FLAGS, f"--user-data-dir={profile}",
-                f"--window-size={size[0]},{size[1]}", "about:blank",
+                executable,
+                *FLAGS,
+                f"--user-data-dir={profile}",
+                f"--window-size={size[0]},{size[1]}",
+                "about:blank",
             ],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(3, 4), preexec_fn=place,
-        )  # fmt: skip
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(3, 4),
+            preexec_fn=place,
+        )
         os.close(out_read)
         os.close(in_write)
-        self._buffer, self._number = b"", 0
+        self._buffer = b""
+        self._number = 0
         self._session: str | None = None
         self.requests: list[str] = []
         self.errors: list[str] = []

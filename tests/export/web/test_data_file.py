@@ -44,7 +44,8 @@ def test_splats_come_back_within_their_steps(head):
     triangle."""
     _, arrays = read_web_data(head.data())
     order = np.argsort(head.avatar.splats.face, kind="stable")
-    original, found = head.avatar.splats.rows(order), splats_of(arrays)
+    original = head.avatar.splats.rows(order)
+    found = splats_of(arrays)
     unit = original.rotation / np.linalg.norm(original.rotation, axis=1, keepdims=True)
     assert np.array_equal(found.face, original.face)
     assert np.abs(found.xyz - original.xyz).max() <= data_file.POSITION_STEP_M
@@ -101,7 +102,8 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     """Catches FLAME's blend shapes in a file that was asked for without them, a page that keeps
     quiet about them, or about FLAME's triangles and meshes in it, one of any other head that names
     FLAME's licence, and a data file left behind by an export that fails at the player beside it."""
-    path, meshes = tmp_path / "a.stga", list(enumerate(head.meshes))
+    path = tmp_path / "a.stga"
+    meshes = list(enumerate(head.meshes))
     (tmp_path / ELEMENT).mkdir()
     with pytest.raises(StgaError, match=ELEMENT):
         write_web(path, head.avatar, Playback(), meshes)

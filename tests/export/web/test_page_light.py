@@ -44,7 +44,8 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
     """A head whose light is known: brighter from above, with a part of the mesh as wet as eyes.
     lashes: around a nose that is wet as well."""
     head = make_head(**options)
-    neutral, faces = head.avatar.neutral.astype(np.float64), head.avatar.faces
+    neutral = head.avatar.neutral.astype(np.float64)
+    faces = head.avatar.faces
     transfer, occlusion = transfer_of(neutral, faces, 48)
     radiance = uniform((0.5, 0.45, 0.4))
     radiance[1] = 0.3
@@ -52,7 +53,8 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
     arriving = arriving + Bounce(neutral, faces, occlusion).light(arriving)
     eye = lashes & (np.linalg.norm(neutral - neutral[neutral[:, 2].argmax()], axis=1) < 0.012)
     wet = np.where((neutral[:, 0] > 0.05) | eye, 0.2, 0).astype(np.float32)
-    radiance, arriving = radiance.astype(np.float32), arriving.astype(np.float32)
+    radiance = radiance.astype(np.float32)
+    arriving = arriving.astype(np.float32)
     light = AvatarLight(radiance, transfer, occlusion, arriving, wet, 0.05, damping)
     splats = with_lashes(head.avatar, eye) if lashes else head.avatar.splats
     return replace(head, avatar=replace(head.avatar, light=light, splats=splats))
@@ -61,13 +63,15 @@ def lit_head(damping: float = 0.0, lashes: bool = False, **options: object) -> H
 def with_lashes(avatar: Avatar, eye: np.ndarray) -> Splats:
     """The splats of an avatar, the first LASHES of them black and 5 mm above the triangles around
     an eye (V,) bool."""
-    middle, centers = avatar.neutral[eye].mean(0), avatar.neutral[avatar.faces].mean(1)
+    middle = avatar.neutral[eye].mean(0)
+    centers = avatar.neutral[avatar.faces].mean(1)
     near = np.linalg.norm(centers - middle, axis=1) < 0.02
     around = np.flatnonzero(~eye[avatar.faces].any(1) & near)
     unit = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention).scale
     splats = avatar.splats.rows(np.arange(len(avatar.splats)))
     chosen = np.resize(around, LASHES)
-    splats.face[:LASHES], splats.opacity[:LASHES] = chosen, 2
+    splats.face[:LASHES] = chosen
+    splats.opacity[:LASHES] = 2
     splats.xyz[:LASHES] = 0
     splats.xyz[:LASHES, 1 if avatar.convention == "gaussian_avatars" else 2] = 0.005 / unit[chosen]
     splats.log_scale[:LASHES] = np.log([0.003, 0.001, 0.0002]) - np.log(unit[chosen])[:, None]
@@ -103,7 +107,8 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
     alike = options.pop("alike", False)
     head = lit_head(lashes=True, **options)
     show(browser, tmp_path, head.data(exact=exact))
-    world, sun_light = harmonics(), SUN
+    world = harmonics()
+    sun_light = SUN
     if alike:
         world = head.avatar.light.radiance * np.array([1.2, 1.0, 0.8])
         sun_light = {**SUN, "color": [0.6, 0.45, 0.3]}
@@ -194,7 +199,8 @@ def test_light_controls(browser, tmp_path):
         """Brightness of the right half of the picture over the left."""
         levels = picture(browser, 0)
         covered = levels.min(2) < 250
-        half, shown = covered.shape[1] // 2, levels.mean(2)
+        half = covered.shape[1] // 2
+        shown = levels.mean(2)
         left, right = (shown[:, k][covered[:, k]].mean() for k in np.s_[:half, half:])
         return float(right / left)
 

@@ -28,7 +28,8 @@ from .test_page import psnr
 pytestmark = pytest.mark.needs("chromium")
 
 ROOT = Path(__file__).resolve().parents[3]
-PLAY_S, PLAY_RATE = 600, 4
+PLAY_S = 600
+PLAY_RATE = 4
 """Length of the long play, and pictures drawn in each second of it."""
 BATCH = 200
 """Pictures drawn at once."""
@@ -108,7 +109,8 @@ def forward(head: Head, frame: FlameFrame) -> np.ndarray:
 def test_touch(browser, head, tmp_path):
     """Catches fingers that do nothing, scroll the page, or move the head the wrong way."""
     show(browser, tmp_path, head.data())
-    first, middle = np.reshape(browser.evaluate(CAMERA), (4, 4)), browser.evaluate(MIDDLE_IN_CAMERA)
+    first = np.reshape(browser.evaluate(CAMERA), (4, 4))
+    middle = browser.evaluate(MIDDLE_IN_CAMERA)
     touch(browser, line((200, 120), (260, 120)))
     turned = np.reshape(browser.evaluate(CAMERA), (4, 4))
     assert turned[2, 0] != pytest.approx(first[2, 0], abs=0.1)  # the viewing direction has turned
@@ -344,7 +346,8 @@ def test_face_shapes_and_a_performance(browser, head, tmp_path):
     np.testing.assert_allclose(found, driven_mesh(head, weights), atol=1e-5)
     np.testing.assert_allclose(vertices(browser, "avatar.release();"), before, atol=1e-12)
 
-    rows, turns = rng.random((4, COUNT)) * 0.5, rng.normal(0, 0.2, (4, 3))
+    rows = rng.random((4, COUNT)) * 0.5
+    turns = rng.normal(0, 0.2, (4, 3))
     take = Performance(np.array([0, 1, 2, 4]) / 30, rows, turns, 30.0)
     write_performance(tmp_path / "take.csv", take)
     text = json.dumps((tmp_path / "take.csv").read_text())

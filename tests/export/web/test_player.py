@@ -65,7 +65,8 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
     """Catches strain of rest that is not taken off, and a single frame that is refused."""
     for offsets in (tuple(OFFSETS), ()):
         head = make_head(sh_degree=0, offsets=offsets)
-        neutral, faces = head.avatar.neutral, head.avatar.faces
+        neutral = head.avatar.neutral
+        faces = head.avatar.faces
         avatar = replace(head.avatar, strain_range=trained_range(len(faces)))
         data = data_file(avatar, baked_rig([neutral]), Playback(), exact=True)
         [result] = evaluated(data, tmp_path)["results"]
@@ -154,7 +155,8 @@ LIGHT = {"damping": 0.5, "recorded": [1] * 27, "typical": [1] * 3}
 def test_damaged_files_are_refused_in_one_sentence(head, tmp_path):
     """Catches a player that hangs, or draws garbage, on a file that was cut off, altered or made by
     a later version."""
-    whole, packed = head.data(), functools.partial(gzip.compress, compresslevel=1)
+    whole = head.data()
+    packed = functools.partial(gzip.compress, compresslevel=1)
     raw = gzip.decompress(whole)
     altered = [
         (whole[: len(whole) // 2], "is damaged."),

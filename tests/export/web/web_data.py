@@ -22,7 +22,8 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     at = 12 + length
     arrays = {}
     for name, entry in header["arrays"].items():
-        shape, count = entry["shape"], int(np.prod(entry["shape"]))
+        shape = entry["shape"]
+        count = int(np.prod(entry["shape"]))
         if entry["type"] == "float32":
             arrays[name] = np.frombuffer(raw, "<f4", count, at).reshape(shape)
             at += 4 * count
@@ -42,7 +43,8 @@ def read_web_data(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def splats_of(arrays: dict[str, np.ndarray]) -> Splats:
     """The splats of a data file, sorted by triangle."""
     count = len(arrays["xyz"])
-    largest, smaller = arrays["rotation_largest"], arrays["rotation"].astype(np.float64)
+    largest = arrays["rotation_largest"]
+    smaller = arrays["rotation"].astype(np.float64)
     rotation = np.empty((count, 4))
     for row in range(4):
         chosen = largest == row

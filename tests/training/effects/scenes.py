@@ -12,7 +12,9 @@ from stga_addon.avatar.strain import deformation, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.model import Capture, View
 
-SIZE, FOCAL, SUPERSAMPLED = 100, 420.0, 3
+SIZE = 100
+FOCAL = 420.0
+SUPERSAMPLED = 3
 NOISE = 1.5  # levels
 
 Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -44,7 +46,8 @@ def gloss(deformed: np.ndarray, direction: np.ndarray, place: np.ndarray) -> np.
 def unlike_cameras() -> tuple[np.ndarray, np.ndarray]:
     """Gain and offset (8, 3) of eight cameras, against their mean."""
     rng = np.random.default_rng(5)
-    gain, offset = rng.uniform(0.92, 1.08, (8, 3)), rng.normal(0, 3, (8, 3))
+    gain = rng.uniform(0.92, 1.08, (8, 3))
+    offset = rng.normal(0, 3, (8, 3))
     return gain / gain.mean(0), offset - offset.mean(0)
 
 
@@ -69,7 +72,8 @@ class Scene:
 def photograph(folder: Path, scene: Scene) -> Capture:
     """Write the scene's images; every camera and timestep is for training."""
     ball = trimesh.creation.icosphere(3, 0.1)
-    vertices, faces = np.array(ball.vertices), np.array(ball.faces, np.int32)
+    vertices = np.array(ball.vertices)
+    faces = np.array(ball.faces, np.int32)
     rng = np.random.default_rng(scene.seed)
     place = vertices[faces].mean(1) / 0.1
     colors = _own_colors(place, rng)
@@ -94,9 +98,16 @@ def photograph(folder: Path, scene: Scene) -> Capture:
             image = np.where(mask[..., None] > 0, noisy, np.array(scene.background))
             views.append(_keep(folder, t, c, camera, image, mask if scene.masks else None))
     return Capture(
-        folder, "mesh", faces, vertices, {"train": tuple(views)}, tuple(meshes), {},
-        meshes.__getitem__, lambda timestep, zero_pose: meshes[timestep],
-    )  # fmt: skip
+        folder,
+        "mesh",
+        faces,
+        vertices,
+        {"train": tuple(views)},
+        tuple(meshes),
+        {},
+        meshes.__getitem__,
+        lambda timestep, zero_pose: meshes[timestep],
+    )
 
 
 def own_colors(capture: Capture, seed: int = 0) -> np.ndarray:
@@ -132,8 +143,10 @@ def _draw(mesh, faces, camera, colors):
     pixels, depth = camera.project(mesh)
     pixels = SUPERSAMPLED * pixels - 0.5
     large = (SUPERSAMPLED * SIZE, SUPERSAMPLED * SIZE)
-    picture, mask = Image.new("RGB", large), Image.new("L", large)
-    draw, cover = ImageDraw.Draw(picture), ImageDraw.Draw(mask)
+    picture = Image.new("RGB", large)
+    mask = Image.new("L", large)
+    draw = ImageDraw.Draw(picture)
+    cover = ImageDraw.Draw(mask)
     levels = np.clip(colors, 0, 255).round().astype(int)
     for face in np.argsort(-depth[faces].mean(1)).tolist():
         corners = pixels[faces[face]].ravel().tolist()

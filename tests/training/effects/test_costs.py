@@ -77,9 +77,11 @@ def test_exposure_is_taken_away(painted):
     rows = tuple(map(tuple, table.tolist()))
     correct = exposure_correction(make_settings(iterations=1, exposure=rows))
     assert correct is not None
-    alike, unlike = painted(), painted(gain=gain, offset=offset)
+    alike = painted()
+    unlike = painted(gain=gain, offset=offset)
     for same, other in zip(alike.views["train"][:8], unlike.views["train"][:8], strict=True):
-        (_, expected, _), (view, image, mask) = read_view(same), read_view(other)
+        (_, expected, _) = read_view(same)
+        (view, image, mask) = read_view(other)
         corrected = correct(view, image, mask)
         pair = image.astype(int), corrected.astype(int)
         before, after = (abs(shown - expected)[mask > 0].mean() for shown in pair)
@@ -113,7 +115,9 @@ def test_no_splats_on_teeth(painted):
 
 def test_antialiasing_reaches_training_and_evaluation(painted):
     """Catches an effect that is decided and then forgotten: against float64."""
-    capture, losses, pictures = painted(), [], []
+    capture = painted()
+    losses = []
+    pictures = []
     view, image, _ = read_view(capture.views["train"][0], 0.4)
     target = torch.from_numpy(image.transpose(2, 0, 1) / 255)
     for choice in ("on", "off"):
@@ -141,7 +145,8 @@ def reference_image(small: trainer.Trainer, view: View, antialiased: bool) -> to
     """The trainer's splats over white, by the reference renderer in float64."""
     state = small.state
     p = Parameters(*(torch.from_numpy(array).double() for array in state.parameters))
-    face, frames = torch.from_numpy(state.face).long(), small.frames.of(view.timestep)
+    face = torch.from_numpy(state.face).long()
+    frames = small.frames.of(view.timestep)
     placed = reference.embed(p.xyz, p.rotation, p.log_scale, frames, face)
     color, alpha, _ = reference.render(
         *placed, p.opacity, p.sh, view.camera, 0, antialiased=antialiased

@@ -15,7 +15,8 @@ from stga_addon.training.settings import make_settings
 
 from .scenes import Scene, photograph
 
-TIMESTEPS, LEFT_OUT = 24, (3, 8, 14, 19)
+TIMESTEPS = 24
+LEFT_OUT = (3, 8, 14, 19)
 PHASES = np.array([0.0, 0.5, 2.0])
 DRIFT = 1 + 0.12 * np.sin(np.arange(TIMESTEPS)[:, None] / 5 + PHASES)
 

@@ -5,7 +5,8 @@ import pytest
 
 from stga_addon.training.effects.evidence import consecutive_folds, linear_evidence, scattered_folds
 
-VIEWS, TRIANGLES = 48, 60
+VIEWS = 48
+TRIANGLES = 60
 GROUP = np.arange(VIEWS) // 6
 """Eight timesteps of six cameras each."""
 FOLDS = consecutive_folds(GROUP)
@@ -43,7 +44,8 @@ def test_features_beyond_the_fitted_range_are_clipped():
 def test_the_range_is_counted_from_rest():
     """Catches a margin counted from 0: a constant added to all strain changes nothing."""
     rng = np.random.default_rng(2)
-    rest, features = np.zeros((TRIANGLES, 3)), rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
+    rest = np.zeros((TRIANGLES, 3))
+    features = rng.normal(0, 1, (8, TRIANGLES, 3))[GROUP]
     color = 100 + 20 * np.clip(features, -0.6, 0.6) + rng.normal(0, 1, (VIEWS, TRIANGLES, 3))
     plain, shifted = (
         linear_evidence(color, features + by, FOLDS, rest=rest + by) for by in (0.0, -0.2)

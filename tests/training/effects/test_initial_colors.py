@@ -94,9 +94,11 @@ def _mouth(folder: Path) -> Capture:
         np.column_stack([0.001 * (half * corner + (x, y)), np.full(4, 0.5 + behind)])
         for x, y, half, behind, _ in PLATES.values()
     ]
-    neutral, faces = np.concatenate(plates), np.array([[0, 1, 2], [0, 2, 3]])
+    neutral = np.concatenate(plates)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
     lifted = neutral + np.array([[0, 0.06, 0]]) * (np.arange(12) < 4)[:, None]
-    meshes, views = (neutral, lifted), []
+    meshes = (neutral, lifted)
+    views = []
     for timestep, mesh in enumerate(meshes):
         picture = Image.new("RGB", (200, 200), "white")
         for plate, (*_, color) in sorted(
@@ -109,6 +111,13 @@ def _mouth(folder: Path) -> Capture:
         views.append(View(timestep, 0, camera, f"{timestep}.png", folder / f"{timestep}.png"))
     faces = np.concatenate([faces + 4 * n for n in range(3)]).astype(np.int32)
     return Capture(
-        folder, "mesh", faces, neutral, {"train": tuple(views)}, (0, 1), {},
-        meshes.__getitem__, lambda timestep, zero_pose: meshes[timestep],
-    )  # fmt: skip
+        folder,
+        "mesh",
+        faces,
+        neutral,
+        {"train": tuple(views)},
+        (0, 1),
+        {},
+        meshes.__getitem__,
+        lambda timestep, zero_pose: meshes[timestep],
+    )

@@ -98,7 +98,8 @@ def test_what_cannot_be_is_one_sentence(root, tmp_path, capsys, effect):
 def test_baselines_decide_nothing(root, tmp_path, capsys):
     """Catches the paper's letter, or GaussianAvatars' method, with effects of ours."""
     for number, options in enumerate(("--schedule paper", "--strategy gaussian-avatars")):
-        out, train = tmp_path / str(number), ("train", root, "--iterations 2", options, "--out")
+        out = tmp_path / str(number)
+        train = ("train", root, "--iterations 2", options, "--out")
         assert stga(*train, out) == 0
         run = read_run(out)
         assert (run.effect_plan, run.settings.effects) == ((), None)

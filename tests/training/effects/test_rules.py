@@ -63,10 +63,13 @@ STILL = {"timesteps": 1, "deformed": 0.0}
         ({"cameras": 1, "paint": gloss}, "view_color", "because a single camera"),
         ({"cameras": 1, "timesteps": 1}, "exposure", "because a single image"),
         ({"masks": False, **FEW_VIEWS}, "background", "because not every image has a mask"),
-        ({"masks": False, "background": (90, 110, 70), **FEW_VIEWS}, "hull_points",
-         "because without masks"),
+        (
+            {"masks": False, "background": (90, 110, 70), **FEW_VIEWS},
+            "hull_points",
+            "because without masks",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_work_is_refused(painted, scene, choice, reason):
     """Catches a choice that the capture tells nothing about and that is trained all the same."""
     flag = f"--effect {choice.replace('_', '-')}=on"
@@ -169,7 +172,8 @@ def test_cameras_of_different_exposure(painted):
     rows = np.array(settings.exposure)
     assert rows[:, 0].tolist() == list(range(8))
     for level in (80, 120, 160):  # what the ball's colors are
-        truth, found = gain * level + offset, rows[:, 1:4] * level + rows[:, 4:]
+        truth = gain * level + offset
+        found = rows[:, 1:4] * level + rows[:, 4:]
         assert abs(found - truth).max() < 2.0
     assert abs(gain * 120 + offset - 120).max() > 8.0
 
@@ -441,7 +445,8 @@ def test_each_timestep_is_posed_once(painted, monkeypatch):
 def test_lips_that_part(painted, shared_data):
     """Catches other vertices than FLAME's lips, and a turn taken for lips that part."""
     with np.load(shared_data / "flame_open/flame2023_open_basis.npz") as data:
-        template, faces = data["v_template"].astype(float), data["faces"]
+        template = data["v_template"].astype(float)
+        faces = data["faces"]
     closed = np.concatenate([template, np.zeros((TEETH_VERTICES, 3))])
     faces = np.concatenate([faces, teeth_faces(TEMPLATE_VERTICES)])
     model = SimpleNamespace(
