@@ -113,7 +113,8 @@ MISTAKES = {
     'out = "r"\n': r"holds no job; expected a table \[job.NAME\]",
     'out = "r"\n[job."a/b"]\n': r"\[job.'a/b'\]: expected a name",
     'out = "r"\n[job.replaced]\n': "other than 'replaced'",
-    'out = "r"\n[job.a]\nrequest = "fly"\n': r"\[job.a\]: request: expected one of train, .*got 'fly'",
+    'out = "r"\n[job.a]\nrequest = "fly"\n': r"\[job.a\]: request: expected one of train, "
+    r".*got 'fly'",
     'out = "r"\n[job.a]\n': r"\[job.a\]: request: expected one of",
     'out = "r"\n' + ONE + 'capturee = "x"\n': r"\[job.one\]: capturee: is not a key",
     'out = "r"\n' + ONE + "device = 3\n": r"\[job.one\]: device: expected a text",

@@ -44,7 +44,8 @@ REFUSALS = [
             ("--out {o} --camera 1", "--camera: has no effect without --video or --turntable"),
             (
                 "--out {o} --turntable --seconds 1e9",
-                "--seconds 1e+09: is 25000000000 images at 25 frames per second; expected up to 100000",
+                "--seconds 1e+09: is 25000000000 images at 25 frames per second; "
+                "expected up to 100000",
             ),
             (
                 "--out {o} --cameras {cameras} --frames 7:9",
@@ -105,9 +106,8 @@ REFUSALS = [
     *(
         (
             f"{command} {{none}} {option} --resume",
-            f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined with "
-            f"--resume, which "
-            "continues RUN as it began",
+            f"{option.split()[0] if option.startswith('-') else 'CAPTURE'}: cannot be combined "
+            "with --resume, which continues RUN as it began",
         )
         for command, option in (
             ("refine", "--region mouth"),
