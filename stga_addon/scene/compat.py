@@ -113,9 +113,11 @@ def enable_nodes(owner: Any) -> Any:
     return owner.node_tree
 
 
-def world_nodes(world: Any) -> Any:
-    """A world's node tree; None where it is a plain color, possible before Blender 5."""
-    return world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None
+def shader_nodes(owner: Any) -> Any:
+    """The node tree of a world or a light; None where it is a plain color, possible for worlds
+    before Blender 5.0, for lights before 5.3."""
+    always_since = (5, 0, 0) if owner.id_type == "WORLD" else (5, 3, 0)
+    return owner.node_tree if bpy.app.version >= always_since or owner.use_nodes else None
 
 
 def native_splats(tree: Any, points: Any) -> Any:

@@ -17,7 +17,7 @@ from ..light.relight import Relighter
 from ..light.values import SKIN_ROUGHNESS, Caster, Light, Lighting
 from . import tags
 from .arrays import mesh_vertices, read_values
-from .compat import light_strength, world_nodes
+from .compat import light_strength, shader_nodes
 from .display import splat_nodes
 from .display.splat_object import get_input
 from .layers import Relit
@@ -141,7 +141,7 @@ def light_of(light: Any, matrix: Any) -> Light | None:
         if light.type == "SPOT":
             own |= {"cone": light.spot_size, "blend": light.spot_blend}
     color = light_strength(light, area)
-    shader = _surface_node(light.use_nodes and light.node_tree)
+    shader = _surface_node(shader_nodes(light))
     if shader is not None and shader.type == "EMISSION":
         emitted, strength = (shader.inputs[name] for name in ("Color", "Strength"))
         color = color * np.array(emitted.default_value[:3]) * strength.default_value
@@ -196,7 +196,7 @@ class WorldLight(NamedTuple):
 
 def world_light(world: Any) -> WorldLight | None:
     """The light of a world, one color or an environment texture; None for other nodes."""
-    tree = world_nodes(world) if world is not None else None
+    tree = shader_nodes(world) if world is not None else None
     if world is not None and tree is None:
         return WorldLight(tuple(world.color))
     background = _surface_node(tree)
