@@ -1,17 +1,5 @@
 """Render splats or an avatar with a camera.
 
-From a PLY file to a picture:
-
-    >>> from pathlib import Path
-    >>> from PIL import Image
-    >>> from stga_addon.export.ply import read_ply
-    >>> from stga_addon.capture.camera import look_at
-    >>> from stga_addon.render.render import render, to_uint8
-    >>> splats = read_ply(Path("splats.ply"))
-    >>> camera = look_at(eye=(0, 0, 1), target=(0, 0, 0), width=640, height=480, focal_length=800)
-    >>> image = render(splats, camera, background=(1, 1, 1))
-    >>> Image.fromarray(to_uint8(image)).save("splats.png")
-
 `cpu.autograd.render_differentiable` renders torch tensors that require gradients.
 """
 
