@@ -1,5 +1,7 @@
 # Everything runs in .venv, which the first target that needs it makes from pyproject.toml.
 PYTHON ?= python3.11
+# For Blender 5.3, whose module bpy needs it
+PYTHON_5_3 ?= python3.13
 BIN := .venv/bin
 # tests/conftest.py says how many processes. `worksteal` gives each of them neighboring tests, so that few fixtures are
 # made twice.
@@ -8,7 +10,7 @@ PARALLEL := -n auto --dist worksteal
 # assertions, anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-footage test test-all kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
+.PHONY: demo demo-footage test test-all test-5.3 kernels test-fast test-tools test-gui lint lint-web fuzz extension extension-complete repository clean
 
 demo: .venv/ready
 	$(BIN)/python -m stga_addon demo --out out/demo
@@ -26,6 +28,11 @@ test: .venv/ready
 test-all: .venv/ready
 	$(MAKE) --jobs 2 --output-sync lint kernels
 	$(BIN)/python -m pytest $(PARALLEL)
+	$(MAKE) test-5.3
+
+# Blender's side in Blender 5.3
+test-5.3: .venv-5.3/ready
+	.venv-5.3/bin/python -m pytest $(PARALLEL) tests/blender -m "not nightly"
 
 # What the tests would each compile
 kernels: .venv/ready
@@ -70,12 +77,13 @@ extension-complete: .venv/ready
 repository: .venv/ready
 	$(BIN)/python -m stga_addon.development.repository dist --out dist/repository --blender '$(or $(BLENDER),blender)'
 
-.venv/ready: pyproject.toml
-	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --editable '.[dev]'
+.venv-5.3/ready: PYTHON = $(PYTHON_5_3)
+.venv/ready .venv-5.3/ready: pyproject.toml
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --editable '.[dev]'
 	# Without dependencies: it lists numpy 2, and runs with numpy 1.26 too.
-	$(BIN)/pip install --quiet --no-deps opencv-python-headless==4.14.0.94
+	$(@D)/bin/pip install --quiet --no-deps opencv-python-headless==4.14.0.94
 	touch $@
 
 clean:
-	rm -rf .venv build dist out wheels *.egg-info
+	rm -rf .venv .venv-5.3 build dist out wheels *.egg-info
