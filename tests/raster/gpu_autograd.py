@@ -57,7 +57,8 @@ def render(options, camera_frames, face, splats, cotangents=None, rasterizer=Non
     """Image and transmittance, and the gradients where there are cotangents of these two."""
     rasterizer = rasterizer or shared_rasterizer()
     device = rasterizer.device
-    (height, width) = (options.camera.height, options.camera.width)
+    height = options.camera.height
+    width = options.camera.width
     while True:
         table = upload_splats(device, splats, face)
         frames = upload_frames(device, camera_frames)

@@ -138,29 +138,38 @@ ADAM = numba.types.void(
     *[numba.types.Array(numba.float32, 1, "C")] * 3,
     numba.typeof(optimizer.AdamOptions(*np.zeros(5, np.float32))),
 )
+ROW = numba.float32[::1]
+ROWS = numba.typeof(image_loss._Rows(*[np.zeros(2, np.float32)] * 9))
+COLUMNS = numba.typeof(image_loss._Columns(*[0] * 6))
+WEIGHTS = numba.types.UniTuple(numba.float32, 2)
 LOOPS = {
     "falloff": (blend._falloff, f"void(u8, {LIST}, {STATE}, b1, {STATE})", 1, 8),
     "blend": (blend._blend, f"void(u8, {LIST}, i8, {STATE}, {STATE})", 1, 4),
     "unblend": (blend._unblend, f"void(u8, {LIST}, i8, {STATE}, {STATE})", 1, 4),
     "gradient of a splat": (blend._sum_gradient, f"void({PIXELS}, {STATE}, {STATE})", 1, 0),
     "horizontal blur": (image_loss._blur_row, f"void({STATE}, i8, {STATE}, i8, i8)", 1, 0),
-    "vertical blur": (image_loss._blur_column, f"void({STATE}, i8, i8, i8, {STATE}, i8, i8)", 1, 0),
-    "SSIM": (image_loss._similarity_row, f"void({STATE}, i8, i8, {STATE}, {STATE})", 1, 8),
+    "vertical blur": (
+        image_loss._blur_column,
+        numba.types.void(ROW, numba.int64, numba.int64, ROW, COLUMNS),
+        1,
+        0,
+    ),
+    "SSIM": (image_loss._similarity_row, numba.types.void(ROWS, COLUMNS), 1, 8),
     "gradient of the loss": (
         image_loss._gradient_row,
-        f"void({STATE}, {STATE}, i8, {STATE}, i8, i8, i8, i8, f4, f4, {STATE}, {STATE})",
+        numba.types.void(ROW, ROW, numba.int64, ROWS, COLUMNS, WEIGHTS),
         1,
         4,
     ),
     "Adam": (optimizer._adam_block, ADAM, 2, 1),
-    "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 80),
+    "projection": (splat_block.project_geometry, f"void({STATE}, {STATE}, {LIMITS})", 1, 82),
     "bounds in tiles": (splat_block.project_bounds, f"void({STATE}, f4, f4)", 1, 12),
     "harmonics": (splat_block.compute_harmonics, f"void({STATE}, f4[:, ::1])", 1, 20),
     "gradient of the projection": (
         splat_block.differentiate_geometry,
         f"void({STATE}, {STATE}, {LIMITS}, UniTuple(f4, 2), f4)",
         1,
-        230,
+        232,
     ),
     "gradient of the harmonics": (
         splat_block.differentiate_position,

@@ -524,6 +524,25 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
     return np.int64(deepest)
 
 
+@part_jit
+def _list_group(pairs, pair_blocks, stepped, places, listed):
+    """List the blocks of a group of a batch's pairs, the deepest first; how many there are.
+
+    pairs: the batch's first pair, the end of the group in the batch, how many it has. stepped: the
+    blocks of the tile that are walked through. places: where each pair's blocks begin in values.
+    """
+    batch_begin, group_end, group = pairs
+    blocks = np.uint64(0)
+    for n in range(group):
+        q = np.uint64(group_end - 1 - n)
+        # A frozen one is only stepped through, where a wanted one reaches.
+        reached = np.uint16(pair_blocks[np.uint64(batch_begin) + q] & stepped)
+        places[n] = blocks * np.uint64(BLOCK_PIXELS)
+        blocks = _list_blocks(listed, blocks, q, reached)
+    places[group] = blocks * np.uint64(BLOCK_PIXELS)
+    return blocks
+
+
 @parallel(lambda tiles, *_: len(tiles), piece=RUN_TILES)
 def blend_backward(
     work,
@@ -581,15 +600,8 @@ def blend_backward(
                 _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)
-                    blocks = np.uint64(0)
-                    for n in range(group):
-                        q = np.uint64(group_end - 1 - n)
-                        j = np.uint64(batch_begin) + q
-                        # A frozen one is only stepped through, where a wanted one reaches.
-                        reached = np.uint16(pair_blocks[j] & stepped)
-                        places[n] = blocks * np.uint64(BLOCK_PIXELS)
-                        blocks = _list_blocks(listed, blocks, q, reached)
-                    places[group] = blocks * np.uint64(BLOCK_PIXELS)
+                    pairs = (batch_begin, group_end, group)
+                    blocks = _list_group(pairs, pair_blocks, stepped, places, listed)
                     _falloff(blocks, listed, batch, True, s)
                     _unblend(blocks, listed, batch_begin - begin, batch, s)
                     for n in range(group):

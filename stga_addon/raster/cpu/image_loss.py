@@ -6,6 +6,8 @@ et al. 2004, as used by 3D Gaussian splatting). Rows of horizontally blurred val
 eleven, so the intermediate maps never reach main memory.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from . import inline_jit, jit, part_jit
@@ -30,15 +32,48 @@ TWO = np.float32(2.0)
 N1, N2, N3, N4, N5, N6, N7, N8, N9, N10 = (np.uint64(n) for n in range(1, 11))
 
 
+class _Columns(NamedTuple):
+    """Which columns of the image are looked at for those of a rectangle.
+
+    left      the first; span: how many, from there to the last that matters
+    padded    of a row buffer's values, those that are computed: blurs go beyond the span, where
+              nothing reads
+    stride    from one row buffer to the next, PADDING_PX of zeros before and after
+    first, past   the rectangle's own, counted from `left`
+    """
+
+    left: int
+    span: int
+    padded: int
+    stride: int
+    first: int
+    past: int
+
+
+class _Rows(NamedTuple):
+    """Row buffers of one channel, each value's row behind that of the one before."""
+
+    target: np.ndarray  # as floats: the last RING_ROWS
+    source: np.ndarray  # image, target, sum of squares, product
+    first: np.ndarray  # the four of them blurred horizontally: the last RING_ROWS
+    moments: np.ndarray  # the four of them blurred
+    slopes: np.ndarray  # of SSIM by three of the four
+    second: np.ndarray  # the three of them blurred horizontally: the last RING_ROWS
+    blurred: np.ndarray  # the three of them blurred
+    similarities: np.ndarray
+    differences: np.ndarray
+
+
 @inline_jit
-def _blur(a, i0, i1, i2, i3, i4, i5, i6, i7, i8, i9, i10):
+def _blur(a, i):
+    """Eleven values, at the indices i, weighted by the window."""
     return (
-        W0 * (a[i0] + a[i10])
-        + W1 * (a[i1] + a[i9])
-        + W2 * (a[i2] + a[i8])
-        + W3 * (a[i3] + a[i7])
-        + W4 * (a[i4] + a[i6])
-        + W5 * a[i5]
+        W0 * (a[i[0]] + a[i[10]])
+        + W1 * (a[i[1]] + a[i[9]])
+        + W2 * (a[i[2]] + a[i[8]])
+        + W3 * (a[i[3]] + a[i[7]])
+        + W4 * (a[i[4]] + a[i[6]])
+        + W5 * a[i[5]]
     )
 
 
@@ -50,58 +85,90 @@ def _blur_row(source, offset, out, at, count):
         i = np.uint64(offset + PADDING_PX - WINDOW_RADIUS_PX) + x
         out[np.uint64(at) + x] = _blur(
             source,
-            i,
-            i + N1,
-            i + N2,
-            i + N3,
-            i + N4,
-            i + N5,
-            i + N6,
-            i + N7,
-            i + N8,
-            i + N9,
-            i + N10,
-        )
-
-
-@part_jit
-def _blur_column(ring, plane, stride, row, out, at, count):
-    """Vertical blur of the ring's eleven rows around `row` to out[at : at + count]."""
-    base = plane * RING_ROWS
-    r0 = np.uint64((base + (row - 5) % RING_ROWS) * stride)
-    r1 = np.uint64((base + (row - 4) % RING_ROWS) * stride)
-    r2 = np.uint64((base + (row - 3) % RING_ROWS) * stride)
-    r3 = np.uint64((base + (row - 2) % RING_ROWS) * stride)
-    r4 = np.uint64((base + (row - 1) % RING_ROWS) * stride)
-    r5 = np.uint64((base + row % RING_ROWS) * stride)
-    r6 = np.uint64((base + (row + 1) % RING_ROWS) * stride)
-    r7 = np.uint64((base + (row + 2) % RING_ROWS) * stride)
-    r8 = np.uint64((base + (row + 3) % RING_ROWS) * stride)
-    r9 = np.uint64((base + (row + 4) % RING_ROWS) * stride)
-    r10 = np.uint64((base + (row + 5) % RING_ROWS) * stride)
-    for x in range(np.uint64(count)):
-        out[np.uint64(at) + x] = _blur(
-            ring,
-            r0 + x,
-            r1 + x,
-            r2 + x,
-            r3 + x,
-            r4 + x,
-            r5 + x,
-            r6 + x,
-            r7 + x,
-            r8 + x,
-            r9 + x,
-            r10 + x,
+            (i, i + N1, i + N2, i + N3, i + N4, i + N5, i + N6, i + N7, i + N8, i + N9, i + N10),
         )
 
 
 @inline_jit
-def _similarity_row(moments, stride, padded, similarity, slopes):
-    """Write SSIM of a row of `padded` pixels to `similarity`, and its derivatives by three of the
-    four blurred values to `slopes`. Both others hold one value behind the other, `stride` apart;
-    slopes from PADDING_PX on."""
-    for n in range(np.uint64(padded)):
+def _ring_row(plane, row, stride):
+    return np.uint64((plane * RING_ROWS + row % RING_ROWS) * stride)
+
+
+@part_jit
+def _blur_column(ring, plane, row, out, columns):
+    """Vertical blur of the ring's eleven rows around `row` to the plane's row of `out`."""
+    stride = columns.stride
+    r0 = _ring_row(plane, row - 5, stride)
+    r1 = _ring_row(plane, row - 4, stride)
+    r2 = _ring_row(plane, row - 3, stride)
+    r3 = _ring_row(plane, row - 2, stride)
+    r4 = _ring_row(plane, row - 1, stride)
+    r5 = _ring_row(plane, row, stride)
+    r6 = _ring_row(plane, row + 1, stride)
+    r7 = _ring_row(plane, row + 2, stride)
+    r8 = _ring_row(plane, row + 3, stride)
+    r9 = _ring_row(plane, row + 4, stride)
+    r10 = _ring_row(plane, row + 5, stride)
+    at = np.uint64(plane * stride)
+    for x in range(np.uint64(columns.padded)):
+        out[at + x] = _blur(
+            ring,
+            (
+                r0 + x,
+                r1 + x,
+                r2 + x,
+                r3 + x,
+                r4 + x,
+                r5 + x,
+                r6 + x,
+                r7 + x,
+                r8 + x,
+                r9 + x,
+                r10 + x,
+            ),
+        )
+
+
+@part_jit
+def _blur_into_ring(values, planes, ring, row, inside, columns):
+    """Blur each plane of `values` horizontally into the ring's row; zeros for a row that is not
+    inside of the image."""
+    for plane in range(planes):
+        into = (plane * RING_ROWS + row % RING_ROWS) * columns.stride
+        if inside:
+            _blur_row(values, plane * columns.stride, ring, into, columns.padded)
+        else:
+            ring[into : into + columns.span] = ZERO
+
+
+@part_jit
+def _load_source(image, target, row, c, rows, columns):
+    """Write a row's `source` and `target`; image (3, H, W), target (H, W, 3)."""
+    left = np.uint64(columns.left)
+    keep = np.uint64((row % RING_ROWS) * columns.stride)
+    stride = columns.stride
+    source = rows.source
+    target_row = rows.target
+    for n in range(np.uint64(columns.span)):
+        value = target[np.uint64(row), left + n, np.uint64(c)]
+        target_row[keep + n] = np.float32(value) * np.float32(1 / 255)
+    for n in range(np.uint64(columns.span)):
+        x = image[c, row, left + n]
+        y = target_row[keep + n]
+        source[np.uint64(PADDING_PX) + n] = x
+        source[np.uint64(stride + PADDING_PX) + n] = y
+        source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
+        source[np.uint64(3 * stride + PADDING_PX) + n] = x * y
+
+
+@inline_jit
+def _similarity_row(rows, columns):
+    """Write SSIM of a row to `similarities`, and its derivatives by three of the four `moments` to
+    `slopes`, there from PADDING_PX on."""
+    moments = rows.moments
+    slopes = rows.slopes
+    stride = columns.stride
+    for n in range(np.uint64(columns.padded)):
         mx = moments[n]
         my = moments[np.uint64(stride) + n]
         squares = moments[np.uint64(2 * stride) + n]
@@ -126,7 +193,10 @@ def _similarity_row(moments, stride, padded, similarity, slopes):
         slopes[np.uint64(PADDING_PX) + n] = by_mean
         slopes[np.uint64(stride + PADDING_PX) + n] = by_squares
         slopes[np.uint64(2 * stride + PADDING_PX) + n] = by_product
-        similarity[n] = ssim
+        rows.similarities[n] = ssim
+    for plane in range(3):  # what lies beyond the image has no slope
+        beyond = plane * stride + PADDING_PX
+        slopes[beyond + columns.span : beyond + columns.padded] = ZERO
 
 
 @part_jit
@@ -147,37 +217,53 @@ def _sum_row(values, first, past):
 
 
 @inline_jit
-def _gradient_row(
-    image,
-    target_row,
-    keep,
-    blurred,
-    stride,
-    left,
-    first,
-    past,
-    ssim_weight,
-    scale,
-    gradient,
-    differences,
-):
-    """Write the loss's gradient in a row, pixels `first` to `past` counted from column `left`, and
-    |image − target|.
+def _gradient_row(image, gradient, keep, rows, columns, weights):
+    """Write the loss's gradient in a row of the rectangle, and |image − target| to `differences`.
 
-    image, gradient (W,): the row; target_row: the target's, from `keep` on; blurred: the three
-    blurred slopes, `stride` apart; differences: from `first` to `past`.
+    image, gradient (W,): the row; keep: where the target's begins. weights: of SSIM, and of the
+    whole.
     """
-    for n in range(np.uint64(first), np.uint64(past)):
-        x = image[np.uint64(left) + n]
-        y = target_row[np.uint64(keep) + n]
+    ssim_weight, scale = weights
+    left = np.uint64(columns.left)
+    stride = columns.stride
+    blurred = rows.blurred
+    for n in range(np.uint64(columns.first), np.uint64(columns.past)):
+        x = image[left + n]
+        y = rows.target[np.uint64(keep) + n]
         sign = ONE if x > y else (-ONE if x < y else ZERO)
-        differences[n] = abs(x - y)
+        rows.differences[n] = abs(x - y)
         slope = (
             blurred[n]
             + TWO * x * blurred[np.uint64(stride) + n]
             + y * blurred[np.uint64(2 * stride) + n]
         )
-        gradient[np.uint64(left) + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+        gradient[left + n] = scale * ((ONE - ssim_weight) * sign - ssim_weight * slope)
+
+
+@part_jit
+def _columns_of(rectangle, width):
+    left = max(0, rectangle[0] - LOSS_REACH_PX)
+    right = min(width, rectangle[2] + LOSS_REACH_PX)
+    span = right - left
+    padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX
+    stride = padded + 2 * PADDING_PX
+    return _Columns(left, span, padded, stride, rectangle[0] - left, rectangle[2] - left)
+
+
+@part_jit
+def _new_rows(columns):
+    stride = columns.stride
+    return _Rows(
+        np.zeros(RING_ROWS * stride, np.float32),
+        np.zeros(4 * stride, np.float32),
+        np.zeros(4 * RING_ROWS * stride, np.float32),
+        np.zeros(4 * stride, np.float32),
+        np.zeros(3 * stride, np.float32),
+        np.zeros(3 * RING_ROWS * stride, np.float32),
+        np.zeros(3 * stride, np.float32),
+        np.empty(columns.padded, np.float32),
+        np.empty(columns.padded, np.float32),
+    )
 
 
 @parallel(lambda image, target, rectangles, *_: 3 * len(rectangles))
@@ -192,58 +278,24 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
     an image is cut into bands.
     """
     height = image.shape[1]
-    width = image.shape[2]
     for first_job, past_job in pieces(work):
         # one channel of one rectangle: row by row, the gradient ten rows behind
         for job in range(first_job, past_job):
             r = job // 3
             c = job % 3
-            x0 = rectangles[r, 0]
             y0 = rectangles[r, 1]
-            x1 = rectangles[r, 2]
             y1 = rectangles[r, 3]
             first_sum = -y0  # where the sums of the rectangle's rows begin, less its first row
             for before in range(r):
                 first_sum += rectangles[before, 3] - rectangles[before, 1]
-            # Columns [left, right) hold everything that matters; each row buffer is padded by
-            # PADDING_PX zeros.
-            left = max(0, x0 - LOSS_REACH_PX)
-            right = min(width, x1 + LOSS_REACH_PX)
-            span = right - left
-            # Blurs go beyond the span, where nothing reads.
-            padded = (span + ROW_UNIT_PX - 1) // ROW_UNIT_PX * ROW_UNIT_PX
-            stride = padded + 2 * PADDING_PX
-            # the target's last rows, as floats
-            target_row = np.zeros(RING_ROWS * stride, np.float32)
-            source = np.zeros(4 * stride, np.float32)  # image, target, sum of squares, product
-            first = np.zeros(4 * RING_ROWS * stride, np.float32)
-            moments = np.zeros(4 * stride, np.float32)
-            slopes = np.zeros(3 * stride, np.float32)
-            second = np.zeros(3 * RING_ROWS * stride, np.float32)
-            blurred = np.zeros(3 * stride, np.float32)
-            similarities = np.empty(padded, np.float32)
-            differences = np.empty(padded, np.float32)
+            columns = _columns_of(rectangles[r], image.shape[2])
+            rows = _new_rows(columns)
             for row in range(y0 - LOSS_REACH_PX, y1 + LOSS_REACH_PX):
                 # 1. horizontal blur of this row's four values
                 inside = 0 <= row < height
                 if inside:
-                    keep = (row % RING_ROWS) * stride
-                    for n in range(np.uint64(span)):
-                        value = target[np.uint64(row), np.uint64(left) + n, np.uint64(c)]
-                        target_row[np.uint64(keep) + n] = np.float32(value) * np.float32(1 / 255)
-                    for n in range(np.uint64(span)):
-                        x = image[c, row, np.uint64(left) + n]
-                        y = target_row[np.uint64(keep) + n]
-                        source[np.uint64(PADDING_PX) + n] = x
-                        source[np.uint64(stride + PADDING_PX) + n] = y
-                        source[np.uint64(2 * stride + PADDING_PX) + n] = x * x + y * y
-                        source[np.uint64(3 * stride + PADDING_PX) + n] = x * y
-                for plane in range(4):
-                    into = (plane * RING_ROWS + row % RING_ROWS) * stride
-                    if inside:
-                        _blur_row(source, plane * stride, first, into, padded)
-                    else:
-                        first[into : into + span] = ZERO
+                    _load_source(image, target, row, c, rows, columns)
+                _blur_into_ring(rows.source, 4, rows.first, row, inside, columns)
                 # 2. SSIM of the row five above, and its slopes blurred horizontally
                 middle = row - WINDOW_RADIUS_PX
                 if middle < y0 - WINDOW_RADIUS_PX:
@@ -251,43 +303,23 @@ def image_loss(work, image, target, rectangles, ssim_weight, scale, gradient, su
                 inside = 0 <= middle < height
                 if inside:
                     for plane in range(4):
-                        _blur_column(first, plane, stride, middle, moments, plane * stride, padded)
-                    _similarity_row(moments, stride, padded, similarities, slopes)
-                    for plane in range(3):  # what lies beyond the image has no slope
-                        beyond = plane * stride + PADDING_PX
-                        slopes[beyond + span : beyond + padded] = ZERO
+                        _blur_column(rows.first, plane, middle, rows.moments, columns)
+                    _similarity_row(rows, columns)
                     if y0 <= middle < y1:
-                        sums[1, c, first_sum + middle] = _sum_row(
-                            similarities, x0 - left, x1 - left
-                        )
-                for plane in range(3):
-                    into = (plane * RING_ROWS + middle % RING_ROWS) * stride
-                    if inside:
-                        _blur_row(slopes, plane * stride, second, into, padded)
-                    else:
-                        second[into : into + span] = ZERO
+                        similarity = _sum_row(rows.similarities, columns.first, columns.past)
+                        sums[1, c, first_sum + middle] = similarity
+                _blur_into_ring(rows.slopes, 3, rows.second, middle, inside, columns)
                 # 3. gradient of the row five above that
                 out = middle - WINDOW_RADIUS_PX
                 if out < y0 or out >= y1 or out < 0 or out >= height:
                     continue
                 for plane in range(3):
-                    _blur_column(second, plane, stride, out, blurred, plane * stride, padded)
-                keep = (out % RING_ROWS) * stride
-                _gradient_row(
-                    image[c, out],
-                    target_row,
-                    keep,
-                    blurred,
-                    stride,
-                    left,
-                    x0 - left,
-                    x1 - left,
-                    ssim_weight,
-                    scale,
-                    gradient[c, out],
-                    differences,
-                )
-                sums[0, c, first_sum + out] = _sum_row(differences, x0 - left, x1 - left)
+                    _blur_column(rows.second, plane, out, rows.blurred, columns)
+                keep = (out % RING_ROWS) * columns.stride
+                weights = (ssim_weight, scale)
+                _gradient_row(image[c, out], gradient[c, out], keep, rows, columns, weights)
+                difference = _sum_row(rows.differences, columns.first, columns.past)
+                sums[0, c, first_sum + out] = difference
 
 
 @jit

@@ -8,7 +8,7 @@ back.
 
 import numpy as np
 
-from . import part_jit
+from . import inline_jit, part_jit
 from . import splat_block as block
 from .layout import BLUE, GREEN, MEAN_X, MEAN_Y, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR, TILE
 from .splat_block import BLOCK_SPLATS, HALF, ONE, ZERO
@@ -168,6 +168,42 @@ def _list_seen(rows, covered, rect, b, seen):
     return count
 
 
+@inline_jit
+def _is_finite(color):
+    red, green, blue = color
+    return abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf
+
+
+@part_jit
+def _store(b, q, i, color, projection, depth_as_color):
+    """Write row i of the projection from splat q of the block; a color that is no number makes the
+    splat one that is not finite."""
+    rect = projection.rect
+    columns = projection.columns
+    # Before the cut at zero, which would turn NaN and −∞ into black.
+    if not _is_finite(color):
+        rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
+        return
+    z = b[block.CAMERA_Z + q]
+    if depth_as_color:
+        color = (z, ZERO, ZERO)
+    rect[i, 0] = np.int32(b[block.X0 + q])
+    rect[i, 1] = np.int32(b[block.Y0 + q])
+    rect[i, 2] = np.int32(b[block.X1 + q])
+    rect[i, 3] = np.int32(b[block.Y1 + q])
+    projection.depth[i] = z
+    projection.extent_y[i] = b[block.EXTENT_Y + q]
+    columns[i, MEAN_X] = b[block.MEAN_X + q]
+    columns[i, MEAN_Y] = b[block.MEAN_Y + q]
+    columns[i, PRECISION_X] = b[block.PRECISION_X + q]
+    columns[i, SHEAR] = b[block.SHEAR + q]
+    columns[i, PRECISION_Y] = b[block.PRECISION_Y + q]
+    columns[i, OPACITY] = b[block.OPACITY + q]
+    columns[i, RED] = max(ZERO, color[0])
+    columns[i, GREEN] = max(ZERO, color[1])
+    columns[i, BLUE] = max(ZERO, color[2])
+
+
 @parallel(lambda rows, *_: len(rows), piece=SPLATS_PER_PIECE)
 def project_forward(
     work, rows, covered, splats, face, frames, degree, depth_as_color, antialiased, projection
@@ -182,12 +218,6 @@ def project_forward(
     a splat's area is taken from its opacity (Mip-Splatting's 2D filter, gsplat's "antialiased"
     mode).
     """
-    sh = splats.sh
-    by_face = frames.color
-    projected = projection.columns
-    depth = projection.depth
-    extent_y = projection.extent_y
-    rect = projection.rect
     tiles_x = (frames.size[0] + TILE - 1) // TILE
     tiles_y = (frames.size[1] + TILE - 1) // TILE
     limits = _tan_limits(frames.intrinsics, frames.size)
@@ -202,46 +232,20 @@ def project_forward(
             if antialiased:
                 block.compensate_low_pass(b)
             block.project_bounds(b, np.float32(tiles_x), np.float32(tiles_y))
-            count = _list_seen(some, covered, rect, b, seen)
+            count = _list_seen(some, covered, projection.rect, b, seen)
             if count == 0:
                 continue
             block.compute_harmonics(b, frames.to_world)
             for n in range(count):
                 q = seen[n]
                 i = np.uint64(some[q])
-                red, green, blue = _color(b, q, i, coefficients, sh)
-                if by_face.shape[1] > 0:
+                red, green, blue = _color(b, q, i, coefficients, splats.sh)
+                if frames.color.shape[1] > 0:
                     f = np.uint64(face[i])
-                    red = red + by_face[f, 0]
-                    green = green + by_face[f, 1]
-                    blue = blue + by_face[f, 2]
-                # Before the cut at zero, which would turn NaN and −∞ into black.
-                if not (abs(red) < np.inf and abs(green) < np.inf and abs(blue) < np.inf):
-                    rect[i, 0] = rect[i, 1] = rect[i, 2] = rect[i, 3] = -1
-                    continue
-                red = max(ZERO, red)
-                green = max(ZERO, green)
-                blue = max(ZERO, blue)
-                z = b[block.CAMERA_Z + q]
-                if depth_as_color:
-                    red = z
-                    green = ZERO
-                    blue = ZERO
-                rect[i, 0] = np.int32(b[block.X0 + q])
-                rect[i, 1] = np.int32(b[block.Y0 + q])
-                rect[i, 2] = np.int32(b[block.X1 + q])
-                rect[i, 3] = np.int32(b[block.Y1 + q])
-                depth[i] = z
-                extent_y[i] = b[block.EXTENT_Y + q]
-                projected[i, MEAN_X] = b[block.MEAN_X + q]
-                projected[i, MEAN_Y] = b[block.MEAN_Y + q]
-                projected[i, PRECISION_X] = b[block.PRECISION_X + q]
-                projected[i, SHEAR] = b[block.SHEAR + q]
-                projected[i, PRECISION_Y] = b[block.PRECISION_Y + q]
-                projected[i, OPACITY] = b[block.OPACITY + q]
-                projected[i, RED] = red
-                projected[i, GREEN] = green
-                projected[i, BLUE] = blue
+                    red = red + frames.color[f, 0]
+                    green = green + frames.color[f, 1]
+                    blue = blue + frames.color[f, 2]
+                _store(b, q, i, (red, green, blue), projection, depth_as_color)
 
 
 @part_jit

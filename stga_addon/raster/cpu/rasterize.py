@@ -145,19 +145,8 @@ def render_forward(
     background = np.asarray(background, np.float32)
     blended = new_image(width, height, lists, buffers)
     blend_forward(tiles, tiles_x, tile_blocks, lists, projection, background, blended)
-    return RenderOutput(
-        blended,
-        projection,
-        lists,
-        tiles,
-        tile_blocks,
-        focus,
-        touched,
-        background,
-        degree,
-        depth_as_color,
-        antialiased,
-    )
+    shown = (blended, projection, lists, tiles, tile_blocks, focus, touched)
+    return RenderOutput(*shown, background, degree, depth_as_color, antialiased)
 
 
 def render_backward(
@@ -183,13 +172,7 @@ def render_backward(
     tiles_x, _ = tile_grid(*frames.size)
     lists = output.lists
     columns = output.projection.columns
-    tiles = output.tiles
-    rows = lists.visible
-    wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
-    if output.focus is not None:
-        wanted = output.focus
-        tiles = tiles[output.touched.ravel()[tiles]]
-        rows = tiling.listed_rows(rows, wanted)
+    tiles, rows, wanted = _in_focus(output, n, buffers)
     pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
     screen_gradient = buffers.get("screen_gradient", (n,))
     if v_transmittance is None:
@@ -224,6 +207,18 @@ def render_backward(
         screen_gradient,
     )
     return rows, screen_gradient
+
+
+def _in_focus(
+    output: RenderOutput, n: int, buffers: BufferPool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The tiles and the visible splats that the backward pass looks at, and whether each of the n
+    splats is wanted."""
+    if output.focus is None:
+        wanted = buffers.kept("wanted", (n,), lambda n: np.ones(n, bool))
+        return output.tiles, output.lists.visible, wanted
+    tiles = output.tiles[output.touched.ravel()[output.tiles]]
+    return tiles, tiling.listed_rows(output.lists.visible, output.focus), output.focus
 
 
 def new_projection(n: int, buffers: BufferPool) -> Projection:

@@ -28,6 +28,8 @@ C0, C1, C2, C3, C4, C5, C6, C7, C8, C9 = (np.float32(c) for c in (
 
 BLOCK_SPLATS = 64
 BASIS_SIZE = 16
+COLUMN = np.uint64(BLOCK_SPLATS)
+TWO_COLUMNS = np.uint64(2 * BLOCK_SPLATS)
 # The splat's frame in camera space and its parameters.
 (M00, M01, M02, M10, M11, M12, M20, M21, M22, ORIGIN_X, ORIGIN_Y, ORIGIN_Z, LOCAL_X, LOCAL_Y,
  LOCAL_Z, RAW_0, RAW_1, RAW_2, RAW_3, LOG_0, LOG_1, LOG_2, LOGIT) = (
@@ -62,18 +64,70 @@ BACKWARD_SIZE = 103 * BLOCK_SPLATS
 
 
 @inline_jit
-def _rotation(q0, q1, q2, q3):
-    """Rotation matrix entries of a unit quaternion wxyz."""
+def _three(b, column, q):
+    """Splat q's values in the column and the two after it."""
+    return b[column + q], b[column + COLUMN + q], b[column + TWO_COLUMNS + q]
+
+
+@inline_jit
+def _store_three(b, column, q, values):
+    b[column + q] = values[0]
+    b[column + COLUMN + q] = values[1]
+    b[column + TWO_COLUMNS + q] = values[2]
+
+
+@inline_jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inline_jit
+def _times(a, b):
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@inline_jit
+def _row_times_matrix(a, rows):
     return (
-        ONE - TWO * (q2 * q2 + q3 * q3),
-        TWO * (q1 * q2 - q0 * q3),
-        TWO * (q1 * q3 + q0 * q2),
-        TWO * (q1 * q2 + q0 * q3),
-        ONE - TWO * (q1 * q1 + q3 * q3),
-        TWO * (q2 * q3 - q0 * q1),
-        TWO * (q1 * q3 - q0 * q2),
-        TWO * (q2 * q3 + q0 * q1),
-        ONE - TWO * (q1 * q1 + q2 * q2),
+        a[0] * rows[0][0] + a[1] * rows[1][0] + a[2] * rows[2][0],
+        a[0] * rows[0][1] + a[1] * rows[1][1] + a[2] * rows[2][1],
+        a[0] * rows[0][2] + a[1] * rows[1][2] + a[2] * rows[2][2],
+    )
+
+
+@inline_jit
+def _matrix_times(rows, a):
+    return _dot(a, rows[0]), _dot(a, rows[1]), _dot(a, rows[2])
+
+
+@inline_jit
+def _minors(a0, a1):
+    """The three 2 × 2 determinants of two rows: of columns 0 and 1, 0 and 2, 1 and 2."""
+    return (
+        a0[0] * a1[1] - a0[1] * a1[0],
+        a0[0] * a1[2] - a0[2] * a1[0],
+        a0[1] * a1[2] - a0[2] * a1[1],
+    )
+
+
+@inline_jit
+def _rows(matrix):
+    """A matrix (3, 3) as tuples."""
+    return (
+        (matrix[0, 0], matrix[0, 1], matrix[0, 2]),
+        (matrix[1, 0], matrix[1, 1], matrix[1, 2]),
+        (matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+    )
+
+
+@inline_jit
+def _rotation(unit):
+    """Rotation matrix, row by row, of a unit quaternion wxyz."""
+    q0, q1, q2, q3 = unit
+    return (
+        (ONE - TWO * (q2 * q2 + q3 * q3), TWO * (q1 * q2 - q0 * q3), TWO * (q1 * q3 + q0 * q2)),
+        (TWO * (q1 * q2 + q0 * q3), ONE - TWO * (q1 * q1 + q3 * q3), TWO * (q2 * q3 - q0 * q1)),
+        (TWO * (q1 * q3 - q0 * q2), TWO * (q2 * q3 + q0 * q1), ONE - TWO * (q1 * q1 + q2 * q2)),
     )
 
 
@@ -100,48 +154,56 @@ def _unit(b, q):
     q3 = q3 * lift
     rn = ONE / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
     per_norm = ZERO if size == ZERO else min(rn * lift, np.float32(1e12))
-    return q0 * rn, q1 * rn, q2 * rn, q3 * rn, per_norm
+    return (q0 * rn, q1 * rn, q2 * rn, q3 * rn), per_norm
+
+
+@inline_jit
+def _frame(b, q):
+    """The triangle's matrix to camera space, row by row."""
+    return _three(b, M00, q), _three(b, M10, q), _three(b, M20, q)
 
 
 @inline_jit
 def _camera_point(b, q):
     """The splat in camera space."""
-    x = b[LOCAL_X + q]
-    y = b[LOCAL_Y + q]
-    z = b[LOCAL_Z + q]
+    local = _three(b, LOCAL_X, q)
+    m = _frame(b, q)
     return (
-        b[M00 + q] * x + b[M01 + q] * y + b[M02 + q] * z + b[ORIGIN_X + q],
-        b[M10 + q] * x + b[M11 + q] * y + b[M12 + q] * z + b[ORIGIN_Y + q],
-        b[M20 + q] * x + b[M21 + q] * y + b[M22 + q] * z + b[ORIGIN_Z + q],
+        _dot(m[0], local) + b[ORIGIN_X + q],
+        _dot(m[1], local) + b[ORIGIN_Y + q],
+        _dot(m[2], local) + b[ORIGIN_Z + q],
     )
 
 
 @inline_jit
-def _pixels_per_local(b, q, jx, jy, tx, ty):
+def _pixels_per_local(b, q, j, slopes):
     """The affine map U from the triangle's local frame to pixels, row by row: the projection's
     Jacobian times its matrix.
 
-    jx, jy: focal lengths over depth; tx, ty: x and y over depth.
+    j: focal lengths over depth; slopes: x and y over depth.
     """
-    m20 = b[M20 + q]
-    m21 = b[M21 + q]
-    m22 = b[M22 + q]
+    m = _frame(b, q)
+    tx, ty = slopes
     return (
-        jx * (b[M00 + q] - tx * m20),
-        jx * (b[M01 + q] - tx * m21),
-        jx * (b[M02 + q] - tx * m22),
-        jy * (b[M10 + q] - ty * m20),
-        jy * (b[M11 + q] - ty * m21),
-        jy * (b[M12 + q] - ty * m22),
+        (
+            j[0] * (m[0][0] - tx * m[2][0]),
+            j[0] * (m[0][1] - tx * m[2][1]),
+            j[0] * (m[0][2] - tx * m[2][2]),
+        ),
+        (
+            j[1] * (m[1][0] - ty * m[2][0]),
+            j[1] * (m[1][1] - ty * m[2][1]),
+            j[1] * (m[1][2] - ty * m[2][2]),
+        ),
     )
 
 
 @inline_jit
-def _row_times_matrix(a0, a1, a2, r00, r01, r02, r10, r11, r12, r20, r21, r22):
+def _clamped(slopes, limits):
+    """x / z and y / z within limits (4,): lowest and highest of x / z, of y / z."""
     return (
-        a0 * r00 + a1 * r10 + a2 * r20,
-        a0 * r01 + a1 * r11 + a2 * r21,
-        a0 * r02 + a1 * r12 + a2 * r22,
+        min(limits[1], max(limits[0], slopes[0])),
+        min(limits[3], max(limits[2], slopes[1])),
     )
 
 
@@ -156,48 +218,31 @@ def project_geometry(b, intrinsics, limits):
     fy = intrinsics[1]
     cx = intrinsics[2]
     cy = intrinsics[3]
-    low_x = limits[0]
-    high_x = limits[1]
-    low_y = limits[2]
-    high_y = limits[3]
+    bounds = (limits[0], limits[1], limits[2], limits[3])
     for q in range(np.uint64(BLOCK_SPLATS)):
         x, y, z = _camera_point(b, q)
         rz = ONE / z
-        tx = min(high_x, max(low_x, x * rz))
-        ty = min(high_y, max(low_y, y * rz))
-        q0, q1, q2, q3, _ = _unit(b, q)
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
-        u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, fx * rz, fy * rz, tx, ty)
+        slopes = _clamped((x * rz, y * rz), bounds)
+        unit, _ = _unit(b, q)
+        rotation = _rotation(unit)
+        u0, u1 = _pixels_per_local(b, q, (fx * rz, fy * rz), slopes)
         s0 = exponential(b[LOG_0 + q])
         s1 = exponential(b[LOG_1 + q])
         s2 = exponential(b[LOG_2 + q])
-        w00, w01, w02 = _row_times_matrix(
-            u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
-        )
-        w10, w11, w12 = _row_times_matrix(
-            u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
-        )
-        a00 = w00 * s0
-        a01 = w01 * s1
-        a02 = w02 * s2
-        a10 = w10 * s0
-        a11 = w11 * s1
-        a12 = w12 * s2
-        xx = a00 * a00 + a01 * a01 + a02 * a02 + LOW_PASS_PX2
-        yy = a10 * a10 + a11 * a11 + a12 * a12 + LOW_PASS_PX2
+        scales = (s0, s1, s2)
+        a0 = _times(_row_times_matrix(u0, rotation), scales)
+        a1 = _times(_row_times_matrix(u1, rotation), scales)
+        xx = _dot(a0, a0) + LOW_PASS_PX2
+        yy = _dot(a1, a1) + LOW_PASS_PX2
         # det of A·Aᵀ + low·I as squared 2×2 minors plus positive terms: never cancels to zero or
         # below.
-        m01 = a00 * a11 - a01 * a10
-        m02 = a00 * a12 - a02 * a10
-        m12 = a01 * a12 - a02 * a11
-        sharp = m01 * m01 + m02 * m02 + m12 * m12
-        b[CAMERA_X + q] = x
-        b[CAMERA_Y + q] = y
-        b[CAMERA_Z + q] = z
+        minors = _minors(a0, a1)
+        sharp = _dot(minors, minors)
+        _store_three(b, CAMERA_X, q, (x, y, z))
         b[MEAN_X + q] = fx * x * rz + cx
         b[MEAN_Y + q] = fy * y * rz + cy
         b[XX + q] = xx
-        b[XY + q] = a00 * a10 + a01 * a11 + a02 * a12
+        b[XY + q] = _dot(a0, a1)
         b[YY + q] = yy
         b[DETERMINANT + q] = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2)
         b[SHARP + q] = sharp
@@ -226,7 +271,9 @@ def project_bounds(b, tiles_x, tiles_y):
         infinite = np.float32(np.inf)
         ex = math.sqrt(reach * b[XX + q])
         ey = math.sqrt(reach * yy)
-        b[PRECISION_X + q], b[SHEAR + q], b[PRECISION_Y + q] = yy / det, b[XY + q] / yy, ONE / yy
+        b[PRECISION_X + q] = yy / det
+        b[SHEAR + q] = b[XY + q] / yy
+        b[PRECISION_Y + q] = ONE / yy
         b[EXTENT_Y + q] = ey
         b[X0 + q] = min(tiles_x, max(ZERO, np.floor((mean_x - ex) / size)))
         b[X1 + q] = min(tiles_x, max(ZERO, np.ceil((mean_x + ex) / size)))
@@ -265,8 +312,24 @@ def basis(x, y, z):
 
 
 @inline_jit
-def basis_gradient(x, y, z, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12, w13, w14, w15):
-    """Gradient with respect to (x, y, z) of the sum of the harmonics 1 to 15 with these weights."""
+def _basis_gradient(b, q, x, y, z):
+    """Gradient with respect to the unit direction (x, y, z) of the sum of the harmonics 1 to 15
+    with the splat's weights."""
+    w1 = b[W1 + q]
+    w2 = b[W2 + q]
+    w3 = b[W3 + q]
+    w4 = b[W4 + q]
+    w5 = b[W5 + q]
+    w6 = b[W6 + q]
+    w7 = b[W7 + q]
+    w8 = b[W8 + q]
+    w9 = b[W9 + q]
+    w10 = b[W10 + q]
+    w11 = b[W11 + q]
+    w12 = b[W12 + q]
+    w13 = b[W13 + q]
+    w14 = b[W14 + q]
+    w15 = b[W15 + q]
     xx = x * x
     yy = y * y
     zz = z * z
@@ -288,26 +351,14 @@ def basis_gradient(x, y, z, w1, w2, w3, w4, w5, w6, w7, w8, w9, w10, w11, w12, w
 def compute_harmonics(b, to_world):
     """Write TOWARD_X to PER_DISTANCE and B0 to B15; to_world (3, 3): rotation from camera to world
     space."""
-    t00 = to_world[0, 0]
-    t01 = to_world[0, 1]
-    t02 = to_world[0, 2]
-    t10 = to_world[1, 0]
-    t11 = to_world[1, 1]
-    t12 = to_world[1, 2]
-    t20 = to_world[2, 0]
-    t21 = to_world[2, 1]
-    t22 = to_world[2, 2]
+    rows = _rows(to_world)
     for q in range(np.uint64(BLOCK_SPLATS)):
-        x = b[CAMERA_X + q]
-        y = b[CAMERA_Y + q]
-        z = b[CAMERA_Z + q]
-        rd = ONE / math.sqrt(x * x + y * y + z * z)
-        dx = (t00 * x + t01 * y + t02 * z) * rd
-        dy = (t10 * x + t11 * y + t12 * z) * rd
-        dz = (t20 * x + t21 * y + t22 * z) * rd
-        b[TOWARD_X + q] = dx
-        b[TOWARD_Y + q] = dy
-        b[TOWARD_Z + q] = dz
+        point = _three(b, CAMERA_X, q)
+        rd = ONE / math.sqrt(_dot(point, point))
+        dx = _dot(rows[0], point) * rd
+        dy = _dot(rows[1], point) * rd
+        dz = _dot(rows[2], point) * rd
+        _store_three(b, TOWARD_X, q, (dx, dy, dz))
         b[PER_DISTANCE + q] = rd
         (
             b[B0 + q],
@@ -330,25 +381,109 @@ def compute_harmonics(b, to_world):
 
 
 @inline_jit
-def _compensation_gradient(v, a00, a01, a02, a10, a11, a12, m01, m02, m12):
+def _compensation_gradient(v, a0, a1, minors):
     """Gradient with respect to A's two rows of v·ln sqrt(sharp / det), as in
     `compensate_low_pass`."""
     low = LOW_PASS_PX2
-    sharp = m01 * m01 + m02 * m02 + m12 * m12
-    xx = a00 * a00 + a01 * a01 + a02 * a02
-    yy = a10 * a10 + a11 * a11 + a12 * a12
+    m01, m02, m12 = minors
+    sharp = _dot(minors, minors)
+    xx = _dot(a0, a0)
+    yy = _dot(a1, a1)
     det = sharp + low * (xx + yy + low)
     # v holds sqrt(sharp) as a factor, so the quotient stays finite where a splat has no area and v
     # = 0.
     w = v * low * (xx + yy + low) / (det * max(sharp, np.float32(1e-30)))
     u = -v * low / det
     return (
-        w * (m01 * a11 + m02 * a12) + u * a00,
-        w * (-m01 * a10 + m12 * a12) + u * a01,
-        w * (-m02 * a10 - m12 * a11) + u * a02,
-        w * (-m01 * a01 - m02 * a02) + u * a10,
-        w * (m01 * a00 - m12 * a02) + u * a11,
-        w * (m02 * a00 + m12 * a01) + u * a12,
+        (
+            w * (m01 * a1[1] + m02 * a1[2]) + u * a0[0],
+            w * (-m01 * a1[0] + m12 * a1[2]) + u * a0[1],
+            w * (-m02 * a1[0] - m12 * a1[1]) + u * a0[2],
+        ),
+        (
+            w * (-m01 * a0[1] - m02 * a0[2]) + u * a1[0],
+            w * (m01 * a0[0] - m12 * a0[2]) + u * a1[1],
+            w * (m02 * a0[0] + m12 * a0[1]) + u * a1[2],
+        ),
+    )
+
+
+@inline_jit
+def _shape_gradient(b, q, a0, a1, compensated):
+    """Gradients v0 and v1 with respect to A's rows a0 and a1, the latter less −shear·v0, and those
+    of the three log scales.
+
+    The x precision is 1 / s, s = xx − shear·xy. With the residual e = a0 − shear·a1, ds = 2·e·(da0
+    − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy: the gradient with respect to a0
+    is v0, that with respect to a1 is −shear·v0 + v1. The residual, and every product of −shear·v0
+    with something of row 1, is taken together with row 0, because the two cancel for long splats.
+    """
+    precision_x = b[PRECISION_X + q]
+    shear = b[SHEAR + q]
+    inverse_yy = b[PRECISION_Y + q]
+    minors = _minors(a0, a1)
+    m01, m02, m12 = minors
+    e0 = inverse_yy * (LOW_PASS_PX2 * a0[0] + a1[1] * m01 + a1[2] * m02)
+    e1 = inverse_yy * (LOW_PASS_PX2 * a0[1] - a1[0] * m01 + a1[2] * m12)
+    e2 = inverse_yy * (LOW_PASS_PX2 * a0[2] - a1[0] * m02 - a1[1] * m12)
+    vs = -TWO * precision_x * precision_x * b[G_PRECISION_X + q]
+    vk = inverse_yy * b[G_SHEAR + q]
+    vw = -TWO * inverse_yy * inverse_yy * b[G_PRECISION_Y + q]
+    of_opacity = compensated * b[G_OPACITY + q] * b[OPACITY + q]
+    b0, b1 = _compensation_gradient(of_opacity, a0, a1, minors)
+    v0 = (
+        vs * e0 + vk * a1[0] + b0[0],
+        vs * e1 + vk * a1[1] + b0[1],
+        vs * e2 + vk * a1[2] + b0[2],
+    )
+    v1 = (
+        vk * e0 + vw * a1[0] + b1[0] + shear * b0[0],
+        vk * e1 + vw * a1[1] + b1[1] + shear * b0[1],
+        vk * e2 + vw * a1[2] + b1[2] + shear * b0[2],
+    )
+    by_scale = (
+        v0[0] * e0 + v1[0] * a1[0],
+        v0[1] * e1 + v1[1] * a1[1],
+        v0[2] * e2 + v1[2] * a1[2],
+    )
+    return v0, v1, by_scale
+
+
+@inline_jit
+def _quaternion_gradient(unit, h):
+    """Gradient with respect to a unit quaternion, and its part along it, from that with respect to
+    the rotation matrix, h."""
+    q0, q1, q2, q3 = unit
+    h0, h1, h2 = h
+    v0 = TWO * (q3 * (h1[0] - h0[1]) + q2 * (h0[2] - h2[0]) + q1 * (h2[1] - h1[2]))
+    v1 = TWO * (
+        q2 * (h0[1] + h1[0])
+        + q3 * (h0[2] + h2[0])
+        + q0 * (h2[1] - h1[2])
+        - TWO * q1 * (h1[1] + h2[2])
+    )
+    v2 = TWO * (
+        q1 * (h0[1] + h1[0])
+        + q3 * (h1[2] + h2[1])
+        + q0 * (h0[2] - h2[0])
+        - TWO * q2 * (h0[0] + h2[2])
+    )
+    v3 = TWO * (
+        q1 * (h0[2] + h2[0])
+        + q2 * (h1[2] + h2[1])
+        + q0 * (h1[0] - h0[1])
+        - TWO * q3 * (h0[0] + h1[1])
+    )
+    return (v0, v1, v2, v3), v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3
+
+
+@inline_jit
+def _outer_sum(p, v0, u, v1):
+    """p·v0ᵀ + u·v1ᵀ, row by row."""
+    return (
+        (p[0] * v0[0] + u[0] * v1[0], p[0] * v0[1] + u[0] * v1[1], p[0] * v0[2] + u[0] * v1[2]),
+        (p[1] * v0[0] + u[1] * v1[0], p[1] * v0[1] + u[1] * v1[1], p[1] * v0[2] + u[1] * v1[2]),
+        (p[2] * v0[0] + u[2] * v1[0], p[2] * v0[1] + u[2] * v1[1], p[2] * v0[2] + u[2] * v1[2]),
     )
 
 
@@ -364,183 +499,74 @@ def differentiate_geometry(b, intrinsics, limits, half_size, compensated):
     fy = intrinsics[1]
     half_width = half_size[0]
     half_height = half_size[1]
-    low_x = limits[0]
-    high_x = limits[1]
-    low_y = limits[2]
-    high_y = limits[3]
+    bounds = (limits[0], limits[1], limits[2], limits[3])
     for q in range(np.uint64(BLOCK_SPLATS)):
         g_mean_x = b[G_MEAN_X + q]
         g_mean_y = b[G_MEAN_Y + q]
-        g_opacity = b[G_OPACITY + q]
         half_x = half_width * g_mean_x
         half_y = half_height * g_mean_y
         b[V_SCREEN + q] = math.sqrt(half_x * half_x + half_y * half_y)
         x, y, z = _camera_point(b, q)
         rz = ONE / z
-        slope_x = x * rz
-        slope_y = y * rz
-        tx = min(high_x, max(low_x, slope_x))
-        ty = min(high_y, max(low_y, slope_y))
-        q0, q1, q2, q3, rn = _unit(b, q)
-        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _rotation(q0, q1, q2, q3)
+        slopes = (x * rz, y * rz)
+        clamped = _clamped(slopes, bounds)
+        unit, per_norm = _unit(b, q)
+        rotation = _rotation(unit)
         jx = fx * rz
         jy = fy * rz
-        u00, u01, u02, u10, u11, u12 = _pixels_per_local(b, q, jx, jy, tx, ty)
+        u0, u1 = _pixels_per_local(b, q, (jx, jy), clamped)
         s0 = exponential(b[LOG_0 + q])
         s1 = exponential(b[LOG_1 + q])
         s2 = exponential(b[LOG_2 + q])
-        w00, w01, w02 = _row_times_matrix(
-            u00, u01, u02, r00, r01, r02, r10, r11, r12, r20, r21, r22
-        )
-        w10, w11, w12 = _row_times_matrix(
-            u10, u11, u12, r00, r01, r02, r10, r11, r12, r20, r21, r22
-        )
-        a00 = w00 * s0
-        a01 = w01 * s1
-        a02 = w02 * s2
-        a10 = w10 * s0
-        a11 = w11 * s1
-        a12 = w12 * s2
-
-        # The x precision is 1 / s, s = xx − shear·xy. With rows a0, a1 of A and the residual e = a0
-        # − shear·a1, ds = 2·e·(da0 − shear·da1) and dshear = (a1·(da0 − shear·da1) + e·da1) / yy:
-        # the gradient with respect to a0 is v0, that with respect to a1 is −shear·v0 + v1. The
-        # residual, and every product of −shear·v0 with something of row 1, is taken together with
-        # row 0, because the two cancel for long splats.
-        precision_x = b[PRECISION_X + q]
-        shear = b[SHEAR + q]
-        inverse_yy = b[PRECISION_Y + q]
-        m01 = a00 * a11 - a01 * a10
-        m02 = a00 * a12 - a02 * a10
-        m12 = a01 * a12 - a02 * a11
-        e0 = inverse_yy * (LOW_PASS_PX2 * a00 + a11 * m01 + a12 * m02)
-        e1 = inverse_yy * (LOW_PASS_PX2 * a01 - a10 * m01 + a12 * m12)
-        e2 = inverse_yy * (LOW_PASS_PX2 * a02 - a10 * m02 - a11 * m12)
-        vs = -TWO * precision_x * precision_x * b[G_PRECISION_X + q]
-        vk = inverse_yy * b[G_SHEAR + q]
-        vw = -TWO * inverse_yy * inverse_yy * b[G_PRECISION_Y + q]
-        b00, b01, b02, b10, b11, b12 = _compensation_gradient(
-            compensated * g_opacity * b[OPACITY + q], a00, a01, a02, a10, a11, a12, m01, m02, m12
-        )
-        v00 = vs * e0 + vk * a10 + b00
-        v01 = vs * e1 + vk * a11 + b01
-        v02 = vs * e2 + vk * a12 + b02
-        v10 = vk * e0 + vw * a10 + b10 + shear * b00
-        v11 = vk * e1 + vw * a11 + b11 + shear * b01
-        v12 = vk * e2 + vw * a12 + b12 + shear * b02
-        by0 = v00 * e0 + v10 * a10
-        by1 = v01 * e1 + v11 * a11
-        by2 = v02 * e2 + v12 * a12
-        b[V_LOG_0 + q] = by0
-        b[V_LOG_1 + q] = by1
-        b[V_LOG_2 + q] = by2
+        scales = (s0, s1, s2)
+        a0 = _times(_row_times_matrix(u0, rotation), scales)
+        a1 = _times(_row_times_matrix(u1, rotation), scales)
+        v0, v1, by_scale = _shape_gradient(b, q, a0, a1, compensated)
+        _store_three(b, V_LOG_0, q, by_scale)
         # A = U·R·diag(s): to R, then through the normalized quaternion.
-        v00 = v00 * s0
-        v01 = v01 * s1
-        v02 = v02 * s2
-        v10 = v10 * s0
-        v11 = v11 * s1
-        v12 = v12 * s2
-        p0 = u00 - shear * u10
-        p1 = u01 - shear * u11
-        p2 = u02 - shear * u12
-        h00 = p0 * v00 + u10 * v10
-        h01 = p0 * v01 + u10 * v11
-        h02 = p0 * v02 + u10 * v12
-        h10 = p1 * v00 + u11 * v10
-        h11 = p1 * v01 + u11 * v11
-        h12 = p1 * v02 + u11 * v12
-        h20 = p2 * v00 + u12 * v10
-        h21 = p2 * v01 + u12 * v11
-        h22 = p2 * v02 + u12 * v12
-        vq0 = TWO * (q3 * (h10 - h01) + q2 * (h02 - h20) + q1 * (h21 - h12))
-        vq1 = TWO * (
-            q2 * (h01 + h10) + q3 * (h02 + h20) + q0 * (h21 - h12) - TWO * q1 * (h11 + h22)
-        )
-        vq2 = TWO * (
-            q1 * (h01 + h10) + q3 * (h12 + h21) + q0 * (h02 - h20) - TWO * q2 * (h00 + h22)
-        )
-        vq3 = TWO * (
-            q1 * (h02 + h20) + q2 * (h12 + h21) + q0 * (h10 - h01) - TWO * q3 * (h00 + h11)
-        )
-        radial = vq0 * q0 + vq1 * q1 + vq2 * q2 + vq3 * q3
-        b[V_RAW_0 + q] = (vq0 - radial * q0) * rn
-        b[V_RAW_1 + q] = (vq1 - radial * q1) * rn
-        b[V_RAW_2 + q] = (vq2 - radial * q2) * rn
-        b[V_RAW_3 + q] = (vq3 - radial * q3) * rn
+        v0 = _times(v0, scales)
+        v1 = _times(v1, scales)
+        shear = b[SHEAR + q]
+        p = (u0[0] - shear * u1[0], u0[1] - shear * u1[1], u0[2] - shear * u1[2])
+        v_unit, radial = _quaternion_gradient(unit, _outer_sum(p, v0, u1, v1))
+        b[V_RAW_0 + q] = (v_unit[0] - radial * unit[0]) * per_norm
+        b[V_RAW_1 + q] = (v_unit[1] - radial * unit[1]) * per_norm
+        b[V_RAW_2 + q] = (v_unit[2] - radial * unit[2]) * per_norm
+        b[V_RAW_3 + q] = (v_unit[3] - radial * unit[3]) * per_norm
         # to U, and through it to the camera-space position (the Jacobian depends on it).
-        d00 = v00 * r00 + v01 * r01 + v02 * r02
-        d01 = v00 * r10 + v01 * r11 + v02 * r12
-        d02 = v00 * r20 + v01 * r21 + v02 * r22
-        d10 = v10 * r00 + v11 * r01 + v12 * r02
-        d11 = v10 * r10 + v11 * r11 + v12 * r12
-        d12 = v10 * r20 + v11 * r21 + v12 * r22
-        m20 = b[M20 + q]
-        m21 = b[M21 + q]
-        m22 = b[M22 + q]
-        from_row_0 = d00 * m20 + d01 * m21 + d02 * m22
+        depth_row = _three(b, M20, q)
+        from_row_0 = _dot(_matrix_times(rotation, v0), depth_row)
         vtx = -jx * from_row_0
-        vty = -jy * (d10 * m20 + d11 * m21 + d12 * m22 - shear * from_row_0)
-        vtx = vtx if tx == slope_x else ZERO
-        vty = vty if ty == slope_y else ZERO
-        vtx = vtx + g_mean_x * fx
-        vty = vty + g_mean_y * fy
+        vty = -jy * (_dot(_matrix_times(rotation, v1), depth_row) - shear * from_row_0)
+        vtx = (vtx if clamped[0] == slopes[0] else ZERO) + g_mean_x * fx
+        vty = (vty if clamped[1] == slopes[1] else ZERO) + g_mean_y * fy
         b[V_CAMERA_X + q] = vtx * rz
         b[V_CAMERA_Y + q] = vty * rz
         # U shrinks with z as the scales do.
-        b[V_CAMERA_Z + q] = -rz * (by0 + by1 + by2) - (vtx * slope_x + vty * slope_y) * rz
-        b[CAMERA_X + q] = x
-        b[CAMERA_Y + q] = y
-        b[CAMERA_Z + q] = z
+        by_size = by_scale[0] + by_scale[1] + by_scale[2]
+        b[V_CAMERA_Z + q] = -rz * by_size - (vtx * slopes[0] + vty * slopes[1]) * rz
+        _store_three(b, CAMERA_X, q, (x, y, z))
         # σ(−x) instead of 1 − σ(x), which cancels for nearly opaque splats.
-        b[V_LOGIT + q] = g_opacity * b[OPACITY + q] / (ONE + exponential(b[LOGIT + q]))
+        b[V_LOGIT + q] = b[G_OPACITY + q] * b[OPACITY + q] / (ONE + exponential(b[LOGIT + q]))
 
 
 @inline_jit
 def differentiate_position(b, to_world):
     """Write V_LOCAL_X to V_LOCAL_Z from V_CAMERA_X to V_CAMERA_Z and the weights W1 to W15 of the
     harmonics."""
-    t00 = to_world[0, 0]
-    t01 = to_world[0, 1]
-    t02 = to_world[0, 2]
-    t10 = to_world[1, 0]
-    t11 = to_world[1, 1]
-    t12 = to_world[1, 2]
-    t20 = to_world[2, 0]
-    t21 = to_world[2, 1]
-    t22 = to_world[2, 2]
+    rows = _rows(to_world)
     for q in range(np.uint64(BLOCK_SPLATS)):
-        dx = b[TOWARD_X + q]
-        dy = b[TOWARD_Y + q]
-        dz = b[TOWARD_Z + q]
+        dx, dy, dz = _three(b, TOWARD_X, q)
         rd = b[PER_DISTANCE + q]
-        ex, ey, ez = basis_gradient(
-            dx,
-            dy,
-            dz,
-            b[W1 + q],
-            b[W2 + q],
-            b[W3 + q],
-            b[W4 + q],
-            b[W5 + q],
-            b[W6 + q],
-            b[W7 + q],
-            b[W8 + q],
-            b[W9 + q],
-            b[W10 + q],
-            b[W11 + q],
-            b[W12 + q],
-            b[W13 + q],
-            b[W14 + q],
-            b[W15 + q],
-        )
+        ex, ey, ez = _basis_gradient(b, q, dx, dy, dz)
         along = ex * dx + ey * dy + ez * dz
         ex = (ex - along * dx) * rd
         ey = (ey - along * dy) * rd
         ez = (ez - along * dz) * rd
-        vx = b[V_CAMERA_X + q] + t00 * ex + t10 * ey + t20 * ez
-        vy = b[V_CAMERA_Y + q] + t01 * ex + t11 * ey + t21 * ez
-        vz = b[V_CAMERA_Z + q] + t02 * ex + t12 * ey + t22 * ez
-        b[V_LOCAL_X + q] = b[M00 + q] * vx + b[M10 + q] * vy + b[M20 + q] * vz
-        b[V_LOCAL_Y + q] = b[M01 + q] * vx + b[M11 + q] * vy + b[M21 + q] * vz
-        b[V_LOCAL_Z + q] = b[M02 + q] * vx + b[M12 + q] * vy + b[M22 + q] * vz
+        turned = _row_times_matrix((ex, ey, ez), rows)
+        v = (
+            b[V_CAMERA_X + q] + turned[0],
+            b[V_CAMERA_Y + q] + turned[1],
+            b[V_CAMERA_Z + q] + turned[2],
+        )
+        _store_three(b, V_LOCAL_X, q, _row_times_matrix(v, _frame(b, q)))

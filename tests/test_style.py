@@ -1,0 +1,49 @@
+"""Rules of CONTRIBUTING.md, "How we write", that ruff has no rule for."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("stga_addon", "operators", "ui", "tests", "benchmarks")
+FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+MAX_FUNCTION_LINES = 60
+
+
+def names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+def packed_values(tree: ast.AST) -> Iterator[int]:
+    """Lines that assign independent values at once, `a, b = c, d`, and swap or unpack nothing."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
+            target = node.targets[0]
+            if isinstance(target, ast.Tuple) and not names(target) & names(node.value):
+                yield node.lineno
+
+
+def long_functions(tree: ast.AST) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            lines = (node.end_lineno or node.lineno) - node.lineno + 1
+            if lines > MAX_FUNCTION_LINES:
+                yield f"{node.name} ({lines} lines)"
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_one_assignment_a_line(folder: str) -> None:
+    """Catches values packed into one line to save lines, which then read slower."""
+    files = [path for path in FILES if path.is_relative_to(ROOT / folder)]
+    assert files
+    for path in files:
+        assert not list(packed_values(ast.parse(path.read_text()))), path.relative_to(ROOT)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_functions_fit_on_a_screen(folder: str) -> None:
+    """Catches a function that has become several."""
+    for path in (path for path in FILES if path.is_relative_to(ROOT / folder)):
+        assert not list(long_functions(ast.parse(path.read_text()))), path.relative_to(ROOT)
