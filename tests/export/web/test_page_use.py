@@ -159,6 +159,41 @@ def test_keyboard(browser, head, tmp_path):
     assert browser.errors == []
 
 
+def click(browser: Browser, selector: str) -> None:
+    """A click of the mouse on the middle of an element."""
+    box = f"document.querySelector('{selector}').getBoundingClientRect().toJSON()"
+    found = browser.evaluate(box)
+    middle = found["x"] + found["width"] / 2, found["y"] + found["height"] / 2
+    place = {"x": middle[0], "y": middle[1], "button": "left", "clickCount": 1}
+    for kind in ("mousePressed", "mouseReleased"):
+        browser.send("Input.dispatchMouseEvent", type=kind, **place)
+
+
+def test_keys_press_the_control_that_has_the_focus(browser, head, tmp_path):
+    """Catches a checkbox, a button or a slider that the keyboard reaches, but whose keys play the
+    motion; and a clicked button that keeps Space from playing it."""
+    show(browser, tmp_path, head.data())
+    of_avatar(browser, "pause()")
+    press(browser, "c")
+    for selector, member in (("#show-selection", "showSelection"), ("#loop", "loop")):
+        before = of_avatar(browser, member)
+        browser.evaluate(f"document.querySelector('{selector}').focus()")
+        press(browser, " ")
+        assert of_avatar(browser, member) is not before, selector
+        assert not of_avatar(browser, "playing"), selector
+    of_avatar(browser, "frame = 1")
+    browser.evaluate("document.querySelector('#pose .slider input').focus()")
+    press(browser, "Home")
+    assert of_avatar(browser, "frame") == 1
+    loop = of_avatar(browser, "loop")
+    click(browser, "#loop")
+    assert of_avatar(browser, "loop") is not loop
+    press(browser, " ")
+    assert of_avatar(browser, "playing")
+    assert of_avatar(browser, "loop") is not loop
+    assert browser.errors == []
+
+
 def test_sliders_are_flames(browser, head, tmp_path):
     """Catches a slider that moves another shape, joint or axis, or another first camera."""
     show(browser, tmp_path, head.data(exact=True))

@@ -8,7 +8,8 @@ import { addControls, bounds, cameraOfView, fitted, frontCamera } from './camera
 import { DataError, readData } from './data.js';
 import { FaceFrames } from './face_frames.js';
 import { LightPass, litBy } from './light.js';
-import { Motion, Rig, readPerformance } from './motion.js';
+import { Motion, Rig } from './motion.js';
+import { readPerformance } from './performance.js';
 import { DepthSort, Renderer, RendererError } from './renderer.js';
 import { vector } from './vector.js';
 
