@@ -430,10 +430,25 @@ const KEYS = {
   x: releaseAll,
 };
 
+// Whether a control that has the focus uses a key itself.
+/** @type {(control: Element, key: string) => boolean} */
+function usesKey(control, key) {
+  if (control.matches('select')) return true;
+  if (key !== ' ') return /^(Arrow.*|Home|End)$/.test(key) && control.matches('input');
+  return control.matches('input:not([type="range"]), button, summary');
+}
+
+// A button that the mouse has clicked gives up the focus: Space plays again.
+/** @param {MouseEvent} event whose `detail` counts clicks, 0 of the keyboard's */
+function releaseFocus(event) {
+  const focused = document.activeElement;
+  if (event.detail && focused instanceof HTMLElement && focused.matches('button, summary'))
+    focused.blur();
+}
+
 /** @param {KeyboardEvent} event */
 function press(event) {
-  const typing = event.key.startsWith('Arrow') ? 'select, input' : 'select';
-  if (event.target instanceof Element && event.target.matches(typing)) return;
+  if (event.target instanceof Element && usesKey(event.target, event.key)) return;
   if (event.ctrlKey || event.metaKey || event.altKey || !avatar.info) return;
   const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const action = /^[1-9]$/.test(key) ? () => showView(Number(key) - 1) : KEYS[key];
@@ -487,6 +502,7 @@ document.documentElement.dataset.theme = isDark ? 'dark' : 'light';
 byId('theme').addEventListener('click', toggleTheme);
 byId('fullscreen').addEventListener('click', toggleFullscreen);
 addEventListener('keydown', press);
+addEventListener('click', releaseFocus);
 avatar.addEventListener('load', start, { once: true });
 avatar.addEventListener('error', () => {
   for (const id of ['heading', 'transport', 'panel', 'open']) byId(id).hidden = true;
