@@ -260,6 +260,45 @@ def test_a_lost_graphics_context_comes_back(browser, head, tmp_path):
     assert browser.errors == []
 
 
+def test_a_removed_element_stops_and_goes_on_where_it_is_put_back(browser, head, tmp_path):
+    """Catches avatars of an application's earlier views that play on unseen and keep their graphics
+    memory, until the browser takes the context of one that is seen; and a move within the page that
+    stops one."""
+    show(browser, tmp_path, head.data())
+    of_avatar(browser, "setExpression(1, 0.9)")
+    found = browser.evaluate("""(async () => {
+      const avatar = document.querySelector('stga-avatar');
+      const pause = (time) => new Promise((done) => setTimeout(done, time));
+      const picture = () => String(avatar.player.read(avatar.player.camera));
+      const before = picture();
+      const { gl } = avatar.player;
+      document.querySelector('nav').append(avatar);
+      await pause(50);
+      const moved = [gl.isContextLost(), avatar.player.gl === gl];
+      avatar.loop = true;
+      avatar.play();
+      avatar.remove();
+      await pause(50);
+      const frame = avatar.frame;
+      await pause(100);
+      const removed = [gl.isContextLost(), avatar.frame === frame];
+      document.body.prepend(avatar);
+      await pause(300);
+      const back = [avatar.player.gl.isContextLost(), avatar.playing && avatar.frame !== frame];
+      avatar.pause();
+      avatar.frame = 0;
+      const hidden = avatar.shadowRoot.querySelector('p').hidden;
+      const canvases = avatar.shadowRoot.querySelectorAll('canvas').length;
+      return { moved, removed, back, hidden, canvases, same: picture() === before };
+    })()""")
+    states = {"moved": [False, True], "removed": [True, True], "back": [False, True]}
+    assert found == states | {"hidden": True, "canvases": 1, "same": True}
+    before = browser.evaluate(CAMERA)
+    touch(browser, line((200, 120), (260, 120)))
+    assert browser.evaluate(CAMERA) != before
+    assert browser.errors == []
+
+
 @pytest.mark.nightly
 def test_ten_minutes_of_play_leave_nothing_behind(browser, head, tmp_path):
     """Catches textures, buffers and objects that pile up, on an accelerated clock."""

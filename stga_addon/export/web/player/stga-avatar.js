@@ -124,7 +124,8 @@ export class StgaAvatar extends HTMLElement {
   #last = 0;
   #request = 0;
   #loading = 0;
-  #canvas = document.createElement('canvas');
+  #removed = false; // from the page, without having been put back
+  #canvas = this.#newCanvas();
   #message = document.createElement('p');
   speed = 1;
   loop = false;
@@ -134,14 +135,18 @@ export class StgaAvatar extends HTMLElement {
     const style = Object.assign(document.createElement('style'), { textContent: STYLE });
     Object.assign(this.#message, { role: 'alert', hidden: true });
     this.attachShadow({ mode: 'open' }).append(style, this.#canvas, this.#message);
-    const get = () => this.#player;
-    addControls(this.#canvas, get, event => this.#changed(event));
-    this.#canvas.addEventListener('webglcontextlost', event => {
-      event.preventDefault(); // so that it will be given back
-      this.#say('The graphics driver was restarted. Waiting for it …');
-    });
-    this.#canvas.addEventListener('webglcontextrestored', () => this.#restore());
     new ResizeObserver(() => this.#resize()).observe(this);
+  }
+
+  connectedCallback() {
+    if (!this.#removed) return;
+    this.#removed = false;
+    this.#restore();
+  }
+
+  disconnectedCallback() {
+    // What moves an element removes it for a moment.
+    queueMicrotask(() => this.isConnected || this.#release());
   }
 
   /** @type {(name: string, before: string | null, value: string | null) => void} */
@@ -400,6 +405,33 @@ export class StgaAvatar extends HTMLElement {
     return sliders[this.#index(names, name, 'expression')].component;
   }
 
+  #newCanvas() {
+    const canvas = document.createElement('canvas');
+    const get = () => this.#player;
+    addControls(canvas, get, event => this.#changed(event));
+    canvas.addEventListener('webglcontextlost', event => {
+      if (canvas !== this.#canvas) return; // this element has given it back
+      event.preventDefault(); // so that it will be given back
+      this.#say('The graphics driver was restarted. Waiting for it …');
+    });
+    canvas.addEventListener('webglcontextrestored', () => this.#restore());
+    return canvas;
+  }
+
+  /** Stop, and give the graphics memory back, of which a browser lends to few elements at a time. */
+  #release() {
+    this.#removed = true;
+    cancelAnimationFrame(this.#request);
+    this.#request = 0;
+    if (!this.#player) return;
+    const used = this.#canvas;
+    this.#canvas = this.#newCanvas();
+    this.#canvas.hidden = used.hidden;
+    used.replaceWith(this.#canvas);
+    this.#player.dispose();
+    this.#player.gl.getExtension('WEBGL_lose_context')?.loseContext();
+  }
+
   /** @param {Player} player */
   #show(player) {
     this.#player?.dispose();
@@ -414,6 +446,7 @@ export class StgaAvatar extends HTMLElement {
     this.dispatchEvent(new CustomEvent('load'));
     if (this.hasAttribute('autoplay')) this.play();
     this.#changed('frame'); // the first one is drawn once, as whoever waited for "load" wants it
+    if (this.#removed) this.#release();
   }
 
   /** Upload everything again, and go on where it was. */
@@ -427,6 +460,7 @@ export class StgaAvatar extends HTMLElement {
       return this.#fail(error);
     }
     this.#message.hidden = true;
+    this.#resize();
     this.#posed();
   }
 
@@ -479,7 +513,8 @@ export class StgaAvatar extends HTMLElement {
     const [width, height] = sides.map(side => Math.max(1, Math.round(side * ratio)));
     if (this.#canvas.width === width && this.#canvas.height === height) return;
     Object.assign(this.#canvas, { width, height });
-    if (this.#player) this.#player.draw(); // at once: setting its size has cleared the canvas
+    const player = this.#player;
+    if (player && !player.gl.isContextLost()) player.draw(); // setting its size has cleared it
   }
 }
 
