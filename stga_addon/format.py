@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 
 def format_duration(seconds: float) -> str:
@@ -22,6 +23,12 @@ def format_bytes(size: float) -> str:
             value = size / factor
             return f"{value:.1f} {unit}" if value < 10 else f"{value:.0f} {unit}"
     return f"{size:.0f} bytes"
+
+
+def format_name(path: Path) -> str:
+    """A folder's name, or a file's without its suffix, as what is made of it is called."""
+    resolved = path.resolve()
+    return resolved.name if resolved.is_dir() else resolved.stem
 
 
 def format_table(rows: Sequence[tuple[str, str]]) -> list[str]:

@@ -16,7 +16,7 @@ from ..export.formats import FORMATS, Meshes, check_free_space, check_suffix, ex
 from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
 from ..export.web.page import flame_notice
 from ..flame.sequence import FlameSequence
-from ..format import format_bytes
+from ..format import format_bytes, format_name
 from ..light.relight import albedo_avatar
 from ..options import flag_of, like, option
 from ..progress import Report, Say, Written, counted
@@ -180,7 +180,7 @@ def _say_licence(notice: str, say: Say) -> None:
 
 def _title(request: Export) -> str:
     path = request.source.resolve()
-    return str(path.parent.name if path.name == AVATAR else path.stem)
+    return format_name(path.parent if path.name == AVATAR else path)
 
 
 def capture_views(capture: Capture) -> dict[str, Camera]:

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from ..errors import StgaError
+from ..format import format_name
 from . import tags
 
 # Receives one sentence for the user; operators pass their own report.
@@ -23,7 +24,7 @@ def capture_root(source: Path) -> Any:
     existing = tags.find(tags.ROOT, source)
     if existing:
         return existing[0]
-    name = source.resolve().stem
+    name = format_name(source)
     collection = bpy.data.collections.new(name)
     bpy.context.scene.collection.children.link(collection)
     root = bpy.data.objects.new(name, None)

@@ -128,6 +128,13 @@ def test_problems_are_reported(tmp_path):
     assert "00004_00.png" in missing
 
 
+def test_the_parent_is_called_like_the_capture(tmp_path):
+    """Catches a folder's name that is cut at a dot, as if it were a file's."""
+    (tmp_path / "anna.v2").mkdir()
+    assert capture_root(tmp_path / "anna.v2").name == "anna.v2"
+    assert capture_root(tmp_path / "ben.v2.mp4").name == "ben.v2"
+
+
 def test_second_import_replaces_the_first(tmp_path):
     """Fails when a second import duplicates cameras or images, or keeps lost ones."""
     root = capture_root(tmp_path)

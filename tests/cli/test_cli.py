@@ -163,6 +163,14 @@ def test_export_of_frames(trained, root, tmp_path, capsys):
     assert low[0] > low[1] > low[2]
 
 
+def test_a_page_is_called_like_its_run(trained, tmp_path):
+    """Catches a folder's name that is cut at a dot, as if it were a file's."""
+    run = shutil.copytree(trained, tmp_path / "anna.v2")
+    out = tmp_path / "page.stga"
+    assert stga("export", run, "--format web --frames 0:0 --out", out) == 0
+    assert read_web_data(out.read_bytes())[0]["title"] == "anna.v2"
+
+
 @pytest.mark.parametrize("format", ["ply-sequence", "web"])
 def test_export_to_a_full_disk(trained, tmp_path, capsys, monkeypatch, format):
     """Catches a range that fills the disk."""

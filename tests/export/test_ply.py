@@ -147,6 +147,9 @@ def head(body: str) -> bytes:
 GOOD = "".join(f"property float {name}\n" for name in layout(0))
 
 
+BEFORE = "element camera 2\nproperty float a\nproperty uchar b\n"  # 10 bytes of data
+
+
 def ascii_head(body: str) -> bytes:
     return head(body).replace(b"binary_little_endian", b"ascii")
 
@@ -160,6 +163,7 @@ def ascii_head(body: str) -> bytes:
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n", "no complete header"),
         (head("element vertex 1000000000000\n" + GOOD), "truncated"),
         (head("element vertex 1\n" + GOOD) + bytes(55), "truncated"),
+        (head(BEFORE + "element vertex 1\n" + GOOD) + bytes(10 + 55), "truncated"),
         (head("element vertex -1\n" + GOOD), "no vertices"),
         (head("element vertex many\n" + GOOD), "cannot be understood"),
         (head("element vertex 0\nproperty half x\n"), "cannot be understood"),

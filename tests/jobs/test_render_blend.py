@@ -12,7 +12,7 @@ import pytest
 from stga_addon.errors import StgaError
 from stga_addon.jobs.blender import RenderBlend, blender_command
 from stga_addon.jobs.perform import perform, worker_arguments, write_request
-from stga_addon.progress import Cancelled, Progress, ignore
+from stga_addon.progress import Cancelled, Progress, Written, ignore
 
 BLENDER = """
 import os, sys, time
@@ -109,6 +109,13 @@ def test_cancelling_ends_blender(shot, tmp_path, monkeypatch):
     process = int((tmp_path / "log").read_text().split()[0])
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)
+
+
+def test_a_film_cancelled_with_its_last_picture_is_whole(shot: RenderBlend) -> None:
+    """Catches a job that is reported as cancelled, and done again, though no picture is missing."""
+    result = perform(shot, lambda progress: progress.share == 1, lambda line: None)
+    assert result == Written(shot.output)
+    assert pictures(shot.output) == WHOLE
 
 
 @pytest.mark.skipif(
