@@ -16,6 +16,7 @@ from ...files import replacing_together
 from ...flame.sequence import FlameSequence
 from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS
+from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..playback import Playback
 from .data_file import baked_rig, data_file, flame_rig
 
@@ -53,6 +54,7 @@ def _source(name: str) -> str:
     for comment in (IMPORT, EXPORT, TYPES):
         source = comment.sub("", source)
     source = source.replace("{{harmonics}}", "; ".join(harmonics_text()[1:]))
+    source = source.replace("{{splat}}", SPLAT_DEFINES + SPLAT_FUNCTIONS)
     return source.replace("{{shading}}", SHADING_DEFINES + SHADING_FUNCTIONS)
 
 

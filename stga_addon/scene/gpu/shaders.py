@@ -38,6 +38,7 @@ import numpy as np
 
 from ...avatar.splats import harmonics_text
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS, SRGB_FUNCTIONS
+from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
 from . import packing
@@ -60,7 +61,6 @@ def texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
     return gpu.types.GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
 
 
-MIN_ALPHA = 1 / 255  # a splat adds nothing to a pixel where its alpha is less, as in the rasterizer
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
 BLOCK_SPLATS = 128
@@ -70,10 +70,11 @@ MAP_COLUMNS = 4
 NOTHING = 1e30  # depth of a shadow map where nothing is
 
 _CONSTANTS = {name: value for name, value in vars(packing).items() if name.endswith("_TEXELS")}
-_CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS, "MIN_ALPHA": MIN_ALPHA}
+_CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS}
 _CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES, "FROZEN_COLOR": f"vec3{FROZEN_COLOR_SRGB}"}
 _CONSTANTS["TEXEL(image, k)"] = "texelFetch(image, ivec2((k) % WIDTH, (k) / WIDTH), 0)"
 _DEFINES = "".join(f"#define {name} {value}\n" for name, value in _CONSTANTS.items())
+_DEFINES += SPLAT_DEFINES
 RELIT_DEFINES = f"""
 #define RELIT
 #define MAP_COLUMNS {MAP_COLUMNS}
@@ -239,8 +240,6 @@ vec3 spherical_harmonics(int first, int degree, vec3 d)
 """
 
 _PROJECTION_FRAGMENT = """
-const float LOW_PASS_PX2 = 0.3;
-
 void main()
 {
   place_out = sides_out = shade_out = vec4(0.0);
@@ -269,19 +268,16 @@ void main()
       return;
     }
   }
-  /* Linearized projection; slopes far outside the image are clamped (as the rasterizer's). */
-  vec2 focal = lens.xy, principal = lens.zw, margin = 0.15 * image.xy / focal;
-  vec2 least = -principal / focal - margin, most = (image.xy - principal) / focal + margin;
-  vec2 slope = clamp(p.xy / p.z, least, most), zoom = focal / p.z;
+  vec2 focal = lens.xy, principal = lens.zw, zoom = focal / p.z;
+  vec2 slope = limited_slope(p, focal, principal, image.xy);
   vec3 u = zoom.x * (r0.xyz - slope.x * r2.xyz), v = zoom.y * (r1.xyz - slope.y * r2.xyz);
   vec3 a = display.y * vec3(dot(u, axis0.xyz), dot(u, axis1.xyz), dot(u, axis2.xyz));
   vec3 b = display.y * vec3(dot(v, axis0.xyz), dot(v, axis1.xyz), dot(v, axis2.xyz));
-  float xx = dot(a, a) + LOW_PASS_PX2, xy = dot(a, b), yy = dot(b, b) + LOW_PASS_PX2;
-  vec3 minors = cross(a, b); /* the determinant without cancellation */
-  float sharp = dot(minors, minors), determinant = sharp + LOW_PASS_PX2 * (xx + yy - LOW_PASS_PX2);
+  vec4 covariance = screen_covariance(a, b);
   if (display.x > 0.5) {
-    opacity *= sqrt(sharp / determinant);
+    opacity = antialiased_opacity(opacity, covariance);
   }
+  float determinant = covariance_determinant(covariance);
   if (!(opacity >= MIN_ALPHA) || !(determinant < 1e30) || display.y <= 0.0) {
     return;
   }
@@ -299,11 +295,12 @@ void main()
     color = FROZEN_COLOR;
   }
   /* A rectangle along the ellipse's axes, up to where alpha falls below MIN_ALPHA. */
+  float xx = covariance.x, xy = covariance.y, yy = covariance.z;
   float mean = 0.5 * (xx + yy), spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.0));
   float large = mean + spread, small = max(determinant / large, 1e-9);
   vec2 major = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
   major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : major;
-  float reach = sqrt(2.0 * log(opacity / MIN_ALPHA)) * 1.001;
+  float reach = splat_reach(opacity) * 1.001;
   vec2 pixel = focal * p.xy / p.z + principal, to_device = vec2(2.0, -2.0) / image.xy;
   place_out = vec4(to_device * pixel + vec2(-1.0, 1.0), p.z, reach);
   vec2 minor = vec2(-major.y, major.x);
@@ -326,10 +323,10 @@ void main()
 }
 """
 
-_SPLAT_FRAGMENT = """
+_SPLAT_MAIN = """
 void main()
 {
-  float alpha = min(0.999, shade.a * exp(-0.5 * dot(offset, offset)));
+  float alpha = splat_alpha(shade.a, offset);
   if (alpha < MIN_ALPHA) {
     discard;
   }
@@ -337,6 +334,7 @@ void main()
   depth_out = vec4(depth * alpha, alpha, 0.0, alpha); /* the fourth is what blending reads */
 }
 """
+_SPLAT_FRAGMENT = SPLAT_FUNCTIONS + _SPLAT_MAIN
 
 _SCREEN_VERTEX = """
 void main()
@@ -392,7 +390,7 @@ def projection_shader(relit: bool = False) -> Any:
     """First pass: fills PROJECTED_TEXTURES, a texel for each of the `count` splats in `orders`;
     others become 0. relit: for layers of which at least one is lit by the scene."""
     defines = _DEFINES
-    functions = _HARMONICS
+    functions = SPLAT_FUNCTIONS + _HARMONICS
     samplers: tuple[str, ...] = PACKED_TEXTURES
     if relit:
         defines += RELIT_DEFINES

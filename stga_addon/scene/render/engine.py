@@ -19,11 +19,11 @@ from bpy.app.handlers import persistent
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage, PosedSplats
+from ...raster.splat_shader import MIN_ALPHA
 from ...render.client import RenderClient, missing_packages
 from ..cameras import render_camera, viewport_camera
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer, has_gpu_context
-from ..gpu.shaders import MIN_ALPHA
 from ..layers import SceneLayer
 from ..light import settings_values
 from .scene_splats import SplatCache, visible_layers

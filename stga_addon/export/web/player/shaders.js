@@ -12,7 +12,6 @@ export const VERTEX_TEXELS = 3; // position | normal | irradiance of the world a
 export const MAP_SIZE = 512;
 export const LIFT_M = 0.001;
 const SKIN_ROUGHNESS = 0.45;
-const MIN_ALPHA = 1 / 255;
 /** Of the recorded color without what depends on the view, by degree from 1 (light/relight.py). */
 const VIEW_MEANS = [0.65, 0.195, -0.089375];
 
@@ -23,6 +22,9 @@ precision highp sampler2D;
 ivec2 texel(int index) {
   return ivec2(index & ${TEXTURE_WIDTH - 1}, index >> ${Math.log2(TEXTURE_WIDTH)});
 }`;
+
+const SPLAT = `
+{{splat}}`;
 
 /** Of degree 1 on, by x, y, z and their squares: what the export writes here. */
 const SH = '{{harmonics}}'.split('; ');
@@ -64,12 +66,11 @@ function tailColor(arrays, direction, sum) {
   return lines.join('\n  ');
 }
 
-// The limits and constants are those of the kernels that trained the splats (raster/cpu). isLit:
-// whether colors come from the light pass.
+// isLit: whether colors come from the light pass.
 /** @type {(arrays: Arrays, isLit: boolean) => string} */
 export function splatVertexShader(arrays, isLit) {
   const lit = 'color = texelFetch(uColors, texel(splat), 0).rgb;';
-  return `${PREAMBLE}
+  return `${PREAMBLE}${SPLAT}
 uniform sampler2D uFaces;
 uniform sampler2D uSplats;
 uniform sampler2D ${isLit ? 'uColors' : 'uTail'};
@@ -83,7 +84,7 @@ flat out vec4 vColor;
 
 // Pixels: more than a corner moves to the driver's grid, of 1/16 pixel at the coarsest.
 const float SNAP = 0.07;
-const float NEAR = 0.01, LOW_PASS = 0.3, MARGIN = 0.15;
+const float NEAR = 0.01;
 
 mat3 rotation(vec4 q) {
   float w = q.x, x = q.y, y = q.z, z = q.w;
@@ -111,25 +112,21 @@ void main() {
   axes[1] *= shape.y;
   axes[2] *= shape.z;
   // Rows of Jacobian · frame: the affine map from the local frame to pixels.
-  vec2 slope = clamp(center.xy / center.z, -uCenter / uFocal - MARGIN * uSize / uFocal,
-    (uSize - uCenter) / uFocal + MARGIN * uSize / uFocal);
+  vec2 slope = limited_slope(center, uFocal, uCenter, uSize);
   vec3 a = (uFocal.x / center.z * (rowX.xyz - slope.x * rowZ.xyz)) * axes;
   vec3 b = (uFocal.y / center.z * (rowY.xyz - slope.y * rowZ.xyz)) * axes;
-  float xx = dot(a, a) + LOW_PASS, xy = dot(a, b), yy = dot(b, b) + LOW_PASS;
-  vec3 minors = cross(a, b);
-  float sharp = dot(minors, minors);
-  float det = sharp + LOW_PASS * (xx + yy - LOW_PASS); // never cancels to zero or below
+  vec4 covariance = screen_covariance(a, b);
   float opacity = shape.w;
-  if (uAntialiased) opacity *= sqrt(sharp / det);
-  if (!(opacity >= ${MIN_ALPHA})) return;
+  if (uAntialiased) opacity = antialiased_opacity(opacity, covariance);
+  if (!(opacity >= MIN_ALPHA)) return;
 
-  float middle = 0.5 * (xx + yy);
-  float longer = middle + length(vec2(0.5 * (xx - yy), xy));
+  float xx = covariance.x, xy = covariance.y, yy = covariance.z;
+  float longer = 0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy));
   vec2 axis = xx >= yy ? vec2(longer - yy, xy) : vec2(xy, longer - xx);
   axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
+  vec2 deviation = vec2(sqrt(longer), sqrt(covariance_determinant(covariance) / longer));
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-  vec2 deviation = vec2(sqrt(longer), sqrt(det / longer));
-  vec2 reach = corner * (sqrt(2.0 * log(opacity / ${MIN_ALPHA})) * deviation + SNAP);
+  vec2 reach = corner * (splat_reach(opacity) * deviation + SNAP);
   vec2 pixel = uFocal * center.xy / center.z + uCenter;
   vCenter = vec2(pixel.x, uSize.y - pixel.y); // gl_FragCoord counts from below
   vToUnit = mat2(vec2(axis.x, -axis.y) / deviation.x, -axis.yx / deviation.y);
@@ -150,15 +147,15 @@ void main() {
 // From the pixel's own place: an interpolated offset would move with the corners, which drivers
 // round to a grid.
 export const SPLAT_FRAGMENT_SHADER = `#version 300 es
-precision highp float;
+precision highp float;${SPLAT}
 flat in vec2 vCenter;
 flat in mat2 vToUnit;
 flat in vec4 vColor;
 out vec4 result;
 void main() {
   vec2 offset = (gl_FragCoord.xy - vCenter) * vToUnit; // in standard deviations
-  float alpha = min(0.999, vColor.a * exp(-0.5 * dot(offset, offset)));
-  if (alpha < ${MIN_ALPHA}) discard;
+  float alpha = splat_alpha(vColor.a, offset);
+  if (alpha < MIN_ALPHA) discard;
   result = vec4(vColor.rgb * alpha, alpha);
 }`;
 

@@ -1,0 +1,8 @@
+"""GLSL that projects splats and fades them as the rasterizers do, for Blender and the web page."""
+
+from pathlib import Path
+
+MIN_ALPHA = 1 / 255  # a splat adds nothing to a pixel where its alpha is less
+_CONSTANTS = {"MIN_ALPHA": MIN_ALPHA, "MAX_ALPHA": 0.999, "LOW_PASS_PX2": 0.3, "SLOPE_MARGIN": 0.15}
+SPLAT_DEFINES = "".join(f"#define {name} {value!r}\n" for name, value in _CONSTANTS.items())
+SPLAT_FUNCTIONS = Path(__file__).with_name("splat.glsl").read_text(encoding="utf-8")
