@@ -27,6 +27,16 @@ float antialiased_opacity(float opacity, vec4 covariance)
   return opacity * sqrt(covariance.w / covariance_determinant(covariance));
 }
 
+/* Direction of the ellipse's longer axis; standard deviations along it and across. */
+vec4 ellipse_axes(vec4 covariance)
+{
+  float xx = covariance.x, xy = covariance.y, yy = covariance.z;
+  float longer = 0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy));
+  vec2 axis = xx >= yy ? vec2(longer - yy, xy) : vec2(xy, longer - xx); /* the part that does not cancel */
+  axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
+  return vec4(axis, sqrt(longer), sqrt(covariance_determinant(covariance) / longer));
+}
+
 /* Standard deviations from the center to where alpha falls below MIN_ALPHA. */
 float splat_reach(float opacity)
 {

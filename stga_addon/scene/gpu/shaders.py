@@ -277,8 +277,8 @@ void main()
   if (display.x > 0.5) {
     opacity = antialiased_opacity(opacity, covariance);
   }
-  float determinant = covariance_determinant(covariance);
-  if (!(opacity >= MIN_ALPHA) || !(determinant < 1e30) || display.y <= 0.0) {
+  bool is_finite = covariance_determinant(covariance) < 1e30;
+  if (!(opacity >= MIN_ALPHA) || !is_finite || display.y <= 0.0) {
     return;
   }
   vec3 toward = normalize(p);
@@ -295,16 +295,12 @@ void main()
     color = FROZEN_COLOR;
   }
   /* A rectangle along the ellipse's axes, up to where alpha falls below MIN_ALPHA. */
-  float xx = covariance.x, xy = covariance.y, yy = covariance.z;
-  float mean = 0.5 * (xx + yy), spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.0));
-  float large = mean + spread, small = max(determinant / large, 1e-9);
-  vec2 major = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
-  major = abs(xy) > 1e-6 * large ? normalize(vec2(xy, large - xx)) : major;
+  vec4 ellipse = ellipse_axes(covariance);
   float reach = splat_reach(opacity) * 1.001;
   vec2 pixel = focal * p.xy / p.z + principal, to_device = vec2(2.0, -2.0) / image.xy;
   place_out = vec4(to_device * pixel + vec2(-1.0, 1.0), p.z, reach);
-  vec2 minor = vec2(-major.y, major.x);
-  sides_out = reach * vec4(sqrt(large) * to_device * major, sqrt(small) * to_device * minor);
+  vec2 major = ellipse.xy, minor = vec2(-major.y, major.x);
+  sides_out = reach * vec4(ellipse.z * to_device * major, ellipse.w * to_device * minor);
   shade_out = vec4(max(color, vec3(0.0)), opacity);
 }
 """

@@ -120,11 +120,8 @@ void main() {
   if (uAntialiased) opacity = antialiased_opacity(opacity, covariance);
   if (!(opacity >= MIN_ALPHA)) return;
 
-  float xx = covariance.x, xy = covariance.y, yy = covariance.z;
-  float longer = 0.5 * (xx + yy) + length(vec2(0.5 * (xx - yy), xy));
-  vec2 axis = xx >= yy ? vec2(longer - yy, xy) : vec2(xy, longer - xx);
-  axis = dot(axis, axis) > 0.0 ? normalize(axis) : vec2(1.0, 0.0);
-  vec2 deviation = vec2(sqrt(longer), sqrt(covariance_determinant(covariance) / longer));
+  vec4 ellipse = ellipse_axes(covariance);
+  vec2 axis = ellipse.xy, deviation = ellipse.zw;
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   vec2 reach = corner * (splat_reach(opacity) * deviation + SNAP);
   vec2 pixel = uFocal * center.xy / center.z + uCenter;
