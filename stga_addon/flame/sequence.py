@@ -250,7 +250,8 @@ def _identity(path: Path, arrays: Arrays, model: FlameModel) -> Identity:
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
-    array = array.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = array.astype(np.float64)
     if not (np.abs(array) <= MAX_PARAMETER).all():
         beyond = f"that are not finite, or beyond {MAX_PARAMETER:g}"
         raise StgaError(f"{path}: {name} holds values {beyond}")

@@ -95,7 +95,7 @@ def mutate_json(rng: random.Random, path: Path) -> str:
     kind = rng.choice(["replace"] * 6 + ["delete", "copy", "scale"])
     if kind == "replace":
         node[key] = copy.deepcopy(rng.choice(JSON_VALUES))
-    elif kind == "scale" and isinstance(node[key], (int, float)):
+    elif kind == "scale" and isinstance(node[key], (int, float)) and abs(node[key]) < 1e308:
         node[key] *= rng.choice([-1, 0, 1e-9, 1e9, 0.5])
     elif kind == "copy":
         node[key] = copy.deepcopy(rng.choice([node[k] for k in keys]))
@@ -114,6 +114,8 @@ def mutate_npz(rng: random.Random, path: Path) -> str:
         with zipfile.ZipFile(path) as archive:
             stored = {entry: archive.read(entry) for entry in archive.namelist()}
     except Exception:  # an earlier damage
+        return mutate_bytes(rng, path)
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):  # an earlier one too
         return mutate_bytes(rng, path)
     if not arrays:
         return "nothing"
