@@ -31,12 +31,27 @@ from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.scene.compat import APPENDED
+from ..stga_addon.scene.display.splat_object import hide_covered, hide_in_layers, keep_evaluated
+from ..stga_addon.scene.objects import layers_with
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker import status
 from .common import TAB, AtEnd, is_head, register_handlers
-from .results import CHANGED, PLACES, SHOW, load_avatar, stop_loading
+from .results import (
+    HEADS,
+    PLACES,
+    SHOW,
+    avatar_of,
+    changed_object,
+    forget_heads,
+    load_avatar,
+    panel_head,
+    record_head,
+    stop_loading,
+    store_avatar,
+    store_head,
+)
 
 MAX_SIDEBAR_ATTEMPTS = 10
 
@@ -99,8 +114,9 @@ def state_of(scene: Any, kind: Kind) -> RequestState:
 def follow(
     scene: Any, kind: Kind, subject: Path, folder: Path, process: "Popen[bytes] | None" = None
 ) -> None:
-    """The request in the folder is that of the scene. process: its worker; None: this process
-    carries it out."""
+    """The request in the folder is that of the scene, and about the head of its panel. process: its
+    worker; None: this process carries it out."""
+    record_head(scene, kind, panel_head(scene, kind))
     _processes.pop(folder, None)
     if process is not None:
         _processes[folder] = process
@@ -160,7 +176,7 @@ def _check(scene: Any, kind: Kind) -> float | None:
         if not state.building:
             state = handle(scene, kind, _read_status(scene, state))
         if state.loading is not None and not bpy.app.is_job_running("RENDER"):
-            changed = CHANGED[kind](scene, state) if kind in CHANGED else None
+            changed = changed_object(scene, state)
             # Blender crashes where a mesh changes while it renders, or in Edit Mode.
             if changed is None or changed.mode != "EDIT":
                 state = handle(scene, kind, states.SceneFree())
@@ -209,15 +225,16 @@ def _read_scene(scene: Any, kind: Kind) -> RequestState:
 
 
 def _locate(scene: Any, state: RequestState) -> Path | None:
-    """The request's folder; where a run is gone, that in the scene's run folder, which may have
-    moved along with the .blend file."""
+    """The request's folder; where a run is gone, that beside or in the scene's run folder, which
+    may have moved along with the .blend file."""
     if state.kind not in STORED or state.subject is None:
         return state.folder
     named = request_folder(state.subject)
-    if state.kind == Kind.TRAINING and not named.is_dir():
-        beside = request_folder(Path(bpy.path.abspath(scene.stga.run_folder)))
-        return beside if beside.is_dir() else named
-    return named
+    if state.kind != Kind.TRAINING or named.is_dir():
+        return named
+    run = Path(bpy.path.abspath(scene.stga.run_folder))
+    moved = run.parent / state.subject.name, run  # that of a continued run is still its parent's
+    return next((request_folder(each) for each in moved if request_folder(each).is_dir()), named)
 
 
 def _read_status(scene: Any, state: RequestState) -> states.StatusRead:
@@ -281,8 +298,11 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             path, shown = PLACES[state.kind]
             setattr(scene.stga, path, str(subject or ""))
             setattr(scene.stga, shown, result_shown)
+            if subject is None:
+                record_head(scene, state.kind, None)
+            store_head(scene, state.kind)
         case states.StoreAvatar(path):
-            scene.stga.avatar = str(path)
+            store_avatar(scene, state, path)
         case states.LoadAvatar(path):
             load_avatar(scene, path)
         case states.Show():
@@ -378,32 +398,62 @@ def _after_save(path: str) -> None:
 
 
 def _rebase(old: str, new: str) -> None:
-    """Let scenes find their run and avatar from another .blend file: relative where they lie beside
-    it or below, so that all can be moved together."""
-    beside = Path(new).parent
+    """Let scenes and splats find their run and avatar from another .blend file."""
     for settings in [scene.stga for scene in bpy.data.scenes if scene.library is None]:
         for name in ("run_folder", "avatar"):
             value = getattr(settings, name)
-            place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
-            if not value or (value.startswith("//") and not old) or not place.exists():
-                continue
-            is_beside = place.is_relative_to(beside)
-            moved = f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
+            moved = _rebased(value, old, new)
             if moved != value:
                 setattr(settings, name, moved)
+    for thing in bpy.data.objects:
+        if tags.AVATAR in thing and thing.library is None:
+            thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], old, new)
+
+
+def _rebased(value: str, old: str, new: str) -> str:
+    """A path of the .blend file `old` ("": not saved) for `new`: relative where it lies beside that
+    or below, so that all can be moved together; as it is where there is nothing."""
+    place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
+    beside = Path(new).parent
+    if not value or (value.startswith("//") and not old) or not place.exists():
+        return value
+    is_beside = bool(new) and place.is_relative_to(beside)
+    return f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
 
 
 @persistent
 def _after_load(_: Any) -> None:
     _close()
+    forget_heads()
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
-    _after_append(None)
+    _choose_head()
     _start_timer()
 
 
 @persistent
-def _after_append(_: Any) -> None:
+def _after_append(imported: Any) -> None:
+    """Show what was appended or linked as its own file shows it, and let the panel find it."""
+    scene = bpy.context.scene
+    layer = bpy.context.view_layer
+    for item in imported.import_items:
+        thing = item.id
+        if thing is None or tags.KIND not in thing:
+            continue
+        if isinstance(thing, bpy.types.Collection):  # of bones or cameras
+            for shown in layers_with(thing, layer):
+                shown.hide_viewport = True
+        elif tags.WORLD in thing:
+            hide_in_layers(thing, scene)
+        elif tags.CONVENTION in thing:
+            hide_covered(thing, scene)
+            if tags.AVATAR in thing and thing.library is None and item.source_library is not None:
+                source = bpy.path.abspath(item.source_library.filepath)
+                thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], source, bpy.data.filepath)
+    _choose_head()
+
+
+def _choose_head() -> None:
     """Let the panel work on the one head, and the splats, of a file that was made without it, as
     `stga demo` does, or into which an avatar was appended."""
     for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
@@ -415,7 +465,7 @@ def _after_append(_: Any) -> None:
             show_panel()
             if settings.splats is None and len(shown) == 1:
                 settings.splats = shown[0]
-                settings.avatar = settings.avatar or shown[0].get(tags.AVATAR, "")
+                settings.avatar = settings.avatar or avatar_of(shown[0])
         if not has_run(Path(bpy.path.abspath(settings.run_folder))):
             settings.run_folder = run_of(settings.avatar) or settings.run_folder
 
@@ -429,10 +479,12 @@ def run_of(avatar: str) -> str:
 @persistent
 def _after_update(scene: Any, *_: Any) -> None:
     """Let the panel work on no head, and no splats, that were deleted: its pointers keep them."""
-    for name in ("head", "splats"):
+    for name in ("head", "splats", *HEADS.values()):
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:
             setattr(scene.stga, name, None)
+    if is_head(scene.stga.head):
+        keep_evaluated(scene.stga.head, scene)
 
 
 def register(at_end: AtEnd) -> None:
@@ -455,3 +507,4 @@ def _end() -> None:
                 _remove(kind, state.folder)
     for known in (_states, curves, _processes):
         known.clear()
+    forget_heads()

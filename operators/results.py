@@ -1,7 +1,9 @@
 """How the result of each kind of request reaches the scene, and what the scene stores of it."""
 
 import json
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +13,16 @@ from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.monitor_state import RequestState, Shown, SliceBuilt
 from ..stga_addon.jobs.perform import read_request, read_result
-from ..stga_addon.jobs.table import Kind
+from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
-from ..stga_addon.scene.display import splat_object
+from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
-from ..stga_addon.training.run.folder import AVATAR, TRACKING
+from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
+from ..stga_addon.worker.status import WorkerState
 from .common import is_head
 from .select import count_selected
 
@@ -38,8 +41,74 @@ def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
     return Shown()
 
 
+# The head that a request is about
+
+
+_heads: dict[tuple[int, Kind], int] = {}
+"""Session ids of a scene and, by the kind of its request, of the head that it is about."""
+
+
+def panel_head(scene: Any, kind: Kind) -> Any:
+    """The head that a request of this kind is about as it begins; None: it has none, as yet."""
+    splats = scene.stga.splats
+    head = scene.stga.head
+    if kind == Kind.AVATAR:
+        return None
+    if kind == Kind.LIGHT and splats is not None:
+        head = splat_object.get_input(splats, splat_nodes.HEAD)
+    return head if is_head(head) else None
+
+
+def record_head(scene: Any, kind: Kind, head: Any) -> None:
+    """The scene's request of this kind is about the head, whatever the panel holds later; None:
+    about none, as yet."""
+    if head is None:
+        _heads.pop((scene.session_uid, kind), None)
+    else:
+        _heads[scene.session_uid, kind] = head.session_uid
+    store_head(scene, kind)
+
+
+def store_head(scene: Any, kind: Kind) -> None:
+    """Store the head with the file, also where an undo step has taken that back."""
+    if kind in HEADS:
+        setattr(scene.stga, HEADS[kind], _head_in_session(scene, kind))
+
+
+def _head_in_session(scene: Any, kind: Kind) -> Any:
+    uid = _heads.get((scene.session_uid, kind))
+    # one that was deleted stays in the file while a property points to it
+    there = (each for each in bpy.data.objects if each.session_uid == uid and each.users_collection)
+    return None if uid is None else next(there, None)
+
+
+def request_head(scene: Any, state: RequestState) -> Any:
+    """The head that the request is about; None where it is gone, or is still to be imported."""
+    if state.kind == Kind.TRACKING:
+        return _head_of_capture(scene, state.place)
+    if (scene.session_uid, state.kind) in _heads:
+        return _head_in_session(scene, state.kind)
+    stored = getattr(scene.stga, HEADS[state.kind]) if state.kind in HEADS else None
+    return stored if stored is not None and stored.users_collection else None
+
+
+def _head_of_capture(scene: Any, capture: Path) -> Any:
+    folder = str(capture.resolve())
+    heads = (thing for thing in scene.objects if is_head(thing) and thing[tags.CAPTURE] == folder)
+    return next(heads, None)
+
+
+def forget_heads() -> None:
+    """Of the file before, whose session ids are no longer valid; files store theirs."""
+    _heads.clear()
+
+
 # Avatars
 
+
+MIN_ITERATIONS = 300
+"""Below, new splats look like gray fog: neither previews nor a run that was cancelled replace
+another avatar."""
 
 _pool = ThreadPoolExecutor(1, "stga")
 _loading: dict[int, Future[tuple[Avatar, SplatAttributes]]] = {}
@@ -67,23 +136,81 @@ def _run(state: RequestState) -> Path:
     return state.subject / RUN_FOLDER if state.kind == Kind.AVATAR else state.subject
 
 
-def _run_object(scene: Any, state: RequestState) -> Any:
-    """The object that shows the run, or None."""
-    return next((thing for thing in scene.objects if thing.get(tags.RUN) == str(_run(state))), None)
+def shown_splats(scene: Any, head: Any) -> Any:
+    """The splat object that shows an avatar on the head and can be changed, the panel's where that
+    does; None without one."""
+    found = splat_object.splats_of(head, scene) if head is not None else []
+    return scene.stga.splats if scene.stga.splats in found else next(iter(found), None)
+
+
+def avatar_of(splats: Any) -> str:
+    """Path of the avatar that a splat object shows, as the open file takes it; "" where unknown."""
+    stored = str(splats.get(tags.AVATAR, ""))
+    if splats.library is None or not stored:
+        return stored
+    return str(bpy.path.abspath(stored, library=splats.library))
+
+
+def follow_head(settings: Any) -> None:
+    """Let the panel show the splats of the head that was chosen in it, and name their avatar."""
+    shown = shown_splats(settings.id_data, settings.head)
+    if shown is not None:
+        settings.splats = shown
+        settings.avatar = avatar_of(shown) or settings.avatar
+
+
+def _is_too_early(scene: Any, state: RequestState) -> bool:
+    """Whether this would put new splats, hardly trained, in the place of another avatar."""
+    head = request_head(scene, state)
+    snapshot = state.snapshot
+    settings = scene.stga
+    is_ended = snapshot.state == WorkerState.FINISHED
+    if is_ended or snapshot.status.figures.get("iteration", 0) >= MIN_ITERATIONS:
+        return False
+    with suppress(StgaError):  # a run that is damaged, or has not begun
+        if read_run(state.run).continuation is not None:  # begins with a trained avatar
+            return False
+    shown = shown_splats(scene, head)
+    named = Path(bpy.path.abspath(settings.avatar))
+    is_named = settings.head == head and named.is_file() and named != state.run / AVATAR
+    return is_named or (shown is not None and shown.get(tags.RUN) != str(_run(state)))
+
+
+def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
+    """Name the avatar that was trained in the panel, unless that holds another head; and the run
+    that has continued the panel's."""
+    settings = scene.stga
+    head = request_head(scene, state)
+    if head not in (None, settings.head) or _is_too_early(scene, state):
+        return
+    settings.avatar = str(path)
+    with suppress(StgaError):  # the request was removed
+        parent = getattr(read_request(state.folder), "parent", None)
+        if parent == Path(bpy.path.abspath(settings.run_folder)).resolve():
+            settings.run_folder = str(_run(state))
 
 
 def _show_avatar(scene: Any, state: RequestState) -> Answer:
-    """Show the avatar that was loaded, in the run's object or in a new one, a slice at a time."""
+    """Show the avatar that was loaded on the head that it was trained for, by the splat object that
+    shows one there or by a new one, a slice at a time."""
     loading = _loading[scene.session_uid]
     run = _run(state)
     if not loading.done():
         return None
-    head = scene.stga.head
-    shown = _run_object(scene, state)
-    if not is_head(head):
-        raise StgaError("No head in the scene to show the avatar on; import the capture")
+    head = request_head(scene, state)
+    is_result = state.loading.name == AVATAR
+    if head is None:
+        gone = "the head that it was trained for is no longer in the scene"
+        raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
+    if _is_too_early(scene, state):
+        if not is_result:
+            return Shown()
+        count = f"{state.snapshot.status.figures.get('iteration', 0):.0f} iterations"
+        shows = f"{head.name} keeps the avatar that it has; Show Avatar shows the new one"
+        raise StgaError(f"{run}: was cancelled after {count}, so {shows}")
     avatar, attributes = loading.result()
     splat_object.check_head(avatar, head)
+    shown = shown_splats(scene, head)
     is_update = shown is not None and splat_object.can_update(shown, avatar)
     if not is_update and splat_object.build_next_node_group(avatar):
         return SliceBuilt()
@@ -91,36 +218,59 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     if is_update:
         splat_object.update_splats(shown, attributes)
     else:
-        if shown is not None:
-            bpy.data.objects.remove(shown)
-        shown = splat_object.show_avatar(avatar, head, f"{head.name} {run.name}", attributes)
-        shown[tags.RUN] = str(run)
-        splat_object.hide_object(head, scene)
+        is_new = shown is None
+        name = f"{head.name} {run.name}"
+        shown = splat_object.show_avatar(avatar, head, name, attributes, shown, scene)
+        if is_new:
+            splat_object.hide_object(head, scene)
+    shown[tags.RUN] = str(run)
+    if is_result:
+        shown[tags.AVATAR] = str(state.loading)
+    if scene.stga.head == head:
         scene.stga.splats = shown
-    show_world(run / AVATAR, head)
+    show_world(run / AVATAR, head, scene)
     return Shown(undoable=not is_update)
 
 
 def _show_made(scene: Any, state: RequestState) -> Answer:
     """Import the capture once it is tracked; then show the previews and the avatar, at last on the
     head that training refined."""
-    head = scene.stga.head
     if state.loading.name == CAPTURE_FOLDER:
-        scene.stga.run_folder = str(_run(state))
-        is_there = is_head(head) and Path(head[tags.CAPTURE]) == state.loading
-        return Shown() if is_there else _import(scene, state)
+        is_there = _head_of_capture(scene, state.loading) is not None
+        answer = Shown() if is_there else _import(scene, state)
+        head = _head_of_capture(scene, state.loading)
+        record_head(scene, state.kind, head)
+        if scene.stga.head == head:
+            scene.stga.run_folder = str(_run(state))
+        return answer
     answer = _show_avatar(scene, state)
     is_refined = state.loading.name == AVATAR and state.files.tracking is not None
     if isinstance(answer, Shown) and is_refined:
+        head = request_head(scene, state)
         refined = str(state.run / TRACKING)
-        first = head[tags.TIMESTEPS][0]
-        _operate(scene, bpy.ops.stga.apply_motion, filepath=refined, own_offsets=True, start=first)
+        how = {"own_offsets": True, "start": head[tags.TIMESTEPS][0]}
+        with _in_panel(scene, head):
+            _operate(scene, bpy.ops.stga.apply_motion, filepath=refined, **how)
     return answer
+
+
+@contextmanager
+def _in_panel(scene: Any, head: Any) -> Iterator[None]:
+    """Let operators work on the head, whichever the panel holds."""
+    settings = scene.stga
+    before = scene.stga.head
+    if before != head:
+        settings.head = head
+    try:
+        yield
+    finally:
+        if before != head:
+            settings.head = before
 
 
 def _store_light(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats the light that is now in the avatar of the run."""
-    shown = scene.stga.splats
+    shown = shown_splats(scene, request_head(scene, state))
     if shown is None or not splat_object.store_light(shown, read_avatar(state.subject / AVATAR)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
@@ -154,9 +304,9 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
 
 def _select_for_take(scene: Any, state: RequestState) -> Answer:
     """Select what extending the run by the head's take would train."""
-    head = scene.stga.head
-    found: Any = read_result(state.folder)
-    if not is_head(head) or Path(head[tags.CAPTURE]) != state.subject:
+    head = request_head(scene, state)
+    found = read_result(state.folder)
+    if head is None or head != scene.stga.head:
         raise StgaError(f"{state.subject}: its head is no longer that of the scene")
     write_selection(head, dict(found.selection))
     count_selected(scene, head)
@@ -164,8 +314,10 @@ def _select_for_take(scene: Any, state: RequestState) -> Answer:
 
 
 def _apply_performance(scene: Any, state: RequestState) -> Answer:
-    if not is_head(scene.stga.head):
-        raise StgaError(f"{state.subject}: was written, but the scene has no head to apply it to")
+    head = request_head(scene, state)
+    if head is None or head != scene.stga.head:
+        problem = "was written, but its head is no longer that of the scene"
+        raise StgaError(f"{state.subject}: {problem}; Apply Motion applies it to a head")
     path = str(state.subject)
     first = scene.frame_start
     return _operate(scene, bpy.ops.stga.apply_motion, filepath=path, start=first)
@@ -181,13 +333,21 @@ SHOW = {
     Kind.LIGHT: _store_light,
 }
 """Puts the result of a kind of request into the scene. Raises StgaError or RuntimeError."""
-CHANGED = dict.fromkeys((Kind.TRAINING, Kind.AVATAR), _run_object) | dict.fromkeys(
-    (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE), lambda scene, state: scene.stga.head
-)
-"""The object that this changes, which has to leave Edit Mode before."""
+
+
+def changed_object(scene: Any, state: RequestState) -> Any:
+    """The object that showing the result changes, which has to leave Edit Mode before; or None."""
+    if state.kind in TRAINS:
+        return shown_splats(scene, request_head(scene, state))
+    return request_head(scene, state) if state.kind in CHANGES_HEAD else None
+
+
+CHANGES_HEAD = (Kind.TRACKING, Kind.SELECTION, Kind.PERFORMANCE)
 PLACES = {
     Kind.TRAINING: ("training_run", "result_shown"),
     Kind.TRACKING: ("tracking_capture", "tracking_shown"),
     Kind.AVATAR: ("avatar_folder", "avatar_shown"),
 }
 """Properties of the scene's settings: the subject's path, and whether its result was shown."""
+HEADS = {Kind.TRAINING: "training_head", Kind.AVATAR: "avatar_head"}
+"""Properties of the scene's settings: the head that its avatar is trained for."""

@@ -147,7 +147,8 @@ class HeatMap(Edit, bpy.types.Operator):
         if splats is not None and all(in_view.get(each.name) is each for each in (splats, head)):
             # Only one of the two: each covers the other.
             splats.hide_set(self.show)
-            head.hide_set(not self.show)
+            head.hide_viewport = not self.show
+            head.hide_set(False)
         for area in context.screen.areas if context.screen else ():
             if area.type == "VIEW_3D":
                 shading = area.spaces.active.shading

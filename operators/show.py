@@ -11,6 +11,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export.ply import read_ply
 from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.compat import NATIVE_SPLATS
 from ..stga_addon.scene.display import splat_nodes, splat_object
@@ -24,6 +25,7 @@ from .common import Action, Edit, FileImport, file_path, head_of, need
 from .monitor import run_of
 from .options import ONCE
 from .request import idle, start, training_python
+from .results import shown_splats
 
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""
@@ -50,10 +52,18 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
         settings = context.scene.stga
         avatar = read_avatar(path)
         show_progress(0.3)
-        settings.splats = splat_object.show_avatar(avatar, head, f"{head.name} {path.stem}")
+        before = shown_splats(context.scene, head)
+        name = f"{head.name} {path.stem}"
+        shown = splat_object.show_avatar(avatar, head, name, replaced=before)
+        shown.hide_viewport = False
+        if before is not None and context.view_layer.objects.get(shown.name) is shown:
+            shown.hide_set(False)
+        shown[tags.AVATAR] = self.filepath
+        shown[tags.RUN] = str(path.resolve().parent)
+        settings.splats = shown
         if self.hide_head:
             splat_object.hide_object(head, context.scene)
-        show_world(path, head)
+        show_world(path, head, context.scene)
         settings.avatar = self.filepath
         settings.run_folder = run_of(self.filepath) or settings.run_folder
         if self.hide_head and head.library is not None:

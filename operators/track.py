@@ -13,6 +13,7 @@ import numpy as np
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import track as jobs
+from ..stga_addon.jobs.perform import has_request, read_request, request_folder
 from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, Track
 from ..stga_addon.jobs.train import Train
@@ -22,7 +23,7 @@ from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
-from ..stga_addon.training.settings import make_settings
+from ..stga_addon.training.settings import TrainingSettings, make_settings
 from . import common, monitor, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig
 from .options import ONCE
@@ -211,10 +212,12 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
             self.layout.prop(self, name)
 
     def run(self, context: Any) -> None:
+        settings = None
         if self.folder and not self.filepath:  # continues
             began_with = jobs.read_inputs(file_path(self.folder, "folder"))
             self.filepath = str(began_with.get("footage", ""))
             self.focal = began_with.get("focal") or 0.0
+            settings = self._settings_before()
         video = file_path(self.filepath, "video").resolve()
         if not video.is_file():
             raise StgaError(f"{video}: is not a file; expected a video")
@@ -223,12 +226,23 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
             capture = file_path(self.folder, "folder").resolve() / CAPTURE_FOLDER
         else:
             capture = proposed_folder(self._tracking(video, Path()))
-        settings = make_settings("global", seconds=round(60 * self.minutes, DIGITS), effects={})
+        if settings is None:
+            seconds = round(60 * self.minutes, DIGITS)
+            settings = make_settings("global", seconds=seconds, effects={})
         train = Train(capture.parent / jobs.RUN_FOLDER, capture, settings)
         request = jobs.MakeAvatar(self._tracking(video, capture), train)
         monitor.show_panel()  # where it can be watched and cancelled, also after a drop
         if start(context.scene, request, python):
             self.inform(f"Made {request.out}")
+
+    def _settings_before(self) -> TrainingSettings | None:
+        """Those that the request in the folder began with, such as its time; None where minutes are
+        given, or the request was dismissed."""
+        began = request_folder(file_path(self.folder, "folder"))
+        if self.properties.is_property_set("minutes") or not has_request(began):
+            return None
+        request = read_request(began)
+        return request.train.settings if isinstance(request, jobs.MakeAvatar) else None
 
     def _tracking(self, video: Path, capture: Path) -> Track:
         return Track(video, None, capture, focal=round(self.focal, DIGITS) or None)

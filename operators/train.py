@@ -11,7 +11,6 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import train as jobs
 from ..stga_addon.jobs.analyze import Analyze
 from ..stga_addon.jobs.table import TRAINS, Kind
-from ..stga_addon.scene import tags
 from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.training.effect_catalog import parse_choice
 from ..stga_addon.training.run.folder import AVATAR, next_folder, read_run
@@ -194,23 +193,15 @@ class ContinueOperator(TrainingOperator, Edit):
     """Mixin of operators that train a run further, in a new folder."""
 
     def go_on(self: Any, context: Any, make: Any, *what: Any, **more: Any) -> None:
-        """Start the training of the request `make(run, parent, *what, …)`; the splats that show the
-        run before show the new one, so that its preview changes them. Raises StgaError where there
-        is no avatar to go on with."""
+        """Start the training of the request `make(run, parent, *what, …)`; the panel stays at the
+        run before until the new one has an avatar. Raises StgaError where there is no avatar to go
+        on with."""
         parent = file_path(self.directory, "run folder").resolve()
         if not (parent / AVATAR).is_file():
             raise StgaError(f"{parent}: holds no trained avatar; train one first")
         source = {"flame": capture_source(head_of(context))[1], "device": self.chosen_device}
         how = {**more, **self.budget(self.seconds), **source}
-        request = make(next_folder(parent), parent, *what, **how)
-        self.start(context, request)
-        settings = context.scene.stga
-        shown = [thing for thing in context.scene.objects if thing.get(tags.RUN) == str(parent)]
-        if not shown and settings.splats is not None:
-            shown = [settings.splats]
-        for thing in shown:
-            thing[tags.RUN] = str(request.run)
-        settings.run_folder = str(request.run)
+        self.start(context, make(next_folder(parent), parent, *what, **how))
 
 
 class Refine(ContinueOperator, RefineOptions, DeviceOptions, bpy.types.Operator):

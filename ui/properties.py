@@ -9,6 +9,7 @@ from ..operators import options
 from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
 from ..operators.request import has_training_python, test
+from ..operators.results import follow_head
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
@@ -32,7 +33,8 @@ class SelectedFrame(bpy.types.PropertyGroup):
     splats: options.integer("Splats", "Splats on those triangles")
 
 
-def _forget_rows(settings: Any, context: Any) -> None:
+def _choose_head(settings: Any, context: Any) -> None:
+    follow_head(settings)
     settings.selected_frames.clear()  # rows of another head
     settings.effects.clear()
     settings.preset_timing = ""
@@ -103,7 +105,7 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     # The module bpy 4.2 crashes when its Python ends where a property has a poll or update
     # function; Blender does not.
 
-    head: object_property("Head", "Imported head that the steps work on", update=_forget_rows)
+    head: object_property("Head", "Imported head that the steps work on", update=_choose_head)
     track: bpy.props.PointerProperty(type=TrackSettings)
     # absolute paths of the last tracking, avatar of a video, and run; whether they have reached the
     # scene (`operators.results.PLACES`)
@@ -113,6 +115,9 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     avatar_shown: _hidden(bpy.props.BoolProperty)
     training_run: _hidden(bpy.props.StringProperty)
     result_shown: _hidden(bpy.props.BoolProperty)
+    # heads that these are trained for (`operators.results.HEADS`)
+    avatar_head: object_property("Head", "Head of the avatar of a video", options={"HIDDEN"})
+    training_head: object_property("Head", "Head that is trained", options={"HIDDEN"})
     selected_frames: bpy.props.CollectionProperty(type=SelectedFrame)
     selected_row: options.integer("Frame", "Go to this frame", get=_current_row, set=_go_to_row)
     motion_source: object_property(

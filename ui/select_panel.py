@@ -34,8 +34,10 @@ class CapturePanel(SidebarPanel, bpy.types.Panel):
         layout.label(text=f"{timesteps} timesteps, {triangles} triangles")
         row = layout.row(align=True)
         root = head.parent
+        toggle = {"toggle": True, "invert_checkbox": True}
+        row.prop(head, "hide_viewport", text="Head", icon="USER", **toggle)
         for kind, text, icon in LAYERS if root is not None else ():
-            how = {"text": text, "icon": icon, "toggle": True, "invert_checkbox": True}
+            how = {"text": text, "icon": icon, **toggle}
             for layer in layers_of(root, kind, context.view_layer):
                 row.prop(layer, "hide_viewport", **how)
 

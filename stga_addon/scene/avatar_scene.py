@@ -16,7 +16,7 @@ from . import tags
 from .arrays import evaluated_vertices
 from .cameras import central, configure_scene, import_cameras
 from .compat import enable_nodes
-from .display.splat_object import hide_object, show_avatar, show_world_splats
+from .display.splat_object import hide_in_layers, hide_object, show_avatar, show_world_splats
 from .objects import COLLECTIONS, capture_root, go_to_frame, set_frames_per_second, show_kind
 from .rig.head import import_head
 
@@ -94,19 +94,21 @@ def show_on_head(avatar: Avatar, head: Any, link: str, fps: float) -> Any:
     return shown
 
 
-def show_world(avatar_file: Path, head: Any) -> Any:
+def show_world(avatar_file: Path, head: Any, scene: Any = None) -> Any:
     """Show the splats of the world beside an avatar file, where the head stands, hidden until they
-    are wanted. Returns them; None where there are none, or the scene has them. Raises StgaError."""
+    are wanted, in a scene (None: the context's). Returns them; None where there are none, or the
+    scene has them. Raises StgaError."""
     path = avatar_file.with_name(WORLD_FILE).resolve()
-    scene = bpy.context.scene
-    known = [thing.get(tags.WORLD) for thing in scene.objects]
-    if not path.is_file() or str(path) in known:
+    scene = scene or bpy.context.scene
+    worlds = [thing for thing in scene.objects if tags.WORLD in thing]
+    if not path.is_file() or any(each[tags.WORLD] == str(path) for each in worlds):
         return None
-    world = show_world_splats(read_ply(path), WORLD_NAME)
+    world = show_world_splats(read_ply(path), WORLD_NAME, scene)
     world.parent = head.parent
     world.matrix_parent_inverse = head.matrix_parent_inverse
     world[tags.WORLD] = str(path)
+    world.hide_render = True
     for layer in scene.view_layers:
         layer.update()  # which an object that was just made is not in yet
-    hide_object(world, scene)
+    hide_in_layers(world, scene)
     return world

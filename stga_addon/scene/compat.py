@@ -36,6 +36,16 @@ def action_curves(owner: Any) -> Any:
     return strip.channelbag(animation.action_slot, ensure=True).fcurves
 
 
+def animation_curves(owner: Any) -> list[Any]:
+    """The f-curves and drivers that animate the data-block `owner`; nothing is made."""
+    animation = owner.animation_data
+    if animation is None:
+        return []
+    has_action = animation.action is not None
+    has_action &= not SLOTTED_ACTIONS or animation.action_slot is not None
+    return [*animation.drivers, *(action_curves(owner) if has_action else ())]
+
+
 def copy_action(owner: Any, name: str) -> Any:
     """Give `owner` a copy of its action, or an empty one; the old one stays in the file. Returns
     the new action's f-curves."""

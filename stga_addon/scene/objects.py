@@ -55,9 +55,13 @@ def show_kind(root: Any, kind: str, view_layer: Any, show: bool) -> None:
 
 def layers_of(root: Any, kind: str, view_layer: Any) -> list[Any]:
     """The layer collections of `collection_of`, which may be linked in several places."""
-    collection = collection_of(root, kind)
+    return layers_with(collection_of(root, kind), view_layer)
+
+
+def layers_with(collection: Any, view_layer: Any) -> list[Any]:
+    """The layer collections of a collection; none of None."""
     waiting = [view_layer.layer_collection]
-    found = []
+    found = list[Any]()
     while collection is not None and waiting:
         layer = waiting.pop()
         waiting += layer.children

@@ -21,7 +21,7 @@ CONVENTION = "stga_convention"  # on splats that follow a head: `Avatar.conventi
 ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antialiased`
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
-AVATAR = "stga_avatar"  # on splats that were made without the panel: the avatar's file
+AVATAR = "stga_avatar"  # on splats that follow a head: the file of their avatar
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file
 

@@ -3,6 +3,7 @@
 import importlib.util
 import pkgutil
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from capture.factory import write_flame_capture, write_mesh_capture
 from stga_addon.capture.open import OWN_MODELS
 from stga_addon.development.package import build_zip, fetch_wheels
 from stga_addon.errors import StgaError
+from stga_addon.jobs.table import Kind
+from stga_addon.progress import Progress
 from stga_addon.worker.training_python import missing_packages
 
 collect_ignore_glob = [] if importlib.util.find_spec("bpy") else ["test_*.py"]
@@ -77,6 +80,26 @@ def head(extension, tmp_path: Path):
 
     bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "capture")))
     return bpy.context.scene.stga.head
+
+
+@pytest.fixture
+def worker(extension, head, tmp_path):
+    """A stand-in for a worker of the scene's training: the test says what it does."""
+    import bpy
+
+    jobs = extension.stga_addon.jobs
+    monitor = extension.operators.monitor
+    with ExitStack() as stack:
+        run = tmp_path / "run"
+        settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
+        folder = jobs.perform.request_folder(run)
+        jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
+        monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
+        writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
+        writer.report(Progress(0.25, "Training"))
+        writer.run = run
+        writer.leave = stack.close
+        yield writer
 
 
 @pytest.fixture(scope="session")

@@ -38,6 +38,8 @@ def begin(requests):
     request = requests[-1]
     request.out.mkdir(parents=True, exist_ok=True)
     jobs.write_json(request.out / jobs.INPUTS, jobs._inputs(request.track))
+    perform = import_module(jobs.__name__.replace(".track", ".perform"))
+    perform.write_request(perform.request_folder(request.out), request)
 
 
 def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path, monkeypatch):
@@ -79,11 +81,14 @@ def test_the_folder_is_proposed_beside_the_file(asked, video, tmp_path):
 
 
 def test_what_was_begun_is_continued_by_its_folder(asked, video, tmp_path):
-    """Catches a Continue that asks for the video again, or has other options."""
-    bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0)
+    """Catches a Continue that asks for the video again, or has other options or time."""
+    bpy.ops.stga.avatar_from_video(filepath=str(video), focal=900.0, minutes=20)
     begin(asked)
-    bpy.ops.stga.avatar_from_video("INVOKE_DEFAULT", folder=str(tmp_path / "anna avatar"))
+    folder = str(tmp_path / "anna avatar")
+    bpy.ops.stga.avatar_from_video("INVOKE_DEFAULT", folder=folder)
     assert asked[1] == asked[0]
+    bpy.ops.stga.avatar_from_video(folder=folder, minutes=2)
+    assert asked[2].train.settings.seconds == 120
 
 
 def test_mistakes_are_sentences(extension, video, tmp_path, monkeypatch):
@@ -110,7 +115,7 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     assert settings.head[tags.CAPTURE] == str(out / "capture")
     assert settings.splats[tags.RUN] == settings.run_folder == str(out / "run")
     assert (settings.avatar, settings.avatar_shown) == (str(out / "run/avatar.npz"), True)
-    assert settings.head.hide_get()
+    assert not settings.head.visible_get()
     with np.load(out / "job/picture.npz") as stored:
         assert stored["rgb"].std() > 10
     pixels, *_ = extension.operators.monitor.curves[out / "run"]

@@ -10,7 +10,6 @@ from capture.factory import write_mesh_capture
 from stga_addon.avatar.file import read_avatar
 from stga_addon.jobs.monitor_state import RequestState
 from stga_addon.jobs.table import Kind
-from stga_addon.scene import tags
 from stga_addon.training.run.folder import read_run
 
 from .test_analyze_operator import error_of, tick_until_done, write_interpreter
@@ -43,9 +42,7 @@ def run(tmp_path):
 
 
 def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extension):
-    """Catches another region or selection, lost settings, and a preview in a second object."""
-    bpy.ops.stga.show_avatar(filepath=str(run / "avatar.npz"))
-    shown = bpy.context.scene.stga.splats
+    """Catches another region or selection, and lost settings."""
     chosen = {"device": "gpu", "adapter": "Card (Vulkan)", "seconds": 7, "growth": 0.5}
     bpy.ops.stga.refine(directory=str(run), group="cheek", first=1, last=3, **chosen)
     new = run.with_name("run_2")
@@ -54,7 +51,6 @@ def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extens
     assert (wanted.frames, wanted.seconds, wanted.growth) == ((1, 3), 7, 0.5)
     assert wanted.weights[:40] == pytest.approx(0.8)
     assert (wanted.weights >= 0.5).sum() < 80
-    assert shown[tags.RUN] == bpy.context.scene.stga.run_folder == str(new)
     bpy.ops.stga.refine(directory=str(run), region="mouth", seconds=3)
     assert (asked[-1].region, asked[-1].weights) == ("mouth", None)
     head.hide_set(False)
@@ -66,6 +62,29 @@ def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extens
     bpy.ops.stga.refine(directory=str(run), seconds=3)
     assert np.flatnonzero(asked[-1].weights).tolist() == [3, 5, 8]
     bpy.ops.object.mode_set(mode="OBJECT")
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_the_panel_stays_at_the_run_until_another_continues_it(head, run, tmp_path, fails):
+    """Catches a panel at an empty run after a failure, which refuses the next attempt; and one that
+    does not go on to the run that was trained."""
+    made = "shutil.copy(FOLDER.parents[1] / 'run/avatar.npz', FOLDER.parent)\nend('finished')"
+    body = "end('failed', 'no camera sees it')" if fails else made
+    settings = bpy.context.scene.stga
+    python = write_interpreter(tmp_path / "python", body)
+    settings.run_folder = str(run)
+    settings.avatar = str(run / "avatar.npz")
+    what = {"directory": str(run), "group": "cheek", "python": python}
+    if fails:
+        with pytest.raises(RuntimeError, match="no camera sees it"):
+            bpy.ops.stga.refine(**what)
+        assert settings.run_folder == str(run)
+        write_interpreter(tmp_path / "python", made)
+        bpy.ops.stga.refine(**{**what, "directory": settings.run_folder})
+    else:
+        bpy.ops.stga.refine(**what)
+    trained = settings.training_run
+    assert (settings.run_folder, settings.avatar) == (trained, f"{trained}/avatar.npz")
 
 
 def test_mistakes_are_sentences(head, asked, run, tmp_path):

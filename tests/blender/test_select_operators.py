@@ -125,7 +125,7 @@ def test_heat_map(head, tmp_path):
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
     for show in (True, False):
         bpy.ops.stga.heat_map(show=show)
-        assert head.hide_get() != show
+        assert head.visible_get() == show
         assert bpy.context.scene.stga.splats.hide_get() == show
 
 

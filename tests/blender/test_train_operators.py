@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 
 import bpy
@@ -24,24 +23,6 @@ def head(head):
     """With a selection."""
     bpy.ops.stga.select(threshold=0.0005)
     return head
-
-
-@pytest.fixture
-def worker(extension, head, tmp_path):
-    """A stand-in for a worker of the scene's training: the test says what it does."""
-    jobs = extension.stga_addon.jobs
-    monitor = extension.operators.monitor
-    with ExitStack() as stack:
-        run = tmp_path / "run"
-        settings = extension.stga_addon.training.settings.make_settings("global", iterations=5)
-        folder = jobs.perform.request_folder(run)
-        jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
-        monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
-        writer = stack.enter_context(extension.stga_addon.worker.status.status_writer(folder))
-        writer.report(Progress(0.25, "Training"))
-        writer.run = run
-        writer.leave = stack.close
-        yield writer
 
 
 def ask_only(monkeypatch, extension) -> list:

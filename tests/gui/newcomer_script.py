@@ -124,7 +124,13 @@ def digest() -> dict[str, Any]:
         keys = getattr(thing.data, "shape_keys", None)
         found[thing.name] = str(
             [
-                (thing.hide_get(), thing.hide_render, thing.mode, len(thing.vertex_groups)),
+                (
+                    thing.hide_get(),
+                    thing.hide_viewport,
+                    thing.hide_render,
+                    thing.mode,
+                    len(thing.vertex_groups),
+                ),
                 [*map(tuple, thing.matrix_world)],
                 [round(key.value, 5) for key in keys.key_blocks] if keys else [],
                 getattr(getattr(thing.animation_data, "action", None), "name", ""),
@@ -348,6 +354,7 @@ def select_only(*things: Any) -> None:
     for thing in bpy.context.selected_objects:
         thing.select_set(False)
     for thing in things:
+        thing.hide_viewport = False
         thing.hide_set(False)
         thing.select_set(True)
         bpy.context.view_layer.objects.active = thing

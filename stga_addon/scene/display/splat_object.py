@@ -1,5 +1,6 @@
 """Splat objects: the Blender objects that display avatars and world-space splats."""
 
+import re
 from contextlib import suppress
 from typing import Any
 from uuid import uuid4
@@ -13,8 +14,9 @@ from ...avatar.splats import Splats
 from ...errors import StgaError
 from .. import tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
-from ..compat import modifier_input, set_modifier_input
+from ..compat import animation_curves, modifier_input, set_modifier_input
 from ..layers import DisplaySettings
+from ..objects import remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
@@ -47,46 +49,97 @@ SETTINGS = {getattr(splat_nodes, name.upper()): name for name in DisplaySettings
 
 
 def show_avatar(
-    avatar: Avatar, head: Any, name: str | None = None, prepared: SplatAttributes | None = None
+    avatar: Avatar,
+    head: Any,
+    name: str | None = None,
+    prepared: SplatAttributes | None = None,
+    replaced: Any = None,
+    scene: Any = None,
 ) -> Any:
-    """Make a splat object that follows the evaluated mesh of the object `head`, which has the
-    avatar's triangles, else StgaError. prepared: `avatar_attributes` of the avatar."""
+    """Show the avatar by a splat object that follows the evaluated mesh of the object `head`, which
+    has the avatar's triangles, else StgaError. prepared: `avatar_attributes` of the avatar.
+    replaced: the splat object to show it by, which keeps its name, place, visibility, display
+    settings and keyframes; None: a new one. scene: where all collections of the head are linked."""
     check_head(avatar, head)
     prepared = prepared or avatar_attributes(avatar)
     title = name or f"{head.name} splats"
-    local = [each for each in head.users_collection if each.library is None]
-    collection = [*local, bpy.context.scene.collection][0]  # the scene's where all are linked
-    splat_object = _splat_object(title, collection, _tree_options(avatar))
+    splat_object = replaced
+    if splat_object is None:
+        scene = scene or bpy.context.scene
+        local = [each for each in head.users_collection if each.library is None]
+        splat_object = _splat_object(title, [*local, scene.collection][0], _tree_options(avatar))
+        # A sibling of the head: both have the same object space.
+        splat_object.parent = head.parent
+        splat_object.matrix_parent_inverse = head.matrix_parent_inverse
+        splat_object.matrix_basis = head.matrix_basis
+    else:
+        _exchange_tree(splat_object, splat_nodes.splat_tree(_tree_options(avatar)))
     splat_object[tags.CONVENTION] = avatar.convention
     splat_object[tags.ANTIALIASED] = avatar.antialiased
     set_input(splat_object, splat_nodes.HEAD, head)
+    before = get_input(splat_object, splat_nodes.NEUTRAL)
     # In no collection: it is never displayed, and exists as long as the splats that point to it.
-    neutral = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
-    set_input(splat_object, splat_nodes.NEUTRAL, bpy.data.objects.new(neutral.name, neutral))
+    mesh = triangle_mesh(f"{splat_object.name} neutral", avatar.neutral, avatar.faces)
+    neutral = bpy.data.objects.new(mesh.name, mesh)
+    neutral.hide_render = neutral.hide_viewport = True  # appended, it comes into a collection
+    set_input(splat_object, splat_nodes.NEUTRAL, neutral)
+    if before is not None and before.users == 0:
+        remove([before])
+    for shown_in in splat_object.users_scene:
+        use_transparent_bounces(shown_in)
+    splat_object.data.clear_geometry()  # also of attributes that only the avatar before has
+    splat_object.data.pop(tags.RELIT_FRAME, None)
     update_splats(splat_object, prepared)
-    # A sibling of the head: both have the same object space.
-    splat_object.parent = head.parent
-    splat_object.matrix_parent_inverse = head.matrix_parent_inverse
-    splat_object.matrix_basis = head.matrix_basis
     return splat_object
 
 
-def show_world_splats(splats: Splats, name: str) -> Any:
-    """Make a splat object of a world-space set, for example a standard 3DGS PLY; returns it."""
+def _exchange_tree(splat_object: Any, tree: Any) -> None:
+    """Show the splats by another node tree; inputs keep their values and keyframes by name."""
+    modifier = splat_modifier(splat_object)
+    before = input_identifiers(modifier)
+    values = {name: modifier_input(modifier, identifier) for name, identifier in before.items()}
+    modifier.node_group = tree
+    after = input_identifiers(modifier)
+    for name in values.keys() & after.keys():
+        set_modifier_input(modifier, after[name], values[name])
+    renamed = {old: after.get(name, name) for name, old in before.items()}
+    place = f'modifiers["{bpy.utils.escape_identifier(modifier.name)}"]'
+    for curve in animation_curves(splat_object):
+        if curve.data_path.startswith(place):
+            inside = curve.data_path[len(place) :]
+            moved = re.sub(r"Socket_\d+", lambda found: renamed.get(found[0], found[0]), inside)
+            curve.data_path = place + moved
+
+
+def splats_of(head: Any, scene: Any) -> list[Any]:
+    """The splat objects of the scene that follow the head and can be changed: no linked ones."""
+    own = [each for each in scene.objects if tags.CONVENTION in each and each.library is None]
+    found = []
+    for each in own:
+        with suppress(StgaError):  # it has lost its modifier
+            found += [each] if get_input(each, splat_nodes.HEAD) == head else []
+    return found
+
+
+def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
+    """Make a splat object of a world-space set, for example a standard 3DGS PLY, in a scene (None:
+    the context's); returns it."""
     options = splat_nodes.TreeOptions(None, splats.sh_degree)
-    splat_object = _splat_object(name, bpy.context.scene.collection, options)
+    splat_object = _splat_object(name, (scene or bpy.context.scene).collection, options)
     stored.write_splats(splat_object.data, stored.splat_attributes(splats))
     return splat_object
 
 
 def can_update(splat_object: Any, avatar: Avatar) -> bool:
     """Whether the avatar differs from this object's only in splats and how they follow the mesh."""
-    if _stored_neutral(splat_object) is None:
+    neutral = _stored_neutral(splat_object)
+    if neutral is None or not has_triangles(neutral, avatar.faces):
         return False
     kind = splat_object.get(tags.CONVENTION), splat_object.get(tags.ANTIALIASED)
     tree = find_tree(_tree_options(avatar).tree_name)
     is_same = kind == (avatar.convention, avatar.antialiased)
-    return is_same and splat_modifier(splat_object).node_group == tree
+    is_same &= np.array_equal(mesh_vertices(neutral), avatar.neutral.astype(np.float32))
+    return bool(is_same and splat_modifier(splat_object).node_group == tree)
 
 
 def _stored_neutral(splat_object: Any) -> Any:
@@ -141,12 +194,42 @@ def check_head(avatar: Avatar, head: Any) -> None:
 
 
 def hide_object(obj: Any, scene: Any) -> None:
-    """Hide an object, such as a head that covers its splats; linked ones still render."""
+    """Hide an object, such as a head that covers its splats, wherever it is appended, linked or
+    instanced. Linked ones are hidden in the scene's viewports only: they still render."""
     if obj.library is None:
-        obj.hide_render = True
+        obj.hide_render = obj.hide_viewport = True
+    else:
+        hide_in_layers(obj, scene)
+
+
+def keep_evaluated(head: Any, scene: Any) -> None:
+    """Let Blender move a head that `hide_object` has hidden also where no splats of it are enabled
+    any more, for whose sake it evaluates it: shown where they are gone."""
+    if head.library is not None or not head.hide_viewport:
+        return
+    splats = splats_of(head, scene)
+    if all(each.hide_viewport for each in splats):
+        head.hide_viewport = False
+        hide_in_layers(head, scene, bool(splats))
+
+
+def hide_covered(splat_object: Any, scene: Any) -> None:
+    """Hide what covers splats that were appended or linked: their head, where its file hides it in
+    images, and their neutral mesh."""
+    with suppress(StgaError):  # they have lost their modifier
+        head, neutral = (
+            get_input(splat_object, name) for name in (splat_nodes.HEAD, splat_nodes.NEUTRAL)
+        )
+        for each in (head, neutral):
+            if each is not None and (each.hide_render or each is neutral):
+                hide_object(each, scene)
+
+
+def hide_in_layers(obj: Any, scene: Any, hide: bool = True) -> None:
+    """Hide an object in the scene's viewports, or show it there."""
     for layer in scene.view_layers:
         if layer.objects.get(obj.name) is obj:
-            obj.hide_set(True, view_layer=layer)
+            obj.hide_set(hide, view_layer=layer)
 
 
 def splat_modifier(splat_object: Any) -> Any:
@@ -177,10 +260,14 @@ def get_input(splat_object: Any, name: str) -> Any:
 
 def input_identifier(modifier: Any, name: str) -> str | None:
     """Identifier ("Socket_2") of a modifier's input by its displayed name, or None."""
-    for item in modifier.node_group.interface.items_tree:
-        if item.in_out == "INPUT" and item.name == name:
-            return str(item.identifier)
-    return None
+    return input_identifiers(modifier).get(name)
+
+
+def input_identifiers(modifier: Any) -> dict[str, str]:
+    """Displayed name -> identifier of a modifier's inputs, less the geometry."""
+    items = [each for each in modifier.node_group.interface.items_tree if each.in_out == "INPUT"]
+    plain = [each for each in items if each.socket_type != "NodeSocketGeometry"]
+    return {str(each.name): str(each.identifier) for each in plain}
 
 
 def display_mode(splat_object: Any) -> str:

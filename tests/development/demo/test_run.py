@@ -57,7 +57,7 @@ def test_demo(tmp_path, monkeypatch):
     splats = [thing for thing in bpy.data.objects if thing.get("stga_kind") == "splats"]
     assert len(heads) == 1
     assert len(splats) == 1
-    assert heads[0].hide_get(), "the head covers its splats"
+    assert not heads[0].visible_get(), "the head covers its splats"
     assert [group for group in heads[0].vertex_groups if group.name.startswith("stga_")]
     assert sum(thing.type == "CAMERA" for thing in bpy.data.objects) == len(CAMERAS)
     areas = [area for screen in bpy.data.screens for area in screen.areas]
