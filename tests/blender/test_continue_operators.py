@@ -64,27 +64,28 @@ def test_what_is_painted_or_selected_becomes_the_region(head, asked, run, extens
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-@pytest.mark.parametrize("fails", [True, False])
-def test_the_panel_stays_at_the_run_until_another_continues_it(head, run, tmp_path, fails):
+def test_the_panel_stays_at_the_run_until_another_continues_it(
+    extension, head, run, monkeypatch, tmp_path
+):
     """Catches a panel at an empty run after a failure, which refuses the next attempt; and one that
     does not go on to the run that was trained."""
-    made = "shutil.copy(FOLDER.parents[1] / 'run/avatar.npz', FOLDER.parent)\nend('finished')"
-    body = "end('failed', 'no camera sees it')" if fails else made
+    monitor = extension.operators.monitor
     settings = bpy.context.scene.stga
-    python = write_interpreter(tmp_path / "python", body)
+    monkeypatch.setattr(monitor, "has_timer", lambda: True)
     settings.run_folder = str(run)
     settings.avatar = str(run / "avatar.npz")
-    what = {"directory": str(run), "group": "cheek", "python": python}
-    if fails:
-        with pytest.raises(RuntimeError, match="no camera sees it"):
-            bpy.ops.stga.refine(**what)
-        assert settings.run_folder == str(run)
-        write_interpreter(tmp_path / "python", made)
-        bpy.ops.stga.refine(**{**what, "directory": settings.run_folder})
-    else:
-        bpy.ops.stga.refine(**what)
-    trained = settings.training_run
-    assert (settings.run_folder, settings.avatar) == (trained, f"{trained}/avatar.npz")
+    ends = {
+        "failed": "end('failed', 'no camera sees it')",
+        "finished": f"shutil.copy({settings.avatar!r}, FOLDER.parent)\nend('finished')",
+    }
+    for state, body in ends.items():
+        python = write_interpreter(tmp_path / "python", body)
+        bpy.ops.stga.refine(directory=settings.run_folder, group="cheek", python=python)
+        monitor._processes[monitor.state_of(bpy.context.scene, Kind.TRAINING).folder].wait(60)
+        tick_until_done(extension, Kind.TRAINING)
+        assert monitor.state_of(bpy.context.scene, Kind.TRAINING).snapshot.state == state
+        new = settings.training_run if state == "finished" else str(run)
+        assert (settings.run_folder, settings.avatar) == (new, f"{new}/avatar.npz")
 
 
 def test_mistakes_are_sentences(head, asked, run, tmp_path):

@@ -132,6 +132,7 @@ def test_images_by_other_engines(extension, tmp_path):
     shown = scene.stga.splats
     scene.render.engine = "CYCLES"
     cycles.transparent_max_bounces = 8
+    set_input(shown, DISPLAY, AS_TRAINED)
     bpy.ops.stga.preview_images()
     assert (display_mode(shown), cycles.transparent_max_bounces) == (QUADS, 64)
     with pytest.raises(RuntimeError, match="displayed as trained"):
