@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -29,16 +29,25 @@ def image_size(render: Any) -> tuple[int, int]:
     return max(1, int(render.resolution_x * share)), max(1, int(render.resolution_y * share))
 
 
+class Eye(NamedTuple):
+    """What one view of a stereo image has in place of the camera's own: camera to world (4, 4), and
+    shift."""
+
+    pose: np.ndarray
+    shift_x: float
+
+
 def render_camera(
     camera: Any,
     depsgraph: Any,
     width: int,
     height: int,
     border: tuple[int, int, int, int] | None = None,
+    eye: Eye | None = None,
 ) -> Camera:
     """The evaluated camera object for an image of width × height pixels. border: x, y, width,
-    height in pixels of the render region, from the bottom left. Raises StgaError unless it is
-    perspective."""
+    height in pixels of the render region, from the bottom left. eye: of a stereo image. Raises
+    StgaError unless it is perspective."""
     if camera is None or camera.type != "CAMERA":
         raise StgaError("The scene has no camera to render through")
     if camera.data.type != "PERSP":
@@ -47,8 +56,13 @@ def render_camera(
         )
     render = depsgraph.scene.render
     aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
-    projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **aspect)
+    projection = np.array(camera.calc_matrix_camera(depsgraph, x=width, y=height, **aspect))
     pose = np.array(camera.matrix_world.normalized(), np.float64)
+    if eye is not None:
+        data = camera.data
+        pose = eye.pose
+        sensor = data.sensor_height if data.sensor_fit == "VERTICAL" else data.sensor_width
+        projection[0, 2] += (eye.shift_x - data.shift_x) * projection[0, 0] * sensor / data.lens
     whole = camera_of(pose, projection, width, height)
     x, y, columns, rows = border or (0, 0, width, height)
     cx = whole.cx - x

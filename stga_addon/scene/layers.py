@@ -54,7 +54,7 @@ class Relit:
 class SceneLayer:
     """A visible splat object: its splats, how they are posed (as `PosedSplats`) and displayed.
     frozen (F,) bool: triangles that the frame does not train, None where nobody asks. relit: None
-    where colors are as recorded."""
+    where colors are as recorded. holdout: it makes what it covers transparent."""
 
     splats: Splats
     frames: FaceFrames
@@ -63,6 +63,15 @@ class SceneLayer:
     settings: DisplaySettings = DisplaySettings()
     frozen: np.ndarray | None = None
     relit: Relit | None = None
+    holdout: bool = False
+
+    def painted(self, value: float) -> "SceneLayer":
+        """The same splats in one gray of 0…1, sRGB."""
+        sh = np.full((len(self.splats), 1, 3), (value - 0.5) / SH_C0, np.float32)
+        splats = replace(self.splats, sh=sh)
+        frames = replace(self.frames, color=NO_COLUMNS)
+        settings = replace(self.settings, show_selection=False)
+        return replace(self, splats=splats, frames=frames, settings=settings, relit=None)
 
     def posed(self, eye: np.ndarray | None = None) -> PosedSplats:
         """The splats as the settings show them; eye (3,): camera in the scene, where relit."""

@@ -251,17 +251,18 @@ class SceneLight:
         avatar: Avatar,
         vertices: np.ndarray,
         to_world: np.ndarray,
-        visible: Sequence[tuple[Any, Any]],
+        find_visible: Callable[[], Sequence[tuple[Any, Any]]],
         depsgraph: Any,
     ) -> Relit | None:
         """How the scene lights a head of vertices (V, 3), None where colors are as recorded; the
         same object while all is the same, `vertices` by identity. to_world (4, 4): from the
-        avatar's space. visible: objects and their matrices."""
+        avatar's space. find_visible: objects and their matrices."""
         # A change of the settings of a viewport does not evaluate its scene anew.
         is_viewport = depsgraph.mode == "VIEWPORT"
         settings = lighting_settings(depsgraph.scene if is_viewport else depsgraph.scene_eval)
         if avatar.light is None or settings is None or settings.mode == "recorded":
             return None
+        visible = find_visible()
         lighting = self._lighting(settings, (splat_object, head), to_world, visible, depsgraph)
         casters: tuple[Caster, ...] = ()
         if lighting.shadows:

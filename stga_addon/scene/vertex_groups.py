@@ -99,8 +99,13 @@ def selected_triangles(head: Any) -> np.ndarray:
 
 def frame_selection(head: Any, timestep: int) -> np.ndarray | None:
     """(F,) bool of one timestep's selection group; None where it has none."""
-    group = head.vertex_groups.get(tags.group_name(timestep))
+    group = frame_group(head, timestep)
     return None if group is None else _read_faces(head, [group.index])[0]
+
+
+def frame_group(head: Any, timestep: int) -> Any:
+    """The vertex group with a timestep's selection; None where it has none."""
+    return head.vertex_groups.get(tags.group_name(timestep))
 
 
 def splats_per_face(splat_object: Any, head: Any) -> np.ndarray | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix, Vector
 
 from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0
@@ -484,3 +485,121 @@ def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
     thread.join()
     assert found == ["python"]
     assert callers == [threading.main_thread()] * 2
+
+
+def read_views(path: Path) -> dict[str, np.ndarray]:
+    """View -> (H, W, 4) of an image with the views of a stereo image, or of the one there is."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for channel, values in read_exr(path).items():
+        if "Combined" in channel:
+            view = next((name for name in ("left", "right") if f".{name}" in channel), "")
+            found.setdefault(view, {})[channel[-1]] = values
+    return {view: np.stack([values[c] for c in "RGBA"], 2) for view, values in found.items()}
+
+
+@pytest.mark.parametrize("mode", ["OFFAXIS", "PARALLEL", "MULTIVIEW"])
+def test_stereo(tmp_path, mode):
+    """Catches two equal pictures, eyes that are swapped, and convergence at another distance."""
+    avatar = textured(avatar_of("stga"))
+    shown, head = show(avatar)
+    camera = camera_at()
+    render_settings = bpy.context.scene.render
+    stereo = camera.data.stereo
+    stereo.interocular_distance = 0.065
+    stereo.convergence_distance = 0.9
+    stereo.pivot = "LEFT"
+    right = camera.copy()
+    right.data = camera.data.copy()
+    right.matrix_world = camera.matrix_world @ Matrix.Translation((0.065, 0, 0))
+    bpy.context.scene.collection.objects.link(right)
+    render_settings.use_multiview = True
+    render_settings.views_format = "STEREO_3D"
+    if mode == "MULTIVIEW":
+        render_settings.views_format = mode
+        camera.name = "eye_L"
+        right.name = "eye_R"
+        right.data.lens = 50
+    else:
+        stereo.convergence_mode = mode
+    image = render_settings.image_settings
+    multilayer(image)
+    image.views_format = "MULTIVIEW"
+    render_settings.filepath = str(tmp_path / "image.exr")
+    bpy.ops.render.render(write_still=True)
+    found = read_views(tmp_path / "image.exr")
+    expected = {"left": expected_camera(camera, shown), "right": expected_camera(right, shown)}
+    if mode == "OFFAXIS":  # what is at the convergence distance is at the same pixel
+        eye = expected["right"]
+        expected["right"] = replace(eye, cx=eye.cx + eye.fx * 0.065 / 0.9)
+    vertices = evaluated_vertices(head)
+    for view, seen_by in expected.items():
+        wanted = render_avatar(avatar, vertices, seen_by, (0.0, 0.0, 0.0))
+        passes = dict(zip("RGBA", np.moveaxis(found[view], 2, 0), strict=True))
+        assert np.abs(displayed(passes, 0.0) - np.clip(wanted, 0, 1)).max() < 2 * TOLERANCE
+    assert np.abs(found["left"] - found["right"]).max() > 0.2
+
+
+def veil_before(camera):
+    """World splats, half transparent, nearer to the camera than a head, which cover it in part."""
+    xyz = [camera.matrix_world @ Vector((x, 0.0, -0.3)) for x in (-0.03, 0.0, 0.03)]
+    splats = replace(
+        random_splats(1, 3),
+        xyz=np.array(xyz, np.float32),
+        log_scale=np.full((3, 3), np.log(0.01), np.float32),
+        opacity=np.zeros(3, np.float32),
+    )
+    return show_world_splats(splats, "veil")
+
+
+@pytest.mark.parametrize("transparent", [True, False])
+def test_collections_of_holdouts_and_of_indirect_light(tmp_path, transparent):
+    """Catches splats drawn that mask others, or that the camera does not see; and what is covered
+    in part darkened twice."""
+    shown, _ = show(textured(avatar_of("stga")))
+    camera_at()
+    scene = bpy.context.scene
+    layer = bpy.context.view_layer
+    bpy.context.view_layer.update()
+    front = veil_before(scene.camera)
+    masks = bpy.data.collections.new("masks")
+    scene.collection.children.link(masks)
+    masks.objects.link(front)
+    scene.collection.objects.unlink(front)
+    scene.render.film_transparent = True
+    front.hide_render = True
+    behind = render(tmp_path)
+    front.hide_render = False
+    shown.hide_render = True
+    before = render(tmp_path)
+    shown.hide_render = False
+    both = render(tmp_path)
+    scene.render.film_transparent = transparent
+    place = layer.layer_collection.children["masks"]
+    place.holdout = True
+    masked = render(tmp_path)
+    assert 0.2 < before["A"].max() < 0.98
+    if transparent:
+        np.testing.assert_allclose(masked["A"], behind["A"] * (1 - before["A"]), atol=TOLERANCE)
+        is_seen = masked["A"] > 0.1
+        for channel in "RGB":
+            straight = [each[channel] / np.maximum(each["A"], 1e-6) for each in (masked, behind)]
+            np.testing.assert_allclose(straight[0][is_seen], straight[1][is_seen], atol=0.02)
+    else:
+        np.testing.assert_allclose(masked["A"], 1 - before["A"], atol=TOLERANCE)
+        place.holdout = False
+        whole = render(tmp_path)
+        empty = before["A"] == 0
+        assert empty.any()
+        np.testing.assert_array_equal(masked["R"][empty], whole["R"][empty])
+        return
+    place.holdout = False
+    front.is_holdout = True
+    np.testing.assert_array_equal(render(tmp_path)["A"], masked["A"])
+    front.is_holdout = False
+    place.indirect_only = True
+    np.testing.assert_array_equal(render(tmp_path)["A"], behind["A"])
+    place.indirect_only = False
+    front.visible_camera = False
+    np.testing.assert_array_equal(render(tmp_path)["A"], behind["A"])
+    front.visible_camera = True
+    np.testing.assert_array_equal(render(tmp_path)["A"], both["A"])

@@ -21,7 +21,7 @@ from ...errors import StgaError
 from ...raster.posed_splats import ComposedImage, PosedSplats
 from ...raster.splat_shader import MIN_ALPHA
 from ...render.client import RenderClient, missing_packages
-from ..cameras import render_camera, viewport_camera
+from ..cameras import Eye, render_camera, viewport_camera
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer, has_gpu_context
 from ..layers import SceneLayer
@@ -217,9 +217,7 @@ class EngineViewport:
     def update(self, depsgraph: Any) -> None:
         """The scene has changed: pose the splats again, and read edited meshes again."""
         self._layers = None
-        self._cache.light.forget_casters()
-        changed = (update.id for update in depsgraph.updates)
-        self._cache.discard({each.original for each in changed if isinstance(each, bpy.types.Mesh)})
+        self._cache.scene_changed(depsgraph)
 
     def draw(self, context: Any, depsgraph: Any) -> bool:
         """Draw the current view with the GPU; returns False where it cannot."""
@@ -323,34 +321,70 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             pixels = np.array(edges, np.float32) * np.array([*border[2:]] * 2, np.float32)
             left, low, right, high = pixels.astype(int).tolist()
             border = left, low, right - left, high - low
+        # Passes that the view layer has, of each view; those not given stay empty.
+        result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
         try:
-            passes = self._render(depsgraph, border)
+            for view in result.views:
+                passes = self._render(depsgraph, border, view.name)
+                for name, values in passes.items():
+                    render_pass = result.layers[0].passes.find_by_name(name, view.name)
+                    if render_pass is not None:
+                        from_bottom = np.ascontiguousarray(values[::-1], np.float32)
+                        render_pass.rect.foreach_set(from_bottom.ravel())
         except Exception as error:  # raised, it would not stop Blender from saving an empty image
-            passes = {}
             message = str(error)
             if not isinstance(error, StgaError):
                 traceback.print_exc()
                 message = f"Unexpected error ({type(error).__name__}: {error}); see the console"
-        # Those that the view layer has; those not given stay empty.
-        result = self.begin_result(0, 0, *border[2:], layer=depsgraph.view_layer.name)
-        for render_pass in result.layers[0].passes:
-            if render_pass.name in passes:
-                from_bottom = np.ascontiguousarray(passes[render_pass.name][::-1], np.float32)
-                render_pass.rect.foreach_set(from_bottom.ravel())
         self.end_result(result)
         if message:
             self.report({"ERROR"}, message)  # raised in scripts; nothing is saved
             if not bpy.app.background:
                 self.error_set(message)  # shown in place of the image
 
-    def _render(self, depsgraph: Any, border: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
-        """Values (H, W, channels) of each pass, top row first."""
+    def _render(
+        self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str
+    ) -> dict[str, np.ndarray]:
+        """Values (H, W, channels) of each pass, top row first. view_name: of a stereo image, or
+        empty."""
         scene = depsgraph.scene
-        size = (self.resolution_x, self.resolution_y)
-        camera_object = scene.camera.evaluated_get(depsgraph) if scene.camera else None
-        camera = render_camera(camera_object, depsgraph, *size, border)
+        camera = self._camera(depsgraph, border, view_name)
         layers = visible_layers(depsgraph, SplatCache())
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
+        held_out = any(layer.holdout for layer in layers)
+        shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]
+        image = self._image(shown, camera)
+        hidden = np.zeros_like(image.alpha)
+        if held_out:  # white where splats are seen, black where holdouts hide them
+            white = [layer.painted(0.0 if layer.holdout else 1.0) for layer in layers]
+            hidden = np.clip(image.alpha - self._image(white, camera).rgb[0], 0, image.alpha)
+        view = inverse_view(scene)
+        if view is None and needs_inverse(scene):
+            problem = "The view transform could not be measured in time and changes colors"
+            self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
+        assert image.depth is not None
+        threshold = max(depsgraph.view_layer.pass_alpha_threshold, MIN_ALPHA)
+        covered = image.alpha - hidden >= threshold
+        background = scene_background(scene)
+        return {
+            "Combined": combined(image.rgb, image.alpha, background, view, hidden),
+            "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
+        }
+
+    def _camera(self, depsgraph: Any, border: tuple[int, int, int, int], view_name: str) -> Camera:
+        """The scene's camera, or the eye of it, or the camera, that a view is seen by."""
+        scene = depsgraph.scene
+        eye = None
+        camera = view_camera(scene, view_name)
+        if camera is not None and view_name:
+            self.active_view_set(view_name)
+            pose = np.array(self.camera_model_matrix(camera), np.float64)
+            eye = Eye(pose, self.camera_shift_x(camera))
+        evaluated = camera.evaluated_get(depsgraph) if camera is not None else None
+        size = self.resolution_x, self.resolution_y
+        return render_camera(evaluated, depsgraph, *size, border, eye)
+
+    def _image(self, layers: list[SceneLayer], camera: Camera) -> ComposedImage:
         image = draw_image(layers, camera)
         if image is None:
             _rasterizer.update()
@@ -358,16 +392,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             image = _rasterizer.client.compose(posed, camera, with_depth=True)
             if _rasterizer.client.failure:
                 self.report({"WARNING"}, _rasterizer.client.failure)
-        view = inverse_view(scene)
-        if view is None and needs_inverse(scene):
-            problem = "The view transform could not be measured in time and changes colors"
-            self.report({"WARNING"}, f"{problem}; render again, or choose Standard")
-        assert image.depth is not None
-        covered = image.alpha >= max(depsgraph.view_layer.pass_alpha_threshold, MIN_ALPHA)
-        return {
-            "Combined": combined(image.rgb, image.alpha, scene_background(scene), view),
-            "Depth": np.where(covered, image.depth, BACKGROUND_DEPTH)[..., None],
-        }
+        return image
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
         self._viewport.update(depsgraph)
@@ -386,6 +411,20 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
             self.bind_display_space_shader(depsgraph.scene)
             viewport.draw_image(renderer.image, region.width, region.height)
             self.unbind_display_space_shader()
+
+
+def view_camera(scene: Any, view_name: str) -> Any:
+    """The camera of a view: the scene's, but with Multi-View that of its name with the view's
+    suffix, where there is one; None without a camera."""
+    camera = scene.camera
+    views = scene.render.views
+    if camera is None or not view_name or scene.render.views_format != "MULTIVIEW":
+        return camera
+    suffixes = [each.camera_suffix for each in views if camera.name.endswith(each.camera_suffix)]
+    if not suffixes:
+        return camera
+    name = camera.name.removesuffix(suffixes[0]) + views[view_name].camera_suffix
+    return scene.objects.get(name) or camera
 
 
 def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:

@@ -15,6 +15,7 @@ from ...errors import StgaError
 from .. import tags
 from ..arrays import flat_floats, mesh_vertices
 from ..display import splat_nodes
+from ..display.node_builder import VERSION
 from ..display.splat_attributes import RELIT_COLOR, read_splats, with_alpha, write_attributes
 from ..display.splat_object import (
     display_settings,
@@ -25,7 +26,7 @@ from ..display.splat_object import (
 )
 from ..layers import SceneLayer
 from ..light import SceneLight, lighting_settings
-from ..vertex_groups import frame_selection
+from ..vertex_groups import frame_group, frame_selection
 
 
 class SplatCache:
@@ -36,12 +37,30 @@ class SplatCache:
     def __init__(self) -> None:
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
         self._frames: dict[tuple[Any, ...], tuple[np.ndarray, FaceFrames]] = {}
+        self._selections: dict[tuple[int, int, int], np.ndarray | None] = {}
         self.light = SceneLight()
 
-    def discard(self, meshes: set[Any]) -> None:
-        """Forget meshes that were edited."""
-        uids = {mesh.session_uid for mesh in meshes}
-        self._keep(lambda key: key[0] not in uids)
+    def scene_changed(self, depsgraph: Any) -> None:
+        """Forget meshes that were edited, the selections painted on them, and what throws
+        shadows."""
+        self.light.forget_casters()
+        changed = [update.id.original for update in depsgraph.updates]
+        uids = {each.session_uid for each in changed if isinstance(each, bpy.types.Mesh)}
+        if uids:
+            self._keep(lambda key: key[0] not in uids)
+        # where a group was removed, the scene's relations are built anew
+        if uids or any(isinstance(each, bpy.types.Scene) for each in changed):
+            self._selections.clear()
+
+    def selection(self, head: Any, timestep: int) -> np.ndarray | None:
+        """`frame_selection`, which reads all vertices, as last read."""
+        group = frame_group(head, timestep)
+        if group is None:
+            return None
+        key = head.data.session_uid, group.index, timestep
+        if key not in self._selections:
+            self._selections[key] = frame_selection(head, timestep)
+        return self._selections[key]
 
     def get(self, splat_object: Any) -> Avatar | Splats:
         key = _key(splat_object.data)
@@ -79,21 +98,29 @@ def visible_layers(
     is_wanted: Callable[[Any], bool] = lambda splat_object: True,
 ) -> list[SceneLayer]:
     """The splats of each visible object at the depsgraph's frame. view: the SpaceView3D to draw,
-    None for a final image. Raises StgaError where a head is gone or has other triangles."""
-    visible = [each for each in depsgraph.view_layer.objects if each.visible_get(viewport=view)]
-    if view is None:
-        visible = _rendered_objects(depsgraph.view_layer.layer_collection, depsgraph)
-    shown = [found for each in visible for found in _with_instances(each, depsgraph, Matrix())]
+    None for a final image, where holdouts count and what the camera does not see is left out.
+    Raises StgaError where a head is gone or has other triangles."""
+    if not any(VERSION in tree for tree in bpy.data.node_groups):  # a file without splats
+        return []
+
+    def find_visible() -> list[tuple[Any, Matrix]]:
+        found = _visible_objects(depsgraph, view, lambda each: True)
+        return [(each, matrix) for _, each, matrix in found]
+
     layers = []
-    for each, matrix in shown:
+    for owner, each, matrix in _visible_objects(depsgraph, view, _may_show_splats):
         if each.get(tags.KIND) != tags.SPLATS or not is_wanted(each):
+            continue
+        if view is None and not _is_seen(owner, each, depsgraph):
             continue
         stored = cache.get(each)
         to_world = np.array(matrix, np.float64)
         # From the evaluated object: its settings may be animated.
         settings = display_settings(splat_modifier(each.evaluated_get(depsgraph)))
+        holdout = view is None and _is_holdout(owner, each, depsgraph)
         if isinstance(stored, Splats):
-            layers.append(SceneLayer(stored, WORLD, to_world, settings=settings))
+            how = {"settings": settings, "holdout": holdout}
+            layers.append(SceneLayer(stored, WORLD, to_world, **how))
             continue
         head = get_input(each, splat_nodes.HEAD)
         if head is None:
@@ -108,29 +135,55 @@ def visible_layers(
         to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
         vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
         vertices, frames = cache.frames(each, stored, vertices)
-        relit = cache.light.relit(each, head, stored, vertices, to_world, shown, depsgraph)
+        relit = cache.light.relit(each, head, stored, vertices, to_world, find_visible, depsgraph)
         asks = settings.show_selection or settings.selected_only
-        selected = frame_selection(head, depsgraph.scene.frame_current) if asks else None
+        selected = cache.selection(head, depsgraph.scene.frame_current) if asks else None
         frozen = None if selected is None else ~selected
-        how = stored.antialiased, settings, frozen, relit
+        how = stored.antialiased, settings, frozen, relit, holdout
         layers.append(SceneLayer(stored.splats, frames, to_world, *how))
     return layers
 
 
-def _rendered_objects(layer: Any, depsgraph: Any) -> list[Any]:
+def _may_show_splats(candidate: Any) -> bool:
+    """Whether the object shows splats or instances a collection, which may hold some."""
+    is_splats = candidate.get(tags.KIND) == tags.SPLATS
+    return is_splats or candidate.instance_type == "COLLECTION"
+
+
+def _visible_objects(
+    depsgraph: Any, view: Any, is_asked: Callable[[Any], bool]
+) -> list[tuple[Any, Any, Matrix]]:
+    """The object of the view layer, itself or the instance of it, and its world matrix, of those
+    that are visible. is_asked: asked first, because all else takes longer. view: as of
+    `visible_layers`."""
+    layer = depsgraph.view_layer
+    if view is None:
+        visible = _rendered_objects(layer.layer_collection, depsgraph, is_asked)
+    else:
+        asked = filter(is_asked, layer.objects)
+        visible = [each for each in asked if each.visible_get(viewport=view)]
+    return [
+        (owner, each, matrix)
+        for owner in visible
+        for each, matrix in _with_instances(owner, depsgraph, Matrix(), is_asked)
+    ]
+
+
+def _rendered_objects(layer: Any, depsgraph: Any, is_asked: Callable[[Any], bool]) -> list[Any]:
     """The objects of a layer collection and its children that final images show, each once."""
     if layer.exclude or layer.collection.hide_render:
         return []
     # By evaluated objects: in animations, keyframes do not reach the originals.
-    candidates = [(each, each.evaluated_get(depsgraph)) for each in layer.collection.objects]
+    asked = filter(is_asked, layer.collection.objects)
+    candidates = [(each, each.evaluated_get(depsgraph)) for each in asked]
     found = [each for each, evaluated in candidates if not evaluated.hide_render]
     for child in layer.children:
-        found += _rendered_objects(child, depsgraph)
+        found += _rendered_objects(child, depsgraph, is_asked)
     return list(dict.fromkeys(found))
 
 
 def _with_instances(
-    visible: Any, depsgraph: Any, parent_matrix: Matrix
+    visible: Any, depsgraph: Any, parent_matrix: Matrix, is_asked: Callable[[Any], bool]
 ) -> Iterator[tuple[Any, Matrix]]:
     """An object and its world matrix, and the members of an instanced collection."""
     matrix = parent_matrix @ visible.evaluated_get(depsgraph).matrix_world
@@ -138,9 +191,23 @@ def _with_instances(
     collection = visible.instance_collection if visible.instance_type == "COLLECTION" else None
     if collection is not None:
         inside = matrix @ Matrix.Translation(-collection.instance_offset)
-        for member in collection.all_objects:
+        for member in filter(is_asked, collection.all_objects):
             if not member.evaluated_get(depsgraph).hide_render:
-                yield from _with_instances(member, depsgraph, inside)
+                yield from _with_instances(member, depsgraph, inside, is_asked)
+
+
+def _is_seen(owner: Any, instance: Any, depsgraph: Any) -> bool:
+    """Whether the camera sees an object of a final image, which is an instance of `owner`."""
+    evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
+    is_indirect = owner.indirect_only_get(view_layer=depsgraph.view_layer)
+    return not is_indirect and all(each.visible_camera for each in evaluated)
+
+
+def _is_holdout(owner: Any, instance: Any, depsgraph: Any) -> bool:
+    """Whether an object of a final image hides what it covers, by its collections or its own."""
+    evaluated = [each.evaluated_get(depsgraph) for each in (owner, instance)]
+    is_masked = owner.holdout_get(view_layer=depsgraph.view_layer)
+    return is_masked or any(each.is_holdout for each in evaluated)
 
 
 def relight_frame(splat_object: Any, scene: Any) -> None:

@@ -179,29 +179,39 @@ def _shown(scene: Any, axis: np.ndarray) -> np.ndarray:
         bpy.data.scenes.remove(copy)
 
 
+MIN_SEEN = 1e-6
+"""Share of a pixel below which its color does not matter."""
+
+
 def combined(
     rgb: np.ndarray,
     alpha: np.ndarray,
     background: tuple[float, ...] | None,
     view: InverseView | None = None,
+    hidden: np.ndarray | float = 0.0,
 ) -> np.ndarray:
     """(H, W, 4) scene-linear RGBA, premultiplied, of splats rendered on black: sRGB rgb (3, H, W),
     alpha (H, W). Splats are blended in sRGB, so `background`, scene-linear (3,), is added as the
     sRGB that it is shown as; None: transparent, colors as if they covered their pixels. view: None
-    where the view transform shows sRGB as it is."""
+    where the view transform shows sRGB as it is. hidden (H, W): the part of alpha that black
+    holdouts have, whose pixels are transparent."""
     to_linear = srgb_to_linear if view is None else view.to_linear
     image = np.zeros((*alpha.shape, 4), np.float32)
     covered = alpha > 0
     color = rgb[:, covered].T
     share = alpha[covered][:, None]
+    held_out = np.broadcast_to(hidden, alpha.shape)
+    seen = 1 - held_out[covered][:, None]
     if background is None:
-        image[covered, :3] = to_linear(color / share) * share
-        image[..., 3] = alpha
+        seen = share - held_out[covered][:, None]
+        image[..., 3] = alpha - held_out
     else:
         linear = np.array(background, np.float32)
         behind = linear_to_srgb(np.clip(linear, 0, 1)) if view is None else view.show(linear)
         image[...] = *background, 1
-        image[covered, :3] = to_linear(np.clip(color + (1 - share) * behind, 0, 1))
+        color = np.clip(color + (1 - share) * behind, 0, 1)
+        image[..., 3] = 1 - held_out
+    image[covered, :3] = to_linear(color / np.maximum(seen, MIN_SEEN)) * seen
     return image
 
 

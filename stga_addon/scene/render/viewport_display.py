@@ -94,7 +94,9 @@ class GpuDisplay:
             lambda shown: everything or display_mode(shown) == AS_TRAINED,
         )
         if not layers:
-            if not any(is_shown_as_trained(candidate) for candidate in bpy.data.objects):
+            if self._renderer is not None and not any(
+                is_shown_as_trained(candidate) for candidate in bpy.data.objects
+            ):
                 self._renderer = None  # frees its textures
             return
         if self._renderer is None:
@@ -193,9 +195,9 @@ def _forget_file(*_: Any) -> None:
 
 
 @persistent
-def _scene_changed(*_: Any) -> None:
-    """Read what throws shadows onto heads again."""
-    display.cache.light.forget_casters()
+def _scene_changed(_: Any, depsgraph: Any) -> None:
+    """Read again what was edited, and what throws shadows onto heads."""
+    display.cache.scene_changed(depsgraph)
 
 
 def _handlers() -> tuple[tuple[Any, Any], ...]:
