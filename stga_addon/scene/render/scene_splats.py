@@ -119,8 +119,8 @@ def visible_layers(
         settings = display_settings(splat_modifier(each.evaluated_get(depsgraph)))
         holdout = view is None and _is_holdout(owner, each, depsgraph)
         if isinstance(stored, Splats):
-            how = {"settings": settings, "holdout": holdout}
-            layers.append(SceneLayer(stored, WORLD, to_world, **how))
+            layer = SceneLayer(stored, WORLD, to_world, settings=settings, holdout=holdout)
+            layers.append(layer)
             continue
         head = get_input(each, splat_nodes.HEAD)
         if head is None:
