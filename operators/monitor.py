@@ -31,7 +31,12 @@ from ..stga_addon.report import curve_image
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import open_sidebar
 from ..stga_addon.scene.compat import APPENDED
-from ..stga_addon.scene.display.splat_object import hide_covered, hide_in_layers, keep_evaluated
+from ..stga_addon.scene.display.splat_object import (
+    hide_covered,
+    hide_in_layers,
+    is_enabled_on,
+    keep_evaluated,
+)
 from ..stga_addon.scene.objects import layers_with
 from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
@@ -483,8 +488,10 @@ def _after_update(scene: Any, *_: Any) -> None:
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:
             setattr(scene.stga, name, None)
-    if is_head(scene.stga.head):
-        keep_evaluated(scene.stga.head, scene)
+    head = scene.stga.head
+    splats = scene.stga.splats
+    if is_head(head) and head.hide_viewport and not (splats and is_enabled_on(splats, head)):
+        keep_evaluated(head, scene)  # which looks at all objects
 
 
 def register(at_end: AtEnd) -> None:

@@ -114,11 +114,18 @@ def _exchange_tree(splat_object: Any, tree: Any) -> None:
 def splats_of(head: Any, scene: Any) -> list[Any]:
     """The splat objects of the scene that follow the head and can be changed: no linked ones."""
     own = [each for each in scene.objects if tags.CONVENTION in each and each.library is None]
-    found = []
-    for each in own:
-        with suppress(StgaError):  # it has lost its modifier
-            found += [each] if get_input(each, splat_nodes.HEAD) == head else []
-    return found
+    return [each for each in own if _follows(each, head)]
+
+
+def _follows(splat_object: Any, head: Any) -> bool:
+    with suppress(StgaError):  # it has lost its modifier
+        return bool(get_input(splat_object, splat_nodes.HEAD) == head)
+    return False
+
+
+def is_enabled_on(splat_object: Any, head: Any) -> bool:
+    """Whether Blender evaluates the head for the splat object's sake."""
+    return not splat_object.hide_viewport and _follows(splat_object, head)
 
 
 def show_world_splats(splats: Splats, name: str, scene: Any = None) -> Any:
