@@ -83,13 +83,18 @@ def _head_in_session(scene: Any, kind: Kind) -> Any:
 
 
 def request_head(scene: Any, state: RequestState) -> Any:
-    """The head that the request is about; None where it is gone, or is still to be imported."""
+    """The head that the request is about, also where its capture was imported again; None where it
+    is gone, or is still to be imported."""
     if state.kind == Kind.TRACKING:
         return _head_of_capture(scene, state.place)
-    if (scene.session_uid, state.kind) in _heads:
-        return _head_in_session(scene, state.kind)
-    stored = getattr(scene.stga, HEADS[state.kind]) if state.kind in HEADS else None
-    return stored if stored is not None and stored.users_collection else None
+    head = _head_in_session(scene, state.kind)
+    if head is None and state.kind in HEADS:
+        stored = getattr(scene.stga, HEADS[state.kind])
+        head = stored if stored is not None and stored.users_collection else None
+        if head is None:
+            with suppress(StgaError):  # has not begun
+                head = _head_of_capture(scene, read_run(state.run).capture)
+    return head
 
 
 def _head_of_capture(scene: Any, capture: Path) -> Any:
@@ -159,21 +164,15 @@ def follow_head(settings: Any) -> None:
         settings.avatar = avatar_of(shown) or settings.avatar
 
 
-def _is_too_early(scene: Any, state: RequestState) -> bool:
-    """Whether this would put new splats, hardly trained, in the place of another avatar."""
-    head = request_head(scene, state)
-    snapshot = state.snapshot
-    settings = scene.stga
-    is_ended = snapshot.state == WorkerState.FINISHED
-    if is_ended or snapshot.status.figures.get("iteration", 0) >= MIN_ITERATIONS:
+def _is_immature(state: RequestState) -> bool:
+    """Whether these are new splats that are hardly trained, but for a run that was meant to be so
+    short."""
+    is_whole = state.snapshot.state == WorkerState.FINISHED
+    if is_whole or state.snapshot.status.figures.get("iteration", 0) >= MIN_ITERATIONS:
         return False
     with suppress(StgaError):  # a run that is damaged, or has not begun
-        if read_run(state.run).continuation is not None:  # begins with a trained avatar
-            return False
-    shown = shown_splats(scene, head)
-    named = Path(bpy.path.abspath(settings.avatar))
-    is_named = settings.head == head and named.is_file() and named != state.run / AVATAR
-    return is_named or (shown is not None and shown.get(tags.RUN) != str(_run(state)))
+        return read_run(state.run).continuation is None  # else it begins with a trained avatar
+    return True
 
 
 def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
@@ -181,7 +180,8 @@ def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
     that has continued the panel's."""
     settings = scene.stga
     head = request_head(scene, state)
-    if head not in (None, settings.head) or _is_too_early(scene, state):
+    named = Path(bpy.path.abspath(settings.avatar))
+    if head not in (None, settings.head) or (named.is_file() and _is_immature(state)):
         return
     settings.avatar = str(path)
     with suppress(StgaError):  # the request was removed
@@ -202,7 +202,9 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     if head is None:
         gone = "the head that it was trained for is no longer in the scene"
         raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
-    if _is_too_early(scene, state):
+    shown = shown_splats(scene, head)
+    is_other = shown is not None and shown.get(tags.RUN) != str(run)
+    if is_other and _is_immature(state):
         if not is_result:
             return Shown()
         count = f"{state.snapshot.status.figures.get('iteration', 0):.0f} iterations"
@@ -210,7 +212,6 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
         raise StgaError(f"{run}: was cancelled after {count}, so {shows}")
     avatar, attributes = loading.result()
     splat_object.check_head(avatar, head)
-    shown = shown_splats(scene, head)
     is_update = shown is not None and splat_object.can_update(shown, avatar)
     if not is_update and splat_object.build_next_node_group(avatar):
         return SliceBuilt()

@@ -1,6 +1,7 @@
 """Which head the result of a request reaches, and by which splat object an avatar is shown."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import bpy
@@ -22,6 +23,8 @@ from stga_addon.scene.display.splat_object import (
     input_identifier,
     splat_modifier,
 )
+from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.settings import make_settings
 
 from .test_operators import expected_world, write_ball_avatar
 from .test_train_operators import tick_until
@@ -36,7 +39,8 @@ def ben(head, tmp_path):
     """A second head of the same triangles, which the panel holds once it is imported."""
 
     def arrive():
-        head.name = "Anna"  # as a user renames it
+        with suppress(ReferenceError):  # it was deleted
+            head.name = "Anna"  # as a user renames it
         bpy.ops.stga.import_capture(directory=str(write_mesh_capture(tmp_path / "ben")))
         bpy.context.scene.stga.head.name = "Ben"
         return bpy.context.scene.stga.head
@@ -94,6 +98,19 @@ def test_a_result_whose_head_is_gone_reaches_no_other(extension, worker, ben, he
     assert settings.avatar == str(avatar)
     error = extension.operators.monitor.state_of(bpy.context.scene, Kind.TRAINING).error
     assert error.endswith("is no longer in the scene; choose a head, then Show Avatar")
+
+
+def test_a_head_that_was_imported_again_is_found(extension, worker, ben, head, tmp_path):
+    """Catches an avatar that does not find the head of its own capture."""
+    run = Run(tmp_path / "capture", None, "vhap", make_settings("global", iterations=5))
+    write_run(worker.run, run)
+    bpy.data.objects.remove(head)
+    bpy.ops.stga.import_capture(directory=str(tmp_path / "capture"))
+    ben()
+    end(worker)
+    tick_until(extension.operators.monitor, lambda: bpy.context.scene.stga.result_shown)
+    (shown,) = splat_objects()
+    assert get_input(shown, splat_nodes.HEAD)[tags.CAPTURE] == str(tmp_path / "capture")
 
 
 def test_a_head_is_found_after_undo(extension, worker, head):
