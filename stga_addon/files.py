@@ -25,6 +25,11 @@ from .errors import StgaError
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
+STRAY_BYTES = 1 << 10
+DAMAGE_BYTES = 1 << 20
+CHANGED_LINE_ENDS = (
+    "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
+)
 MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
@@ -223,7 +228,29 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     if size > limit:
         raise StgaError(f"{path}: has {size} bytes, more than the {limit} allowed")
     with naming(path, "read"):
-        return path.read_bytes()
+        data = path.read_bytes()
+    if stray := stray_content(data):
+        raise StgaError(f"{path}: {stray}")
+    return data
+
+
+def stray_content(data: bytes) -> str | None:
+    """What stands in the place of a file whose download or checkout went wrong, and what to do, to
+    follow its name in a message; None where it is neither a Git LFS pointer nor a web page."""
+    start = data[:STRAY_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
+    if start.startswith(b"version https://git-lfs.github.com/"):
+        return "is a Git LFS pointer, not the file; fetch the file with git lfs pull"
+    if re.match(
+        rb"(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<(!doctype html|html|head|body)\b", start, re.S
+    ):
+        return "is a web page, not the file; log in and download the file again"
+    return None
+
+
+def line_ends_changed(data: bytes) -> bool:
+    """Whether binary data were carried over as text, which turns each line feed into CR LF."""
+    ends = data.count(b"\n")
+    return ends > 0 and ends == data.count(b"\r\n")
 
 
 def read_json(path: Path) -> Any:
@@ -299,8 +326,17 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
     except StgaError:
         raise
     except Exception as error:
-        problem = f"is not a readable {kind} file ({error or type(error).__name__})"
+        problem = _damage(path) or (
+            f"is not a readable {kind} file ({error or type(error).__name__})"
+        )
         raise StgaError(f"{path}: {problem}") from error
+
+
+def _damage(path: Path) -> str | None:
+    """What happened to a binary file that cannot be read, where its beginning shows it."""
+    with naming(path, "read"), path.open("rb") as stream:
+        start = stream.read(DAMAGE_BYTES)
+    return stray_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)
 
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:

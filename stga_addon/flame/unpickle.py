@@ -12,18 +12,24 @@ import pickle
 import pickletools
 import re
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_bytes
+from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22  # In a sparse matrix; FLAME's joint regressor has 25,115
+MAX_LISTED = 1 << 20  # Values in lists; FLAME has 29,928 corners of triangles
+MAX_DEPTH = 32
+MAX_HASHED = 1 << 16
+"""Of tuples in tuples, and of lists in lists: that many levels; a tuple, which Python hashes
+recursively and without end in C, holds that many values."""
 SPARSE_CLASS = re.compile(
     r"scipy\.sparse(\._?(csc|csr|coo))?\.(?P<format>csc|csr|coo)_(matrix|array)"
 )
@@ -138,15 +144,16 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     """
     data = read_bytes(path, MAX_FILE_BYTES)
     try:
-        for opcode, slot, _ in pickletools.genops(data):
-            # the C unpickler allocates a table of as many memo slots as are named
-            if slot is not None and "PUT" in opcode.name and not 0 <= int(slot) <= len(data):
-                raise pickle.UnpicklingError(f"memo slot {slot} in a file of {len(data)} bytes")
+        _check_values(data)
         loaded = _RestrictedUnpickler(data).load()
     except _Refused as error:
+        if line_ends_changed(data):
+            raise StgaError(f"{path}: {CHANGED_LINE_ENDS}") from error
         refused = f"asks for the class {error}, refused: only arrays are read"
         raise StgaError(f"{path}: {refused}") from error
     except Exception as error:  # a damaged pickle raises anything from the opcodes that it spells
+        if line_ends_changed(data):
+            raise StgaError(f"{path}: {CHANGED_LINE_ENDS}") from error
         reason = str(error) or type(error).__name__
         raise StgaError(f"{path}: is not a readable pickle of arrays ({reason})") from error
     if not isinstance(loaded, dict):
@@ -168,7 +175,126 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     return arrays
 
 
+_COUNT_BYTES = {
+    pickletools.TAKEN_FROM_ARGUMENT1: (1, "little", False),
+    pickletools.TAKEN_FROM_ARGUMENT4: (4, "little", True),
+    pickletools.TAKEN_FROM_ARGUMENT4U: (4, "little", False),
+    pickletools.TAKEN_FROM_ARGUMENT8U: (8, "little", False),
+}
+"""Kind of an argument's length -> bytes of the length, and whether it is signed."""
+_TWO_LINES = ("GLOBAL", "INST")
+
+
+def _opcodes(data: bytes) -> Iterator[tuple[pickletools.OpcodeInfo, bytes]]:
+    """Each opcode up to STOP and its argument as it is stored, without the length. Not decoded, as
+    `pickletools.genops` does: Python 3.10 to 3.13 take Python 2's strings for ASCII. Raises
+    UnpicklingError."""
+    position = 0
+    while position < len(data):
+        code = data[position : position + 1].decode("latin1")
+        position += 1
+        if code not in pickletools.code2op:
+            raise pickle.UnpicklingError(f"byte {code!r} is no opcode")
+        opcode = pickletools.code2op[code]
+        size = 0
+        end = 0
+        kind = opcode.arg.n if opcode.arg is not None else 0
+        if kind == pickletools.UP_TO_NEWLINE:
+            for _ in range(1 + (opcode.name in _TWO_LINES)):
+                end = data.find(b"\n", end or position) + 1
+                if not end:
+                    raise pickle.UnpicklingError(f"{opcode.name} has no end of line")
+        else:
+            if kind in _COUNT_BYTES:
+                size, order, signed = _COUNT_BYTES[kind]
+                kind = int.from_bytes(data[position : position + size], order, signed=signed)
+            end = position + size + kind
+            if kind < 0 or end > len(data):
+                raise pickle.UnpicklingError("pickle data was truncated")
+        yield opcode, data[position + size : end]
+        position = end
+        if opcode.name == "STOP":
+            return
+    raise pickle.UnpicklingError("pickle data was truncated")
+
+
+def _check_values(data: bytes) -> None:
+    """Raise UnpicklingError for what the C unpickler could not survive: memo slots that it would
+    allocate by the gigabyte, and tuples, the keys of dictionaries and sets among them, that are
+    nested too deeply or hold too much once those that they share are unfolded."""
+    values: list[tuple[int, int]] = []  # the unpickler's stack: depth and size of tuples, else 0, 1
+    marks: list[int] = []
+    memo: dict[int, tuple[int, int]] = {}
+    plain = 0, 1
+    for opcode, argument in _opcodes(data):
+        name = opcode.name
+        before = opcode.stack_before
+        if "PUT" in name or name == "MEMOIZE":
+            slot = len(memo) if name == "MEMOIZE" else _slot(name, argument)
+            if not 0 <= slot <= len(data):
+                raise pickle.UnpicklingError(f"memo slot {slot} in a file of {len(data)} bytes")
+            memo[slot] = values[-1]
+            continue
+        if name == "MARK":
+            marks.append(len(values))
+            continue
+        if name == "POP" and marks and marks[-1] == len(values):
+            marks.pop()
+            continue
+        count = len(before)
+        if pickletools.markobject in before:
+            count = len(values) - marks.pop() + before.index(pickletools.markobject)
+        if count > len(values):
+            raise pickle.UnpicklingError("unexpected MARK found")
+        taken = values[len(values) - count :]
+        del values[len(values) - count :]
+        made = plain
+        if "TUPLE" in name or name == "FROZENSET":
+            depths = max((depth for depth, _ in taken), default=0)
+            made = 1 + depths, 1 + sum(size for _, size in taken)
+            if made[0] > MAX_DEPTH or made[1] > MAX_HASHED:
+                raise pickle.UnpicklingError("tuples are nested too deeply, or too large")
+        elif "GET" in name:
+            made = memo[_slot(name, argument)]
+        elif name == "DUP":
+            made = taken[0]
+        values += [made] * len(opcode.stack_after)
+
+
+def _slot(name: str, argument: bytes) -> int:
+    return int(argument) if name in ("PUT", "GET") else int.from_bytes(argument, "little")
+
+
+def _check_lists(value: Any) -> None:
+    """Raise _NotAnArray for lists in lists that unfold to too many values, or are too deep."""
+    level: list[Any] = [value]
+    for _ in range(MAX_DEPTH):
+        inner = [each for each in level if isinstance(each, list | tuple)]
+        if not inner:
+            return
+        if sum(map(len, inner)) > MAX_LISTED:
+            break
+        level = list(chain.from_iterable(inner))
+    raise _NotAnArray("a list of lists that are too many, or too deep")
+
+
+def _plain(value: Any) -> Any:
+    """Lists in lists, with numpy's numbers and arrays in them as such."""
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return _leaf(value) if isinstance(value, _Inert) else value
+
+
 def _dense(value: Any) -> np.ndarray:
+    source = value.source if isinstance(value, _Inert) else ""
+    if sparse := SPARSE_CLASS.fullmatch(source):
+        return _sparse(value, sparse["format"])
+    return _chumpy(value) if CHUMPY_CLASS.fullmatch(source) else _leaf(value)
+
+
+def _leaf(value: Any) -> np.ndarray:
+    """The array that a value stores itself. Parts of matrices are such: what refers to others that
+    refer to others could take for ever."""
     source = value.source if isinstance(value, _Inert) else type(value).__name__
     if source == ARRAY:
         if not isinstance(value.state, tuple) or len(value.state) < 4:
@@ -182,13 +308,10 @@ def _dense(value: Any) -> np.ndarray:
         return _from_bytes(raw, _dtype(dtype), shape, "F" if order == "F" else "C")
     if source == SCALAR and len(value.arguments) == 2:
         return _from_bytes(value.arguments[1], _dtype(value.arguments[0]), (), "C")
-    if sparse := SPARSE_CLASS.fullmatch(source):
-        return _sparse(value, sparse["format"])
-    if CHUMPY_CLASS.fullmatch(source):
-        return _chumpy(value)
     if isinstance(value, list | tuple | int | float):
+        _check_lists(value)
         try:
-            plain = np.asarray(value)
+            plain = np.asarray(_plain(value))
         except (ValueError, OverflowError) as error:
             raise _NotAnArray("a ragged list") from error
         if plain.dtype.kind in "biuf":
@@ -229,7 +352,7 @@ def _sparse(value: _Inert, form: str) -> np.ndarray:
         raise _NotAnArray("a sparse matrix without a shape")
     if math.prod(shape) > MAX_DENSE_ELEMENTS:
         raise _NotAnArray(f"a sparse matrix of shape {shape}, too large to fill in")
-    data = _dense(state.get("data"))
+    data = _leaf(state.get("data"))
     if form == "coo":
         coords = state.get("coords", ())
         pair = coords if len(coords) == 2 else (state.get("row"), state.get("col"))
@@ -253,7 +376,7 @@ def _sparse(value: _Inert, form: str) -> np.ndarray:
 
 
 def _integers(value: Any) -> np.ndarray:
-    array = _dense(value)
+    array = _leaf(value)
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise _NotAnArray("a sparse matrix with broken indices")
     return array.astype(np.int64)
@@ -266,7 +389,7 @@ def _chumpy(value: _Inert) -> np.ndarray:
         return _dense(state["x"])
     if "a" in state and "idxs" in state:
         source = _dense(state["a"]).ravel()
-        chosen = _dense(state["idxs"])
+        chosen = _leaf(state["idxs"])
         inside = not chosen.size or 0 <= chosen.min() <= chosen.max() < source.size
         if chosen.dtype.kind not in "iu" or not inside:
             raise _NotAnArray(f"a {value.source} with indices outside its array")

@@ -12,6 +12,7 @@ import pytest
 import scipy.sparse
 
 from stga_addon.errors import StgaError
+from stga_addon.files import read_npy
 from stga_addon.flame.model import key_regions, read_flame
 from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 
@@ -83,6 +84,61 @@ def test_mask_file_beside_the_model(tmp_path):
     assert keys["left_eye"][[0, 1]].all()
     assert keys["right_eye"][2]
     assert "mouth" not in keys
+
+
+def python2_masks(end: str = "\n") -> bytes:
+    """FLAME_masks.pkl as Python 2's pickle.dump(masks, file) wrote the published one."""
+    text = "(dp0\n"
+    for name, ids in (("nose", [0, 128, 200]), ("left_ear", [10, 13, 34])):
+        data = "".join(f"\\x{byte:02x}" for byte in np.array(ids, "<i8").tobytes())
+        text += f"S'{name}'\np1\ncnumpy.core.multiarray\n_reconstruct\np2\n(cnumpy\nndarray\n"
+        text += f"p3\n(I0\ntS'b'\ntRp4\n(I1\n(I{len(ids)}\ntcnumpy\ndtype\np5\n(S'i8'\nI0\nI1\n"
+        text += f"tRp6\n(I3\nS'<'\nNNNI-1\nI-1\nI0\ntbI00\nS'{data}'\ntbs"
+    return (text + ".").replace("\n", end).encode()
+
+
+def test_masks_as_published(tmp_path):
+    """Catches Python 2's text pickles, whose strings are not ASCII, being refused, as Python 3.10
+    to 3.13's own list of opcodes does: and with the masks the whole capture."""
+    path = tmp_path / "FLAME_masks.pkl"
+    path.write_bytes(python2_masks())
+    masks = read_pickled_arrays(path)
+    assert {name: ids.tolist() for name, ids in masks.items()} == {
+        "nose": [0, 128, 200],
+        "left_ear": [10, 13, 34],
+    }
+
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+PAGE = b"\r\n<!DOCTYPE html>\n<html><head><title>Sign in</title></head></html>"
+
+
+@pytest.mark.parametrize(
+    ("name", "read"), [("a.pkl", read_flame), ("a.npz", read_flame), ("a.npy", read_npy)]
+)
+def test_what_stands_in_the_place_of_a_file(tmp_path, name, read):
+    """Catches a checkout without Git LFS, a download that was a login page, and a transfer as text,
+    told as an unknown opcode or a broken archive."""
+    path = tmp_path / name
+    if name == "a.npy":
+        np.save(path, np.arange(10_000))
+    elif name == "a.npz":
+        np.savez(path, **random_arrays())
+    else:
+        path.write_bytes(pickle.dumps(random_arrays(), 2))
+    read(path)
+    as_text = path.read_bytes().replace(b"\n", b"\r\n")
+    for data, sentence in (
+        (POINTER, "is a Git LFS pointer"),
+        (PAGE, "is a web page"),
+        (as_text, "was carried over as text"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(StgaError, match=f"{name}: {sentence}"):
+            read(path)
+    (tmp_path / "masks.pkl").write_bytes(python2_masks("\r\n"))
+    with pytest.raises(StgaError, match="masks.pkl: was carried over as text"):
+        read_pickled_arrays(tmp_path / "masks.pkl")
 
 
 class _Attack:

@@ -384,6 +384,18 @@ PICKLES = {
     "persistent": b"\x80\x02P1\n.",
     "memo of 16 GB": b"\x80\x02Nr\xff\xff\xff\x7f.",
     "array's shape": b"\x80\x02" + RECONSTRUCT + b"(cnumpy\nndarray\n(J\xff\xff\xff\x7ft",
+    "lists that hold the list before twice": pickled(
+        b"]q\x00K\x01a0" + b"".join(b"](h%ch%ceq%c0" % (n, n, n + 1) for n in range(29)) + b"h\x1d"
+    ),
+    "selections of themselves": pickled(
+        b"N"
+        + b"".join(
+            b"0cchumpy.reordering\nSelect\n)\x81q\x01}(U\x01ah\x00U\x04idxsh\x00ubq\x00"
+            for _ in range(40)
+        ).replace(b"h\x00", b"N", 2)
+    ),
+    "tuple in tuples": b"\x80\x02})" + b"\x85" * 150_000 + b"Ns.",
+    "tuples that hold the tuple before twice": b"\x80\x02})" + b"2\x86" * 40 + b"Ns.",
     "rebuilds a set": b"\x80\x02ccopy_reg\n_reconstructor\n(" + SET_OF_OBJECT + b"NtR.",
 }
 
