@@ -27,6 +27,7 @@ MAX_JSON_BYTES = 256 << 20
 MAX_TOML_BYTES = 16 << 20
 STRAY_BYTES = 1 << 10
 DAMAGE_BYTES = 1 << 20
+WEB_PAGE = re.compile(rb"(<\?xml[^>]*>|<!--.*?-->|\s)*<(!doctype html|html|head|body)\b", re.DOTALL)
 CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
@@ -240,9 +241,7 @@ def stray_content(data: bytes) -> str | None:
     start = data[:STRAY_BYTES].removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith(b"version https://git-lfs.github.com/"):
         return "is a Git LFS pointer, not the file; fetch the file with git lfs pull"
-    if re.match(
-        rb"(<\?xml[^>]*>\s*)?(<!--.*?-->\s*)*<(!doctype html|html|head|body)\b", start, re.S
-    ):
+    if WEB_PAGE.match(start):
         return "is a web page, not the file; log in and download the file again"
     return None
 

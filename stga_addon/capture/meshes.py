@@ -1,9 +1,8 @@
 """Tracked meshes (OBJ, PLY, GLB, STL) in the file's order; regions of triangles."""
 
 import io
-import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from ..files import parse_json, read_bytes, read_json, read_npz
 from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
 from .model import Capture
+from .ply import ply_rows
 
 Mesh = tuple[np.ndarray, np.ndarray]  # Vertices (V, 3) and triangles (F, 3)
 MAGIC = b"glTF"
@@ -24,10 +24,18 @@ HEADER_BYTES = 20
 CHUNK_HEADER_BYTES = 8
 """The file's header and that of its first chunk; and that of any later chunk."""
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".stl")
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Type of a GLB's accessor -> numbers of an element."""
+MIN_NUMBERS_ALLOWANCE = 1 << 20
+MAX_NUMBERS_PER_BYTE = 8
+PRIMITIVE_NUMBERS = (
+    1000  # That each primitive counts for: trimesh takes time even where it is small
+)
 CACHE_BYTES = 8 << 20
 MAX_MESH_BYTES = 512 << 20
 MIN_EXTENT_M = 1e-9
 """A smaller mesh is a point: no shape to train on, and no scale to compare motion with."""
+PLY_CORNERS = ("vertex_indices", "vertex_index")  # The names that writers give a face's list
 SELECTED_WEIGHT = 0.5  # Least weight of a triangle that belongs to the region
 
 
@@ -60,6 +68,8 @@ def read_mesh(path: Path) -> Mesh:
     data = read_bytes(path, MAX_MESH_BYTES)
     if suffix == ".obj":
         return checked_mesh(path, *_parse_obj(path, data))
+    if suffix == ".ply":
+        return checked_mesh(path, *_parse_ply(path, data))
     return checked_mesh(path, *_parse_with_trimesh(path, data, suffix[1:]))
 
 
@@ -159,12 +169,6 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> Mesh:
         needed = "needs the Python package trimesh"
         raise StgaError(f"{path}: reading {file_type.upper()} {needed}") from error
     try:
-        if file_type == "ply":  # trimesh allocates what the header promises
-            header = data[: max(0, data.find(b"end_header"))]
-            for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", header, re.MULTILINE):
-                if not 0 <= int(count) <= len(data):
-                    found = f"{int(count)} of {name.decode('latin-1')}"
-                    raise ValueError(f"its {len(data)} bytes cannot hold {found}")
         if file_type == "glb":
             _check_glb(data)
         with np.errstate(all="ignore"):
@@ -177,14 +181,26 @@ def _parse_with_trimesh(path: Path, data: bytes, file_type: str) -> Mesh:
         raise StgaError(f"{path}: is not a readable {file_type.upper()} mesh ({error})") from error
 
 
+def allowed_numbers(size: int) -> int:
+    """Numbers that the joined mesh of a GLB of `size` bytes may hold. Accessors without data may
+    promise any number of zeros, and nodes repeat meshes; sparse morph targets of a real head reach
+    4 a byte."""
+    return MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
+
+
 def _check_glb(data: bytes) -> None:
-    """Raises ValueError where accessors promise more than the file can hold, which trimesh would
-    allocate, and where nodes are no trees, which it would follow without end."""
+    """Raises ValueError where accessors promise more than the file can hold, or nodes repeat more,
+    which trimesh would allocate, and where nodes are no trees, which it would follow without end.
+    """
     document, _ = glb_chunks(data)
     nodes = document.get("nodes", [])
-    counts = [accessor["count"] for accessor in document.get("accessors", [])]
+    allowed = allowed_numbers(len(data))
+    accessors = document.get("accessors", [])
+    counts = [accessor["count"] for accessor in accessors]
     if any(type(count) is not int or not 0 <= count <= len(data) for count in counts):
         raise ValueError("an accessor counts more than the file can hold")
+    widths = [WIDTHS[accessor["type"]] for accessor in accessors]
+    numbers = sum(count * width for count, width in zip(counts, widths, strict=True))
     children = [child for node in nodes for child in node.get("children", [])]
     if len(set(children)) < len(children):
         raise ValueError("its nodes are not trees")
@@ -194,6 +210,49 @@ def _check_glb(data: bytes) -> None:
             waiting += nodes[waiting.pop()].get("children", [])
     if waiting:
         raise ValueError("its nodes form a cycle")
+    of_mesh = [_numbers(mesh, counts) for mesh in document.get("meshes", [])]
+    numbers += sum(of_mesh) + sum(of_mesh[node["mesh"]] for node in nodes if "mesh" in node)
+    if numbers > allowed:
+        limit = f"more than the {allowed} allowed to a file of this size"
+        raise ValueError(f"its meshes hold {numbers} numbers, {limit}")
+
+
+def _numbers(mesh: dict[str, Any], counts: Sequence[int]) -> int:
+    """Numbers that a GLB's mesh holds, with what its primitives cost besides."""
+    numbers = 0
+    for primitive in mesh["primitives"]:
+        numbers += PRIMITIVE_NUMBERS + 3 * counts[primitive["attributes"]["POSITION"]]
+        numbers += counts[primitive["indices"]] if "indices" in primitive else 0
+    return numbers
+
+
+def _parse_ply(path: Path, data: bytes) -> Mesh:
+    """With our own reader: trimesh splits the vertices where texture coordinates differ, and cannot
+    read triangles mixed with other polygons, as Blender writes them."""
+    rows = ply_rows(path, data, ["vertex", "face", "tristrips"])
+    vertices = rows.get("vertex")
+    faces = rows.get("face")
+    names = () if vertices is None else vertices.scalars.dtype.names or ()
+    if vertices is None or not {"x", "y", "z"} <= set(names):
+        raise StgaError(f"{path}: has no vertices with x, y and z")
+    lists = {} if faces is None else faces.lists
+    corners = next((own for name, own in lists.items() if name in PLY_CORNERS), None)
+    if corners is None:
+        kind = "triangle strips" if "tristrips" in rows else "no polygons"
+        raise StgaError(f"{path}: holds {kind}; expected faces with vertex_indices")
+    points = np.stack([vertices.scalars[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    if (corners.lengths < 3).any():
+        row = int((corners.lengths < 3).argmax())
+        raise StgaError(f"{path}: face {row} has fewer than three corners")
+    return points, corners.values.astype(np.int64)[_fans(corners.lengths)]
+
+
+def _fans(counts: np.ndarray) -> np.ndarray:
+    """(F, 3): which of the corners of polygons, one after another, are those of their triangles."""
+    fan = counts - 2
+    first = np.repeat(np.cumsum(counts) - counts, fan)
+    second = first + 1 + np.arange(fan.sum()) - np.repeat(np.cumsum(fan) - fan, fan)
+    return np.stack([first, second, second + 1], axis=1)
 
 
 def _parse_obj(path: Path, data: bytes) -> Mesh:
@@ -229,10 +288,7 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     if (index == 0).any():
         raise ValueError("vertex 0, but OBJ counts from 1")
     index = np.where(index > 0, index - 1, np.repeat(np.array(earlier, int), count) + index)
-    fan = count - 2
-    first = np.repeat(np.cumsum(count) - count, fan)
-    second = first + 1 + np.arange(fan.sum()) - np.repeat(np.cumsum(fan) - fan, fan)
-    return np.asarray(index[np.stack([first, second, second + 1], axis=1)])
+    return np.asarray(index[_fans(count)])
 
 
 def is_region_file(name: str) -> bool:

@@ -4,19 +4,18 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
-from numpy.lib.recfunctions import unstructured_to_structured
 
 from ..avatar.embedding import FaceFrames, face_frames, to_local, to_world
 from ..avatar.file import Avatar
 from ..avatar.splats import MAX_SH_DEGREE, Splats
+from ..capture.ply import ply_rows
 from ..errors import StgaError
-from ..files import NumberedFiles, file_size, replacing, replacing_together, save_npz
+from ..files import NumberedFiles, read_bytes, replacing, replacing_together, save_npz
 from ..flame.sequence import FlameSequence, motion_arrays
 
-MAX_HEADER_BYTES = 1 << 16
+MAX_PLY_BYTES = 16 << 30
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
 """Name of a frame of a sequence: 00012.ply."""
 REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
@@ -25,12 +24,6 @@ PROPERTIES = (
     *(f"f_rest_{i}" for i in range(REST_COEFFICIENTS)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-_DTYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
-    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
-}  # fmt: skip
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 def write_ply(path: Path, world: Splats) -> None:
@@ -135,75 +128,12 @@ def save_columns(path: Path, names: Sequence[str], columns: np.ndarray) -> None:
 def read_vertices(path: Path) -> np.ndarray:
     """Structured array (N,) of a PLY file's vertices, binary or ASCII, one field a property.
 
-    Raises StgaError where the file is missing, malformed or shorter than its header says. Nothing
-    is allocated before the file is known to hold it.
+    Raises StgaError where the file is missing, malformed, packed or shorter than its header says.
     """
-    size = file_size(path)
-    try:
-        with path.open("rb") as file:
-            is_ascii, offset, skipped, count, dtype = _read_header(path, file)
-            names = dtype.names or ()
-            # An ASCII number takes at least two bytes with its separator.
-            need = count * dtype.itemsize + skipped
-            if is_ascii:
-                need = 2 * (count * len(names) + skipped) - 1
-            if size < offset + need:
-                raise StgaError(f"{path}: is truncated: {size} bytes cannot hold {count} vertices")
-            file.seek(offset if is_ascii else offset + skipped)
-            if not is_ascii or not count:
-                return np.fromfile(file, dtype, count)
-            table = np.loadtxt(file, np.float64, None, skiprows=skipped, max_rows=count, ndmin=2)
-    except OSError as error:
-        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
-        raise StgaError(f"{path}: vertices are not rows of numbers ({error})") from error
-    expected = count, len(names)
-    if table.shape != expected:
-        raise StgaError(f"{path}: has vertices of shape {table.shape}, expected {expected}")
-    return np.asarray(unstructured_to_structured(table, dtype))
-
-
-def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, int, int, np.dtype]:
-    """Whether ASCII; start of the data; bytes (or rows) before vertices; their count and type."""
-    start = file.read(MAX_HEADER_BYTES)
-    end = start.find(b"\nend_header")
-    newline = start.find(b"\n", end + 1)
-    if not start.startswith(b"ply") or end < 0 or newline < 0:
-        raise StgaError(f"{path}: is not a PLY file (no complete header)")
-    order = ""
-    elements: dict[str, tuple[int, dict[str, str]]] = {}
-    properties: dict[str, str] = {}
-    try:
-        for line in start[:end].decode("latin-1").split("\n"):
-            match line.split():
-                case ["format", name, _]:
-                    order = _BYTE_ORDERS[name]
-                case ["element", name, count]:
-                    properties = {}
-                    elements[name] = (int(count), properties)
-                case ["property", kind, name] if name not in properties:
-                    properties[name] = order + _DTYPES[kind]
-                case ["property", "list", _, _, name]:
-                    properties[name] = "list"
-                case ["ply"] | ["comment" | "obj_info", *_] | []:
-                    pass
-                case _:
-                    raise ValueError(line)
-    except (ValueError, KeyError) as error:
-        raise StgaError(f"{path}: PLY header cannot be understood ({error})") from error
-    is_ascii = order == "="
-    skipped = 0
-    for name, (number, properties) in elements.items():
-        if number < 0 or not order or not properties:
-            break
-        if "list" in properties.values():
-            problem = f"PLY element {name!r} has a list property before the vertices end"
-            raise StgaError(f"{path}: {problem}, not supported")
-        dtype = np.dtype(list(properties.items()))
-        if name == "vertex":
-            return is_ascii, newline + 1, skipped, number, dtype
-        skipped += number if is_ascii else number * dtype.itemsize
-    raise StgaError(f"{path}: PLY header describes no vertices")
+    rows = ply_rows(path, read_bytes(path, MAX_PLY_BYTES), ["vertex"]).get("vertex")
+    if rows is None or not rows.scalars.dtype.names:
+        raise StgaError(f"{path}: PLY header describes no vertices")
+    return rows.scalars
 
 
 def write_gaussian_avatars(

@@ -175,11 +175,12 @@ def read_pickled_arrays(path: Path, names: tuple[str, ...] | None = None) -> dic
     return arrays
 
 
+_OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
 _COUNT_BYTES = {
-    pickletools.TAKEN_FROM_ARGUMENT1: (1, "little", False),
-    pickletools.TAKEN_FROM_ARGUMENT4: (4, "little", True),
-    pickletools.TAKEN_FROM_ARGUMENT4U: (4, "little", False),
-    pickletools.TAKEN_FROM_ARGUMENT8U: (8, "little", False),
+    pickletools.TAKEN_FROM_ARGUMENT1: (1, False),
+    pickletools.TAKEN_FROM_ARGUMENT4: (4, True),
+    pickletools.TAKEN_FROM_ARGUMENT4U: (4, False),
+    pickletools.TAKEN_FROM_ARGUMENT8U: (8, False),
 }
 """Kind of an argument's length -> bytes of the length, and whether it is signed."""
 _TWO_LINES = ("GLOBAL", "INST")
@@ -193,11 +194,10 @@ def _opcodes(data: bytes) -> Iterator[tuple[pickletools.OpcodeInfo, bytes]]:
     while position < len(data):
         code = data[position : position + 1].decode("latin1")
         position += 1
-        if code not in pickletools.code2op:
+        if code not in _OPCODES:
             raise pickle.UnpicklingError(f"byte {code!r} is no opcode")
-        opcode = pickletools.code2op[code]
-        size = 0
-        end = 0
+        opcode = _OPCODES[code]
+        size = end = 0
         kind = opcode.arg.n if opcode.arg is not None else 0
         if kind == pickletools.UP_TO_NEWLINE:
             for _ in range(1 + (opcode.name in _TWO_LINES)):
@@ -206,8 +206,8 @@ def _opcodes(data: bytes) -> Iterator[tuple[pickletools.OpcodeInfo, bytes]]:
                     raise pickle.UnpicklingError(f"{opcode.name} has no end of line")
         else:
             if kind in _COUNT_BYTES:
-                size, order, signed = _COUNT_BYTES[kind]
-                kind = int.from_bytes(data[position : position + size], order, signed=signed)
+                size, signed = _COUNT_BYTES[kind]
+                kind = int.from_bytes(data[position : position + size], "little", signed=signed)
             end = position + size + kind
             if kind < 0 or end > len(data):
                 raise pickle.UnpicklingError("pickle data was truncated")

@@ -7,19 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ..capture.meshes import glb_chunks
+from ..capture.meshes import WIDTHS, allowed_numbers, glb_chunks
 from ..errors import StgaError, shorten
 from ..files import read_bytes
 from ..flame.quaternions import to_matrices
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3}
 TRIANGLES = 4
-MIN_NUMBERS_ALLOWANCE = 1 << 20
-MAX_NUMBERS_PER_BYTE = 8
-"""Numbers that the joined mesh may hold: any file's, and more for each byte. Accessors without data
-promise as many zeros as they like, and nodes repeat meshes; sparse morph targets of a real head
-reach 4 a byte."""
 PRIMITIVE_NUMBERS = 100
 """That each primitive counts for besides its own: it takes time even where it is small."""
 UNREADABLE = LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError
@@ -71,7 +65,7 @@ def read_glb(path: Path) -> MorphMesh:
 def _placed_primitives(path: Path, document: Json, size: int) -> list[Placed]:
     """The triangle primitives of the scene's meshes. Raises StgaError where these hold more numbers
     than a file of this size may."""
-    allowed = MIN_NUMBERS_ALLOWANCE + MAX_NUMBERS_PER_BYTE * size
+    allowed = allowed_numbers(size)
     vertices = 0
     corners = 0
     accessors = document["accessors"]

@@ -1,6 +1,7 @@
 """Tracked meshes: the readers, constant topology, regions and the rigid fit."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -64,6 +65,92 @@ def test_obj_dialects(tmp_path):
     for before, expected in (("", [0, 1, 2]), ("v 2 0 0\n", [1, 2, 3]), ("", [0, 1, 2])):
         path.write_text(before + three)
         np.testing.assert_array_equal(read_mesh(path)[1], [expected])
+
+
+POLYGONS = [(0, 1, 2), (0, 2, 3, 4), (4, 3, 2), (1, 2, 3, 4, 0)]
+TRIANGLES = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (4, 3, 2), (1, 2, 3), (1, 3, 4), (1, 4, 0)]
+SEAM = [0.1, 0.9] * 5  # Texture coordinates of a vertex differ from polygon to polygon
+
+
+def ply_of(kind: str, ending: str, polygons: list[tuple[int, ...]]) -> bytes:
+    """A PLY as photogrammetry writes it: a texture's name, an element before the vertices, their
+    texture coordinates or colors, triangles mixed with other polygons, and corners' coordinates."""
+    lines = ["ply", f"format {kind} 1.0", "comment TextureFile head.png", "obj_info from a scan"]
+    lines += ["element camera 1", "property list uchar short view", "element vertex 5"]
+    lines += [f"property float {axis}" for axis in "xyz"] + ["property uchar red"]
+    lines += [f"element face {len(polygons)}", "property uchar material"]
+    lines += ["property list uchar uint vertex_index", "property list uchar float texcoord"]
+    head = ending.join([*lines, "end_header", ""]).encode()
+    points = [(n, n * n, -n, 7) for n in range(5)]
+    if kind == "ascii":
+        rows = ["2 5 6", *(" ".join(map(str, row)) for row in points)]
+        for n, own in enumerate(polygons):
+            seam = SEAM[n : n + 2] * len(own)
+            rows.append(" ".join(map(str, [1, len(own), *own, len(seam), *seam])))
+        return head + "".join(row + ending for row in rows).encode()
+    order = "<" if "little" in kind else ">"
+    body = struct.pack(order + "B2h", 2, 5, 6)
+    body += b"".join(struct.pack(order + "3fB", *row) for row in points)
+    for n, own in enumerate(polygons):
+        seam = SEAM[n : n + 2] * len(own)
+        body += struct.pack(f"{order}BB{len(own)}I", 1, len(own), *own)
+        body += struct.pack(f"{order}B{len(seam)}f", len(seam), *seam)
+    return head + body
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_ply_dialects(tmp_path, capfd, kind, ending):
+    """Catches triangles mixed with quads refused, as Blender writes them; vertices split where
+    texture coordinates differ, which regions then do not name; and a library's traceback about a
+    texture."""
+    path = tmp_path / "a.ply"
+    for polygons, triangles in ((POLYGONS, TRIANGLES), (TRIANGLES, TRIANGLES)):
+        path.write_bytes(ply_of(kind, ending, polygons))
+        vertices, faces = read_mesh(path)
+        np.testing.assert_array_equal(vertices, [[n, n * n, -n] for n in range(5)])
+        np.testing.assert_array_equal(faces, triangles)
+    assert capfd.readouterr() == ("", "")
+
+
+def repeated(nodes: int, primitives: int) -> bytes:
+    """A GLB whose mesh of 60 kB is placed by many nodes, or is many times its own part."""
+    points = np.random.default_rng(0).random((5_000, 3))
+    corners = np.arange(4_998)
+    data = points.astype("<f4").tobytes() + corners.astype("<u4").tobytes()
+    one = {"attributes": {"POSITION": 0}, "indices": 1}
+    document = json.dumps(
+        {
+            "asset": {"version": "2.0"},
+            "scenes": [{"nodes": list(range(nodes))}],
+            "nodes": [{"mesh": 0}] * nodes,
+            "meshes": [{"primitives": [one] * primitives}],
+            "accessors": [
+                {"bufferView": 0, "componentType": 5126, "count": 5_000, "type": "VEC3"},
+                {"bufferView": 1, "componentType": 5125, "count": 4_998, "type": "SCALAR"},
+            ],
+            "bufferViews": [
+                {"buffer": 0, "byteLength": 60_000},
+                {"buffer": 0, "byteOffset": 60_000, "byteLength": len(data) - 60_000},
+            ],
+            "buffers": [{"byteLength": len(data)}],
+        }
+    ).encode()
+    document += b" " * (-len(document) % 4)
+    chunks = struct.pack("<I4s", len(document), b"JSON") + document
+    chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def test_glb_that_repeats_its_mesh(tmp_path):
+    """Catches a small GLB that unfolds to gigabytes, and one that may not place a mesh twice."""
+    path = tmp_path / "a.glb"
+    path.write_bytes(repeated(2, 1))
+    assert read_mesh(path)[0].shape == (10_000, 3)
+    for counts in ((400, 1), (1, 400)):
+        path.write_bytes(repeated(*counts))
+        with pytest.raises(StgaError, match=r"a\.glb: .*hold \d+ numbers, more than the"):
+            read_mesh(path)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb", ".stl"])

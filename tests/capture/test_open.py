@@ -253,6 +253,7 @@ def test_numpy_alone_is_enough(tmp_path):
     trimesh or torch. What does need them says so."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     ply = factory.write_mesh_capture(tmp_path / "ply", suffix=".ply")
+    stl = factory.write_mesh_capture(tmp_path / "stl", suffix=".stl")
     only = tmp_path / "packages"
     only.mkdir()
     for package in Path(np.__file__).parents[1].glob("numpy*"):
@@ -267,12 +268,13 @@ def test_numpy_alone_is_enough(tmp_path):
         f"capture = open_capture(Path({str(root)!r}))\n"
         "summarize_capture(capture), capture.mesh(3), capture.expression_mesh(3, 'head')\n"
         "from stga_addon.errors import StgaError\n"
-        f"try: open_capture(Path({str(ply)!r}))\n"
+        f"open_capture(Path({str(ply)!r}))\n"
+        f"try: open_capture(Path({str(stl)!r}))\n"
         "except StgaError as error: print(error)\n"
     )
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert "neutral.ply: reading PLY needs the Python package trimesh" in result.stdout
+    assert "neutral.stl: reading STL needs the Python package trimesh" in result.stdout
 
 
 def remove(name: str) -> Callable[[Path], object]:

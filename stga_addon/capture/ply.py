@@ -1,0 +1,256 @@
+"""Reading of PLY files: any elements and properties, binary or ASCII."""
+
+import re
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import StgaError, shorten
+from ..files import CHANGED_LINE_ENDS, line_ends_changed
+
+MAX_HEADER_BYTES = 1 << 16
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+"""Type of numpy -> that of `struct`."""
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+@dataclass(frozen=True)
+class Lists:
+    """A list property of N rows: `lengths` (N,), and the `values` of all rows in order."""
+
+    lengths: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of a header.
+
+    scalars  property -> numpy's type with byte order, of all but lists
+    lists    list property -> types of its length and of its values
+    order    names of all properties as they follow each other in a row
+    """
+
+    name: str
+    count: int
+    scalars: dict[str, str] = field(default_factory=dict)
+    lists: dict[str, tuple[str, str]] = field(default_factory=dict)
+    order: list[str] = field(default_factory=list)
+
+    @property
+    def row_bytes(self) -> int:
+        """The least that a row takes."""
+        kinds = [*self.scalars.values(), *(length for length, _ in self.lists.values())]
+        return sum(np.dtype(kind).itemsize for kind in kinds)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An element's rows: `scalars` (N,), a field for each property; `lists` by property."""
+
+    scalars: np.ndarray
+    lists: dict[str, Lists] = field(default_factory=dict)
+
+
+def ply_header(path: Path, data: bytes) -> tuple[list[Element], str, int]:
+    """The elements of a PLY file, "<", ">" or, for ASCII, "=", and where its rows begin. Raises
+    StgaError naming the file. Source: Greg Turk, The PLY Polygon File Format."""
+    start = data[:MAX_HEADER_BYTES]
+    is_old_mac = re.match(rb"ply[ \t]*\r(?!\n)", start) is not None
+    ending = rb"\rend_header[ \t]*\r" if is_old_mac else rb"\nend_header[ \t\r]*\n"
+    end = re.search(ending, start)
+    if not start.startswith(b"ply") or end is None:
+        raise StgaError(f"{path}: is not a PLY file (no complete header)")
+    order = ""
+    elements = dict[str, Element]()
+    try:
+        for line in start[: end.start()].decode("latin-1").splitlines():
+            own = elements[next(reversed(elements))] if elements else None
+            match line.split():
+                case ["format", name, _]:
+                    order = _BYTE_ORDERS[name]
+                case ["element", name, count] if name not in elements and int(count) >= 0:
+                    elements[name] = Element(name, int(count))
+                case ["property", kind, name] if own is not None and name not in own.order:
+                    own.scalars[name] = order + _TYPES[kind]
+                    own.order.append(name)
+                case ["property", "list", length, kind, name] if own and name not in own.order:
+                    own.lists[name] = order + _TYPES[length], order + _TYPES[kind]
+                    own.order.append(name)
+                case ["ply"] | ["comment" | "obj_info", *_] | []:
+                    pass
+                case _:
+                    raise ValueError(line)
+    except (ValueError, KeyError) as error:
+        problem = f"PLY header cannot be understood ({shorten(str(error))})"
+        raise StgaError(f"{path}: {problem}") from error
+    if not order:
+        raise StgaError(f"{path}: PLY header cannot be understood (no format)")
+    return list(elements.values()), order, end.end()
+
+
+def ply_rows(path: Path, data: bytes, names: Sequence[str]) -> dict[str, Rows]:
+    """The rows of the named elements that the contents of a PLY file have, in file order. Raises
+    StgaError where it is malformed or shorter than its header says; nothing is allocated before the
+    file is known to hold it."""
+    elements, order, position = ply_header(path, data)
+    lines: list[bytes] = []
+    if order == "=":
+        lines = [line for line in re.split(rb"[\r\n]+", data[position:]) if line.strip()]
+        position = 0
+    last = max((n for n, element in enumerate(elements) if element.name in names), default=-1)
+    found: dict[str, Rows] = {}
+    try:
+        for element in elements[: last + 1]:
+            if order == "=":
+                _require(path, element, len(lines) - position)
+                end = position + element.count
+                rows = _ascii_rows(element, lines[position:end])
+            else:
+                _require(path, element, (len(data) - position) // max(element.row_bytes, 1))
+                rows, end = _binary_rows(element, order, data, position)
+            if element.name in names:
+                found[element.name] = rows
+            position = end
+    except (ValueError, struct.error, OverflowError) as error:
+        changed = order != "=" and line_ends_changed(data)
+        problem = CHANGED_LINE_ENDS if changed else f"is not a readable PLY ({error})"
+        raise StgaError(f"{path}: {problem}") from error
+    return found
+
+
+def _require(path: Path, element: Element, most: int) -> None:
+    """Raise StgaError where the file has not as many rows as the header says."""
+    if element.count > most:
+        rows = f"{element.count} rows of {shorten(element.name)}"
+        raise StgaError(f"{path}: is truncated: it cannot hold {rows}")
+
+
+def _binary_rows(element: Element, order: str, data: bytes, position: int) -> tuple[Rows, int]:
+    """The rows that begin at a position, and where they end. Raises ValueError, struct.error."""
+    if not element.lists:
+        dtype = np.dtype(list(element.scalars.items()))
+        end = position + element.count * dtype.itemsize
+        if not dtype.itemsize:
+            return Rows(np.zeros(element.count, dtype)), end
+        return Rows(np.frombuffer(data, dtype, element.count, position)), end
+    even = _even_rows(element, data, position)
+    if even is not None:
+        return even
+    readers = []
+    for name in element.order:
+        kinds = element.lists.get(name, (element.scalars.get(name, ""),))
+        readers.append([(struct.Struct(order + _CODES[kind[1:]]), kind[1:]) for kind in kinds])
+    values = [list[float]() for _ in readers]
+    lengths = [list[int]() for _ in readers]
+    for _ in range(element.count):
+        for column, (first, *more) in enumerate(readers):
+            (number,) = first[0].unpack_from(data, position)
+            position += first[0].size
+            if not more:
+                values[column].append(number)
+                continue
+            length = int(number)
+            kind = more[0][1]
+            if length < 0:
+                raise ValueError("a list of negative length")
+            values[column] += struct.unpack_from(f"{order}{length}{_CODES[kind]}", data, position)
+            position += length * more[0][0].size
+            lengths[column].append(length)
+    return _as_rows(element, values, lengths), position
+
+
+def _even_rows(element: Element, data: bytes, position: int) -> tuple[Rows, int] | None:
+    """The rows where all lists are as long as those of the first row; None where they are not."""
+    dtype = list[tuple[str, str, int]]()
+    row = position
+    for name in element.order:
+        if name in element.scalars:
+            dtype.append((name, element.scalars[name], 1))
+            row += np.dtype(element.scalars[name]).itemsize
+            continue
+        length, kind = element.lists[name]
+        start = np.frombuffer(data[row : row + np.dtype(length).itemsize], length)
+        if not len(start) or not 0 < start[0] <= len(data):
+            return None
+        dtype += [(f"{name} length", length, 1), (name, kind, int(start[0]))]
+        row += np.dtype(length).itemsize + int(start[0]) * np.dtype(kind).itemsize
+    whole = np.dtype([(n, k) if size == 1 else (n, k, (size,)) for n, k, size in dtype])
+    end = position + element.count * whole.itemsize
+    if end > len(data):
+        return None
+    table = np.frombuffer(data, whole, element.count, position)
+    lists = {}
+    for name in element.lists:
+        lengths = table[f"{name} length"]
+        if (lengths != lengths[:1]).any():
+            return None
+        lists[name] = Lists(lengths.astype(np.int64), table[name].reshape(-1))
+    return Rows(table[list(element.scalars)], lists), end
+
+
+def _ascii_rows(element: Element, lines: Sequence[bytes]) -> Rows:
+    """The rows of lines of text, a row a line. Raises ValueError."""
+    if not element.lists and lines:
+        table = np.loadtxt(lines, np.float64, None, ndmin=2)
+        if table.shape[1] != len(element.scalars):
+            raise ValueError(f"has {table.shape[1]} numbers a row, expected {len(element.scalars)}")
+        return _as_rows(element, list(table.T), [[]] * len(element.order))
+    values = [list[float]() for _ in element.order]
+    lengths = [list[int]() for _ in element.order]
+    for line in lines:
+        words = line.split()
+        place = 0
+        for column, name in enumerate(element.order):
+            if name in element.scalars:
+                values[column] += map(float, words[place : place + 1])
+                place += 1
+                continue
+            length = int(words[place]) if place < len(words) else 0
+            if length < 0:
+                raise ValueError("a list of negative length")
+            values[column] += map(float, words[place + 1 : place + 1 + length])
+            lengths[column].append(length)
+            place += 1 + length
+        if place != len(words):
+            expected = f"a row of {shorten(element.name)} has {len(words)} numbers"
+            raise ValueError(f"{expected}, expected {place}")
+    return _as_rows(element, values, lengths)
+
+
+def _as_rows(
+    element: Element, values: Sequence[ArrayLike], lengths: Sequence[Sequence[int]]
+) -> Rows:
+    """The rows of columns of numbers, in the order of the element's properties."""
+    table = np.empty(element.count, list(element.scalars.items()))
+    lists = {}
+    with np.errstate(invalid="ignore"):  # text that is no whole number, for a whole number
+        for name, numbers, sizes in zip(element.order, values, lengths, strict=True):
+            if name in element.scalars:
+                table[name] = np.asarray(numbers)
+            else:
+                own = np.asarray(numbers).astype(element.lists[name][1])
+                lists[name] = Lists(np.array(sizes, np.int64), own)
+    return Rows(table, lists)
