@@ -37,7 +37,7 @@ IMPORTS = (
     ("stga.import_capture", "Head Capture (STGA)"),
     ("stga.import_motion", "FLAME Motion (.npz)"),
     ("stga.import_meshes", "Mesh Sequence (STGA)"),
-    ("stga.import_ply", "Gaussian Splats (.ply)"),
+    ("stga.import_ply", "Gaussian Splats (.ply, .spz, .splat)"),
 )
 EXPORTS = (
     ("stga.export_avatar", "Gaussian Head Avatar (STGA)"),

@@ -13,6 +13,7 @@ from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
 from ..stga_addon.errors import StgaError
+from ..stga_addon.export.splat_files import READERS
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import frame_head
@@ -251,5 +252,5 @@ def _handler(name: str, label: str, operator: str, *suffixes: str) -> type:
 VideoDrop = _handler("video", "Avatar from Video", "avatar_from_video", *VIDEO_SUFFIXES)
 CaptureDrop = _handler("capture", "Head Capture", "import_capture", ".json")
 NpzDrop = _handler("npz", "Avatar or FLAME Motion", "open_npz", ".npz")
-PlyDrop = _handler("ply", "Gaussian Splats", "import_ply", ".ply")
+PlyDrop = _handler("ply", "Gaussian Splats", "import_ply", *READERS)
 MotionDrop = _handler("performance", "Face Performance", "apply_motion", ".csv", ".json", ".txt")

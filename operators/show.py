@@ -8,7 +8,7 @@ import bpy
 
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.errors import StgaError
-from ..stga_addon.export.ply import read_ply
+from ..stga_addon.export.splat_files import READERS, read_splats
 from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
@@ -73,11 +73,11 @@ class ShowAvatar(Edit, bpy.types.Operator, FileImport):
 
 
 class ImportPly(Edit, bpy.types.Operator, FileImport):
-    """Import a 3D Gaussian Splatting PLY file"""
+    """Import 3D Gaussians of a PLY, SPZ or .splat file"""
 
     bl_label = "Import Gaussian Splats"
 
-    filter_glob: options.file_filter(".ply")
+    filter_glob: options.file_filter(*READERS)
     up: options.choice(
         "Up",
         "Axis of the file that points up",
@@ -87,8 +87,8 @@ class ImportPly(Edit, bpy.types.Operator, FileImport):
     )
 
     def run(self, context: Any) -> None:
-        path = file_path(self.filepath, "PLY")
-        splats = read_ply(path)
+        path = file_path(self.filepath, "splat")
+        splats = read_splats(path, self.warn)
         shown = context.scene.stga.splats = splat_object.show_world_splats(splats, path.stem)
         shown.rotation_euler = (radians(UP_ROTATION_DEG[self.up]), 0.0, 0.0)
         self.inform(f"{len(splats)} splats")

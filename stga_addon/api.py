@@ -6,7 +6,7 @@ Other modules may move. Importing this one needs numpy alone; rendering needs nu
     >>> from pathlib import Path
     >>> from PIL import Image
     >>> import stga_addon.api as stga
-    >>> splats = stga.read_ply(Path("splats.ply"))
+    >>> splats = stga.read_splats(Path("splats.ply"))
     >>> camera = stga.look_at((0, 0, 1), (0, 0, 0), width=640, height=480, focal_length=800)
     >>> image = stga.render(splats, camera, background=(1, 1, 1))
     >>> Image.fromarray(stga.to_uint8(image)).save("splats.png")
@@ -27,7 +27,8 @@ from .capture.camera import Camera, camera_from_gl, look_at, turntable
 from .capture.model import Capture
 from .capture.open import open_capture
 from .errors import StgaError
-from .export.ply import read_ply, write_ply
+from .export.ply import write_ply
+from .export.splat_files import read_splats
 from .jobs.analyze import Analyze, Select
 from .jobs.convert_motion import ConvertMotion
 from .jobs.export import Export
@@ -72,7 +73,7 @@ __all__ = [
     "open_capture",
     "perform",
     "read_avatar",
-    "read_ply",
+    "read_splats",
     "render",
     "render_avatar",
     "render_differentiable",

@@ -1,5 +1,6 @@
 """Progress of work, whatever it is, and how it is reported and cancelled."""
 
+import logging
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -39,6 +40,11 @@ class Progress:
 Report = Callable[[Progress], bool]
 """Called now and then; returns True to stop and keep what there is."""
 Say = Callable[[str], None]  # Called with a line for people
+
+
+def warn(sentence: str) -> None:
+    """What to say a repair with, where nobody else listens."""
+    logging.getLogger(__name__).warning("warning: %s", sentence)
 
 
 @dataclass(frozen=True)

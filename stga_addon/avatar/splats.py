@@ -18,6 +18,11 @@ SH_C0 = 0.28209479177387814
 coefficient."""
 
 
+MAX_LOGIT = 15.0
+MIN_LOG_SCALE = -20.0
+"""An opacity of 1 to 3e-7, and a standard deviation of nothing, before activation."""
+
+
 @dataclass(frozen=True)
 class Splats:
     """N Gaussians before activation, float32 unless noted.
@@ -75,6 +80,28 @@ class SplatArray:
     dtype: str = "float32"
     shape: tuple[int, ...] = ()
     sizes: tuple[int, ...] = ()
+
+
+def in_world(
+    xyz: np.ndarray,
+    rotation: np.ndarray,
+    log_scale: np.ndarray,
+    opacity: np.ndarray,
+    sh: np.ndarray,
+) -> Splats:
+    """World-space splats of a file's numbers, before activation. Infinite opacities and scales of
+    minus infinity, as other programs write 0 and 1, get numbers that show no difference."""
+    opacity = np.where(np.isinf(opacity), np.copysign(MAX_LOGIT, opacity), opacity)
+    log_scale = np.where(np.isneginf(log_scale), MIN_LOG_SCALE, log_scale)
+    return Splats(
+        xyz=np.asarray(xyz, np.float32),
+        rotation=np.asarray(rotation, np.float32),
+        log_scale=np.asarray(log_scale, np.float32),
+        opacity=np.asarray(opacity, np.float32),
+        sh=np.asarray(sh, np.float32),
+        face=np.zeros(len(xyz), np.int32),
+        unbound=np.zeros(len(xyz), bool),
+    )
 
 
 ARRAYS = {

@@ -18,7 +18,7 @@ from ..capture.model import Capture, summarize_capture
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..export.formats import FORMATS
-from ..export.ply import is_ply
+from ..export.splat_files import is_splats
 from ..files import write_npz
 from ..format import describe_figures, format_table
 from ..jobs.analyze import Analyze, Select, TimePresets
@@ -354,7 +354,7 @@ def _render(options: Namespace, head: OpenHead | None) -> None:
     if output is None:
         raise StgaError("--out: is missing; expected it, or --video")
     given = {**given_options(options, Render), "output": output, "video": options.video is not None}
-    if head is not None and options.motion is None and not is_ply(options.source):
+    if head is not None and options.motion is None and not is_splats(options.source):
         given["played"] = head.played()
     carry_out(Render(**given))
 

@@ -1,5 +1,6 @@
 """3D Gaussians as PLY files, and GaussianAvatars' pair of bound splats and FLAME motion."""
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -9,13 +10,16 @@ import numpy as np
 
 from ..avatar.embedding import FaceFrames, face_frames, to_local, to_world
 from ..avatar.file import Avatar
-from ..avatar.splats import MAX_SH_DEGREE, Splats
+from ..avatar.splats import MAX_SH_DEGREE, SH_C0, Splats, in_world
 from ..capture.ply import ply_rows
 from ..errors import StgaError
 from ..files import NumberedFiles, read_bytes, replacing, replacing_together, save_npz
 from ..flame.sequence import FlameSequence, motion_arrays
+from ..progress import Say, warn
 
-MAX_PLY_BYTES = 16 << 30
+MAX_SPLAT_BYTES = 16 << 30
+READ_FILES = "the folder of a run, an avatar (.npz), or splats (.ply, .spz, .splat)"
+COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"))
 FRAME_NAME = re.compile(r"(\d{5,}|-\d{4,})\.ply")
 """Name of a frame of a sequence: 00012.ply."""
 REST_COEFFICIENTS = 3 * ((MAX_SH_DEGREE + 1) ** 2 - 1)
@@ -62,35 +66,64 @@ def ply_bytes(splats: Splats) -> int:
     return 4 * len(PROPERTIES) * len(splats)
 
 
-def is_ply(path: Path) -> bool:
-    """Whether a path is named as a PLY file."""
-    return path.suffix.lower() == ".ply"
+def read_ply(path: Path, say: Say = warn) -> Splats:
+    """World-space splats of a 3D Gaussian Splatting PLY.
 
-
-def read_ply(path: Path) -> Splats:
-    """Read world-space splats from a 3D Gaussian Splatting PLY of SH degree 0 to 3.
-
-    Properties may stand in any order, beside others. Raises StgaError naming the file and the
-    property that is missing, not finite or truncated.
+    Properties may stand in any order, beside others; red, green and blue may stand for f_dc_0…2;
+    of harmonics above degree 3, and of flat splats' missing third scale, `say` gets a sentence.
+    Values may be not finite. Raises StgaError naming the file and the property that is missing, and
+    for splats that are packed, or bound to triangles.
     """
     vertices = read_vertices(path)
-    rest = sum(1 for name in vertices.dtype.names or () if name.startswith("f_rest_"))
-    if rest not in [3 * (size**2 - 1) for size in range(1, MAX_SH_DEGREE + 2)]:
+    names = vertices.dtype.names or ()
+    binding = next((name for name in names if name.startswith("binding")), None)
+    if binding is not None:
+        where = "these splats lie in the frames of a head's triangles, not in the world"
+        advice = "render the run, or export it as --format ply"
+        raise StgaError(f"{path}: has the property {binding}: {where}; {advice}")
+    return splats_of(path, vertices, say)
+
+
+def splats_of(path: Path, vertices: np.ndarray, say: Say) -> Splats:
+    """The splats of a PLY's vertices, as `read_ply` reads them, in the axes of the file."""
+    names = set(vertices.dtype.names or ())
+    rest = sum(1 for name in names if name.startswith("f_rest_"))
+    size = math.isqrt(rest // 3 + 1)
+    if rest != 3 * (size**2 - 1):
         raise StgaError(f"{path}: has {rest} f_rest properties, expected 0, 9, 24 or 45")
-    count = len(vertices)
-    sh = np.empty((count, 1 + rest // 3, 3), np.float32)
-    sh[:, 0] = stack_columns(path, vertices, [f"f_dc_{i}" for i in range(3)])
-    channels = stack_columns(path, vertices, [f"f_rest_{i}" for i in range(rest)])
-    sh[:, 1:] = channels.reshape(count, 3, rest // 3).transpose(0, 2, 1)
-    return Splats(
-        xyz=stack_columns(path, vertices, ["x", "y", "z"]),
-        rotation=stack_columns(path, vertices, [f"rot_{i}" for i in range(4)]),
-        log_scale=stack_columns(path, vertices, [f"scale_{i}" for i in range(3)]),
-        opacity=stack_columns(path, vertices, ["opacity"])[:, 0],
-        sh=sh,
-        face=np.zeros(count, np.int32),
-        unbound=np.zeros(count, bool),
+    channels = _columns(path, vertices, [f"f_rest_{i}" for i in range(rest)])
+    channels = channels.reshape(len(vertices), 3, rest // 3).transpose(0, 2, 1)
+    if size > MAX_SH_DEGREE + 1:
+        say(f"{path}: harmonics of degree {size - 1} are cut at {MAX_SH_DEGREE}")
+        channels = channels[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
+    scales = [f"scale_{i}" for i in range(3)]
+    flat = {"scale_0", "scale_1"} <= names and "scale_2" not in names
+    log_scale = _columns(path, vertices, scales[:2] if flat else scales)
+    if flat:
+        say(f"{path}: has no scale_2: its splats are flat (2D Gaussian Splatting)")
+        log_scale = np.pad(log_scale, ((0, 0), (0, 1)), constant_values=-np.inf)
+    return in_world(
+        _columns(path, vertices, ["x", "y", "z"]),
+        _columns(path, vertices, [f"rot_{i}" for i in range(4)]),
+        log_scale,
+        _columns(path, vertices, ["opacity"])[:, 0],
+        np.concatenate([_base_color(path, vertices)[:, None], channels], axis=1),
     )
+
+
+def _base_color(path: Path, vertices: np.ndarray) -> np.ndarray:
+    """(N, 3) coefficients of degree 0: f_dc_0…2, or those of red, green and blue."""
+    names = vertices.dtype.names or ()
+    colors = next((own for own in COLOR_NAMES if set(own) <= set(names)), None)
+    if "f_dc_0" in names or colors is None:
+        return _columns(path, vertices, [f"f_dc_{i}" for i in range(3)])
+    dtype = vertices.dtype[colors[0]]
+    values = _columns(path, vertices, colors)
+    if dtype.kind in "iu":
+        values = values / np.iinfo(dtype).max
+    elif values.max(initial=0) > 1:  # a color of a byte, written as a number
+        values = values / 255
+    return (values - 0.5) / SH_C0
 
 
 def splat_columns(splats: Splats) -> np.ndarray:
@@ -103,16 +136,16 @@ def splat_columns(splats: Splats) -> np.ndarray:
     return np.column_stack([*parts, splats.opacity, splats.log_scale, splats.rotation])
 
 
-def stack_columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """(N, len(names)) float32. Raises StgaError where one is missing or not finite."""
+def _columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """(N, len(names)) float32. Raises StgaError where one is missing, naming what is there."""
     columns = np.empty((len(vertices), len(names)), np.float32)
     for i, name in enumerate(names):
-        if name not in (vertices.dtype.names or ()):
-            raise StgaError(f"{path}: has no property {name!r}, as a PLY of 3D Gaussians must")
-        columns[:, i] = vertices[name]
-    if not np.isfinite(columns).all():
-        bad = names[int(np.argmin(np.isfinite(columns).all(axis=0)))]
-        raise StgaError(f"{path}: property {bad!r} holds a value that is not finite")
+        given = vertices.dtype.names or ()
+        if name not in given:
+            problem = f"has no property {name!r}, as a PLY of 3D Gaussians must"
+            raise StgaError(f"{path}: {problem}; it has {', '.join(given):.200}")
+        with np.errstate(over="ignore"):  # of doubles; what is not finite is left out
+            columns[:, i] = vertices[name]
     return columns
 
 
@@ -130,9 +163,13 @@ def read_vertices(path: Path) -> np.ndarray:
 
     Raises StgaError where the file is missing, malformed, packed or shorter than its header says.
     """
-    rows = ply_rows(path, read_bytes(path, MAX_PLY_BYTES), ["vertex"]).get("vertex")
-    if rows is None or not rows.scalars.dtype.names:
+    rows = ply_rows(path, read_bytes(path, MAX_SPLAT_BYTES), ["vertex"]).get("vertex")
+    names = () if rows is None else rows.scalars.dtype.names
+    if rows is None or not names:
         raise StgaError(f"{path}: PLY header describes no vertices")
+    if any(name.startswith("packed_") for name in names):
+        packed = "is a compressed PLY (packed_position, …), as SuperSplat writes them"
+        raise StgaError(f"{path}: {packed}; save it there as a plain PLY")
     return rows.scalars
 
 

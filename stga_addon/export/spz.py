@@ -1,19 +1,30 @@
-"""Writing of world-space splats in Niantic's compressed format SPZ."""
+"""World-space splats in Niantic's compressed format SPZ."""
 
 import gzip
 import math
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 
-from ..avatar.splats import Splats
-from ..files import replacing
+from ..avatar.splats import MAX_SH_DEGREE, Splats, in_world
+from ..errors import StgaError
+from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes, replacing
 from ..flame.quaternions import normalized
+from ..progress import Say, warn
+from .ply import READ_FILES
 
 MAGIC = b"NGSP"
 VERSION = 3
 """The last packed by gzip: version 4 needs Zstandard, which Blender's Python lacks."""
+READ_VERSIONS = 1, 2, 3
+HEADER_BYTES = 16
+GZIP_MAGIC = b"\x1f\x8b"
+# The format's own limits
+MAX_SPZ_BYTES = 2 << 30
+MAX_SPZ_SPLATS = 10_000_000
+MAX_SPZ_DEGREE = 4
 ANTIALIASED = 1
 MAX_FRACTION_BITS = 16
 """Resolution of positions: 2⁻¹⁶ m = 15 µm, within ±128 m; coarser where splats are farther away."""
@@ -55,6 +66,85 @@ def write_spz(path: Path, world: Splats, antialiased: bool = False) -> None:
     packed = gzip.compress(header + b"".join(column.tobytes() for column in columns), mtime=0)
     with replacing(path) as partial:
         partial.write_bytes(packed)
+
+
+def read_spz(path: Path, say: Say = warn) -> Splats:
+    """World-space splats of an .spz of version 1 to 3, in the axes of the file; of harmonics above
+    degree 3 and of antialiasing, `say` gets a sentence. Raises StgaError naming the file."""
+    data = read_bytes(path, MAX_SPZ_BYTES)
+    try:
+        return _unpacked(path, data, say)
+    except (ValueError, struct.error, zlib.error, EOFError) as error:
+        problem = CHANGED_LINE_ENDS if line_ends_changed(data) else f"({error})"
+        unread = f"is not a readable SPZ file {problem}; expected {READ_FILES}"
+        raise StgaError(f"{path}: {unread}") from error
+
+
+def _unpacked(path: Path, data: bytes, say: Say) -> Splats:
+    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    header = data[:HEADER_BYTES]
+    if data[:2] == GZIP_MAGIC:
+        header = stream.decompress(data, HEADER_BYTES)
+    magic, version, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", header)
+    if magic != MAGIC:
+        raise ValueError("it does not begin as one")
+    if version not in READ_VERSIONS or data[:2] != GZIP_MAGIC:
+        raise ValueError(f"version {version}; read are 1 to 3; save it as .ply")
+    others = (degree + 1) ** 2 - 1
+    parts = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * others)
+    needed = count * sum(parts)
+    if count > MAX_SPZ_SPLATS or degree > MAX_SPZ_DEGREE:
+        raise ValueError(f"{count} splats of degree {degree}")
+    body = stream.decompress(stream.unconsumed_tail, needed + 1)
+    if len(body) != needed:
+        raise ValueError(f"{len(body)} bytes of {count} splats, expected {needed}")
+    edges = np.cumsum([0, *(count * size for size in parts)])
+    places, alpha, color, scale, turn, rest = (
+        np.frombuffer(body, np.uint8, size * count, start).reshape(count, size)
+        for size, start in zip(parts, edges.tolist(), strict=False)
+    )
+    if flags & ANTIALIASED:
+        say(f"{path}: is marked as antialiased; splats of files are drawn without")
+    if degree > MAX_SH_DEGREE:
+        say(f"{path}: harmonics of degree {degree} are cut at {MAX_SH_DEGREE}")
+    share = alpha[:, 0] / 255
+    with np.errstate(divide="ignore"):
+        opacity = np.log(share / (1 - share))
+    harmonics = (rest.reshape(count, others, 3).astype(np.float32) - 128) / 128
+    base = (color.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
+    sh = np.concatenate([base[:, None], harmonics[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]], axis=1)
+    rotation = _smallest_three(turn) if version == 3 else _three(turn)
+    xyz = places.view("<f2") if version == 1 else _fixed(places) / 2.0**bits
+    return in_world(xyz, rotation, scale.astype(np.float32) / 16 - 10, opacity, sh)
+
+
+def _fixed(places: np.ndarray) -> np.ndarray:
+    """(N, 3) whole numbers of 24 bits in two's complement, from bytes (N, 9)."""
+    wide = np.zeros((len(places), 3, 4), np.uint8)
+    wide[..., 1:] = places.reshape(-1, 3, 3)
+    return wide.view("<i4")[..., 0] >> 8
+
+
+def _three(turn: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) wxyz of x, y and z as bytes; w is positive."""
+    xyz = turn.astype(np.float32) / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(axis=1, keepdims=True)))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _smallest_three(turn: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) wxyz of what `write_spz` packs into 4 bytes."""
+    packed = turn.copy().view("<u4")[:, 0]
+    largest = packed >> 30
+    found = np.zeros((len(packed), 4))
+    for part in range(3, -1, -1):
+        own = largest != part
+        magnitude = (packed & 511) * np.where(packed & 512, -1, 1) / (511 * math.sqrt(2))
+        found[own, part] = magnitude[own]
+        packed = np.where(own, packed >> 10, packed)
+    rows = np.arange(len(packed))
+    found[rows, largest] = np.sqrt(np.maximum(0, 1 - (found**2).sum(axis=1)))
+    return found[:, [3, 0, 1, 2]]
 
 
 def _byte(values: np.ndarray) -> np.ndarray:

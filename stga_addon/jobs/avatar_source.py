@@ -1,6 +1,5 @@
 """What poses an avatar: a capture, a motion, or the head of an open .blend file, or its folder."""
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,10 +13,11 @@ from ..capture.open import open_capture, sequence_capture
 from ..capture.transforms import PRINCIPAL_POINTS
 from ..driving.open_motion import Motion, MotionOptions, open_motion, trained_range
 from ..errors import StgaError
+from ..export.ply import READ_FILES
 from ..files import read_json, read_npz, write_json, write_npz
 from ..flame.sequence import motion_of
 from ..options import option
-from ..progress import Say
+from ..progress import Say, warn
 from ..schema import Arrays, from_json, setting, to_json
 from ..training.run.folder import AVATAR, open_refined, open_run, read_run, with_refined_tracking
 
@@ -85,7 +85,7 @@ def open_avatar(request: Posed) -> tuple[Avatar, Capture | None]:
         capture = open_capture(given, request.flame, avatar.principal_point)
         if avatar.settings.get("tracking"):
             what = "was trained on refined meshes, which only its run's folder has"
-            logging.getLogger(__name__).warning("warning: %s: %s", source, what)
+            warn(f"{source}: {what}")
     if capture is None:
         return avatar, None
     if not np.array_equal(capture.faces, avatar.faces):
@@ -118,7 +118,10 @@ def timesteps_between(capture: Capture, span: tuple[int, int] | None, say: Say) 
 
 
 def avatar_path(source: Path) -> Path:
-    """The avatar file that a run folder or an avatar file names."""
+    """The avatar file that a run folder or an avatar file names. Raises StgaError for a file of
+    another kind."""
+    if source.is_file() and source.suffix.lower() != ".npz":
+        raise StgaError(f"{source}: is no avatar; expected {READ_FILES}")
     return source / AVATAR if source.is_dir() else source
 
 

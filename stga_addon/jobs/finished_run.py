@@ -11,7 +11,7 @@ from ..capture.camera import central_camera
 from ..capture.color import srgb_to_linear
 from ..capture.model import Capture
 from ..errors import StgaError
-from ..export.ply import read_ply
+from ..export.splat_files import read_splats
 from ..files import write_json
 from ..light.environment import read_hdr, split_environment
 from ..options import like, option
@@ -125,7 +125,7 @@ def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
     avatar = read_avatar(folder / AVATAR)
     quality = evaluate_avatar(avatar, capture, split, perceptual=True)
     if (folder / WORLD_FILE).is_file():
-        recorded = psnr_recorded(avatar, read_ply(folder / WORLD_FILE), capture, split)
+        recorded = psnr_recorded(avatar, read_splats(folder / WORLD_FILE), capture, split)
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
     write_json(path, {"views": len(views), **quality.as_json()})

@@ -14,7 +14,7 @@ from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..driving.open_motion import MotionOptions
 from ..errors import StgaError
 from ..export.playback import DEFAULT_FPS, playback_fps
-from ..export.ply import is_ply, read_ply
+from ..export.splat_files import is_splats, read_splats
 from ..files import replacing
 from ..flame.sequence import sequence_mesh
 from ..light.environment import read_lighting, turned
@@ -132,8 +132,8 @@ def render(request: Render, report: Report, say: Say) -> Written:
         _turntable_images(request, request.fps or DEFAULT_FPS)  # before anything is read
     views: Sequence[View] = ()
     if request.cameras is not None:
-        principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # a PLY has none
-        if request.principal_point is None and not is_ply(request.source):
+        principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # splats have none
+        if request.principal_point is None and not is_splats(request.source):
             principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
         views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
     composer = Composer(request.device)
@@ -247,19 +247,19 @@ def _turntable_images(request: Render, fps: float) -> int:
 
 
 def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
-    """An avatar with its capture or moved by another person's motion, or a world-space PLY."""
+    """An avatar with its capture or moved by another person's motion, or world-space splats."""
     source = request.source
-    if is_ply(source):
+    if is_splats(source):
         for given, why in (
             (request.motion, "splats are bound to no mesh that a motion could move"),
             (request.light, "light is not known; --light needs an avatar"),
             (request.world, "folder is not that of a run, which --world needs"),
         ):
             if given:
-                raise StgaError(f"{source}: is a PLY, whose {why}")
+                raise StgaError(f"{source}: holds splats in the world, whose {why}")
         from ..render.render import render
 
-        splats = read_ply(source)
+        splats = read_splats(source, say)
         return _Subject(
             lambda view, _: render(splats, view.camera, request.background, composer=composer),
             (),
@@ -310,7 +310,7 @@ def _pictured(
         if not path.is_file():
             shown = "--world shows what a training with --effect world=on has written"
             raise StgaError(f"{path}: is missing; {shown}")
-        behind = read_ply(path)
+        behind = read_splats(path)
     if request.light is None:
         return lambda view, _: render_avatar(
             avatar, mesh(view), view.camera, background, composer, behind

@@ -10,7 +10,7 @@ from mathutils import Vector
 
 from ..avatar.file import Avatar
 from ..capture.model import Capture
-from ..export.ply import read_ply
+from ..export.splat_files import read_splats
 from ..training.run.folder import WORLD_FILE
 from . import tags
 from .arrays import evaluated_vertices
@@ -103,7 +103,7 @@ def show_world(avatar_file: Path, head: Any, scene: Any = None) -> Any:
     worlds = [thing for thing in scene.objects if tags.WORLD in thing]
     if not path.is_file() or any(each[tags.WORLD] == str(path) for each in worlds):
         return None
-    world = show_world_splats(read_ply(path), WORLD_NAME, scene)
+    world = show_world_splats(read_splats(path), WORLD_NAME, scene)
     world.parent = head.parent
     world.matrix_parent_inverse = head.matrix_parent_inverse
     world[tags.WORLD] = str(path)

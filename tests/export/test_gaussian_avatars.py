@@ -14,7 +14,13 @@ from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.splats import Splats
 from stga_addon.avatar.strain import trained_range
 from stga_addon.errors import StgaError
-from stga_addon.export.ply import in_convention, read_ply, read_vertices, write_gaussian_avatars
+from stga_addon.export.ply import (
+    in_convention,
+    read_ply,
+    read_vertices,
+    splats_of,
+    write_gaussian_avatars,
+)
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, read_motion, sequence_mesh
@@ -90,7 +96,9 @@ def test_motion_holds_every_array_the_viewer_asks_for(tmp_path, sequence):
 
 def bound_splats(path: Path) -> Splats:
     """Splats in the "gaussian_avatars" convention, with triangles by binding_0."""
-    return replace(read_ply(path), face=read_vertices(path)["binding_0"].astype(np.int32))
+    vertices = read_vertices(path)
+    splats = splats_of(path, vertices, print)
+    return replace(splats, face=vertices["binding_0"].astype(np.int32))
 
 
 def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
@@ -117,9 +125,8 @@ def test_pair_reads_back_to_the_same_moving_splats(tmp_path, sequence):
     for mine, timestep in zip(motion.timesteps, sequence.timesteps, strict=True):
         expected = sequence_mesh(sequence, timestep)
         np.testing.assert_allclose(sequence_mesh(motion, mine), expected, atol=1e-12)
-    plain = read_ply(tmp_path / "point_cloud.ply")  # of readers that ignore the binding
-    np.testing.assert_array_equal(plain.xyz, avatar.splats.xyz)
-    assert not plain.face.any()
+    with pytest.raises(StgaError, match="binding_0: these splats lie in the frames"):
+        read_ply(tmp_path / "point_cloud.ply")  # whose picture would be splats of meters
 
 
 def viewer_world(row: Splats, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

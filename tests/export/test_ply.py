@@ -10,6 +10,7 @@ from avatar.conftest import random_splats
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply, write_ply
+from stga_addon.export.splat_files import read_splats
 
 TYPES = """i1 char int8, u1 uchar uint8, i2 short int16, u2 ushort uint16, i4 int int32,
 u4 uint uint32, f4 float float32, f8 double float64"""
@@ -99,10 +100,10 @@ def test_foreign_files_of_every_degree_and_kind(tmp_path, kind, rest):
     """Catches a wrong split of f_rest, byte order, and order of properties."""
     names = layout(rest)
     rows = numbered_rows(names)
-    shuffled = np.random.default_rng(0).permutation([*names, "binding_0", "red"]).tolist()
-    others = {"red": "uchar", "binding_0": "int", "x": "double"}
+    shuffled = np.random.default_rng(0).permutation([*names, "label", "red"]).tolist()
+    others = {"red": "uchar", "label": "int", "x": "double"}
     kinds = {name: others.get(name, "float") for name in shuffled}
-    content = by_hand(kind, kinds, [row | {"binding_0": 7, "red": 255} for row in rows])
+    content = by_hand(kind, kinds, [row | {"label": 7, "red": 255} for row in rows])
     (tmp_path / "a.ply").write_bytes(content)
     splats = read_ply(tmp_path / "a.ply")
     for i, row in enumerate(rows):
@@ -172,12 +173,14 @@ def ascii_head(body: str) -> bytes:
         (head("element vertex 0\n"), "no vertices"),
         (head(""), "no vertices"),
         (head("element vertex 1\n" + GOOD.replace("opacity", "density")) + bytes(56), "'opacity'"),
-        (head("element vertex 1\n" + GOOD.replace("scale_2", "s2")) + bytes(56), "'scale_2'"),
+        (head("element vertex 1\n" + GOOD.replace("scale_1", "s1")) + bytes(56), "'scale_1'"),
         (head("element vertex 1\n" + GOOD + "property float f_rest_0\n") + bytes(60), "f_rest"),
-        (
-            head("element vertex 1\n" + GOOD) + b"\0\0\xc0\x7f" + bytes(52),
-            "'x' holds .* not finite",
-        ),
+        (head("element vertex 1\n" + GOOD) + b"\0\0\xc0\x7f" + bytes(52), "1 of 1 splats"),
+        (head("element vertex 1\n" + GOOD + "property int binding_0\n") + bytes(60), "binding_0"),
+        (head("element vertex 1\nproperty uint packed_position\n") + bytes(4), "compressed PLY"),
+        (head("element vertex 1\nproperty float x\n") + bytes(4), "it has x"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS pointer"),
+        (head("element vertex 1\n" + GOOD).replace(b"\n", b"\r\n"), "truncated"),
         (ascii_head("element vertex 1\n" + GOOD) + b"1 2 three\n" * 9, "three"),
         (ascii_head("element vertex 2\n" + GOOD) + b"1 1\n" * 14, "2 numbers a row"),
         (ascii_head("element vertex 90000000\n" + GOOD) + b"1 " * 14, "truncated"),
@@ -189,4 +192,4 @@ def test_broken_files_are_named(tmp_path, content, complaint):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(StgaError, match="broken.ply.*" + complaint):
-        read_ply(path)
+        read_splats(path)

@@ -1,0 +1,97 @@
+"""Reading of world-space splats of any kind of file: PLY, SPZ, .splat."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from ..avatar.splats import SH_C0, Splats, in_world
+from ..errors import StgaError
+from ..files import read_bytes
+from ..progress import Say, warn
+from .ply import MAX_SPLAT_BYTES, READ_FILES, read_ply
+from .spz import read_spz
+
+CONVERTED = "are not read; save them as .ply, for example with SuperSplat"
+UNREAD_SUFFIXES = {
+    ".ksplat": "mkkellogg's splats",
+    ".sog": "PlayCanvas' SOG",
+    ".sogs": "PlayCanvas' SOG",
+    ".splatv": "4D splats",
+    ".spx": "Reall3D's splats",
+    ".lcc": "XGRIDS' splats",
+    ".rad": "Spark's splats",
+    ".gsz": "packed splats",
+    ".glb": "splats in glTF",
+    ".gltf": "splats in glTF",
+    ".usd": "splats in USD",
+    ".usda": "splats in USD",
+    ".usdc": "splats in USD",
+    ".usdz": "splats in USD",
+    ".pt": "PyTorch's checkpoints",
+    ".pth": "PyTorch's checkpoints",
+    ".ckpt": "PyTorch's checkpoints",
+}
+"""Suffix of files of splats, which are not read -> what they are."""
+SPLAT_ROW = np.dtype(
+    [("xyz", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
+)
+"""Of antimatter15's .splat: linear scales; red, green, blue, opacity; w, x, y, z from -1 to 1."""
+
+
+def is_splats(path: Path) -> bool:
+    """Whether a path is named as a file of splats that are bound to no head."""
+    return path.suffix.lower() in (*READERS, *UNREAD_SUFFIXES)
+
+
+def read_splats(path: Path, say: Say = warn) -> Splats:
+    """World-space splats of a .ply, .spz or .splat file, with harmonics of degree 0 to 3.
+
+    Rows that hold a value that is not finite are left out. `say` gets a sentence about what was
+    left out or repaired. Raises StgaError naming the file, also for other kinds of files.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in READERS:
+        kind = UNREAD_SUFFIXES.get(suffix, f"files named {suffix}")
+        raise StgaError(f"{path}: {kind} {CONVERTED}; expected {READ_FILES}")
+    splats = READERS[suffix](path, say)
+    finite = np.ones(len(splats), bool)
+    for each in fields(splats):
+        values = getattr(splats, each.name).reshape(len(splats), -1)
+        finite &= np.isfinite(values).all(axis=1)
+    if finite.all():
+        return splats
+    lost = f"{len(finite) - finite.sum()} of {len(finite)} splats hold values that are not finite"
+    if not finite.any():
+        raise StgaError(f"{path}: {lost}")
+    say(f"{path}: left out splats: {lost}")
+    return splats.rows(finite)
+
+
+def read_splat(path: Path, say: Say = warn) -> Splats:
+    """The splats of a .splat file, without harmonics above degree 0. Raises StgaError."""
+    data = read_bytes(path, MAX_SPLAT_BYTES)
+    if not data or len(data) % SPLAT_ROW.itemsize:
+        rows = f"has {len(data)} bytes, which are no rows of {SPLAT_ROW.itemsize}"
+        raise StgaError(f"{path}: is not a readable .splat file: {rows}; expected {READ_FILES}")
+    table = np.frombuffer(data, SPLAT_ROW)
+    share = table["color"].astype(np.float32) / 255
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scale = np.log(table["scale"])
+        opacity = np.log(share[:, 3] / (1 - share[:, 3]))
+    return in_world(
+        table["xyz"],
+        (table["rotation"].astype(np.float32) - 128) / 128,
+        log_scale,
+        opacity,
+        ((share[:, :3] - 0.5) / SH_C0)[:, None],
+    )
+
+
+READERS: dict[str, Callable[[Path, Say], Splats]] = {
+    ".ply": read_ply,
+    ".spz": read_spz,
+    ".splat": read_splat,
+}
+"""Suffix -> reader."""
