@@ -79,14 +79,29 @@ def read_image(view: View, background: tuple[int, int, int] = WHITE) -> np.ndarr
 
 
 def read_mask(view: View) -> np.ndarray | None:
-    """The view's foreground mask (H, W) uint8, 255 inside; an image's transparency where it has no
-    mask file. None where there is neither. Raises StgaError as `read_image` does."""
+    """The view's foreground mask (H, W) uint8, 255 inside, also where its file holds only 0 and
+    another number; an image's transparency where it has no mask file. None where there is neither.
+    Raises StgaError as `read_image` does."""
     if view.mask is None:
         return _transparency(_decode(view.image, view, "image"))
+    mask = stored_mask(view)
+    return np.where(mask > 0, np.uint8(255), np.uint8(0)) if is_labeled(mask) else mask
+
+
+def stored_mask(view: View) -> np.ndarray:
+    """The view's mask file (H, W) uint8, as it is stored. Raises StgaError as `read_image` does."""
+    assert view.mask is not None
     pixels = _decode(view.mask, view, "mask")
     # A mask drawn in color is gray in all channels; one drawn in transparency only is its alpha.
     alpha = _transparency(pixels)
     return pixels if pixels.ndim == 2 else pixels[..., 0] if alpha is None else alpha
+
+
+def is_labeled(mask: np.ndarray) -> bool:
+    """Whether a stored mask holds 0 and one other number that is not 255, as segmentation networks
+    write 1 for a head. A matte has numbers between."""
+    level = mask.max(initial=0)
+    return bool(0 < level < 255 and ((mask == 0) | (mask == level)).all())
 
 
 def read_view(
@@ -126,6 +141,10 @@ def _decode(path: Path, view: View, kind: str) -> np.ndarray:
             convert = _conversion(image, path) if kind == "image" else None
             turn = size == expected and _orientation(image) != 1
             turned = ImageOps.exif_transpose(image) if turn else image
+            if kind == "mask" and turned.mode.startswith("I"):
+                numbers = np.asarray(turned)
+                if 0 <= numbers.min() <= numbers.max() <= 255:  # those of 8 bits, in 16
+                    return numbers.astype(np.uint8)
             return _as_uint8(turned if convert is None else convert(turned))
     if size == expected:
         more = f"more than are read ({MAX_IMAGE_PIXELS})"

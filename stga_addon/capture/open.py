@@ -26,6 +26,7 @@ from ..flame.sequence import (
 )
 from ..flame.teeth import flame_model
 from . import meshes
+from .distortion import distortion
 from .mesh_geometry import without_head_motion
 from .model import Capture, Views, evenly_spread
 from .transforms import (
@@ -37,6 +38,7 @@ from .transforms import (
     read_splits,
     tracked_files,
     transforms_files,
+    transforms_warnings,
     with_principal_point,
 )
 
@@ -44,6 +46,7 @@ MIN_HEAD_EXTENT_M = 0.05
 TYPICAL_HEAD_EXTENT_M = 0.3
 MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
+NEUTRAL = ("neutral", "canonical")  # Names of a mesh without expression
 MAX_COMPARED_VIEWS = 4
 MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 CANONICAL_NAME = "canonical_flame_param.npz"
@@ -94,8 +97,12 @@ def open_capture(
             if not isfile(file):
                 raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
             seen.add(file)
+    if distorted := distortion(transforms.frames):
+        raise StgaError(distorted)
     capture = _open_layout(root, transforms, flame)
     warnings = list(capture.warnings)
+    warnings += transforms_warnings(transforms.frames, principal_point)
+    warnings += _mask_warnings(transforms.frames)
     if found := _principal_point_warning(transforms.frames, capture.mesh, principal_point):
         warnings.append(found)
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
@@ -167,13 +174,33 @@ def _principal_point_warning(
     return f"{outside_masks} {read_so}: the capture was probably written that way"
 
 
+def _mask_warnings(frames: Sequence[Frame]) -> list[str]:
+    """What the masks of a few views hold instead of 0 to 255; nothing without Pillow, which Blender
+    lacks."""
+    views = [frame.view for frame in frames if frame.view.mask is not None]
+    if not views or find_spec("PIL") is None:
+        return []
+    from .images import is_labeled, stored_mask
+
+    masks = [stored_mask(view) for view in evenly_spread(views, MAX_COMPARED_VIEWS)]
+    level = max(int(mask.max(initial=0)) for mask in masks)
+    if level == 255:
+        return []
+    where = views[0].mask
+    outside = "expected 255 inside the head, 0 outside"
+    if level == 0:
+        return [f"{where}: the masks are empty; {outside}"]
+    if all(is_labeled(mask) for mask in masks if mask.any()):
+        return [f"{where}: the masks hold only 0 and {level}, which is read as 255"]
+    return [f"{where}: the masks hold nothing above {level}; {outside}"]
+
+
 def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:
     """Capture of layout "mesh" without views: a folder of meshes, one a timestep. Timesteps are the
     numbers at the end of the names, or the alphabetical order where a name has none. A mesh called
     `neutral` or `canonical` is the canonical one, and `regions.json` the regions file."""
-    names = ("neutral", "canonical")
     regions = root / "regions.json"
-    canonical = next((path for path in listed if path.stem.lower() in names), None)
+    canonical = next((path for path in listed if path.stem.lower() in NEUTRAL), None)
     tracked = [path for path in listed if path != canonical]
     if not tracked:
         expected = f"holds no tracked mesh besides {canonical}; expected one file per timestep"
@@ -197,9 +224,10 @@ def _mesh_capture(
     canonical = transforms.canonical_mesh
     regions_file = transforms.regions
     if canonical is None:
-        canonical = files[min(files)]
-        first = f"{canonical.name}, the first timestep, is the neutral mesh"
-        warnings.append(f"no canonical mesh is given: {first}")
+        canonical, used = _neutral_beside(root, files[min(files)], read)
+        warnings.append(
+            f"no canonical mesh is given: {canonical.name}, {used}, is the neutral mesh"
+        )
     neutral, faces = read(canonical)
     if any(path.suffix.lower() == ".stl" for path in (canonical, *files.values())):
         checked = "of the topology, only the number of triangles can be checked"
@@ -221,6 +249,20 @@ def _mesh_capture(
         expression_mesh=lambda timestep, zero_pose: without_head_motion(mesh(timestep), neutral),
         warnings=tuple(warnings),
     )
+
+
+def _neutral_beside(
+    root: Path, first: Path, read: Callable[[Path], meshes.Mesh]
+) -> tuple[Path, str]:
+    """A mesh called as a canonical one, as INSTA leaves it in the capture's folder, with the
+    triangles of the first timestep's; else that one. With a few words about where it is from."""
+    named = [
+        folder / f"{name}{first.suffix}" for folder in (root, first.parent) for name in NEUTRAL
+    ]
+    for path in named:
+        if path != first and isfile(path) and np.array_equal(read(path)[1], read(first)[1]):
+            return path, "which lies there"
+    return first, "the first timestep"
 
 
 def _open_release(root: Path, transforms: Transforms) -> Capture:

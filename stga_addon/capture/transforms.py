@@ -3,8 +3,10 @@
 import itertools
 import math
 import posixpath
+import re
 import sys
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os.path import isfile
 from pathlib import Path, PureWindowsPath
@@ -29,6 +31,15 @@ MIN_ANGLE = 1e-9  # radians; half of it still has a tangent
 MAX_PATH_CHARACTERS = 2000
 MAX_NAME_BYTES = 255
 MATRIX = "a 4x4 matrix of finite numbers"
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+"""Of images, in the order in which a path without one is looked for."""
+TIMESTEP_KEYS = ("timestep_index", "keyframe")
+"""VHAP writes timestep_index, the STGA authors' release keyframe."""
+READ_PATHS = ("file_path", "fg_mask_path", "mask_path", "mesh_path", "flame_param_path")
+TOP_PATHS = ("canonical_mesh_path", "regions_path", "ply_file_path")
+"""Of a frame, and of the top level; nerfstudio's points are of no use."""
+NUMBERED = "without timestep_index, timesteps are the numbers of the tracked files"
+SCALED = "the scale of transform_matrix was left out"
 
 
 @dataclass(frozen=True)
@@ -80,6 +91,7 @@ class Frame:
     camera_id  name of the camera in the file, or None
     mesh, flame  file of the tracked mesh or FLAME parameters of the frame's timestep, or None
     record     the entry, with what the top level says besides
+    repairs    what was read in another way than it is written, in a few words each
     """
 
     view: View
@@ -88,6 +100,7 @@ class Frame:
     mesh: Path | None
     flame: Path | None
     record: Record
+    repairs: tuple[str, ...] = ()
 
     @property
     def where(self) -> str:
@@ -145,7 +158,7 @@ def read_transforms(
     may leave it only for a sibling folder (union sets of VHAP). Raises StgaError naming the file
     and the field.
     """
-    return _numbered(_read_frames(path, read_json(path), principal_point))
+    return _numbered(_timed(_read_frames(path, read_json(path), principal_point)))
 
 
 def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Transforms:
@@ -165,7 +178,7 @@ def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) ->
         meshes.append(record.path_of("canonical_mesh_path"))
         regions.append(record.path_of("regions_path"))
         rates.append(record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None)
-    numbered = iter(_numbered([frame for split in frames.values() for frame in split]))
+    numbered = iter(_numbered(_timed([frame for split in frames.values() for frame in split])))
     counts = {split: len(frames.get(split, ())) for split in SPLITS}
     splits = {split: tuple(itertools.islice(numbered, n)) for split, n in counts.items()}
 
@@ -224,7 +237,7 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
     shared = Record(path, path.parent.resolve(), "", values)
     timed = any(_timestep_key(entry) for entry in values["frames"] if isinstance(entry, dict))
-    cameras: dict[tuple[bytes | float, ...], Camera] = {}
+    cameras: dict[tuple[bytes | float, ...], tuple[Camera, bool]] = {}
     frames = []
     for number, entry in enumerate(values["frames"]):
         if not isinstance(entry, dict):
@@ -234,8 +247,7 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         where = record.where
         if image is None:
             raise StgaError(f"{where('file_path')}: is missing; expected the path of the image")
-        if not image.suffix:  # as Blender's NeRF exporters write it
-            image = image.with_name(image.name + ".png")
+        image = _with_suffix(image)
         key = _timestep_key(entry)
         if timed and key is None:
             raise StgaError(f"{where('timestep_index')}: is missing, though other frames have it")
@@ -248,24 +260,40 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
             raise StgaError(f"{where('transform_matrix')}: expected {MATRIX}") from error
         known = matrix.tobytes(), *size, *focal, *written  # most frames share a camera
         if known not in cameras:
-            camera = camera_from_gl(_pose(record, matrix), *size, *focal, *written)
-            cameras[known] = with_principal_point(camera, written, principal_point)
+            rigid, is_scaled = _pose(record, matrix)
+            camera = camera_from_gl(rigid, *size, *focal, *written)
+            camera = with_principal_point(camera, written, principal_point)
+            cameras[known] = camera, is_scaled
+        camera, is_scaled = cameras[known]
         timestep = record.natural(key) if key else 0
         index = record.natural("camera_index") if record.has("camera_index") else -1
         name = entry["file_path"].replace("\\", "/")  # files are named after views
-        view = View(timestep, index, cameras[known], name, image, record.path_of("fg_mask_path"))
+        mask = record.path_of("fg_mask_path") or record.path_of("mask_path")  # nerfstudio's
+        mask = None if mask is None else _with_suffix(mask)
+        view = View(timestep, index, camera, name, image, mask)
         camera_id = str(entry["camera_id"]) if record.has("camera_id") else None
         mesh = record.path_of("mesh_path")
         flame = record.path_of("flame_param_path")
         whole = replace(record, values=values | entry)
-        frames.append(Frame(view, written, camera_id, mesh, flame, whole))
+        repairs = (SCALED,) if is_scaled else ()
+        frames.append(Frame(view, written, camera_id, mesh, flame, whole, repairs))
     return frames
 
 
+def _with_suffix(path: Path) -> Path:
+    """The image that a path names without its suffix, as Blender's NeRF exporters write it; .png
+    where there is none."""
+    if path.suffix.lower() in IMAGE_SUFFIXES or (path.suffix and isfile(path)):
+        return path
+    named = [path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES]
+    named += [path.with_name(path.name + suffix.upper()) for suffix in IMAGE_SUFFIXES]
+    found = next((each for each in named if isfile(each)), None)
+    return found or (path if path.suffix else named[0])
+
+
 def _timestep_key(values: dict[str, Any]) -> str | None:
-    """The key of the timestep: VHAP writes timestep_index, the STGA authors' release keyframe."""
-    keys = ("timestep_index", "keyframe")
-    return next((key for key in keys if values.get(key) is not None), None)
+    """The key of the timestep, None without one."""
+    return next((key for key in TIMESTEP_KEYS if values.get(key) is not None), None)
 
 
 def _principal(record: Record, shared: Record, key: str, size: int) -> float:
@@ -282,8 +310,11 @@ def _image_size(record: Record, shared: Record, image: Path) -> tuple[int, int]:
         if not isfile(image):
             missing = f"w and h are missing, and so is the image {image} to take them from"
             raise StgaError(f"{record.where('w')}: {missing}")
-        from .images import image_size
-
+        try:
+            from .images import image_size
+        except ImportError as error:
+            needed = "w and h are missing; to take them from the image needs Pillow, which Blender"
+            raise StgaError(f"{record.where('w')}: {needed} lacks: write them") from error
         return image_size(image)
     width = source.number("w", low=0)
     height = source.number("h", low=0)
@@ -315,20 +346,75 @@ def _focal(record: Record, shared: Record, width: int, height: int) -> tuple[flo
     return fl_x, fl_y
 
 
-def _pose(record: Record, matrix: np.ndarray) -> np.ndarray:
+def _pose(record: Record, matrix: np.ndarray) -> tuple[np.ndarray, bool]:
+    """(4, 4) rotation and translation, of a matrix that may lack its last row or be written in one
+    line; and whether its axes were scaled, as those of an object in Blender may be."""
     where = record.where("transform_matrix")
+    if matrix.shape == (16,):
+        matrix = matrix.reshape(4, 4)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0, 0, 0, 1]])
     finite = matrix.shape == (4, 4) and np.isfinite(matrix).all()
     if not finite or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6):
         raise StgaError(f"{where}: expected {MATRIX} that ends in the row 0 0 0 1")
     if np.abs(matrix).max() > MAX_COORDINATE_M:
         far = f"farther than {MAX_COORDINATE_M:g} from the origin"
         raise StgaError(f"{where}: the camera lies {far}")
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    is_scaled = bool(lengths.min() > 0 and np.abs(lengths - 1).max() >= ROTATION_TOLERANCE / 2)
+    if is_scaled:
+        matrix = matrix / np.append(lengths, 1.0)
     rotation = matrix[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
     if not orthonormal or np.linalg.det(rotation) < 0:
-        expected = "a rotation without scale, shear or mirroring in its upper left 3x3 part"
+        expected = "a rotation without shear or mirroring in its upper left 3x3 part"
         raise StgaError(f"{where}: expected {expected}")
-    return matrix
+    return matrix, is_scaled
+
+
+def _timed(frames: Sequence[Frame]) -> list[Frame]:
+    """Frames without any timestep by their tracked files: the numbers that the names end in, or the
+    files' order. Monocular trackers, such as INSTA's, write an image and a mesh a frame so."""
+    tracked = [frame.mesh or frame.flame for frame in frames]
+    files = list(dict.fromkeys(path for path in tracked if path is not None))
+    written = any(frame.record.has(key) for frame in frames for key in TIMESTEP_KEYS)
+    if written or len(files) < 2 or None in tracked:
+        return list(frames)
+    numbers = [re.search(r"\d{1,9}$", path.stem, re.ASCII) for path in files]
+    number_of = {path: int(found[0]) for path, found in zip(files, numbers, strict=True) if found}
+    if len(set(number_of.values())) < len(files):
+        number_of = {path: number for number, path in enumerate(files)}
+    timed = []
+    for frame, path in zip(frames, tracked, strict=True):
+        view = replace(frame.view, timestep=number_of[path] if path is not None else 0)
+        timed.append(replace(frame, view=view, repairs=(*frame.repairs, NUMBERED)))
+    return timed
+
+
+def transforms_warnings(frames: Sequence[Frame], principal_point: str) -> list[str]:
+    """Sentences about what was repaired, about a principal point that may be another, and about
+    files that the frames name and nobody reads; each names the first of the transforms files."""
+    found = []
+    counts = Counter(repair for frame in frames for repair in frame.repairs)
+    for repair, count in counts.items():
+        first = next(frame for frame in frames if repair in frame.repairs)
+        found.append(f"{first.where}: {repair} (in {count} of {len(frames)} frames)")
+    doubtful = [f for f in frames if NUMBERED in f.repairs and f.view.mask is None]
+    height = doubtful[0].view.camera.height if doubtful else 0
+    if principal_point == "vhap" and doubtful and abs(2 * doubtful[0].principal[1] - height) > 1:
+        read = "cy is counted from the bottom, as VHAP writes it"
+        other = "if another program wrote it, give --principal-point opencv"
+        found.append(f"{doubtful[0].where}: {read}; {other}")
+    unread = dict[str, Frame]()
+    for frame in frames:
+        for key in frame.record.values:
+            if key.endswith("_path") and key not in (*READ_PATHS, *TOP_PATHS):
+                unread.setdefault(key, frame)
+    if unread:
+        names = ", ".join(unread)
+        where = next(iter(unread.values())).where
+        found.append(f"{where}: not read: {names:.200}; a mask is named by fg_mask_path")
+    return found
 
 
 def _numbered(frames: list[Frame]) -> tuple[Frame, ...]:

@@ -25,7 +25,7 @@ from ..files import CHANGED_LINE_ENDS, line_ends_changed, read_bytes
 
 MAX_FILE_BYTES = 2 << 30
 MAX_DENSE_ELEMENTS = 1 << 22  # In a sparse matrix; FLAME's joint regressor has 25,115
-MAX_LISTED = 1 << 20  # Values in lists; FLAME has 29,928 corners of triangles
+MAX_LISTED = 1 << 18  # Values in lists; FLAME has 29,928 corners of triangles
 MAX_DEPTH = 32
 MAX_HASHED = 1 << 16
 """Of tuples in tuples, and of lists in lists: that many levels; a tuple, which Python hashes

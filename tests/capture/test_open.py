@@ -1,6 +1,8 @@
 """Whole captures of every layout, as written by the tests and as a studio hands them over."""
 
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -63,6 +65,141 @@ def test_mesh_capture(tmp_path, suffix):
         assert capture.warnings == ()
         expected = (vertices[:, 1] < -0.06)[faces].all(axis=1)
         np.testing.assert_array_equal(capture.regions["mouth"], expected)
+
+
+DISTORTED: list[tuple[dict[str, Any], str]] = [
+    ({"camera_model": "OPENCV", "k1": -0.35, "p2": 0.01}, "k1 -0.35, p2 0.01"),
+    ({"k3": 9e3}, "k3 9000"),
+    ({"distortion_params": [2, 0, 0, 0, 0, 0]}, "k1 2"),
+    ({"camera_model": "OPENCV_FISHEYE"}, "camera_model: is 'OPENCV_FISHEYE'"),
+    ({"camera_model": "EQUIRECTANGULAR"}, "camera_model: is 'EQUIRECTANGULAR'"),
+    ({"is_fisheye": True, "k1": 0.01}, "is_fisheye: is True"),
+]
+
+
+@pytest.mark.parametrize(("lens", "says"), DISTORTED)
+@pytest.mark.parametrize("layout", ["mesh", "flame"])
+def test_distorted_images(tmp_path, lens, says, layout):
+    """Catches images of a lens that is no pinhole, trained on as if they were, without a word."""
+    if layout == "mesh":
+        root = factory.write_mesh_capture(tmp_path / "capture")
+        model = None
+    else:
+        root, model = factory.write_flame_capture(tmp_path / "capture")
+    factory.edit(root / "transforms_val.json", lambda document: document.update(lens))
+    with pytest.raises(StgaError, match=rf"_val\.json: frames\[0\].*{re.escape(says)}.*undistort"):
+        open_capture(root, model)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"camera_model": "PINHOLE", "k1": 0.3},
+        {"k1": 0.0, "k4": 0, "p1": 0.0},
+        {"camera_model": "OPENCV", "k1": 1e-3, "is_fisheye": False},
+    ],
+)
+def test_lenses_that_show_no_distortion(tmp_path, lens):
+    """Catches captures refused for coefficients of nerfstudio's files that bend nothing."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    each_split(root, lambda document: document.update(lens))
+    assert open_capture(root).warnings == ()
+
+
+def stored_masks(root: Path, store: Callable[[np.ndarray], Any]) -> Path:
+    for path in (root / "fg_masks").iterdir():
+        store(np.asarray(Image.open(path)) > 0).save(path)
+    return root
+
+
+def paletted(mask: np.ndarray) -> Image.Image:
+    image = Image.fromarray(mask.astype(np.uint8), mode="P")
+    image.putpalette([0, 0, 0, 128, 0, 0])
+    return image
+
+
+@pytest.mark.parametrize(
+    ("store", "level"),
+    [
+        (lambda mask: Image.fromarray(mask.astype(np.uint8)), 1),
+        (lambda mask: Image.fromarray(mask.astype(np.uint16)), 1),
+        (lambda mask: Image.fromarray(mask.astype(np.uint16) * 255), 255),
+        (lambda mask: Image.fromarray(mask), 255),
+        (paletted, 128),
+        (lambda mask: Image.fromarray(np.dstack([mask.astype(np.uint8)] * 3)), 1),
+    ],
+)
+def test_masks_of_labels(tmp_path, store, level):
+    """Catches masks of 0 and 1, as segmentation networks write them, taken for nearly transparent:
+    3 dB are lost without a word."""
+    capture = open_capture(stored_masks(factory.write_mesh_capture(tmp_path / "capture"), store))
+    for view in capture.views["train"]:
+        np.testing.assert_array_equal(read_mask(view), factory.silhouette() * 255)
+    warnings = [f"only 0 and {level}, which is read as 255"] if level < 255 else []
+    assert len(capture.warnings) == len(warnings)
+    assert all(each in found for each, found in zip(warnings, capture.warnings, strict=True))
+
+
+def test_masks_of_parts(tmp_path):
+    """Catches a map of many parts' numbers taken for a mask without a word; a matte keeps its."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    parts = (factory.silhouette() * (1 + np.arange(factory.WIDTH) % 9)).astype(np.uint8)
+    stored_masks(root, lambda _: Image.fromarray(parts))
+    capture = open_capture(root)
+    assert ["nothing above 9; expected 255" in line for line in capture.warnings] == [True]
+    np.testing.assert_array_equal(read_mask(capture.views["val"][0]), parts)
+
+
+def test_capture_of_a_monocular_tracker(tmp_path):
+    """Catches INSTA's folder refused, its canonical mesh overlooked, and files that it names and
+    nobody reads, or a principal point from the other end, passed over."""
+    root = factory.write_mesh_capture(tmp_path / "capture", (0, 1, 2), (0,))
+    (root / "meshes/neutral.obj").rename(root / "canonical.obj")
+
+    def as_insta(document):
+        del document["canonical_mesh_path"]
+        for entry in document["frames"]:
+            for name in ("timestep_index", "camera_index", "camera_id", "fg_mask_path"):
+                del entry[name]
+            entry |= {"seg_mask_path": "seg_mask/0.png", "exp_path": "flame/exp/0.txt"}
+
+    each_split(root, as_insta)
+    capture = open_capture(root)
+    assert capture.timesteps == (0, 1, 2)
+    np.testing.assert_allclose(capture.neutral, factory.ball()[0], atol=1e-8)
+    said = "\n".join(capture.warnings)
+    for part in (
+        "canonical.obj, which lies there",
+        "(in 3 of 3 frames)",
+        "seg_mask_path, exp_path",
+        "--principal-point opencv",
+    ):
+        assert part in said, part
+    assert len(capture.warnings) == 4
+    swapped = factory.ball()[1][::-1]
+    factory.write_mesh(root / "canonical.obj", factory.ball()[0], swapped)
+    assert "00000.obj, the first timestep" in open_capture(root).warnings[0]
+
+
+def test_size_without_pillow(tmp_path):
+    """Catches a traceback about PIL in Blender, which lacks it, where a file gives no size."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    each_split(root, lambda document: [entry.pop("w") for entry in document["frames"]])
+    code = (
+        "import sys; sys.modules['PIL'] = None\n"
+        "from pathlib import Path\n"
+        "from stga_addon.capture.open import open_capture\n"
+        "from stga_addon.errors import StgaError\n"
+        f"try: open_capture(Path({str(root)!r}))\n"
+        "except StgaError as error: print(error)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(stga_addon.__file__).parents[1])}
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    assert (
+        "frames[0].w: w and h are missing; to take them from the image needs Pillow"
+        in result.stdout
+    )
 
 
 @pytest.mark.parametrize(("timesteps", "cameras"), [((5,), (0, 1)), ((0, 1), (3,)), ((7,), (2,))])

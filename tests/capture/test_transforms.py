@@ -119,6 +119,57 @@ def test_static_capture_without_timesteps(tmp_path):
     assert frame.view.image == tmp_path / "images/00000_00.png"
 
 
+def test_paths_without_suffix(tmp_path):
+    """Catches images that are JPEGs, or masks, being missed where a path leaves out the suffix."""
+    for name in ("a.jpg", "b.PNG", "c.0001.jpeg", "d.jpg", "d.png"):
+        (tmp_path / name).touch()
+    for path, found in (
+        ("a", "a.jpg"),
+        ("b", "b.PNG"),
+        ("c.0001", "c.0001.jpeg"),
+        ("d", "d.png"),
+        ("e", "e.png"),
+        ("d.jpg", "d.jpg"),
+    ):
+        view = read_one(tmp_path, factory.frame(0, 0, file_path=path, fg_mask_path=path)).view
+        assert (view.image.name, view.mask.name, view.name) == (found, found, path)
+
+
+def test_poses_as_programs_write_them(tmp_path):
+    """Catches a matrix of three rows, in one line, or with a scale, as a camera in Blender may
+    have, being refused; and a scale that is not taken out, or moves the camera."""
+    own = factory.pose(2)
+    own[:3, 3] = 0.3, 0.5, 0.9
+    expected = read_one(tmp_path, factory.frame(0, 2, transform_matrix=own.tolist()))
+    scaled = own * [2.0, 2.0, 0.25, 1.0]
+    for matrix, repairs in ((own[:3], 0), (own.ravel(), 0), (scaled, 1), (scaled[:3], 1)):
+        frame = read_one(tmp_path, factory.frame(0, 2, transform_matrix=matrix.tolist()))
+        np.testing.assert_allclose(
+            frame.view.camera.world_to_camera, expected.view.camera.world_to_camera, atol=1e-12
+        )
+        assert len(frame.repairs) == repairs
+
+
+@pytest.mark.parametrize(
+    ("names", "timesteps"),
+    [
+        (("0004.obj", "take2_0007.obj"), [4, 7]),
+        (("a.obj", "b.obj"), [0, 1]),
+        (("x/1.obj", "y/1.obj"), [0, 1]),
+        (("a.obj", "a.obj"), [0, 0]),
+    ],
+)
+@pytest.mark.parametrize("field", ["mesh_path", "flame_param_path"])
+def test_timesteps_of_monocular_trackers(tmp_path, names, timesteps, field):
+    """Catches frames without timestep_index, as INSTA writes them, all taken for timestep 0."""
+    frames = [factory.frame(0, 0, **{field: name}) for name in names]
+    for frame in frames:
+        del frame["timestep_index"]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    for found in (read_transforms(tmp_path / "transforms.json"), read_splits(tmp_path).frames):
+        assert [frame.view.timestep for frame in found] == timesteps
+
+
 def test_union_paths_stay_beside_the_capture(tmp_path):
     """Catches VHAP's union sets, whose frames lie in sibling folders, being refused."""
     root = tmp_path / "union"

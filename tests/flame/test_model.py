@@ -137,7 +137,7 @@ def test_what_stands_in_the_place_of_a_file(tmp_path, name, read):
         with pytest.raises(StgaError, match=f"{name}: {sentence}"):
             read(path)
     (tmp_path / "masks.pkl").write_bytes(python2_masks("\r\n"))
-    with pytest.raises(StgaError, match="masks.pkl: was carried over as text"):
+    with pytest.raises(StgaError, match=r"masks\.pkl: was carried over as text"):
         read_pickled_arrays(tmp_path / "masks.pkl")
 
 
