@@ -12,7 +12,7 @@ import time
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
@@ -287,25 +287,48 @@ def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) ->
         content.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read every array of an npz without pickle. Raises StgaError where it is missing, truncated,
-    above 4 GiB unpacked, or holds objects."""
-    file_size(path)  # refuses pipes, whose reading need never end
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Read the arrays of an npz that are among `names`, by default every one, without pickle.
+    Raises StgaError where it is missing, truncated, above 4 GiB unpacked, or holds objects."""
     arrays = {}
+    with _npz_entries(path) as entries:
+        for name, entry, archive in entries:
+            if names is None or name in names:
+                with archive.open(entry) as stream:
+                    arrays[name] = _read_array(stream, entry.file_size)
+    return arrays
+
+
+def npz_outlines(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an npz with their types and shapes, without contents, which take no memory: to
+    look at before a small file is unpacked to gigabytes. Raises StgaError as `read_npz` does."""
+    outlines = {}
+    with _npz_entries(path) as entries:
+        for name, entry, archive in entries:
+            with archive.open(entry) as stream:
+                shape, dtype = _read_outline(stream, entry.file_size)
+            outlines[name] = np.broadcast_to(np.zeros((), dtype), shape)
+    return outlines
+
+
+@contextmanager
+def _npz_entries(path: Path) -> Iterator[list[tuple[str, zipfile.ZipInfo, zipfile.ZipFile]]]:
+    """Name and entry of each array of an npz, and the open archive. Raises as `read_npz`."""
+    file_size(path)  # refuses pipes, whose reading need never end
     with _reading(path, "npz"), zipfile.ZipFile(path) as archive:
         unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > MAX_UNPACKED_BYTES:
             problem = f"unpacks to {unpacked} bytes, more than the {MAX_UNPACKED_BYTES} allowed"
             raise StgaError(f"{path}: {problem}")
+        entries = []
         for entry in archive.infolist():
             if not entry.filename.endswith(".npy"):
                 raise ValueError(f"entry '{entry.filename}' is no array")
             # LZMA's own header makes it allocate gigabytes
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise ValueError("is packed as no npz is")
-            with archive.open(entry) as stream:
-                arrays[entry.filename.removesuffix(".npy")] = _read_array(stream, entry.file_size)
-    return arrays
+            entries.append((entry.filename.removesuffix(".npy"), entry, archive))
+        yield entries
 
 
 def read_npy(path: Path) -> np.ndarray:
@@ -340,6 +363,14 @@ def _damage(path: Path) -> str | None:
 
 def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """The array of a npy stream of `size` bytes, which bounds what its header promises."""
+    _read_outline(stream, size)
+    stream.seek(0)
+    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))  # type: ignore[no-untyped-call]
+
+
+def _read_outline(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type that the header of a npy stream of `size` bytes says. Raises ValueError where
+    they do not make up its size."""
     version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
     if version != (1, 0):  # newer ones are for headers of more than 64 kB, of many named columns
         raise ValueError(f"npy format {version} is not supported")
@@ -347,8 +378,7 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     promised = stream.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject or not dtype.itemsize or min(shape, default=0) < 0 or promised != size:
         raise ValueError(f"an array of {dtype} {shape} in {size} bytes")
-    stream.seek(0)
-    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))  # type: ignore[no-untyped-call]
+    return shape, dtype
 
 
 def write_npz(path: Path, arrays: dict[str, np.ndarray], compressed: bool = False) -> None:

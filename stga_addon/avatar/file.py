@@ -12,7 +12,7 @@ import numpy as np
 
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
-from ..files import parse_json, read_npz, write_npz
+from ..files import npz_outlines, parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
 from .splats import ARRAYS, SH_C0, Splats
@@ -21,6 +21,7 @@ from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, stra
 FORMAT = "stga-avatar"
 VERSIONS = 2, 3
 """Read; the last is written. In version 2, each splat has strain colors of its own."""
+MAX_HEADER_BYTES = 16 << 20
 _HEADER = {
     "convention": str,
     "background": list,
@@ -192,13 +193,33 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
 
 def read_avatar(path: Path) -> Avatar:
     """Read an avatar file. Raises StgaError naming the file and the field that is missing or
-    malformed."""
-    arrays = read_npz(path)
-    header = _read_header(path, arrays)
+    malformed; names, types and shapes are looked at before anything is unpacked."""
+    outlines = npz_outlines(path)
+    if outlines.get("header", np.zeros(0)).size > MAX_HEADER_BYTES:
+        raise StgaError(f"{path}: header has more than {MAX_HEADER_BYTES} bytes")
+    header = _read_header(path, read_npz(path, ("header",)))
     needed = (*ARRAYS, "neutral", "faces", "region_faces")
-    missing = [name for name in needed if name not in arrays]
+    missing = [name for name in needed if name not in outlines]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
+    is_old = header["version"] == VERSIONS[0]
+    if is_old:
+        _check_old_strain(path, outlines)
+    _check_shapes(path, _avatar_of(path, header, outlines))
+    if "light" in header:
+        _check_light_shapes(path, outlines)
+    optional = ("strain_range", "strain_color", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
+    arrays = read_npz(path, (*needed, *optional))
+    if is_old:
+        _convert_strain(path, arrays)
+    avatar = _avatar_of(path, header, arrays)
+    _check(path, avatar)
+    light = _light(path, arrays, header["light"]) if "light" in header else None
+    return replace(avatar, light=light)
+
+
+def _avatar_of(path: Path, header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Avatar:
+    """The avatar of a file's arrays, or of their outlines, without light."""
     names = header["regions"]
     masks = arrays["region_faces"]
     if masks.ndim != 2 or len(masks) != len(names):
@@ -207,19 +228,14 @@ def read_avatar(path: Path) -> Avatar:
     values = {name: header[name] for name in _HEADER}
     values["regions"] = dict(zip(names, masks, strict=True))
     values["background"] = tuple(header["background"])
-    if header["version"] == VERSIONS[0]:
-        _convert_strain(path, arrays)
-    avatar = Avatar(
+    return Avatar(
         splats=Splats(**{name: arrays[name] for name in ARRAYS}),
         neutral=arrays["neutral"],
         faces=arrays["faces"],
         **values,
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
-        light=_light(path, arrays, header["light"]) if "light" in header else None,
     )
-    _check(path, avatar)
-    return avatar
 
 
 def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -241,6 +257,18 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
     if not all(isinstance(name, str) for name in header["regions"]):
         raise StgaError(f"{path}: header field 'regions' holds something that is not a name")
     return header
+
+
+def _check_old_strain(path: Path, outlines: dict[str, np.ndarray]) -> None:
+    """Take what follows strain in version 2 out of the outlines. Raises StgaError for shapes."""
+    splats, faces = (len(outlines[name]) if outlines[name].ndim else 0 for name in ("xyz", "faces"))
+    for name, shape in (
+        ("strain_range", (faces, 2, STRAIN_COMPONENTS)),
+        ("strain_color", (splats, STRAIN_COMPONENTS, 3)),
+    ):
+        outline = outlines.pop(name, None)
+        if outline is not None and outline.size:
+            _check_shape(path, name, outline, "float32", shape)
 
 
 def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -283,17 +311,30 @@ def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def _check(path: Path, avatar: Avatar) -> None:
     """Raise StgaError where the parts of an avatar do not fit each other."""
+    _check_shapes(path, avatar)
+    arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
+    arrays |= {"neutral": avatar.neutral, **avatar.driven_offsets}
+    if avatar.strain_range is not None:
+        arrays["strain_range"] = avatar.strain_range
+    for name, array in arrays.items():
+        _check_finite(path, name, array)
+    _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
+    _check_index(path, "face", avatar.splats.face, len(avatar.faces), "faces")
+
+
+def _check_shapes(path: Path, avatar: Avatar) -> None:
+    """Raise StgaError where types and shapes do not fit each other, or the header's fields are of
+    no known kind. Looks at no array's contents."""
     for name, known in (("convention", CONVENTIONS), ("principal_point", PRINCIPAL_POINTS)):
         if getattr(avatar, name) not in known:
             found = shorten(getattr(avatar, name))
             raise StgaError(f"{path}: {name} is {found}, expected one of {', '.join(known)}")
-    check_array(path, "neutral", avatar.neutral, "float32", (-1, 3))
-    check_array(path, "faces", avatar.faces, "int32", (-1, 3))
-    _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
+    _check_shape(path, "neutral", avatar.neutral, "float32", (-1, 3))
+    _check_shape(path, "faces", avatar.faces, "int32", (-1, 3))
     count = len(avatar.splats.xyz) if avatar.splats.xyz.ndim else 0
     for name, kind in ARRAYS.items():
         array = getattr(avatar.splats, name)
-        check_array(path, name, array, kind.dtype, (count, *kind.shape))
+        _check_shape(path, name, array, kind.dtype, (count, *kind.shape))
         if kind.sizes and array.shape[1] not in kind.sizes:
             found = f"{array.shape[1]} coefficients"
             raise StgaError(f"{path}: {name} has {found}, expected one of {kind.sizes}")
@@ -301,12 +342,11 @@ def _check(path: Path, avatar: Avatar) -> None:
     limits = avatar.strain_range
     color = avatar.background
     if limits is not None:
-        check_array(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
+        _check_shape(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
     for name, coefficients in avatar.driven_offsets.items():
-        check_array(path, name, coefficients, "float32", (faces, STRAIN_COMPONENTS, 3))
-    _check_index(path, "face", avatar.splats.face, faces, "faces")
+        _check_shape(path, name, coefficients, "float32", (faces, STRAIN_COMPONENTS, 3))
     for name, mask in avatar.regions.items():
-        check_array(path, f"region {name!r}", mask, "bool", (faces,))
+        _check_shape(path, f"region {name!r}", mask, "bool", (faces,))
     if len(color) != 3 or not all(isinstance(c, (int, float)) and 0 <= c <= 1 for c in color):
         expected = "expected three numbers between 0 and 1"
         raise StgaError(f"{path}: background is {shorten(color)}, {expected}")
@@ -317,12 +357,22 @@ def check_array(
 ) -> None:
     """Raise StgaError unless dtype and shape (-1: any) are as expected and every number is
     finite."""
+    _check_shape(path, name, array, dtype, shape)
+    _check_finite(path, name, array)
+
+
+def _check_shape(
+    path: Path, name: str, array: np.ndarray, dtype: str, shape: tuple[int, ...]
+) -> None:
     sizes = zip(shape, array.shape, strict=False)
     fits = array.ndim == len(shape) and all(want in (-1, have) for want, have in sizes)
     if not fits or array.dtype != dtype:
         expected = ", ".join("any" if size < 0 else str(size) for size in shape)
         found = f"{array.dtype} {array.shape}"
         raise StgaError(f"{path}: {name} is {found}, expected {dtype} ({expected})")
+
+
+def _check_finite(path: Path, name: str, array: np.ndarray) -> None:
     if not np.isfinite(array).all():
         raise StgaError(f"{path}: {name} holds a value that is not finite")
 
@@ -333,13 +383,19 @@ def _check_index(path: Path, name: str, index: np.ndarray, count: int, of: str) 
         raise StgaError(f"{path}: {refers}, but there are {count} {of}")
 
 
-def _light(path: Path, arrays: Mapping[str, np.ndarray], rest: object) -> AvatarLight:
-    """By what the header says. Raises StgaError naming the file and what is wrong."""
-    values: dict[str, Any] = {}
+def _check_light_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, shape in _LIGHT_ARRAYS.items():
         array = arrays.get(_PREFIX + name, np.zeros(0))
         sizes = tuple(len(arrays["neutral"]) if size < 0 else size for size in shape)
-        check_array(path, _PREFIX + name, array, "float16", sizes)
+        _check_shape(path, _PREFIX + name, array, "float16", sizes)
+
+
+def _light(path: Path, arrays: Mapping[str, np.ndarray], rest: object) -> AvatarLight:
+    """By what the header says. Raises StgaError naming the file and what is wrong."""
+    values: dict[str, Any] = {}
+    for name in _LIGHT_ARRAYS:
+        array = arrays[_PREFIX + name]
+        _check_finite(path, _PREFIX + name, array)
         values[name] = array.astype(np.float32)
     match rest:
         case {

@@ -307,7 +307,7 @@ def find_region(capture: Capture, name: str) -> np.ndarray:
     elif name in masks:
         region = faces_within(capture.faces, masks[name])
     elif path.suffix.lower() == ".npz":
-        weights = read_npz(path).get("weights", np.zeros(0, int))
+        weights = read_npz(path, ("weights",)).get("weights", np.zeros(0, int))
         if weights.dtype not in (np.float32, np.float64, np.bool_) or weights.shape != shape:
             found = f"{weights.dtype} {weights.shape}" if weights.size else "no such array"
             expected = f"'weights', one number from 0 to 1 per triangle {shape}"

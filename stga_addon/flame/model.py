@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import StgaError
-from ..files import read_npz
+from ..files import npz_outlines, read_npz
 from .unpickle import read_pickled_arrays
 
 Arrays = Mapping[str, np.ndarray]
@@ -85,7 +85,9 @@ def read_flame(path: Path) -> FlameModel:
     finite, and any class in a pickle that is not an array.
     """
     if path.suffix.lower() == ".npz":
-        arrays = dict(read_npz(path))
+        own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
+        stored = npz_outlines(path)
+        arrays = read_npz(path, [n for n in stored if n in own or n.startswith(MASK_PREFIX)])
         if "shape_steps" in arrays and "v_template" in arrays:
             steps = _floats(path, arrays, "shape_steps", (None, len(arrays["v_template"]), 3))
             arrays["shapedirs"] = np.moveaxis(SHAPE_STEP_M * steps, 0, -1)

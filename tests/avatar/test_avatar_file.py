@@ -1,6 +1,7 @@
 """The avatar's own file: what goes in comes out, and nothing else is let in."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
 from stga_addon.errors import StgaError
+from stga_addon.files import save_npz
 
 SPLAT_FIELDS = ("xyz", "rotation", "log_scale", "opacity", "sh", "face", "unbound")
 
@@ -109,6 +111,46 @@ def test_wrong_arrays_and_header_fields_are_named(tmp_path, avatar, change, comp
     np.savez(tmp_path / "a.npz", **content)
     with pytest.raises(StgaError, match=rf"a\.npz: .*{complaint}"):
         read_avatar(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "zeros", "sentence"),
+    [
+        ("notes", np.zeros(40_000_000, np.uint8), None),
+        ("sh", (1 << 18, 16, 3), "sh is float32"),
+        ("neutral", (1 << 22, 4), "neutral is"),
+        ("light_transfer", (1 << 20, 9), "light_transfer"),
+        ("region_faces", (1 << 8, 1 << 16), "region_faces"),
+        ("header", (40_000_000,), "header"),
+    ],
+)
+def test_a_small_file_is_not_unpacked_to_gigabytes(tmp_path, avatar, name, zeros, sentence):
+    """Catches arrays unpacked before their names and shapes are looked at: 3.6 MB became 3.4 GB."""
+    path = tmp_path / "a.npz"
+    write_avatar(path, avatar)
+    with np.load(path) as data:
+        arrays = dict(data)
+    if name.startswith("light"):
+        header = json.loads(arrays["header"].tobytes()) | {"light": {}}
+        arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        arrays["light_radiance"] = np.zeros((9, 3), np.float16)
+    if name == "header":
+        arrays[name] = np.zeros(zeros, np.uint8)
+    elif sentence:
+        arrays[name] = np.broadcast_to(np.zeros((), np.float32), zeros)
+    else:
+        arrays[name] = zeros
+    save_npz(path, arrays, compressed=True)
+    tracemalloc.start()
+    try:
+        if sentence is None:
+            assert len(read_avatar(path).splats) == len(avatar.splats)
+        else:
+            with pytest.raises(StgaError, match=rf"a\.npz: {sentence}"):
+                read_avatar(path)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_an_encrypted_archive_is_refused(tmp_path, avatar):
