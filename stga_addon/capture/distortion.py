@@ -13,10 +13,6 @@ PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE")
 PERSPECTIVES = (*PINHOLES, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")  # Of instant-ngp
 MAX_SHIFT_PX = 0.5  # At the image's corners, up to which a distortion shows nowhere
-ADVICE = (
-    "captures are read as pinholes: undistort the images, as stga track does of footage, and "
-    "remove these fields"
-)
 
 
 def distortion(frames: Sequence[Frame]) -> str | None:
@@ -33,7 +29,7 @@ def _distortion_of(frame: Frame) -> str | None:
     other = next((name for name in OTHER_LENSES if record.values.get(name)), None)
     if model not in PERSPECTIVES or other is not None:
         name = "camera_model" if other is None else other
-        return f"{record.where(name)}: is {shorten(record.values.get(name))}; {ADVICE}"
+        return f"{record.where(name)}: is {shorten(record.values.get(name))}, which is no pinhole"
     if model in PINHOLES:
         return None
     given = {name: record.number(name) for name in (*RADIAL, *TANGENTIAL) if record.has(name)}
@@ -52,4 +48,4 @@ def _distortion_of(frame: Frame) -> str | None:
     if shift * focal <= MAX_SHIFT_PX:
         return None
     names = ", ".join(f"{name} {value:g}" for name, value in given.items() if value)
-    return f"{frame.where}: is distorted ({names}); {ADVICE}"
+    return f"{frame.where}: is distorted ({names})"

@@ -98,7 +98,8 @@ def open_capture(
                 raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
             seen.add(file)
     if distorted := distortion(transforms.frames):
-        raise StgaError(distorted)
+        advice = "undistort the images, as stga track does of footage, and remove these fields"
+        raise StgaError(f"{distorted}; captures are of pinholes: {advice}")
     capture = _open_layout(root, transforms, flame)
     warnings = list(capture.warnings)
     warnings += transforms_warnings(transforms.frames, principal_point)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..avatar.file import Avatar, read_avatar
 from ..capture.camera import TURNTABLE_S, central_camera, covered_angles, to_and_fro, turntable
+from ..capture.distortion import distortion
 from ..capture.model import View
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, read_transforms
 from ..driving.open_motion import MotionOptions
@@ -135,7 +136,10 @@ def render(request: Render, report: Report, say: Say) -> Written:
         principal_point = request.principal_point or DEFAULT_PRINCIPAL_POINT  # splats have none
         if request.principal_point is None and not is_splats(request.source):
             principal_point = read_avatar(avatar_source.avatar_path(request.source)).principal_point
-        views = [frame.view for frame in read_transforms(request.cameras, principal_point)]
+        frames = read_transforms(request.cameras, principal_point)
+        views = [frame.view for frame in frames]
+        if distorted := distortion(frames):
+            say(f"{distorted}; pictures are drawn as of a pinhole")
     composer = Composer(request.device)
     composer.choose()
     subject = _subject(request, composer, say)

@@ -26,7 +26,9 @@ from stga_addon.capture.meshes import read_mesh, read_regions
 from stga_addon.capture.model import View
 from stga_addon.capture.open import read_face_ids, read_soup
 from stga_addon.capture.transforms import read_transforms
-from stga_addon.export.ply import PROPERTIES, read_ply, splat_columns, write_ply
+from stga_addon.export.ply import PROPERTIES, splat_columns, write_ply
+from stga_addon.export.splat_files import read_splats
+from stga_addon.export.spz import write_spz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
@@ -219,14 +221,21 @@ TARGETS = {
             read_head_model,
         ),
         "avatar": ("a.npz", avatar, read_avatar),
-        "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_ply),
-        "splats as text": ("a.ply", ascii_splats, read_ply),
+        "splats": ("a.ply", lambda p: write_ply(p, random_splats(1, 4, 1)), read_splats),
+        "splats as text": ("a.ply", ascii_splats, read_splats),
+        "splats as spz": ("a.spz", lambda p: write_spz(p, random_splats(1, 4, 1)), read_splats),
+        "splats as splat": ("a.splat", lambda p: p.write_bytes(bytes(range(128))), read_splats),
         "flame npz": ("a.npz", lambda p: np.savez(p, **random_arrays(vertices=6)), read_flame),
         "flame pickle 2": ("a.pkl", flame_pickle(2), read_flame),
         "flame pickle 5": ("a.pkl", flame_pickle(5), read_flame),
         "flame masks": (
             "a.pkl",
             lambda p: p.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 2)),
+            read_pickled_arrays,
+        ),
+        "flame masks as text": (
+            "a.pkl",
+            lambda p: p.write_bytes(pickle.dumps({"nose": np.arange(5), "lips": [1, 2, 3]}, 0)),
             read_pickled_arrays,
         ),
         "flame frame": (
