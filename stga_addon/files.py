@@ -348,14 +348,17 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
     except StgaError:
         raise
     except Exception as error:
-        problem = _damage(path) or (
+        problem = damage_of(path) or (
             f"is not a readable {kind} file ({error or type(error).__name__})"
         )
         raise StgaError(f"{path}: {problem}") from error
 
 
-def _damage(path: Path) -> str | None:
-    """What happened to a binary file that cannot be read, where its beginning shows it."""
+def damage_of(path: Path) -> str | None:
+    """What happened to a binary file that cannot be read, where its beginning shows it; to follow
+    its name in a message. Raises StgaError where it cannot be opened."""
+    if not os.path.isfile(path):  # a pipe need never end
+        return None
     with naming(path, "read"), path.open("rb") as stream:
         start = stream.read(DAMAGE_BYTES)
     return stray_content(start) or (CHANGED_LINE_ENDS if line_ends_changed(start) else None)

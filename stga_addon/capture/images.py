@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageCms, ImageOps
 
 from ..errors import StgaError
+from ..files import damage_of
 from .camera import MAX_IMAGE_PIXELS, is_image_size
 from .color import in_bands, is_srgb, to_srgb, with_gamma
 from .model import View
@@ -54,7 +55,8 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except FileNotFoundError as error:
         raise StgaError(f"{path}: does not exist; expected an image") from error
     except Exception as error:  # Pillow's decoders raise any kind of error for a bad file
-        raise StgaError(f"{path}: is not a readable image ({error})") from error
+        problem = damage_of(path) or f"is not a readable image ({error})"
+        raise StgaError(f"{path}: {problem}") from error
 
 
 def is_plain(path: Path) -> bool:

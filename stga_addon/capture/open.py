@@ -1,5 +1,6 @@
 """Opening a capture folder of any layout."""
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_json, read_npy, read_npz
+from ..files import naming, read_json, read_npy, read_npz
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
 from ..flame.sequence import (
@@ -31,6 +32,7 @@ from .mesh_geometry import without_head_motion
 from .model import Capture, Views, evenly_spread
 from .transforms import (
     DEFAULT_PRINCIPAL_POINT,
+    IMAGE_SUFFIXES,
     PRINCIPAL_POINTS,
     SPLITS,
     Frame,
@@ -48,6 +50,7 @@ MAX_HEAD_EXTENT_M = 3.0
 """Largest extent of a neutral mesh: outside of these, its unit is probably not the meter."""
 NEUTRAL = ("neutral", "canonical")  # Names of a mesh without expression
 MAX_COMPARED_VIEWS = 4
+NAMES_IN_WARNING = 3
 MIN_SHARE_DIFFERENCE = 0.01  # of the vertices
 CANONICAL_NAME = "canonical_flame_param.npz"
 PARAMETERS = "flame_param"
@@ -104,6 +107,7 @@ def open_capture(
     warnings = list(capture.warnings)
     warnings += transforms_warnings(transforms.frames, principal_point)
     warnings += _mask_warnings(transforms.frames)
+    warnings += _unnamed_images(transforms.frames)
     if found := _principal_point_warning(transforms.frames, capture.mesh, principal_point):
         warnings.append(found)
     # Limits, thresholds and the near plane are in meters: a head in millimeters cannot be trained.
@@ -194,6 +198,24 @@ def _mask_warnings(frames: Sequence[Frame]) -> list[str]:
     if all(is_labeled(mask) for mask in masks if mask.any()):
         return [f"{where}: the masks hold only 0 and {level}, which is read as 255"]
     return [f"{where}: the masks hold nothing above {level}; {outside}"]
+
+
+def _unnamed_images(frames: Sequence[Frame]) -> list[str]:
+    """What lies beside the images of the frames, and none of them names."""
+    views = [frame.view for frame in frames]
+    named = {path for view in views for path in (view.image, view.mask)}
+    found = []
+    for folder in dict.fromkeys(view.image.parent for view in views):
+        with naming(folder, "read"):
+            paths = [folder / name for name in sorted(os.listdir(folder))]
+        images = [path for path in paths if path.suffix.lower() in IMAGE_SUFFIXES]
+        left_out = [path for path in images if path not in named]
+        if left_out:
+            names = ", ".join(path.name for path in left_out[:NAMES_IN_WARNING])
+            more = ", …" if len(left_out) > NAMES_IN_WARNING else ""
+            count = f"{len(left_out)} of {len(images)} images are named by no frame"
+            found.append(f"{folder}: {count}: {names}{more}")
+    return found
 
 
 def _open_mesh_folder(root: Path, listed: Sequence[Path]) -> Capture:

@@ -181,6 +181,16 @@ def test_capture_of_a_monocular_tracker(tmp_path):
     assert "00000.obj, the first timestep" in open_capture(root).warnings[0]
 
 
+def test_images_that_no_frame_names(tmp_path):
+    """Catches recorded images that nobody trains on, without a word: a split that is missing, or a
+    tracker that lost its frames."""
+    root = factory.write_mesh_capture(tmp_path / "capture")
+    (root / "transforms_test.json").unlink()
+    (root / "images/notes.txt").touch()
+    (found,) = open_capture(root).warnings
+    assert found.startswith(f"{root}/images: 3 of 9 images are named by no frame: 00003_00.png, ")
+
+
 def test_size_without_pillow(tmp_path):
     """Catches a traceback about PIL in Blender, which lacks it, where a file gives no size."""
     root = factory.write_mesh_capture(tmp_path / "capture")

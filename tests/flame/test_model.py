@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse
+from PIL import Image
 
+from stga_addon.capture.images import image_size
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npy
 from stga_addon.flame.model import key_regions, read_flame
@@ -114,7 +116,8 @@ PAGE = b"\r\n<!DOCTYPE html>\n<html><head><title>Sign in</title></head></html>"
 
 
 @pytest.mark.parametrize(
-    ("name", "read"), [("a.pkl", read_flame), ("a.npz", read_flame), ("a.npy", read_npy)]
+    ("name", "read"),
+    [("a.pkl", read_flame), ("a.npz", read_flame), ("a.npy", read_npy), ("a.png", image_size)],
 )
 def test_what_stands_in_the_place_of_a_file(tmp_path, name, read):
     """Catches a checkout without Git LFS, a download that was a login page, and a transfer as text,
@@ -124,6 +127,8 @@ def test_what_stands_in_the_place_of_a_file(tmp_path, name, read):
         np.save(path, np.arange(10_000))
     elif name == "a.npz":
         np.savez(path, **random_arrays())
+    elif name == "a.png":
+        Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64), np.uint8)).save(path)
     else:
         path.write_bytes(pickle.dumps(random_arrays(), 2))
     read(path)
