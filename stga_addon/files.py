@@ -1,18 +1,20 @@
 """Atomic file writes and bounded reads of JSON, TOML and npz."""
 
 import ctypes
+import errno
 import json
 import math
 import os
 import platform
 import re
 import secrets
+import shutil
 import stat
 import time
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
@@ -32,6 +34,8 @@ CHANGED_LINE_ENDS = (
     "was carried over as text, which changed its line ends (CR LF); copy it again as binary"
 )
 MAX_UNPACKED_BYTES = 4 << 30  # Of an npz: a checkpoint of four million splats
+MAX_NAME_BYTES = 255
+"""Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 PARTIAL_NAME = re.compile(
     r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial", re.DOTALL
 )  # Name of a temporary file: .NAME.HOST-PROCESS-RANDOM.partial
@@ -62,8 +66,11 @@ def replacing(path: Path, patience_s: float = RENAME_PATIENCE_S) -> Iterator[Pat
 @contextmanager
 def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFile]:
     """Yield a function like `replacing` whose files are renamed together when this block succeeds,
-    else all deleted. A failure also removes the folders that were made for the files. Raises
-    StgaError as `replacing` does."""
+    in the order in which they were begun, else all deleted.
+
+    Where a rename fails, the files that were replaced before come back. A failure also removes the
+    folders that were made for the files. Raises StgaError as `replacing` does.
+    """
     partials: dict[Path, Path] = {}
     made_folders: list[Path] = []
 
@@ -71,10 +78,11 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
     def new_file(path: Path) -> Iterator[Path]:
         if not path.name or (os.path.exists(path) and not os.path.isfile(path)):
             raise StgaError(f"{path}: cannot be written (is not a regular file)")
-        name = f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
-        partials[path] = path.with_name(name)
         with naming(path):
             try:
+                if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
+                    raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+                partials[path] = path.with_name(temporary_name(path.name))
                 missing = [each for each in path.parents if not each.is_dir()]
                 for folder in reversed(missing):
                     folder.mkdir(exist_ok=True)
@@ -90,9 +98,7 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
 
     try:
         yield new_file
-        for path, content in partials.items():
-            with naming(path):
-                _once_free(partial(os.replace, content, path), patience_s)
+        _rename_together(partials, patience_s)
     except BaseException:
         for content in partials.values():
             with suppress(OSError, ValueError):  # where it was never created, or is renamed
@@ -101,6 +107,65 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
             with suppress(OSError):  # others have written there
                 folder.rmdir()
         raise
+
+
+def _rename_together(partials: Mapping[Path, Path], patience_s: float) -> None:
+    """Rename each content to its path; where one fails, what the others replaced comes back."""
+    earlier: dict[Path, Path] = {}
+    renamed: list[Path] = []
+    try:
+        for path in partials if len(partials) > 1 else ():
+            with naming(path):
+                if os.path.lexists(path):
+                    earlier[path] = path.with_name(temporary_name(path.name))
+                    _keep(path, earlier[path])
+        for path, content in partials.items():
+            with naming(path):
+                _once_free(partial(os.replace, content, path), patience_s)
+            renamed.append(path)
+    except BaseException:
+        for path in renamed:
+            with suppress(OSError):
+                if path in earlier:
+                    os.replace(earlier[path], path)
+                else:
+                    path.unlink()
+        raise
+    finally:
+        for kept in earlier.values():
+            with suppress(OSError):  # it has its name again
+                kept.unlink()
+
+
+def _keep(path: Path, kept: Path) -> None:
+    """Give a file a second name; a copy where the file system has no links."""
+    try:
+        os.link(path, kept)
+    except OSError:
+        shutil.copy2(path, kept, follow_symlinks=False)
+
+
+def temporary_name(name: str) -> str:
+    """A new name for what lies beside `name`, of which it has as much as fits; what a killed
+    process leaves under it, `remove_leftovers` removes."""
+    end = f".{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.partial"
+    while len(os.fsencode(f".{name}{end}")) > MAX_NAME_BYTES:
+        name = name[:-1]
+    return f".{name}{end}"
+
+
+@contextmanager
+def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Yield an empty folder in `parent`, which is made, for what is there until the block ends;
+    those of killed processes are removed. Raises StgaError where there can be none."""
+    folder = parent / temporary_name(name)
+    with naming(parent):
+        folder.mkdir(parents=True)
+    try:
+        remove_leftovers(parent)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 class NumberedFiles:
@@ -114,9 +179,11 @@ class NumberedFiles:
         self._names = names
         self._written = dict[str, str]()
         self._list = folder / SEQUENCE_FILE
-        text = self._list.read_text(errors="replace") if self._list.is_file() else ""
-        listed = set(text.splitlines())
-        with naming(folder):
+        self._listed = ""
+        if os.path.isfile(self._list):
+            self._listed = read_bytes(self._list).decode("utf-8", "replace")
+        listed = set(self._listed.splitlines())
+        with naming(folder, "read"):
             found = self._found()
             self._earlier = [path for path in found if self._line(path.name, path) in listed]
             other = next((path.name for path in found if path not in self._earlier), None)
@@ -129,6 +196,23 @@ class NumberedFiles:
         with naming(self._list), self._list.open("a") as stream:
             self._written[name] = self._line(name, content)
             stream.write(self._written[name] + "\n")
+
+    @contextmanager
+    def added_together(self) -> Iterator[NewFile]:
+        """Yield a function like `replacing`, whose files get their names together when the block
+        succeeds, as those of `replacing_together`, and are listed before; then `finish`."""
+        with replacing_together() as new_file, new_file(self._list) as content:
+
+            @contextmanager
+            def add(path: Path) -> Iterator[Path]:
+                with new_file(path) as partial:
+                    yield partial
+                    self._written[path.name] = self._line(path.name, partial)
+
+            yield add
+            lines = "".join(f"{line}\n" for line in self._written.values())
+            content.write_text(self._listed + lines, encoding="utf-8")
+        self.finish()
 
     def finish(self) -> None:
         """Remove the earlier sequence's files that none of the written ones replaced, if any was
@@ -185,13 +269,16 @@ class _Checked(Exception):
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes of this computer left in the folder."""
+    """Remove the temporary files and folders that killed processes of this computer left in the
+    folder."""
     with suppress(OSError):
         for name in os.listdir(folder):
             match = PARTIAL_NAME.fullmatch(name)
             if match and match["host"] == _HOST and not _is_running(int(match["process"])):
                 with suppress(OSError):
-                    (folder / name).unlink()
+                    path = folder / name
+                    remove = shutil.rmtree if path.is_dir() else os.unlink
+                    remove(path)
 
 
 _remove_leftovers_once = cache(remove_leftovers)

@@ -12,10 +12,9 @@ from types import NoneType
 from typing import Any, get_args, get_origin
 
 from .errors import StgaError, shorten
+from .files import MAX_NAME_BYTES
 from .schema import alternatives, expectation, setting, type_hints
 
-MAX_NAME_BYTES = 255
-"""Longest name of a file or folder on the file systems of Linux, macOS and Windows."""
 MAX_DIGITS = 18  # Of a whole number on the command line, which fits 64 bits
 
 

@@ -21,6 +21,7 @@ from stga_addon.files import (
     read_npz,
     replacing,
     replacing_together,
+    temporary_folder,
     write_json,
     write_npz,
 )
@@ -57,7 +58,7 @@ UNWRITABLE = (
     "pipe",
     ".",
     "/",
-    "x" * 250,
+    "x" * 256,
     "y" * 5000,
     "a\0",
     "\ud800",
@@ -75,8 +76,8 @@ def test_unwritable_paths(tmp_path, name):
         write_json(path, {})
     with pytest.raises(StgaError, match="cannot be written"):
         check_writable(path)
-    for writable in (tmp_path / "new/inner/video.mp4", tmp_path / "video.mp4", tmp_path / "file"):
-        check_writable(writable)
+    for writable in ("new/inner/video.mp4", "video.mp4", "file", "x" * 255, "x" + "é" * 127):
+        check_writable(tmp_path / writable)
     assert sorted(os.listdir(tmp_path)) == ["file", "folder", "pipe"]
     assert (tmp_path / "file").read_text() == "x"
 
@@ -173,6 +174,16 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
         assert run(WRITE, tmp_path / "a.json") == 0
         assert {path.name for path in tmp_path.iterdir()} == {*kept, "a.json", partial.name}
     assert {path.name for path in tmp_path.iterdir()} == {*kept, "a.json", "b.json"}
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    long_name = tmp_path / ("é" * 127)
+    with temporary_folder(tmp_path / "out", "x") as own, replacing(long_name) as partial:
+        for name in (own.name, partial.name):
+            left = tmp_path / "out" / name.replace(f"-{os.getpid()}-", f"-{process.pid}-")
+            (left / "inner").mkdir(parents=True)
+        with temporary_folder(tmp_path / "out", "x") as other:
+            assert set((tmp_path / "out").iterdir()) == {own, other}
+    assert not list((tmp_path / "out").iterdir())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links need privileges")
@@ -271,3 +282,35 @@ def test_files_that_appear_together(tmp_path):
         assert not (tmp_path / "old/b.json").exists()
     found = {path.name: read_json(path) for path in (tmp_path / "old").iterdir()}
     assert found == {"a.json": 2, "b.json": 2}
+
+
+def write_together(folder: Path, *names: str) -> None:
+    with replacing_together() as new_file:
+        for name in names:
+            with new_file(folder / name) as content:
+                content.write_text("2")
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_rename_that_fails_among_others(tmp_path, monkeypatch, links):
+    """Catches files of two results side by side, earlier ones lost, and temporary files left."""
+    for name in ("a.json", "b.json"):
+        write_json(tmp_path / name, 1)
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    replace = os.replace
+
+    def fails_for_c(source, target):
+        if Path(target).name == "c.json":
+            raise PermissionError(13, "Permission denied")
+        replace(source, target)
+
+    def no_link(source, target):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(files.os, "replace", fails_for_c)
+    if not links:  # as FAT and some network file systems say
+        monkeypatch.setattr(files.os, "link", no_link)
+    with pytest.raises(StgaError, match=r"c\.json: cannot be written"):
+        write_together(tmp_path, "new/x.json", "a.json", "b.json", "c.json")
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+    assert [read_json(tmp_path / name) for name in before] == [1, 1]

@@ -50,14 +50,11 @@ def write_ply_sequence(folder: Path, frames: Iterable[tuple[int, Splats]]) -> li
     """
     files = NumberedFiles(folder, FRAME_NAME)
     written = []
-    with replacing_together() as new_file:
+    with files.added_together() as new_file:
         for number, world in frames:
             written.append(folder / f"{number:05d}.ply")
             with new_file(written[-1]) as partial:
                 save_columns(partial, PROPERTIES, splat_columns(world))
-    for path in written:
-        files.add(path.name, path)
-    files.finish()
     return written
 
 

@@ -3,7 +3,6 @@
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from collections import deque
@@ -11,9 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ..errors import StgaError
+from ..files import naming, temporary_folder
 from ..options import like
 from ..progress import Cancelled, Progress, Report, Say, Written, counted
 from ..render.device import Composer
@@ -23,9 +22,8 @@ from ..worker.launch import end_with_this_process
 from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
 from .train import Train
 
-PARTIAL = ".rendering-"
-"""Start of the name of the folder that Blender writes into; a picture leaves it when it is
-whole."""
+PARTIAL = "rendering"
+"""In the name of the folder that Blender writes into; a picture leaves it when it is whole."""
 SAVED = re.compile(r"Saved: '(?P<path>.+)'")  # What Blender prints when it has written a picture
 LAST_LINES = 30  # Lines of Blender's output that are searched for why it failed
 STOP_TIMEOUT_S = 10.0
@@ -124,11 +122,8 @@ def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:
 
 def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator[Path]:
     """Let Blender render the frames; yields each picture when it is whole."""
-    request.output.mkdir(parents=True, exist_ok=True)
-    for left in request.output.glob(PARTIAL + "*"):  # of a process that was killed
-        shutil.rmtree(left, ignore_errors=True)
-    with TemporaryDirectory(prefix=PARTIAL, dir=request.output) as partial:
-        names = str(Path(partial).absolute() / ("#" * FRAME_DIGITS))
+    with temporary_folder(request.output, PARTIAL) as partial:
+        names = str(partial.absolute() / ("#" * FRAME_DIGITS))
         process = _start(
             [
                 *blender_command(),
@@ -162,7 +157,8 @@ def _rendered(request: RenderBlend, first: int, last: int, say: Say) -> Iterator
                 picture = pictures[min(expected, last)]
                 found = SAVED.search(line)
                 if found is not None and Path(found["path"]).name == picture.name:
-                    os.replace(Path(partial, picture.name), picture)
+                    with naming(picture):
+                        os.replace(partial / picture.name, picture)
                     expected += 1
                     yield picture
             code = process.wait()

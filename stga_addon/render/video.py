@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from fractions import Fraction
 from itertools import count
 from pathlib import Path
@@ -88,17 +88,31 @@ def sequence_writer(folder: Path) -> Iterator[WriteImage]:
     """
     from PIL import Image
 
+    with sequence_files(folder) as next_file:
+
+        def write(image: np.ndarray) -> None:
+            with next_file() as partial:
+                Image.fromarray(image).save(partial, format="PNG")
+
+        yield write
+
+
+@contextmanager
+def sequence_files(folder: Path) -> Iterator[Callable[[], AbstractContextManager[Path]]]:
+    """The files of `sequence_writer`: the block is given a function like `replacing` of the next
+    one."""
     files = NumberedFiles(folder, IMAGE_NAME)
     number = count(1)
 
-    def write(image: np.ndarray) -> None:
+    @contextmanager
+    def next_file() -> Iterator[Path]:
         path = folder / f"{next(number):04d}.png"
         with replacing(path) as partial:
-            Image.fromarray(image).save(partial, format="PNG")
+            yield partial
             files.add(path.name, partial)
 
     try:
-        yield write
+        yield next_file
     finally:
         files.finish()
 

@@ -23,6 +23,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import write_ply
 from stga_addon.jobs.table import Kind
 from stga_addon.raster.posed_splats import ComposedImage
+from stga_addon.render.video import check_output
 from stga_addon.scene.render import drawn_video
 from stga_addon.scene.render.drawn_video import DrawnVideo, png_bytes
 
@@ -250,13 +251,18 @@ def test_video_without_a_training_python(monkeypatch, tmp_path) -> None:
 
 
 def test_images_without_a_training_python(monkeypatch, tmp_path) -> None:
-    """Catches images that are not written, and a GPU that fails without a sentence."""
-    for name in ("drawn", "out"):
-        (tmp_path / name).mkdir()
-    video = DrawnVideo(tmp_path / "drawn", tmp_path / "out", (0.0, 0.0, 0.0))
-    drawn(monkeypatch, video, [0.2, 0.6])
-    video.encode(24.0)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0001.png", "0002.png"]
+    """Catches images that are not written, a folder that takes a sequence only once, and a GPU that
+    fails without a sentence."""
+    out = tmp_path / "out"
+    for shades in ([0.2, 0.6], [0.8]):
+        folder = tmp_path / f"drawn_{len(shades)}"
+        folder.mkdir()
+        check_output(out)
+        video = DrawnVideo(folder, out, (0.0, 0.0, 0.0))
+        drawn(monkeypatch, video, shades)
+        video.encode(24.0)
+        means = [np.asarray(Image.open(path)).mean() / 255 for path in sorted(out.glob("*.png"))]
+        np.testing.assert_allclose(means, shades, atol=0.01)
     monkeypatch.setattr(drawn_video, "draw_image", lambda *_: None)
     with pytest.raises(StgaError, match="no GPU context"):
         video.add([], CAMERA)

@@ -70,6 +70,36 @@ def test_a_sequence_replaces_an_earlier_one(avatar, tmp_path):
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("ends", [OSError(errno.EACCES, "Permission denied"), SystemExit()])
+def test_a_sequence_whose_third_rename_fails(avatar, tmp_path, monkeypatch, ends):
+    """Catches frames of two exports in one folder, and a folder that refuses all later exports,
+    also where the process ends between two renames."""
+    frames = posed(avatar, 1, 2, 3, 4)
+    export_avatar(tmp_path, avatar, "ply-sequence", frames[:2])
+    before = contents(tmp_path)
+    replace = os.replace
+
+    def fails(source, target):
+        if Path(target).name == "00003.ply":
+            monkeypatch.setattr("os.replace", replace if isinstance(ends, OSError) else killed)
+            raise ends
+        replace(source, target)
+
+    def killed(source, target):  # nothing is put back
+        raise ends
+
+    monkeypatch.setattr("os.replace", fails)
+    moved = [(number, mesh + 5) for number, mesh in frames]
+    with pytest.raises(StgaError if isinstance(ends, OSError) else SystemExit):
+        export_avatar(tmp_path, avatar, "ply-sequence", moved)
+    monkeypatch.undo()
+    if isinstance(ends, OSError):
+        assert contents(tmp_path) == before
+    export_avatar(tmp_path, avatar, "ply-sequence", frames[:1])
+    assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["00001.ply"]
+    assert is_posed(tmp_path / "00001.ply", avatar, 1)
+
+
 @pytest.mark.parametrize("fps", [0.0, -25.0, 1e-9, 1e4, 1e300, float("inf"), float("nan")])
 @pytest.mark.parametrize("format", [name for name, format in FORMATS.items() if format.has_rate])
 def test_frame_rates_that_nothing_plays(format, fps, avatar, tmp_path):

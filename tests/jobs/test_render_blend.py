@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -142,4 +143,19 @@ def test_blender_ends_with_a_killed_worker(shot, tmp_path, monkeypatch):
     assert kept.items() <= WHOLE.items()
     perform(shot, ignore, lambda line: None)
     assert pictures(shot.output) == WHOLE
-    assert not list(shot.output.glob(".rendering-*"))
+    assert set(os.listdir(shot.output)) == set(WHOLE)
+
+
+def test_two_jobs_with_one_output(shot: RenderBlend) -> None:
+    """Catches a job that removes what the Blender of another one is writing."""
+    other = replace(shot, frames=(20, 21))
+
+    def report(progress: Progress) -> bool:
+        if progress.share == 0.2:  # the first Blender has four pictures to go
+            perform(other, ignore, lambda line: None)
+        return False
+
+    perform(shot, report, lambda line: None)
+    more = {f"{frame:06d}.png": f"half {frame}" for frame in (20, 21)}
+    assert pictures(shot.output) == WHOLE | more
+    assert set(os.listdir(shot.output)) == set(WHOLE | more)

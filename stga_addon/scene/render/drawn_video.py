@@ -12,7 +12,7 @@ import numpy as np
 from ...capture.camera import Camera
 from ...errors import StgaError
 from ...files import replacing
-from ...render.video import finished, is_video
+from ...render.video import finished, is_video, sequence_files
 from ..compat import choose_format, sequencer_strips
 from ..layers import SceneLayer
 from ..objects import set_frames_per_second
@@ -43,13 +43,17 @@ class DrawnVideo:
         self._images.append(path)
 
     def encode(self, fps: float) -> None:
-        """Write the video, or copy the PNGs to the output folder. Raises StgaError."""
-        outputs = {self._output / image.name: image for image in self._images}
+        """Write the video, or copy the PNGs to the output folder, where they replace an earlier
+        sequence. Raises StgaError."""
         if is_video(self._output):
-            outputs = {self._output: self._encoded(fps)}
-        for output, made in outputs.items():
-            with replacing(output) as partial:
-                shutil.copyfile(made, partial)
+            video = self._encoded(fps)
+            with replacing(self._output) as partial:
+                shutil.copyfile(video, partial)
+            return
+        with sequence_files(self._output) as next_file:
+            for image in self._images:
+                with next_file() as partial:
+                    shutil.copyfile(image, partial)
 
     def _encoded(self, fps: float) -> Path:
         """The video, encoded beside the images in a scene of its own, which is removed."""
