@@ -310,6 +310,11 @@ def file_size(path: Path) -> int:
     return found.st_size
 
 
+def file_address(path: Path) -> str:
+    """What FFmpeg takes for this file: the plain name `take12:30.mp4` is a protocol to it."""
+    return f"file:{os.path.abspath(path)}"
+
+
 def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """What a file holds. Raises StgaError where it is no regular file or above the limit."""
     size = file_size(path)

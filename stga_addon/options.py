@@ -215,13 +215,16 @@ def frame_span(text: str) -> tuple[int, int]:
 
 
 def duration(text: str) -> float:
-    """Seconds in "90", "90s", "10m", "1h30m", more than 0. Raises StgaError for anything else."""
-    match = re.fullmatch(
-        r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip(), re.ASCII
-    )
+    """Seconds in "90", "90s", "10m", "1h30m", "1h30", more than 0. Raises StgaError for anything
+    else."""
+    number = r"(\d+(?:\.\d+)?)"
+    match = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}(s?))?", text.strip(), re.ASCII)
     if not match or not any(match.groups()):
         raise StgaError(f"'{text}' is not a time such as 90s, 10m or 1h30m")
-    hours, minutes, seconds = (float(part or 0) for part in match.groups())
+    hours, minutes, seconds = (float(part or 0) for part in match.groups()[:3])
+    if match[1] and not match[2] and not match[4]:  # what follows the hours alone
+        minutes = seconds
+        seconds = 0.0
     total = 3600 * hours + 60 * minutes + seconds
     if not 0 < total < math.inf:
         raise StgaError(f"'{text}' is not a positive time")

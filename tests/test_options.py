@@ -113,6 +113,10 @@ DURATIONS = {
     "1.5m": 90,
     "1m30": 90,
     " 2m ": 120,
+    "1h30": 5400,
+    "1h30s": 3630,
+    "1h0m30": 3630,
+    "0.5h15": 2700,
 }
 COLORS = {
     "white": (1, 1, 1),
@@ -125,8 +129,8 @@ NO_COLORS = "", "red", "1,1", "1,1,1,1", "255,0,0", "0,-0.1,0", "nan,0,0", "0,0,
 
 
 def test_times_and_colors():
-    """Catches minutes taken for seconds, 0…255 taken for 0…1, channels in another order, and a
-    value that means something else than what was typed."""
+    """Catches minutes taken for seconds, also where no unit names them, 0…255 taken for 0…1,
+    channels in another order, and a value that means something else than what was typed."""
     assert {text: duration(text) for text in DURATIONS} == DURATIONS
     assert {text: color(text) for text in COLORS} == COLORS
     for read, texts, message in (

@@ -13,7 +13,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..errors import StgaError
 from ..export.playback import check_rate
-from ..files import NumberedFiles, check_writable, naming, replacing
+from ..files import NumberedFiles, check_writable, file_address, naming, replacing
 from ..raster.posed_splats import ComposedImage, PosedSplats
 from .client import pack_camera, pack_layers, receive, send, unpack_camera, unpack_layers
 from .device import Composer
@@ -48,7 +48,7 @@ def video_writer(path: Path, fps: float) -> Iterator[WriteImage]:
     with replacing(path) as partial:
         try:
             with av.open(
-                str(partial), "w", format="mp4", options={"movflags": "faststart"}
+                file_address(partial), "w", format="mp4", options={"movflags": "faststart"}
             ) as container:
                 stream: Any = container.add_stream(CODEC, rate=rate, options=QUALITY)
                 stream.pix_fmt = PIXEL_FORMAT

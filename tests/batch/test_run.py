@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.progress import Progress
-from stga_addon.worker import lock
+from stga_addon.worker import lock, status
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
 from .simulated import SimulatedEngine, carry_out, empty_jobs
@@ -148,20 +149,22 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("takes_all", [False, True])
-def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
+def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch, takes_all):
     """Catches times and forecasts that grow with a cluster's queue or a batch's pauses."""
-    queue_s = 0.8
-    work_s = 0.2
-    waited = []
+    queue_s = 800.0
+    work_s = 200.0
+    now = 0.0
+    monkeypatch.setattr(status, "time", SimpleNamespace(monotonic=lambda: now))  # of the workers
 
     class Queued(SimulatedEngine):
         def running(self) -> dict[str, str]:
             return {}
 
         def end(self, job: Job) -> Ended:
-            waited.append(time.sleep(queue_s))
+            nonlocal now
+            now += queue_s
             writer = StatusWriter(job.request_folder)
-            time.sleep(work_s)
+            now += work_s
             writer.report(Progress(0.5, "Working"))
             writer.finish(WorkerState.FINISHED)
             return Ended(inspect_worker(job.request_folder))
@@ -170,8 +173,8 @@ def test_waiting_in_a_queue_is_no_work(tmp_path: Path, takes_all: bool) -> None:
     (entry,) = batch.entries.values()
     record = read_record(entry.job)
     assert record is not None
-    assert len(waited) == 1
-    assert work_s <= record.seconds == round(entry.seconds, 3) < queue_s
+    assert now == queue_s + work_s
+    assert record.seconds == entry.seconds == work_s
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from stga_addon.tracking.footage.calibrations import (
     read_realitycapture_xmp,
 )
 from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.shots import read_xml
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
 
@@ -222,6 +223,22 @@ def test_labels_are_image_names_or_paths(tmp_path):
     assert footage.warnings == (
         f"{tmp_path / 'cameras.xml'}: left out cameras without a pose: spare",
     )
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-be", "iso-8859-1"])
+def test_a_document_type_in_any_encoding(tmp_path, encoding):
+    """Catches entities, which unfold to gigabytes, in a file whose bytes do not spell DOCTYPE."""
+    text = f'<?xml version="1.0" encoding="{encoding.removesuffix("-be")}"?>'
+    text += (
+        '<!DOCTYPE d [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><document>&b;</document>'
+    )
+    mark = "\ufeff" if encoding.endswith("-be") else ""
+    (tmp_path / "cameras.xml").write_bytes((mark + text).encode(encoding))
+    with pytest.raises(StgaError, match="declares a document type; expected a calibration"):
+        read_metashape(tmp_path / "cameras.xml")
+    plain = mark + text.partition("?>")[0] + "?><document><chunk/></document>"
+    (tmp_path / "plain.xml").write_bytes(plain.encode(encoding))
+    assert read_xml(tmp_path / "plain.xml").find("chunk") is not None
 
 
 def test_mirrored_axes(tmp_path):

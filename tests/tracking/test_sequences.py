@@ -1,11 +1,14 @@
 """Frames of folders and videos, in step."""
 
+import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
+from stga_addon.render.video import video_writer
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 
@@ -191,6 +194,23 @@ def test_one_video_without_calibration(tmp_path):
     known = open_footage(tmp_path, focal=55.0)
     assert known.focal == "given"
     assert (known.cameras[0].camera.fl_x, known.cameras[0].camera.cx) == (55.0, 32.0)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no file has such a name")
+@pytest.mark.parametrize("name", ["take12:30.mp4", "http:.mp4", "concat:a|b.mp4", "-i.mp4"])
+def test_names_that_are_protocols(tmp_path, monkeypatch, name):
+    """Catches a relative name taken for a protocol of FFmpeg, read or written."""
+    pytest.importorskip("av")
+    write_video(tmp_path / "plain.mp4", [60, 90, 120], size=(64, 48))
+    monkeypatch.chdir(tmp_path)
+    Path("plain.mp4").rename(name)
+    camera = open_footage(Path(name)).cameras[0]
+    assert [camera.image(timestep).mean() for timestep in (0, 2)] == pytest.approx([60, 120], abs=3)
+    Path(name).unlink()
+    with video_writer(Path(name), 25) as append:
+        append(np.full((48, 64, 3), 80, np.uint8))
+    (again,) = open_footage(Path(name)).cameras
+    np.testing.assert_allclose(again.image(0), 80, atol=3)
 
 
 def test_two_cameras_without_calibration(tmp_path):

@@ -200,10 +200,13 @@ def read_text(path: Path) -> str:
 def read_xml(path: Path) -> ElementTree.Element:
     """The root element. Raises StgaError where it is malformed, or declares entities."""
     data = read_bytes(path)
-    if b"<!DOCTYPE" in data:
-        raise StgaError(f"{path}: declares a document type; expected a calibration")
+
+    class Builder(ElementTree.TreeBuilder):
+        def doctype(self, *_: str | None) -> None:  # which the parser finds in any encoding
+            raise StgaError(f"{path}: declares a document type; expected a calibration")
+
     try:
-        return ElementTree.fromstring(data)
+        return ElementTree.fromstring(data, ElementTree.XMLParser(target=Builder()))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise StgaError(f"{path}: is not valid XML ({error})") from error
 

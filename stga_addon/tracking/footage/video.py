@@ -14,6 +14,7 @@ from ...capture.color import is_srgb, to_srgb
 from ...capture.images import read_mask
 from ...capture.model import View
 from ...errors import StgaError
+from ...files import file_address
 
 MIN_HD_LINES = 720  # From here on, videos without a stated color matrix are in that of HD (BT.709)
 TIMED_CONTAINERS = ("mov", "matroska")
@@ -207,7 +208,7 @@ class VideoFrames:
 
     def _open(self) -> None:
         if self._container is None:
-            self._container = _pyav(self.video.path).open(str(self.video.path))
+            self._container = _open(self.video.path)
             self._container.streams.video[0].thread_type = "AUTO"
 
 
@@ -231,7 +232,7 @@ def opened_video(path: Path) -> Iterator[Any]:
     """A container that has a video stream. Raises StgaError for what fails while it is open."""
     av = _pyav(path)
     try:
-        with av.open(str(path)) as container:
+        with _open(path) as container:
             if not container.streams.video:
                 raise ValueError("it has no video stream")
             yield container
@@ -356,6 +357,11 @@ def _pixels(frame: Any) -> np.ndarray:
         turn = turn[::-1]
     columns, rows = turn.diagonal().astype(int).tolist()
     return np.ascontiguousarray(pixels[::rows, ::columns])
+
+
+def _open(path: Path) -> Any:
+    """A container; raises what PyAV does, and StgaError without it."""
+    return _pyav(path).open(file_address(path))
 
 
 def _pyav(path: Path) -> Any:
