@@ -12,7 +12,7 @@ from bpy_extras.io_utils import ImportHelper
 
 from ..stga_addon.capture.open import open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT
-from ..stga_addon.errors import StgaError
+from ..stga_addon.errors import StgaError, telling_refusals
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene import tags
@@ -61,7 +61,8 @@ class Action:
             manager.progress_begin(0, 1)
             window.cursor_modal_set("WAIT")
         try:
-            return self.run(context) or {"FINISHED"}
+            with telling_refusals():
+                return self.run(context) or {"FINISHED"}
         except (StgaError, Cancelled) as error:
             self.tell("ERROR", str(error))
             return {"CANCELLED"}
@@ -118,7 +119,8 @@ class Stepwise(Action):
         try:
             if event.type == "ESC":
                 self._steps.close()
-            is_running = next(self._steps, self) is not self
+            with telling_refusals():
+                is_running = next(self._steps, self) is not self
         except Cancelled:
             return {"CANCELLED"}
         except StgaError as error:

@@ -1,9 +1,11 @@
 """The exception whose message is shown to the user."""
 
+import os
 import re
 import reprlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 MAX_MESSAGE_CHARACTERS = 1000
 MAX_VALUE_CHARACTERS = 80
@@ -32,10 +34,29 @@ class DeviceError(StgaError):
         self.cause = one_line(cause)
 
 
+@contextmanager
+def telling_refusals() -> Iterator[None]:
+    """Turn what the system refuses in the block, to whomever, into a StgaError that names the file:
+    "cannot be accessed (Permission denied)"."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:  # a library's own
+            raise
+        name = error.filename if isinstance(error.filename, str | bytes) else ""
+        path = os.fsdecode(name) or "a file or device"
+        raise StgaError(f"{path}: cannot be accessed ({error.strerror})") from error
+    except RuntimeError as error:  # pathlib's before Python 3.13, of a link to itself
+        if not str(error).startswith("Symlink loop"):
+            raise
+        raise StgaError(f"{error}: cannot be accessed") from error
+
+
 def exit_code(work: Callable[[], object]) -> int:
     """Of a program that does this work: 0, or 2 after a StgaError, which goes to stderr."""
     try:
-        work()
+        with telling_refusals():
+            work()
     except StgaError as error:
         print(f"stga: {error}", file=sys.stderr)
         return 2

@@ -16,6 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
+from fnmatch import fnmatch
 from functools import cache, partial
 from pathlib import Path
 from typing import IO, Any
@@ -44,6 +45,8 @@ RENAME_INTERVAL_S = 0.1
 """How long, and how often, a rename is tried again while another program has the file open, on
 Windows."""
 WINDOWS_SHARING_ERRORS = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION: of an open file
+NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL)
+"""What the system answers where there is nothing under a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
@@ -296,6 +299,39 @@ def _is_running(process: int) -> bool:
     except (PermissionError, OverflowError):
         return True
     return True
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a regular file. Raises StgaError where the system does not tell."""
+    return stat.S_ISREG(_mode(path))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is a folder. Raises StgaError where the system does not tell."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def matching(folder: Path, pattern: str) -> list[Path]:
+    """What a folder holds under names like the pattern, sorted; nothing where there is no folder.
+    Raises StgaError where it cannot be listed, which `Path.glob` passes over."""
+    if not is_folder(folder):
+        return []
+    with naming(folder, "read"):
+        names = sorted(os.listdir(folder))
+    return [folder / name for name in names if fnmatch(name, pattern)]
+
+
+def _mode(path: Path) -> int:
+    """0 where there is nothing, or cannot be: pathlib raises for some of it, os.path for nothing
+    at all."""
+    try:
+        return os.stat(path).st_mode
+    except ValueError:  # a name that no file can have
+        return 0
+    except OSError as error:
+        if error.errno in NO_FILE:
+            return 0
+        raise StgaError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
 def file_size(path: Path) -> int:

@@ -6,14 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib.util import find_spec
-from os.path import isdir, isfile  # which are False, not an error, for a path that is too long
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import naming, read_json, read_npy, read_npz
+from ..files import is_file, is_folder, matching, naming, read_json, read_npy, read_npz
 from ..flame.forward import FlameFrame
 from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
 from ..flame.sequence import (
@@ -77,13 +76,13 @@ def open_capture(
     if principal_point not in PRINCIPAL_POINTS:
         one = f"is not one of {', '.join(PRINCIPAL_POINTS)}"
         raise StgaError(f"principal point convention {shorten(principal_point)} {one}")
-    if folder.suffix.lower() == ".npz" and isfile(folder):
+    if folder.suffix.lower() == ".npz" and is_file(folder):
         path = folder.resolve()
         # A file that names its expressions is of the bundled head, and needs no model file.
         bundled = EXPRESSION_NAMES in read_npz(path)
         model_file = BUNDLED_HEAD if bundled else _model_file(path, flame)
         return sequence_capture(path, read_motion(path, flame_model(model_file)), model_file, {})
-    if not isdir(folder):
+    if not is_folder(folder):
         raise StgaError(f"{folder}: is not a folder; expected that of a capture")
     root = folder.resolve()
     transforms = Transforms({}, None, None)
@@ -97,7 +96,7 @@ def open_capture(
         for key, file in zip(keys, files, strict=True):
             if file is None or file in seen:
                 continue
-            if not isfile(file):
+            if not is_file(file):
                 raise StgaError(f"{file}: does not exist, but {frame.where} names it as its {key}")
             seen.add(file)
     if distorted := distortion(transforms.frames):
@@ -127,7 +126,7 @@ def _open_layout(root: Path, transforms: Transforms, flame: Path | None) -> Capt
         return _open_flame_capture(root, transforms, flame)
     if any(frame.mesh for frame in frames):
         return _mesh_capture(root, "mesh", tracked_files(frames, "mesh"), transforms)
-    if any((root / "meshes").glob("mesh_*.json")):
+    if matching(root / "meshes", "mesh_*.json"):
         return _open_release(root, transforms)
     if bare:
         return _open_mesh_folder(root, bare)
@@ -347,7 +346,7 @@ def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | N
         timesteps = sorted({frame.view.timestep for frame in frames})
         files = {t: folder / f"{t:05d}.npz" for t in timesteps}
     else:
-        listed = [p for p in folder.glob("*.npz") if re.fullmatch(r"\d+", p.stem, re.ASCII)]
+        listed = [p for p in matching(folder, "*.npz") if re.fullmatch(r"\d+", p.stem, re.ASCII)]
         files = dict(sorted((int(path.stem), path) for path in listed))
     if not files:
         expected = "expected one .npz per timestep, such as 00000.npz"

@@ -8,14 +8,13 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from os.path import isfile
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_json
+from ..files import is_file, read_json
 from .camera import MAX_COORDINATE_M, MAX_FOCAL_PIXELS, Camera, camera_from_gl, is_image_size
 from .model import FPS_LIMIT, Item, View, Views
 
@@ -142,7 +141,7 @@ class Transforms:
 def transforms_files(folder: Path) -> list[Path]:
     """The folder's transforms files: the whole one, and those of splits."""
     files = (folder / name for name in (WHOLE_FILE, *SPLIT_FILES.values()))
-    return [path for path in files if isfile(path)]
+    return [path for path in files if is_file(path)]
 
 
 def read_transforms(
@@ -307,7 +306,7 @@ def _principal(record: Record, shared: Record, key: str, size: int) -> float:
 def _image_size(record: Record, shared: Record, image: Path) -> tuple[int, int]:
     source = next((s for s in (record, shared) if s.has("w") and s.has("h")), None)
     if source is None:
-        if not isfile(image):
+        if not is_file(image):
             missing = f"w and h are missing, and so is the image {image} to take them from"
             raise StgaError(f"{record.where('w')}: {missing}")
         try:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from .. import __version__
-from ..errors import StgaError, one_line
+from ..errors import StgaError, one_line, telling_refusals
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
 from .commands import COMMANDS
 
@@ -50,7 +50,8 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
             head = read_head(Path(folder))
         options = make_parser(head).parse_args(arguments)
         command = options.command
-        COMMANDS[command].carry_out(options, head)
+        with telling_refusals():
+            COMMANDS[command].carry_out(options, head)
     except StgaError as error:
         return _fail(str(error))
     except ModuleNotFoundError as error:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import read_bytes, read_json
+from ..files import matching, read_bytes, read_json
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
 PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
@@ -112,7 +112,7 @@ SCORED = ("score", "value", "weight")
 def is_performance(path: Path) -> bool:
     """Whether a path has a suffix of `READERS`, or is the folder of a Live Link Face take."""
     if path.is_dir():
-        is_capture = (path / "flame_param").is_dir() or any(path.glob("transforms*.json"))
+        is_capture = (path / "flame_param").is_dir() or matching(path, "transforms*.json")
         return not is_capture and bool(_take_files(path))
     return path.suffix.lower() in READERS
 
@@ -139,7 +139,7 @@ def read_performance(path: Path) -> Performance:
 
 
 def _take_files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("*.[cC][sS][vV]") if path.is_file())
+    return [path for path in matching(folder, "*.[cC][sS][vV]") if path.is_file()]
 
 
 def _lines(path: Path) -> list[str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
 
-from ..errors import StgaError
+from ..errors import StgaError, telling_refusals
 from ..files import read_json, read_npz, write_json, write_npz
 from ..options import refuse_useless
 from ..progress import Cancelled, Progress, Report, Say, Written, ignore
@@ -138,7 +138,8 @@ def perform(request: Request, report: Report = ignore, say: Say = print) -> Resu
     """
     refuse_useless(request)
     validate(request)
-    return JOBS[type(request)].work(request, report, say)
+    with telling_refusals():
+        return JOBS[type(request)].work(request, report, say)
 
 
 def perform_in_folder(

@@ -17,9 +17,10 @@ from ..format import format_duration
 from ..options import option, usable_path
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
-from ..tracking.folder import KEPT_FOLDER, REPORT_FILE, SHEET_FILE, is_flame, is_written
+from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
 from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
+from ..worker.lock import hold_folder
 from .train import Train, resumed, train
 
 WORLDS = {
@@ -181,6 +182,7 @@ STAGES = {
 """Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
 share of the time on two processors where one camera recorded a video of 1080p."""
 AVATAR_STAGE = "Avatar"
+WRITER = "tracking is writing this capture"  # Who holds its lock
 MAX_MISFIT = 0.5
 """Median share of the head's pixels, beyond which the avatar is another person's."""
 TRACKING_SHARE = 0.5
@@ -196,7 +198,13 @@ FOCAL_SOURCES = {
 
 
 def track(request: Track, report: Report, say: Say) -> Written:
-    """Track the head into a capture; cancelled, the same request continues. Raises StgaError."""
+    """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
+    while another process writes the capture."""
+    with hold_folder(request.out, LOCK_FILE, WRITER):
+        return _track_held(request, report, say)
+
+
+def _track_held(request: Track, report: Report, say: Say) -> Written:
     from ..tracking.correct import report_errors
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
@@ -255,10 +263,11 @@ def track(request: Track, report: Report, say: Say) -> Written:
 
 
 def solve_again(request: SolveAgain, report: Report, say: Say) -> Written:
-    """Solve the capture again around the keys. Raises StgaError."""
+    """Solve the capture again around the keys. Raises StgaError as `track` does."""
     from ..tracking.correct import correct_capture
 
-    correct_capture(request.capture, request.model, request.keys, report=_Steps(report).report)
+    with hold_folder(request.capture, LOCK_FILE, WRITER):
+        correct_capture(request.capture, request.model, request.keys, report=_Steps(report).report)
     return Written(request.capture)
 
 
@@ -347,7 +356,7 @@ def _track(request: Track, report: Report, say: Say) -> None:
     try:
         for line in track(request, report, say).lines:
             say(line)
-    except StgaError:
+    except (StgaError, OSError):
         if not request.out.exists():  # nothing was tracked yet, so that the inputs may be mended
             (out / INPUTS).unlink()
             if new:

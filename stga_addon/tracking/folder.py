@@ -1,6 +1,8 @@
 """Files of a tracked capture's folder, and what they say of the torso."""
 
+import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +20,8 @@ LANDMARKS_FOLDER = "landmarks"
 PLACES_FILE = "head_model.npz"
 KEPT_FOLDER = "unfinished"
 """Of results of parts, with which an interrupted tracking goes on; removed at its end."""
+LOCK_FILE = "tracking.lock"
+"""Held while the capture is written."""
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 MOTIONS = {"head": "turns with the head", "still": "keeps its direction", "own": "turns on its own"}
 TORSO_KEY = "torso"  # Of the report; null where the motion could not be told
@@ -41,6 +45,26 @@ def is_written(out: Path) -> bool:
     """Whether a folder holds a whole capture; tracking that was interrupted leaves none."""
     files = (SPLIT_FILES[0], "transforms.json")
     return any((out / name).exists() for name in files) and not (out / KEPT_FOLDER).exists()
+
+
+def is_begun(out: Path) -> bool:
+    """Whether a folder holds anything but its lock."""
+    return out.is_dir() and bool(_content(out))
+
+
+def clear(out: Path) -> None:
+    """Remove all but its lock from a folder, and the folder where it has none."""
+    for path in _content(out):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    with suppress(OSError):  # the lock is in it, whose holder removes both
+        out.rmdir()
+
+
+def _content(out: Path) -> list[Path]:
+    return [path for path in out.iterdir() if not path.name.startswith(LOCK_FILE)]
 
 
 def is_in_order(out: Path) -> bool | None:

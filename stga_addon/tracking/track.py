@@ -265,7 +265,7 @@ def _detected(
     show: Show,
 ) -> tuple[RecordedTake, dict[str, CameraLandmarks]]:
     """A take without landmarks yet, and where the networks find them, kept in `out`."""
-    is_new = not out.exists()
+    is_begun = folder.is_begun(out)
     detector = FaceNetworks()
     report("Head model", 0, 1)
     places, reliable = calibrate(head.model, detector, str(head_file or BUNDLED_HEAD))
@@ -278,9 +278,9 @@ def _detected(
         detected = detect_landmarks(footage, detector, kept, helpers, report)
         _check_faces(footage, detected)
     except StgaError:
-        if is_new:  # what it holds is of no use for other footage
+        if not is_begun:  # what it holds is of no use for other footage
             helpers.end()  # which may be writing frames
-            shutil.rmtree(out)
+            folder.clear(out)
         raise
     return take, detected
 

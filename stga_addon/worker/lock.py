@@ -3,8 +3,9 @@
 import errno
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 from filelock import FileLock, SoftFileLease, Timeout
@@ -34,12 +35,15 @@ def hold_folder(
     lease where there are no locks.
 
     leased: hold a lease as well, for storage whose locks other machines do not see. What is yielded
-    is the lease: it has a `compromise` once another process has taken it. Raises StgaError while
-    another process, `holder`, holds it, and where it cannot be written or is a symbolic link.
+    is the lease: it has a `compromise` once another process has taken it. A failure of the block
+    removes the folders that were made, where nothing is in them. Raises StgaError while another
+    process, `holder`, holds it, and where it cannot be written or is a symbolic link.
     """
     path = folder / name
     with ExitStack() as held:
         try:
+            missing = [each for each in (folder, *folder.parents) if not each.is_dir()]
+            held.push(partial(_remove_empty, missing))
             folder.mkdir(parents=True, exist_ok=True)
             try:
                 held.enter_context(_hold_file_lock(path))
@@ -54,6 +58,13 @@ def hold_folder(
         except OSError as error:
             raise StgaError(f"{folder}: cannot be written ({error.strerror or error})") from error
         yield lease
+
+
+def _remove_empty(folders: Sequence[Path], kind: type | None, *_: object) -> None:
+    """As an exit callback: after an exception, remove folders, the innermost first."""
+    with suppress(OSError):  # something is in it
+        for folder in folders if kind is not None else ():
+            folder.rmdir()
 
 
 @contextmanager

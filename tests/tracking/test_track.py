@@ -426,7 +426,7 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
     write_flame(head.model, tmp_path / "head.npz")
     use_detector(monkeypatch, Counting([]), places_on(head, LANDMARKS))
     for name in ("out", "out_0", "out_1"):
-        (tmp_path / name).mkdir()  # else nothing is left of footage without a face
+        (tmp_path / name / "job").mkdir(parents=True)  # else nothing is left without a face
     none = "shows no face"
     other = "holds landmarks of other footage"
     for offset, message in ((1, none), (1, none), (2, other)):
@@ -447,6 +447,24 @@ def test_landmarks_of_another_recording_are_not_used_again(tmp_path, head, monke
             track(footage, tmp_path / "head.npz", tmp_path / f"out_{number}")
 
 
+def test_two_trackings_of_one_capture(recorded, capsys, monkeypatch):
+    """Catches two trackings that write into one folder, of which none says so."""
+    (folder, _) = recorded
+    codes = []
+
+    def meanwhile(head, fit, *_, **__):
+        codes.append(command(folder))
+        return fit
+
+    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", meanwhile)
+    assert command(folder) == 0
+    assert codes == [2]
+    own = f"out: another tracking is writing this capture (process {os.getpid()})"
+    assert own in capsys.readouterr().err
+    assert not (folder / "out/tracking.lock").exists()
+    open_capture(folder / "out", folder / "head.npz")
+
+
 def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     """Catches images and landmarks that stay where the footage is of no use, and a message that
     does not name it."""
@@ -455,7 +473,7 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     use_detector(monkeypatch, Counting([]), places_on(bundled, LANDMARKS))
     message = r"landscape.mp4.*: shows no face, nor does any other of 4 frames"
     with pytest.raises(StgaError, match=message):
-        track(open_footage(tmp_path / "landscape.mp4"), None, tmp_path / "out")
+        perform(Track(tmp_path / "landscape.mp4", None, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 

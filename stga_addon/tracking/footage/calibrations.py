@@ -7,7 +7,6 @@ import csv
 import io
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from os.path import isdir, isfile
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -23,6 +22,7 @@ from ...capture.transforms import (
     with_principal_point,
 )
 from ...errors import StgaError, shorten
+from ...files import is_file, is_folder, matching
 from ...flame.forward import axis_angle_matrices
 from .colmap import find_colmap, read_colmap
 from .shots import Lens, Shot, numbers, pinhole, read_text, read_xml
@@ -58,11 +58,11 @@ def find_calibration(root: Path) -> Path | None:
     colmap = find_colmap(root)
     if colmap is not None:
         return colmap
-    found = [path for path in sorted(root.glob("*.xml")) if isfile(path) and _is_metashape(path)]
-    found += [path for path in sorted(root.glob("*.csv")) if isfile(path) and _is_csv(path)]
+    found = [path for path in matching(root, "*.xml") if is_file(path) and _is_metashape(path)]
+    found += [path for path in matching(root, "*.csv") if is_file(path) and _is_csv(path)]
     if len(found) > 1:
         raise StgaError(f"{root}: {found[0].name} and {found[1].name} are calibrations; choose one")
-    folders = [folder for folder in (root, root / "images") if any(folder.glob("*.xmp"))]
+    folders = [folder for folder in (root, root / "images") if matching(folder, "*.xmp")]
     return next(iter(found + folders), None)
 
 
@@ -72,13 +72,13 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
     StgaError that names file and field."""
     suffix = path.suffix.lower()
     without_pose = list[str]()
-    if isdir(path) and (splits := transforms_files(path)):
+    if is_folder(path) and (splits := transforms_files(path)):
         shots = [shot for name in splits for shot in read_nerfstudio(name)]
-    elif isdir(path) and (colmap := find_colmap(path)):
+    elif is_folder(path) and (colmap := find_colmap(path)):
         shots = read_colmap(colmap)
-    elif isdir(path):
-        shots, without_pose = read_realitycapture_xmp(path.glob("*.xmp"), image_size)
-    elif not isfile(path):
+    elif is_folder(path):
+        shots, without_pose = read_realitycapture_xmp(matching(path, "*.xmp"), image_size)
+    elif not is_file(path):
         raise StgaError(f"{path}: does not exist; expected {EXPECTED}")
     elif suffix in (".bin", ".txt") and find_colmap(path.parent) == path.parent:
         shots = read_colmap(path.parent)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from os.path import isdir, isfile, realpath
+from os.path import realpath
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from ...capture.camera import camera_from_gl
 from ...capture.images import image_size
 from ...capture.model import View
 from ...errors import StgaError
+from ...files import is_file, is_folder
 from .calibrations import EXPECTED, find_calibration, read_calibration
 from .focal_tags import photo_focal, video_focal
 from .model import Footage, FootageCamera, Frames, ImageFrames
@@ -54,10 +55,10 @@ def open_footage(
     image.
     """
     root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
-    if isdir(path):
+    if is_folder(path):
         sources = find_sources(root)
         cameras = find_calibration(root) if cameras is None else cameras
-    elif isfile(path) and is_video(path):
+    elif is_file(path) and is_video(path):
         sources = Sources(root.parent, videos={root.stem: [root]})
     else:
         raise StgaError(f"{path}: is neither a folder nor a video; put photos into a folder")
@@ -74,7 +75,7 @@ def open_footage(
     plated = tuple(replace(own, plate=sources.plates.get(own.name)) for own in footage.cameras)
     if mattes is None:
         return replace(footage, cameras=plated)
-    if not isdir(mattes):
+    if not is_folder(mattes):
         raise StgaError(f"{mattes}: is not a folder; expected one of mattes")
     given = find_sources(Path(realpath(mattes)))
     masked = tuple(_masked(camera, sources, given, len(plated) == 1) for camera in plated)
@@ -204,7 +205,7 @@ def _with_stills(shots: Iterable[Shot], sources: Sources) -> list[Shot]:
         if other is not shot:
             expected = "expected a timestep_index, or one image of each camera"
             raise StgaError(f"{shot.where}: has the pose of {other.label}; {expected}")
-        listed = shot.image if shot.image is not None and isfile(shot.image) else None
+        listed = shot.image if shot.image is not None and is_file(shot.image) else None
         image = listed or still_image(sources, shot.label, shot.where)
         inside = image.is_relative_to(sources.root)
         mask = shot.mask or (sources.mask_of(image) if inside else None)
@@ -248,7 +249,7 @@ def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera
                 two = f"camera {unique} has two images at timestep {timestep}"
                 raise StgaError(f"{shot.where}: {two}")
             for path in filter(None, (shot.image, shot.mask)):
-                if not isfile(path):
+                if not is_file(path):
                     raise StgaError(f"{path}: does not exist, but {shot.where} names it")
             views[timestep] = View(timestep, 0, shot.camera, shot.label, shot.image, shot.mask)
         cameras.append(_camera(unique, group[0], ImageFrames(views)))

@@ -54,10 +54,15 @@ class Sources:
 
 
 def find_sources(root: Path) -> Sources:
-    """List the visible files, four levels deep. Raises StgaError for over a million files."""
+    """List the visible files, four levels deep. Raises StgaError for over a million files, OSError
+    for a folder that cannot be listed."""
     sources = Sources(root)
     count = 0
-    for folder, names, files in os.walk(root):
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for folder, names, files in os.walk(root, onerror=refuse):
         depth = len(Path(folder).relative_to(root).parts)
         names[:] = sorted(name for name in names if not name.startswith(".") and depth < MAX_DEPTH)
         count += len(files)
