@@ -22,11 +22,19 @@ from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
 from ..flame.teeth import flame_model
 from ..options import like, option
 from ..progress import Progress, Report, Say, Written
-from ..tracking.folder import AVATAR_MISFIT, REPORT_FILE, is_written
+from ..tracking.folder import (
+    AVATAR_MISFIT,
+    LOCK_FILE,
+    REPORT_FILE,
+    clear,
+    is_begun,
+    is_written,
+)
 from ..tracking.footage.sources import is_video
 from ..training.run.folder import avatar_version, open_refined, read_run
+from ..worker.lock import hold_folder
 from .avatar_source import findings, motion_options_field
-from .track import MAX_MISFIT, Track, track
+from .track import MAX_MISFIT, WRITER, Track, track
 from .train import Train
 
 SHAPES_SUFFIX = ".csv"
@@ -124,15 +132,23 @@ def _tracked_by_avatar(
     request: ConvertMotion, avatar: Path, report: Report, say: Say
 ) -> Capture | None:
     """The footage tracked by the avatar, in folders beside the result with which a cancelled
-    request goes on; None where some of its timesteps look like somebody else."""
+    request for the same footage and avatar goes on; None where some of its timesteps look like
+    somebody else."""
     from ..tracking.footage.open import open_footage
+    from ..tracking.footage.sequences import FrameRange
+    from ..tracking.track import is_of_footage
 
     count = len(open_footage(request.source).timesteps)
     flame = read_run(avatar).flame
     for suffix, step in ((CHECK_SUFFIX, max(1, count // CHECKED_TIMESTEPS)), (TRACKING_SUFFIX, 1)):
         out = Path(f"{request.output}{suffix}")
-        if is_written(out) and read_json(out / REPORT_FILE)["avatar"] != avatar_version(avatar):
-            shutil.rmtree(out)
+        footage = open_footage(request.source, frames=FrameRange(step=step))
+        is_other = not is_of_footage(out, footage)
+        if is_written(out):
+            is_other |= read_json(out / REPORT_FILE)["avatar"] != avatar_version(avatar)
+        if is_other and is_begun(out):
+            with hold_folder(out, LOCK_FILE, WRITER):
+                clear(out)
         if not is_written(out):
             track(Track(request.source, None, out, avatar=avatar, step=step), report, say)
         misfit = read_json(out / REPORT_FILE)["image_misfit"][AVATAR_MISFIT]

@@ -389,11 +389,15 @@ def _median_px(errors: Errors) -> float:
     return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
 
 
-def _source(
-    footage: Footage, head_file: Path | None, landmarks: Path | None, head: HeadModel
-) -> dict[str, Any]:
-    """What landmarks and mattes are of: of each camera the first frame, the state of all files, and
-    the undistortion; landmarks: the folder that they were read from."""
+def is_of_footage(out: Path, footage: Footage) -> bool:
+    """Whether the tracking in a folder, whole or interrupted, is of this footage."""
+    path = out / folder.FOOTAGE_FILE
+    stored = read_json(path) if path.exists() else None
+    return isinstance(stored, dict) and stored.items() >= footage_state(footage).items()
+
+
+def footage_state(footage: Footage) -> dict[str, Any]:
+    """Of each camera the first frame, the state of all files, and the undistortion; as JSON."""
     cameras = {}
     for camera in footage.cameras:
         own: list[Any] = [camera.source(camera.timesteps[0]), _state(camera.frames.files)]
@@ -402,12 +406,18 @@ def _source(
             intrinsics = pinhole.fl_x, pinhole.fl_y, pinhole.cx, pinhole.cy
             own += [repr(camera.undistortion.lens), *intrinsics]
         cameras[camera.name] = own
+    timesteps = list(footage.timesteps)
+    return {"footage": str(footage.root), "cameras": cameras, "timesteps": timesteps}
+
+
+def _source(
+    footage: Footage, head_file: Path | None, landmarks: Path | None, head: HeadModel
+) -> dict[str, Any]:
+    """What landmarks and mattes are of; landmarks: the folder that they were read from."""
     model = str(head_file.resolve()) if head_file else ""
     template = hashlib.sha256(head.model.v_template.tobytes()).hexdigest()[:16]
     return {
-        "footage": str(footage.root),
-        "cameras": cameras,
-        "timesteps": list(footage.timesteps),
+        **footage_state(footage),
         "head_model": [model, _state([head_file or BUNDLED_HEAD]), template],
         "landmarks": None if landmarks is None else realpath(landmarks),
     }
@@ -422,7 +432,7 @@ def _state(files: Iterable[Path]) -> str:
 
 def _begin(out: Path, source: dict[str, Any]) -> None:
     """Record what the landmarks in `out` are of. Raises StgaError for other footage's."""
-    path = out / folder.LANDMARKS_FOLDER / "footage.json"
+    path = out / folder.FOOTAGE_FILE
     if path.exists() and read_json(path) != source:
         other = "holds landmarks of other footage; give another --out, or delete it"
         raise StgaError(f"{out}: {other}")

@@ -25,7 +25,10 @@ from stga_addon.flame.forward import flame_forward, neutral_frame
 from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.jobs.track import MAX_MISFIT
 from stga_addon.render.video import video_writer
-from stga_addon.tracking.folder import AVATAR_MISFIT, REPORT_FILE
+from stga_addon.tracking.folder import AVATAR_MISFIT, FOOTAGE_FILE, REPORT_FILE
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.sequences import FrameRange
+from stga_addon.tracking.track import footage_state
 from stga_addon.training.run.folder import AVATAR, Run, avatar_version, write_run
 from stga_addon.training.settings import TrainingSettings
 
@@ -127,7 +130,8 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
 
 @pytest.mark.parametrize("misfit", [0.1, 0.8])
 def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit):
-    """Catches another motion, rate or head than tracked, a stranger's avatar, and folders left."""
+    """Catches another motion, rate or head than tracked, a stranger's avatar, what a cancelled
+    request left of another avatar or another day's video, and folders left."""
     root = tmp_path / "capture"
     run = tmp_path / "run"
     video = tmp_path / "face.mp4"
@@ -143,16 +147,20 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     run.mkdir()
     write_run(run, Run(root, files["flame.npz"], "vhap", TrainingSettings(iterations=1)))
     (run / AVATAR).touch()
-    with video_writer(video, 25) as append:
-        for _ in range(20):
-            append(np.full((64, 64, 3), 100, np.uint8))
+    monday = tmp_path / "monday.mp4"
+    for path, shade in ((video, 100), (monday, 50)):
+        with video_writer(path, 25) as append:
+            for _ in range(20):
+                append(np.full((64, 64, 3), shade, np.uint8))
 
     def tracked(request, report, say):
         steps.append(request.step)
-        shutil.copytree(root, request.out)
-        write_report(request.out, misfit, avatar_version(run))
+        leave(request.out, request.footage, request.step, misfit, avatar_version(run))
 
-    def write_report(folder, misfit, version):
+    def leave(folder, source, step, misfit, version):
+        shutil.copytree(root, folder, dirs_exist_ok=True)
+        footage = open_footage(source, frames=FrameRange(step=step))
+        write_json(folder / FOOTAGE_FILE, {**footage_state(footage), "landmarks": None})
         found = {"avatar": version, "image_misfit": {AVATAR_MISFIT: {"0": misfit}}}
         write_json(folder / REPORT_FILE, found)
 
@@ -162,18 +170,22 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     monkeypatch.setattr("stga_addon.jobs.convert_motion.track", tracked)
     monkeypatch.setattr("stga_addon.driving.face_video.watched_performance", watched)
     drive = ["drive", video, "--avatar", run, "--out"]
-    shutil.copytree(root, tmp_path / "a.npz.check")  # left by a cancelled one, of another avatar
-    write_report(tmp_path / "a.npz.check", 1 - misfit, [])
+    # left by cancelled ones: of another avatar, another video, and of the same
+    leave(tmp_path / "a.npz.check", video, 2, 1 - misfit, [])
+    leave(tmp_path / "a.npz.tracking", monday, 1, misfit, avatar_version(run))
+    leave(tmp_path / "a.csv.check", monday, 2, 1 - misfit, avatar_version(run))
+    leave(tmp_path / "b.csv.check", video, 2, misfit, avatar_version(run))
     assert stga(*drive, tmp_path / "a.npz", "--fps", 2 * DEFAULT_FPS) == 0
     assert stga(*drive, tmp_path / "a.csv") == 0
+    assert stga(*drive, tmp_path / "b.csv") == 0
     motion = read_motion(tmp_path / "a.npz", model)
     head = read_performance(tmp_path / "a.csv").head
     assert not [*tmp_path.glob("*.tracking"), *tmp_path.glob("*.check")]
     if misfit > MAX_MISFIT:
-        assert steps == [2, 2]
+        assert steps == [2, 2]  # and none for the last
         assert not head.any()  # does not turn
         return
-    assert steps == [2, 1, 2, 1]
+    assert steps == [2, 1, 2, 1, 1]
     own = open_capture(root, files["flame.npz"]).flame
     frames = [own.frame(timestep) for timestep in own.timesteps]
     for timestep, frame in zip(own.timesteps, frames, strict=True):
