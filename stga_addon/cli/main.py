@@ -3,11 +3,13 @@
 Its standard streams never raise: closed, full, broken pipes, ASCII-only encodings.
 """
 
+import _thread
 import argparse
 import gc
 import io
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,9 @@ from .. import __version__
 from ..errors import StgaError, one_line, telling_refusals
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
 from .commands import COMMANDS
+
+
+DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 
 class _Parser(argparse.ArgumentParser):
@@ -50,7 +55,7 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
             head = read_head(Path(folder))
         options = make_parser(head).parse_args(arguments)
         command = options.command
-        with telling_refusals():
+        with telling_refusals(), _passing_on_interrupts():
             COMMANDS[command].carry_out(options, head)
     except StgaError as error:
         return _fail(str(error))
@@ -72,6 +77,30 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         _fail("interrupted")
         return 130
     return 0
+
+
+@contextmanager
+def _passing_on_interrupts() -> Iterator[None]:
+    """Interrupt again where C code drops a KeyboardInterrupt of what it calls, as LLVM does while
+    it loads kernels."""
+    hook = sys.unraisablehook
+
+    def interrupt_soon() -> None:
+        time.sleep(DROPPED_INTERRUPT_S)
+        _thread.interrupt_main()
+
+    def interrupt_again(details: Any) -> None:
+        if details.exc_type is not KeyboardInterrupt:
+            hook(details)
+            return
+        # later, in another thread: what is raised in here is dropped as well
+        _thread.start_new_thread(interrupt_soon, ())
+
+    sys.unraisablehook = interrupt_again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
 
 
 def _fail(message: str) -> int:

@@ -127,6 +127,27 @@ raise SystemExit(main.main(["info", "capture"]))
 """
 
 
+# One that is interrupted where C code calls Python, as LLVM does for each kernel that it loads.
+DROPPED = """
+import ctypes, signal, time
+from dataclasses import replace
+from stga_addon.cli import main
+calling = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))
+def run(options, head):
+    calling()
+    for _ in range(500):
+        time.sleep(0.01)
+main.COMMANDS["info"] = replace(main.COMMANDS["info"], run=run)
+raise SystemExit(main.main(["info", "capture"]))
+"""
+
+
+def test_interruption_that_c_code_drops() -> None:
+    """Catches Ctrl-C without effect while kernels are loaded."""
+    done = shell(f"\"{sys.executable}\" -c '{DROPPED}'")
+    assert (done.returncode, done.stderr) == (130, "stga: interrupted\n")
+
+
 def test_interruption_says_nothing_of_what_was_half_made() -> None:
     """Catches the traceback of a destructor where Ctrl-C came while a library made an object."""
     done = shell(f"\"{sys.executable}\" -c '{HALF_MADE}'")
