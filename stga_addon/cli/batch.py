@@ -14,8 +14,8 @@ from ..jobs.batch.plan import Plan, plan_of_captures, read_plan
 from ..jobs.train import Train
 from ..options import flag_of, given_options, like, option, option_fields
 from ..training.settings import TrainingSettings
-from ..worker.helpers import processors
 from ..worker.launch import PACKAGES_FOLDER
+from ..worker.machine import processors
 
 PLAN_SUFFIX = ".toml"
 

@@ -20,7 +20,6 @@ from ..errors import StgaError, one_line, telling_refusals
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
 from .commands import COMMANDS
 
-
 DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 

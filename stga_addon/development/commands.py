@@ -16,7 +16,7 @@ from ..jobs.train import Train
 from ..options import duration, given_options, like, option
 from ..progress import Report, Say, Written
 from ..training.settings import TrainingSettings
-from ..worker.helpers import processors
+from ..worker.machine import processors
 from .benchmark.variants import Benchmark
 
 DEMO_SECONDS = 12.0

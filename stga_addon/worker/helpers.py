@@ -25,6 +25,7 @@ import numpy as np
 from ..errors import StgaError
 from ..files import read_npz, write_npz
 from .launch import end_with_this_process, start_python
+from .machine import processors
 from .training_python import own_python
 
 MAX_HELPERS = 8  # Each takes some 300 MB
@@ -40,11 +41,6 @@ RESULT = "result"
 ERROR = "error"
 
 Step = Callable[[], None]  # Called by work after each of its steps
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Helpers:

@@ -1,17 +1,15 @@
 """The engines that there are: this machine, with as many workers at once as its processors and
 memory allow, and those that have a file each."""
 
-import math
 import os
 import platform
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 from ...errors import StgaError
-from ...worker.helpers import processors
 from ...worker.launch import start_worker
+from ...worker.machine import free_memory_gb, processors
 from ...worker.status import inspect_worker
 from ...worker.training_python import find_training_python
 from ..perform import worker_arguments
@@ -73,16 +71,6 @@ class LocalEngine(Engine):
                 is_lost = not code or code < 0 or (IS_WINDOWS and code != 2)
                 found[name] = Ended(snapshot, is_lost)
         return found
-
-
-def free_memory_gb() -> float:
-    """Memory that is available, in GB; infinite where the system does not say (Windows, macOS)."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return math.inf
-    found = (line.split()[1] for line in lines if line.startswith("MemAvailable:"))
-    return float(next(found, "inf")) * 1024 / 1e9
 
 
 def _ray(address: str) -> Engine:

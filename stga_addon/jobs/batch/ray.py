@@ -13,8 +13,8 @@ from importlib.util import find_spec
 from typing import Any
 
 from ...errors import StgaError
-from ...worker.helpers import processors
 from ...worker.launch import PACKAGES_FOLDER
+from ...worker.machine import processors
 from ...worker.status import LOG_FILE, inspect_worker, read_status
 from ...worker.training_python import PYTHON_VARIABLE
 from .plan import Ended, Engine, Job, job_command
