@@ -65,8 +65,12 @@ def exit_code(work: Callable[[], object]) -> int:
 
 def one_line(message: str) -> str:
     """The message in bounded length, with control characters and lone surrogates escaped."""
-    message = _cut(message, MAX_MESSAGE_CHARACTERS)
-    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], message)
+    return printable(_cut(message, MAX_MESSAGE_CHARACTERS))
+
+
+def printable(line: str) -> str:
+    """The line with control characters and lone surrogates escaped, which a terminal would obey."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], line)
 
 
 def shorten(value: object) -> str:

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from .errors import printable
+
 
 def format_duration(seconds: float) -> str:
     """ "45 s", "2 min", "1 h 30 min"."""
@@ -32,7 +34,8 @@ def format_name(path: Path) -> str:
 
 
 def format_table(rows: Sequence[tuple[str, str]]) -> list[str]:
-    """Lines of labels and values, the values below each other."""
+    """Lines of labels and values, the values below each other, as a terminal may get them."""
+    rows = [(printable(label), printable(value)) for label, value in rows]
     width = max((len(label) for label, _ in rows), default=0)
     return [f"{label:<{width}}  {value}" for label, value in rows]
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ..avatar.file import read_avatar
 from ..capture.model import Capture, summarize_capture
 from ..capture.open import open_capture
-from ..errors import StgaError
+from ..errors import StgaError, printable
 from ..export.formats import FORMATS
 from ..export.splat_files import is_splats
 from ..files import write_npz
@@ -34,7 +34,7 @@ from ..options import add_options, flag_of, given_options, like, option, option_
 from ..progress import Progress, ignore
 from ..schema import to_json
 from ..selection import SelectionOptions
-from ..training.run.folder import AVATAR, RUN, Run, has_run, next_folder, read_run
+from ..training.run.folder import AVATAR, RUN, Run, claimed_folder, has_run, read_run
 from ..training.settings import TrainingSettings, make_settings
 from .batch import BatchOptions, EngineOptions, run_batch_command
 
@@ -59,7 +59,7 @@ def carry_out(request: Request, with_bar: bool = True) -> Result:
     with ProgressBar() as bar:
         result = perform(request, bar.report if with_bar else ignore, bar.say)
     for line in getattr(result, "lines", ()):
-        print(line)
+        print(printable(line))
     return result
 
 
@@ -87,13 +87,14 @@ class ProgressBar(ExitStack[None]):
         self._stage = progress.stage
         figures = progress.figures()
         self._bar.bar_format = LAYOUT if "left_s" in figures else LAYOUT_WITH_TIME_LEFT
-        told = [*describe_figures(figures), progress.detail]
+        told = [*describe_figures(figures), printable(progress.detail)]
         self._bar.set_postfix_str("; ".join(filter(None, told)), refresh=False)
         self._bar.update(progress.share - self._bar.n)
         return False
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
+        line = printable(line)
         if self._bar is None:
             print(line)
             return
@@ -295,10 +296,13 @@ def _continuing(kind: Any, seconds: float, *more: Any) -> Command:
                 raise StgaError(f"--select-only: expected one CAPTURE, got {len(takes)}")
             _write_selection(SelectForTake(options.parent, takes[0], options.flame), only)
         else:
-            given.setdefault("run", next_folder(options.parent))
             if not {"seconds", "iterations"} & given.keys():
                 given["seconds"] = seconds
-            carry_out(kind(**given))
+            with ExitStack() as claimed:
+                if "run" not in given:
+                    read_run(options.parent)  # before anything is made beside it
+                    given["run"] = claimed.enter_context(claimed_folder(options.parent))
+                carry_out(kind(**given))
 
     resume = _lone("resume", bool, "RUN was stopped: continue it", False)
     return Command(_about(kind), run, (kind, resume, *more), may_lack=("run", "captures"))

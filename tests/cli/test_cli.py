@@ -329,6 +329,37 @@ def test_refine_and_extend(trained, tmp_path, capsys, root):
     assert "is a take of this run already" in refused(capsys, "extend", out, take)
 
 
+def test_names_that_a_terminal_would_obey(root, tmp_path, capsys):
+    """Catches control characters of a capture's names that clear the screen, or write a title."""
+    capture = shutil.copytree(root, tmp_path / "clear \x1b[2J")
+    evil = "eyes\x1b]0;title\x07\nfolder\x9b2J"
+    factory.edit(capture / "regions.json", lambda document: document.update({evil: [0]}))
+    for command in ("info", "select"):
+        assert main([command, str(capture)]) == 0
+        printed = capsys.readouterr().out
+        assert not set(printed) & set(map(chr, (*range(10), *range(11, 32), *range(127, 160))))
+        assert "\nfolder" not in printed.removeprefix("folder")
+    assert main(["info", str(capture)]) == 0
+    assert r"eyes\x1b]0;title\x07\nfolder\x9b2J" in capsys.readouterr().out
+
+
+def test_refinements_at_once_have_folders_of_their_own(trained, tmp_path, monkeypatch):
+    """Catches two refinements that train into one folder, and a folder left of none."""
+    shutil.copytree(trained, tmp_path / "run")
+    command = ["refine", str(tmp_path / "run"), "--region", "mouth", "--iterations", "1"]
+    runs = []
+
+    def meanwhile(request, *_):
+        runs.append(request.run.name)
+        if len(runs) < 3:
+            assert main(command) == 0
+
+    monkeypatch.setattr("stga_addon.cli.commands.carry_out", meanwhile)
+    assert main(command) == 0
+    assert runs == ["run_2", "run_3", "run_4"]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_frames_cameras_and_selection_of_a_capture(tmp_path):
     """Catches frames, cameras or rates other than asked for, and a page that needs a capture."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture"))

@@ -13,7 +13,7 @@ from ...capture.model import Capture, join_takes
 from ...capture.open import open_capture, with_sequence
 from ...capture.transforms import PRINCIPAL_POINTS
 from ...errors import StgaError, shorten
-from ...files import read_json, read_npz, remove_leftovers, write_json, write_npz
+from ...files import naming, read_json, read_npz, remove_leftovers, write_json, write_npz
 from ...flame.forward import FlameFrame, frame_of
 from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
@@ -147,6 +147,23 @@ def next_folder(run: Path) -> Path:
         folder = run.with_name(f"{name}_{number}")
         if not folder.exists():
             return folder
+
+
+@contextmanager
+def claimed_folder(run: Path) -> Iterator[Path]:
+    """Make and yield `next_folder`, which no other process gets; removed where it stays empty.
+    Raises StgaError where none can be made."""
+    is_made = False
+    while not is_made:
+        folder = next_folder(run)
+        with naming(folder), suppress(FileExistsError):  # another process was faster
+            folder.mkdir()
+            is_made = True
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # it holds the run
+            folder.rmdir()
 
 
 @contextmanager
