@@ -18,8 +18,12 @@ from typing import Any, NoReturn
 from .. import __version__
 from ..errors import StgaError, one_line, telling_refusals
 from ..jobs.avatar_source import FOLDER, OpenHead, read_head
+from ..worker.machine import address_space_gb
 from .commands import COMMANDS
 
+MIN_ADDRESS_SPACE_GB = 4.0
+"""Below, a small training was seen to abort at 0.8; threads and libraries reserve what they never
+use."""
 DROPPED_INTERRUPT_S = 0.05  # After which an interrupt that was dropped is raised again
 
 
@@ -54,6 +58,7 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
             head = read_head(Path(folder))
         options = make_parser(head).parse_args(arguments)
         command = options.command
+        _warn_of_a_tight_limit()
         with telling_refusals(), _passing_on_interrupts():
             COMMANDS[command].carry_out(options, head)
     except StgaError as error:
@@ -76,6 +81,15 @@ def _run(arguments: list[str] | None, head: OpenHead | None) -> int:
         _fail("interrupted")
         return 130
     return 0
+
+
+def _warn_of_a_tight_limit() -> None:
+    """LLVM and other C++ code ends a process that gets no memory, and says std::bad_alloc."""
+    given = address_space_gb()
+    if given < MIN_ADDRESS_SPACE_GB:
+        limit = f"this process may have {given:.1f} GB of addresses (ulimit -v)"
+        expected = f"expected {MIN_ADDRESS_SPACE_GB:g} GB or no limit: a library may abort it"
+        print(f"stga: warning: {limit}; {expected}", file=sys.stderr)
 
 
 @contextmanager

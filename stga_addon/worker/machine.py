@@ -44,6 +44,17 @@ def free_memory_gb(proc: Path = PROC) -> float:
     return max(0.0, min(free)) / 1e9
 
 
+def address_space_gb() -> float:
+    """How much address space this process may have (`ulimit -v`), in GB; infinite without a
+    limit."""
+    if os.name == "nt":
+        return math.inf
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return math.inf if limit == resource.RLIM_INFINITY else limit / 1e9
+
+
 def _groups(controller: str, proc: Path) -> Iterator[Path]:
     """The folders of the groups that limit this process: its own and those above."""
     mounts = [line.split(" ") for line in _text(proc / "self/mountinfo").splitlines()]

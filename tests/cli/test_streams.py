@@ -127,6 +127,16 @@ raise SystemExit(main.main(["info", "capture"]))
 """
 
 
+@pytest.mark.skipif(os.name == "nt", reason="has no such limit")
+def test_a_tight_limit_of_addresses_is_said(capture: Path) -> None:
+    """Catches a process that LLVM aborts, with std::bad_alloc as the only reason."""
+    tight = shell(f"(ulimit -v 3000000; stga info {capture})")
+    assert tight.returncode == 0
+    said = "stga: warning: this process may have 3.1 GB of addresses (ulimit -v); expected 4 GB"
+    assert tight.stderr.startswith(said)
+    assert "ulimit" not in shell(f"stga info {capture}").stderr
+
+
 # One that is interrupted where C code calls Python, as LLVM does for each kernel that it loads.
 DROPPED = """
 import ctypes, signal, time
