@@ -282,7 +282,7 @@ def _neutral_beside(
         folder / f"{name}{first.suffix}" for folder in (root, first.parent) for name in NEUTRAL
     ]
     for path in named:
-        if path != first and isfile(path) and np.array_equal(read(path)[1], read(first)[1]):
+        if path != first and is_file(path) and np.array_equal(read(path)[1], read(first)[1]):
             return path, "which lies there"
     return first, "the first timestep"
 

@@ -282,11 +282,11 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
 def _with_suffix(path: Path) -> Path:
     """The image that a path names without its suffix, as Blender's NeRF exporters write it; .png
     where there is none."""
-    if path.suffix.lower() in IMAGE_SUFFIXES or (path.suffix and isfile(path)):
+    if path.suffix.lower() in IMAGE_SUFFIXES or (path.suffix and is_file(path)):
         return path
     named = [path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES]
     named += [path.with_name(path.name + suffix.upper()) for suffix in IMAGE_SUFFIXES]
-    found = next((each for each in named if isfile(each)), None)
+    found = next((each for each in named if is_file(each)), None)
     return found or (path if path.suffix else named[0])
 
 
