@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from .model import FlameModel
-from .quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
+from .quaternions import from_axis_angle, from_matrices, multiply, to_axis_angle, to_matrices
 
 POSE_SIZE = 15
 TRANSLATION_SIZE = 3
 """At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
+MAX_UNWOUND_RAD = 1.5 * np.pi  # At a whole turn, an axis-angle's change may turn nothing
 SMALL_ANGLE = 1e-4  # Radians, below which a quotient by the squared angle is its limit
 
 
@@ -86,6 +87,74 @@ def moved_pose(
     return to_axis_angle(turned)[0], turn @ (root + translation) + shift - root
 
 
+def change_between(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(..., E + 18) from one frame's parameters to another's, of the same shape.
+
+    Rotations are axis-angles of the turn that follows `start`'s, of up to 180°: differences of
+    axis-angles are none, as the two vectors of half a turn are opposites. All others are
+    subtracted.
+    """
+    change = np.subtract(end, start)
+    turns = np.s_[..., -RIGID_SIZE:-TRANSLATION_SIZE]
+    before, after = (from_axis_angle(_joints(own[turns])) for own in (start, end))
+    turn = to_axis_angle(multiply(after, before * [1, -1, -1, -1]))
+    turn = np.where((before == after).all(-1, keepdims=True), 0.0, turn)  # without rounding
+    change[turns] = turn.reshape(change[turns].shape)
+    return change
+
+
+def changed_by(start: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Parameters (..., E + 18) after a change as of `change_between`, of the same shape; of the
+    axis-angles of a rotation, that nearest to `start`'s. Nothing is rounded where nothing
+    changes."""
+    changed = np.add(start, change)
+    turns = np.s_[..., -RIGID_SIZE:-TRANSLATION_SIZE]
+    before, turn = (_joints(np.broadcast_to(own, changed.shape)[turns]) for own in (start, change))
+    found = to_axis_angle(multiply(from_axis_angle(turn), from_axis_angle(before)))
+    found = np.where(turn.any(-1, keepdims=True), nearest_axis_angle(found, before), before)
+    changed[turns] = found.reshape(changed[turns].shape)
+    return changed
+
+
+def parameters_at(times: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Parameters (T, E + 18) at times (T,), of (K, E + 18) at ascending times `known` (K,): linear
+    between them, rotations on the shortest arc (spherical linear interpolation, Shoemake 1985);
+    constant before and after."""
+    row = np.clip(np.searchsorted(known, times, side="right") - 1, 0, max(len(known) - 2, 0))
+    after = np.minimum(row + 1, len(known) - 1)
+    share = (times - known[row]) / np.maximum(known[after] - known[row], 1e-9)
+    change = np.clip(share, 0, 1)[:, None] * change_between(values[row], values[after])
+    return changed_by(values[row], change)
+
+
+def unwound(parameters: np.ndarray) -> np.ndarray:
+    """Parameters (T, E + 18) of consecutive timesteps, each rotation as the axis-angle nearest to
+    that of the timestep before, up to MAX_UNWOUND_RAD: a head that nods about half a turn does not
+    change its sign."""
+    found = parameters.copy()
+    turns = _joints(found[:, -RIGID_SIZE:-TRANSLATION_SIZE])
+    for row in range(1, len(found)):
+        nearest = nearest_axis_angle(turns[row], turns[row - 1])
+        is_far = np.linalg.norm(nearest, axis=1, keepdims=True) > MAX_UNWOUND_RAD
+        turns[row] = np.where(is_far, turns[row], nearest)
+    found[:, -RIGID_SIZE:-TRANSLATION_SIZE] = turns.reshape(len(found), POSE_SIZE)
+    return found
+
+
+def nearest_axis_angle(vectors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(..., 3) the same rotations as axis-angles (..., 3), with the whole turns that bring them
+    nearest to others (..., 3)."""
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axis = vectors / np.maximum(angle, np.finfo(np.float64).tiny)
+    along = (others * axis).sum(-1, keepdims=True)
+    return np.asarray(vectors + 2 * np.pi * np.round((along - angle) / (2 * np.pi)) * axis)
+
+
+def _joints(vectors: np.ndarray) -> np.ndarray:
+    """(..., J, 3) of axis-angles side by side (..., 3 J)."""
+    return vectors.reshape(*vectors.shape[:-1], -1, 3)
+
+
 def left_jacobian(angles: np.ndarray) -> np.ndarray:
     """(3, 3): the small rotation, before that of an axis-angle (3,), that its change amounts to."""
     angle = float(np.linalg.norm(angles))
@@ -93,6 +162,17 @@ def left_jacobian(angles: np.ndarray) -> np.ndarray:
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # (1 − cos) / angle²
     third = (1 - np.sinc(angle / np.pi)) / angle**2 if angle > SMALL_ANGLE else 1 / 6
     return np.asarray(np.eye(3) + second * cross + third * cross @ cross)
+
+
+def by_change(parameters: np.ndarray) -> np.ndarray:
+    """(E + 18, E + 18) derivative of `changed_by` by the change, at none, of parameters (E + 18,)
+    whose rotations are less than a whole turn."""
+    derivative = np.eye(len(parameters))
+    first = len(parameters) - RIGID_SIZE
+    for joint, angles in enumerate(frame_of(parameters).pose):
+        own = slice(first + 3 * joint, first + 3 * joint + 3)
+        derivative[own, own] = np.linalg.inv(left_jacobian(angles))
+    return derivative
 
 
 def shaped_vertices(

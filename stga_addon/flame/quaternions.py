@@ -1,4 +1,4 @@
-"""Rotations as unit quaternions (w, x, y, z): conversions, products and interpolation."""
+"""Rotations as unit quaternions (w, x, y, z): conversions and products."""
 
 import numpy as np
 
@@ -35,20 +35,6 @@ def continuous(quaternions: np.ndarray) -> np.ndarray:
     flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(1))
     signs = np.cumprod(np.where(flips < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * signs[:, None]])
-
-
-def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(..., 4) on the shortest arc from `first` (share 0) to `second` (share 1), and beyond; share
-    (...,). Spherical linear interpolation (Shoemake 1985)."""
-    cosine = (first * second).sum(-1, keepdims=True)
-    second = np.where(cosine < 0, -second, second)
-    cosine = np.abs(cosine)
-    angle = np.arctan2(np.linalg.norm(second - cosine * first, axis=-1, keepdims=True), cosine)
-    share = np.asarray(share)[..., None]
-    # Ratios of sines as sinc, which is finite where the rotations are equal.
-    whole = np.sinc(angle / np.pi)
-    near, far = ((s * np.sinc(s * angle / np.pi)) / whole for s in (1 - share, share))
-    return np.asarray(near * first + far * second)
 
 
 def normalized(q: np.ndarray) -> np.ndarray:

@@ -10,15 +10,19 @@ from numpy.typing import DTypeLike
 from ..errors import StgaError
 from ..files import read_npz
 from .forward import (
+    RIGID_SIZE,
     FlameFrame,
     axis_angle_matrices,
+    change_between,
+    changed_by,
     flame_forward,
+    frame_of,
     joint_positions,
     neutral_frame,
+    parameters_at,
     shaped_vertices,
 )
 from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
-from .quaternions import from_axis_angle, slerp, to_axis_angle
 from .teeth import TEETH_VERTICES
 
 Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
@@ -297,7 +301,6 @@ PARTS = {
     "neck": ("neck_pose",),
     "head": ("rotation", "translation"),
 }
-ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 TIME_TOLERANCE = 1e-6  # of a timestep; rounding must not drop the last frame
 
 
@@ -307,39 +310,20 @@ def retimed(sequence: FlameSequence, step: float = 1.0) -> list[FlameFrame]:
     Dynamic offsets, which belong to the tracked person, are left out."""
     times = np.asarray(sequence.timesteps, np.float64)
     wanted = np.arange(times[0], times[-1] + TIME_TOLERANCE, step)
-    row = np.searchsorted(times, wanted + TIME_TOLERANCE, side="right") - 1
-    row = np.clip(row, 0, max(len(times) - 2, 0))
-    after = np.minimum(row + 1, len(times) - 1)
-    share = (wanted - times[row]) / np.maximum(times[after] - times[row], 1.0)
-    frames = [sequence.frame(timestep) for timestep in sequence.timesteps]
-    values = {}
-    for name in FRAME_FIELDS:
-        tracked = np.stack([getattr(frame, name) for frame in frames])
-        start = tracked[row]
-        end = tracked[after]
-        if name in ROTATIONS:
-            values[name] = _turned(start, end, share)
-        else:
-            values[name] = start + share[:, None] * (end - start)
-    rows = range(len(wanted))
-    return [FlameFrame(**{name: own[index] for name, own in values.items()}) for index in rows]
+    tracked = np.stack([sequence.frame(timestep).parameters for timestep in sequence.timesteps])
+    return [frame_of(values) for values in parameters_at(wanted, times, tracked)]
 
 
 def strengthened(frames: Sequence[FlameFrame], strength: float) -> list[FlameFrame]:
     """The frames with their motion scaled by `strength`: expression, jaw, eyes and neck about the
     neutral face. Rotation and translation of the head are scaled about the first frame's."""
     first = frames[0]
-    here = np.array([strength])
-    changed = []
-    for frame in frames:
-        turns = {}
-        for name in ROTATIONS:
-            value = getattr(frame, name)[None]
-            start = first.rotation[None] if name == "rotation" else np.zeros_like(value)
-            turns[name] = _turned(start, value, here)[0]
-        moved = first.translation + strength * (frame.translation - first.translation)
-        changed.append(replace(frame, **turns, expr=strength * frame.expr, translation=moved))
-    return changed
+    values = np.stack([frame.parameters for frame in frames])
+    start = np.zeros_like(first.parameters)
+    start[[*range(-RIGID_SIZE, 3 - RIGID_SIZE), -3, -2, -1]] = *first.rotation, *first.translation
+    scaled = changed_by(start, strength * change_between(start, values))
+    rows = zip(scaled, frames, strict=True)
+    return [frame_of(own, frame.dynamic_offset) for own, frame in rows]
 
 
 def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSequence:
@@ -353,10 +337,3 @@ def transferred_motion(motion: FlameSequence, neutral: np.ndarray) -> FlameSeque
         static_offset=neutral - motion.model.v_template,
         frame=lambda timestep: replace(motion.frame(timestep), dynamic_offset=None),
     )
-
-
-def _turned(start: np.ndarray, end: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(T, 3n) axis-angle vectors between (T, 3n) and (T, 3n), n joints side by side; share (T,)."""
-    joints = (len(start), -1, 3)
-    first, second = (from_axis_angle(vectors.reshape(joints)) for vectors in (start, end))
-    return to_axis_angle(slerp(first, second, share[:, None])).reshape(start.shape)

@@ -12,7 +12,7 @@ from ..capture.model import Capture
 from ..capture.open import PARAMETERS, open_capture
 from ..errors import StgaError, shorten
 from ..files import read_json, read_npz, write_json, write_npz
-from ..flame.forward import RIGID_SIZE
+from ..flame.forward import RIGID_SIZE, by_change, change_between, changed_by
 from ..flame.model import FlameModel
 from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, rounded
@@ -96,7 +96,7 @@ def corrected(
     distance = np.abs(np.arange(count)[:, None] - np.array(sorted(keys))).min(axis=1)
     free = (distance > 0) & (distance <= span)
     for row, values in keys.items():
-        change[row] = values - solved[row]
+        change[row] = change_between(solved[row], values)
     near = np.flatnonzero(distance <= span + 2)
     shares = trust[near] * (distance[near] / (span + 1)) ** 2
     # The prior of a change: standard deviations of 1 for coefficients, 1 radian for joints, 1 meter
@@ -105,7 +105,7 @@ def corrected(
     posed = PosedPoints(model, points)
     for row, share in zip(near, shares, strict=True):
         _, jacobian = posed.linearized(solved[row, :-RIGID_SIZE], solved[row, -RIGID_SIZE:])
-        flat = jacobian.reshape(-1, size) / LANDMARK_SIGMA_M
+        flat = jacobian.reshape(-1, size) @ by_change(solved[row]) / LANDMARK_SIGMA_M
         blocks.append(share * (flat.T @ flat) + np.eye(size))
     matrix = block_diag(blocks)
     # second differences of three rows that follow each other
@@ -121,7 +121,7 @@ def corrected(
         flat = change[near].ravel()
         flat[open_] = spsolve(matrix[open_][:, open_], right)
         change[near] = flat.reshape(-1, size)
-    return np.asarray(solved + change)
+    return changed_by(solved, change)
 
 
 def _solved(out: Path, sequence: FlameSequence) -> tuple[list[int], np.ndarray]:

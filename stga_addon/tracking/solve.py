@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE
+from ..flame.forward import POSE_SIZE, RIGID_SIZE, TRANSLATION_SIZE, by_change, unwound
 from ..flame.model import JOINTS, FlameModel
 from .head_model import HeadModel
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
@@ -143,7 +143,7 @@ def solve_take(
         return normal_equations(points, values, observations[row])
 
     stiffness = acceleration_precision(head.model) if ordered else None
-    return _solve_windows(head, terms, start, stiffness)
+    return _solve_windows(head, terms, unwound(start) if ordered else start, stiffness)
 
 
 def in_order(
@@ -195,11 +195,21 @@ def smoothed(
     jumps, such as cuts; None: they are not. head: whose prior parameters (T, E + 18) have.
     """
     pull = np.broadcast_to(right, start.shape)
+    rows = np.arange(len(start))
+    values = start if stiffness is None else unwound(start)
+    moved = rows[(values != start).any(axis=1)]
+    if len(moved):  # terms by parameters of the same rotations, to which derivatives are others
+        information = information.copy()
+        pull = pull.copy()
+    for row in moved:
+        derivative = by_change(start[row]) @ np.linalg.inv(by_change(values[row]))
+        information[row] = derivative.T @ information[row] @ derivative
+        pull[row] = derivative.T @ pull[row]
 
-    def linear(row: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return information[row], pull[row] - information[row] @ (values - start[row])
+    def linear(row: int, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return information[row], pull[row] - information[row] @ (now - values[row])
 
-    return _solve_windows(head, linear, start, stiffness)
+    return _solve_windows(head, linear, values, stiffness)
 
 
 def person(head: HeadModel, shape: np.ndarray) -> HeadModel:

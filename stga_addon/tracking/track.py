@@ -17,6 +17,7 @@ from ..capture.model import evenly_spread
 from ..capture.open import BUNDLED_MODEL
 from ..errors import StgaError
 from ..files import read_json, replacing, write_json
+from ..flame.forward import parameters_at
 from ..flame.model import BUNDLED_HEAD
 from ..schema import to_json
 from ..worker.helpers import Helpers
@@ -362,11 +363,11 @@ def by_images(
 def interpolated(
     parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
 ) -> dict[int, np.ndarray]:
-    """Parameters of all timesteps: linear between the known ones, constant before and after."""
-    known = sorted(parameters)
-    values = np.stack([parameters[timestep] for timestep in known]).T
-    columns = np.stack([np.interp(timesteps, known, column) for column in values], axis=1)
-    return dict(zip(timesteps, columns, strict=True))
+    """Parameters of all timesteps: between the known ones, constant before and after."""
+    known = np.array(sorted(parameters))
+    values = np.stack([parameters[timestep] for timestep in known.tolist()])
+    found = parameters_at(np.array(timesteps), known, values)
+    return dict(zip(timesteps, found, strict=True))
 
 
 def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> Errors:

@@ -9,13 +9,19 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from stga_addon.errors import StgaError
-from stga_addon.flame.forward import FlameFrame, flame_forward, neutral_frame
+from stga_addon.flame.forward import (
+    FlameFrame,
+    change_between,
+    changed_by,
+    flame_forward,
+    neutral_frame,
+    parameters_at,
+)
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.quaternions import continuous, from_axis_angle, slerp, to_axis_angle
+from stga_addon.flame.quaternions import continuous, from_axis_angle, to_axis_angle
 from stga_addon.flame.sequence import (
     FRAME_FIELDS,
     PARTS,
-    ROTATIONS,
     FlameSequence,
     expression_mesh,
     neutral_mesh,
@@ -180,13 +186,13 @@ def _motion(model: FlameModel, timesteps: tuple[int, ...] = (2, 3, 7)) -> FlameS
 def _assert_same(frame: FlameFrame, other: FlameFrame) -> None:
     for name in ("expr", "translation"):
         np.testing.assert_allclose(getattr(frame, name), getattr(other, name), atol=1e-12)
-    for name in ROTATIONS:
+    for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose"):
         both = (_matrices(getattr(own, name)) for own in (frame, other))
         np.testing.assert_allclose(*both, atol=1e-12)
 
 
 def test_quaternions_against_scipy():
-    """Catches another order, sign or half angle, 0/0, and interpolation the long way round."""
+    """Catches another order, sign or half angle, and 0/0."""
     rng = np.random.default_rng(0)
     vectors = [rng.normal(0, 1.2, (50, 3)), rng.normal(0, 1e-9, (5, 3)), np.zeros((1, 3))]
     vectors = np.concatenate(vectors)
@@ -195,17 +201,40 @@ def test_quaternions_against_scipy():
     np.testing.assert_allclose(np.abs((made * expected).sum(1)), 1, atol=1e-14)
     np.testing.assert_allclose(_matrices(to_axis_angle(made)), _matrices(vectors), atol=1e-14)
     np.testing.assert_allclose(_matrices(to_axis_angle(-made)), _matrices(vectors), atol=1e-14)
-    pairs = np.random.default_rng(1).normal(0, 1.5, (30, 2, 3))
-    for a, b in [*pairs, np.zeros((2, 3)), np.full((2, 3), 0.4)]:
-        for share in (0.0, 0.3, 1.0):
-            made = slerp(from_axis_angle(a), -from_axis_angle(b), np.array(share))
-            found = _matrices(to_axis_angle(made))[0]
-            np.testing.assert_allclose(found, _between(a, b, share), atol=1e-12)
     angles = (0.6 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi
     turning = from_axis_angle(np.outer(angles, [0, 1, 0]))
     made = continuous(turning)
     np.testing.assert_array_equal(np.abs(made), np.abs(turning))
     assert ((made[1:] * made[:-1]).sum(1) > 0).all()
+
+
+def test_parameters_between_timesteps_against_scipy():
+    """Catches 0/0, the long way round, and rotations near half a turn, whose axis-angles are
+    opposites: as of heads that face -z, or of a world whose y points down."""
+    rng = np.random.default_rng(1)
+    values = rng.normal(0, 1.5, (2, 40, 4 + 18))
+    values[1, 1, 4:-3] = values[0, 1, 4:-3] = 0
+    half = np.array([np.pi, 0, 0]), np.array([0, np.pi, 0])
+    for row, turn in enumerate(half, start=2):
+        near = [turn * (1 - 0.02), -turn * (1 - 0.03) + [0, 0, 0.02]]
+        values[:, row, 4:-3] = np.tile(near, (1, 5))
+    for share in (0.0, 0.3, 1.0):
+        for first, second in values.swapaxes(0, 1):
+            both = np.stack([first, second])
+            found = parameters_at(np.array([2 + 4 * share]), np.array([2, 6]), both)
+            for column in range(4, 19, 3):
+                own = slice(column, column + 3)
+                expected = _between(first[own], second[own], share)
+                np.testing.assert_allclose(_matrices(found[0, own])[0], expected, atol=1e-12)
+            rest = np.r_[:4, -3:0]
+            mixed = (1 - share) * first[rest] + share * second[rest]
+            np.testing.assert_allclose(found[0, rest], mixed, atol=1e-12)
+    start, end = values
+    again = changed_by(start, change_between(start, end))
+    for own in (start, end, again):
+        own[:, 4:-3] = Rotation.from_rotvec(own[:, 4:-3].reshape(-1, 3)).as_rotvec().reshape(40, 15)
+    np.testing.assert_allclose(again, end, atol=1e-9)
+    np.testing.assert_array_equal(changed_by(start, change_between(start, start)), start)
 
 
 def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):

@@ -22,7 +22,7 @@ from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 
 from .recording import record
-from .test_fit import frame_at, places_on
+from .test_fit import WORLDS, frame_at, meshes_of, moved, places_on
 
 HEAD = HeadModel(small_head(0), "flame")
 PERSON = person(HEAD, np.zeros(HEAD.model.n_identity)).model
@@ -57,6 +57,20 @@ def test_a_key_moves_its_neighbors_and_nothing_else():
     seen[13:16] = False
     unseen = correct({12: opened(12, 0.3)}, seen=seen) - TAKE
     assert unseen[13, JAW] > change[13, JAW] + 0.02
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_world_says_nothing_of_a_correction(world):
+    """Catches keys whose axis-angles are subtracted: near half a turn, a key of 4° turned the heads
+    between by up to 131°."""
+    key = TAKE[12].copy()
+    key[-18:-15] += np.radians([3, -4, 2])
+    expected = meshes_of(HEAD, correct({12: key}))
+    turned, turn = moved(HEAD, TAKE, WORLDS[world])
+    (own,), _ = moved(HEAD, [key], WORLDS[world])
+    seen = np.ones(len(TAKE), bool)
+    found = corrected(PERSON, places_on(HEAD, 60), turned, seen, {12: own}, 5)
+    np.testing.assert_allclose(meshes_of(HEAD, found), expected @ turn.T, atol=5e-4)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,13 @@ from flame.conftest import random_arrays, random_frame
 from scipy.spatial.transform import Rotation
 
 from stga_addon.capture.camera import look_at
-from stga_addon.flame.forward import RIGID_SIZE, FlameFrame, flame_forward, frame_of
+from stga_addon.flame.forward import RIGID_SIZE, FlameFrame, by_change, flame_forward, frame_of
 from stga_addon.flame.model import FlameModel
 from stga_addon.flame.teeth import flame_model
+from stga_addon.tracking import fit as head_fit
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import (
+    HeadFit,
     RecordedTake,
     Similarity,
     TimestepLandmarks,
@@ -29,10 +31,12 @@ from stga_addon.tracking.solve import (
     LID_SHAPES,
     WEIGHT_EXCESS_SIGMA,
     Observation,
+    acceleration_precision,
     in_order,
     parameter_precision,
     person,
     prior_terms,
+    smoothed,
     solve_take,
 )
 from stga_addon.tracking.track import interpolated
@@ -307,8 +311,70 @@ def test_a_linear_model_without_joints_moves_rigidly():
 
 def test_timesteps_without_a_face_are_interpolated():
     """Catches gaps that keep the last pose, or extrapolate beyond the ends."""
-    found = interpolated({2: np.array([0.0, 1.0]), 6: np.array([4.0, 1.0])}, (1, 2, 3, 6, 7))
-    np.testing.assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 1, 4, 4])
+    low = np.zeros(20)
+    high = np.ones(20)
+    found = interpolated({2: low, 6: high}, (1, 2, 3, 6, 7))
+    np.testing.assert_allclose([found[t][0] for t in (1, 2, 3, 6, 7)], [0, 0, 0.25, 1, 1])
+
+
+# y of the world points down; the head faces -z; both are half a turn, but for the head's own
+WORLDS = {"y down": [180, 0, 0], "facing -z": [0, 180, 0], "both": [0, 0, 180]}
+
+
+def moved(head, parameters, degrees):
+    """Parameters of the same heads in a world turned by Euler angles."""
+    turn = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    heads = replace(head, model=person_model(head))
+    shape = np.zeros(0)
+    rows = dict(enumerate(parameters))
+    fit = HeadFit(heads, shape, rows, Similarity(1.0, turn.T, np.zeros(3)))
+    return np.stack([*head_fit.in_cameras_world(fit).parameters.values()]), turn
+
+
+def person_model(head):
+    return person(head, np.zeros(head.model.n_identity)).model
+
+
+def meshes_of(head, parameters):
+    model = person_model(head)
+    return np.stack([flame_forward(model, np.zeros(0), frame_of(own)) for own in parameters])
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_world_says_nothing_of_heads_in_between(head, world):
+    """Catches axis-angles that are interpolated number by number: where they are near half a turn,
+    a missing frame lay 353 mm off."""
+    known = {t: frame_at(head, 3 * t).parameters for t in (0, 4)}
+    known[0][-18:-15] = [0.05, 0.1, 0.03]
+    known[4][-18:-15] = [-0.04, -0.2, 0.0]
+    expected = meshes_of(head, interpolated(known, range(5)).values())
+    turned, turn = moved(head, known.values(), WORLDS[world])
+    found = interpolated(dict(zip(known, turned, strict=True)), range(5))
+    np.testing.assert_allclose(meshes_of(head, found.values()), expected @ turn.T, atol=2e-4)
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_world_says_nothing_of_smoothness(head, world):
+    """Catches a head near half a turn that trembles: where its axis-angle changes its sign, it was
+    taken for a cut, and not smoothed."""
+    rows = np.stack([frame_at(head, 0).parameters] * 40)
+    rng = np.random.default_rng(0)
+    rows[:, -18:-15] = rng.normal(0, 0.02, (40, 3))
+    precision = np.full(rows.shape[1], 1e8)
+    precision[-18:-15] = 300.0
+
+    def smooth(values):
+        turns = [np.linalg.inv(by_change(own)) for own in values]  # terms are of rotations
+        terms = np.stack([turn.T @ np.diag(precision) @ turn for turn in turns])
+        found = smoothed(values, terms, acceleration_precision(person_model(head)))
+        meshes = meshes_of(head, found)
+        return np.linalg.norm(meshes - meshes.mean(0), axis=2).mean()
+
+    turned, _ = moved(head, rows, WORLDS[world])
+    meshes = meshes_of(head, rows)
+    raw = np.linalg.norm(meshes - meshes.mean(0), axis=2).mean()
+    assert smooth(rows) < 0.5 * raw
+    assert smooth(turned) < 1.2 * smooth(rows)
 
 
 def test_nearest_points_of_a_mesh(head):

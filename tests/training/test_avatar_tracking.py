@@ -12,6 +12,7 @@ import pytest
 import torch
 from command_line import stga
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.embedding import FaceFrames, face_frames, frame_backward
 from stga_addon.avatar.file import Avatar, read_avatar
@@ -118,6 +119,28 @@ def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
     tracking.take(found, TIMESTEPS[:-1])
     change = tracking.parameters[:, :-3] - tracking.tracked
     np.testing.assert_allclose(change[:, 0], [1, 2, 3, 4, 0])
+
+
+def test_a_change_near_half_a_turn_is_one_of_rotations(lost: Made) -> None:
+    """Catches axis-angles that are subtracted, where the head faces -z: 3° between the timesteps
+    that are tracked became turns by up to half a turn."""
+    tracking = RefinedTracking(lost[0], "stga")
+    about = np.array([0, np.pi, 0])
+    tilt = np.array([0.05, 0, 0])
+    turns = [
+        Rotation.from_rotvec(about) * Rotation.from_rotvec([0.01 * (-1) ** row, 0.02, 0])
+        for row in range(5)
+    ]
+    own = slice(-18, -15)
+    tracking.tracked[:, own] = [turn.as_rotvec() for turn in turns]
+    tracking.parameters = np.pad(tracking.tracked, ((0, 0), (0, 3)))
+    ends = tracking.tracked[[0, 3]].copy()
+    ends[:, own] = [(Rotation.from_rotvec(tilt) * turns[row]).as_rotvec() for row in (0, 3)]
+    found = AvatarTracking((0, 5), ends, np.zeros(2), np.zeros((2, 3)), np.ones(0), np.eye(1))
+    tracking.take(found, TIMESTEPS[:-1])
+    for row, turn in enumerate(turns[:4]):
+        now = Rotation.from_rotvec(tracking.parameters[row, -21:-18])
+        np.testing.assert_allclose((now * turn.inv()).as_rotvec(), tilt, atol=1e-9)
 
 
 def test_time_says_what_images_do_not(right: Made) -> None:

@@ -28,6 +28,8 @@ from ...flame.forward import (
     RIGID_SIZE,
     TRANSLATION_SIZE,
     FlameFrame,
+    change_between,
+    changed_by,
     flame_forward,
     frame_of,
     parameters_gradient,
@@ -157,11 +159,16 @@ class RefinedTracking:
     def take(self, found: AvatarTracking, timesteps: Sequence[int]) -> None:
         """Give timesteps what was found: those left out in between change as their neighbors."""
         rows, at = ([self._row[t] for t in own] for own in (timesteps, found.timesteps))
-        values = np.concatenate([found.parameters, found.shift], axis=1)
-        change = values - self.parameters[at]
-        between = [np.interp(rows, at, column) for column in change.T]
+        before, shift = np.split(self.parameters[at], [-SHIFT_SIZE], axis=1)
+        parts = change_between(before, found.parameters), found.shift - shift
+        columns = np.concatenate(parts, axis=1).T
+        change = np.stack([np.interp(rows, at, column) for column in columns], axis=1)
+        own = self.parameters[rows]
+        by = change[:, :-SHIFT_SIZE]
+        added = change[:, -SHIFT_SIZE:]
         self.parameters = self.parameters.copy()
-        self.parameters[rows] += np.stack(between, axis=1)
+        self.parameters[rows, :-SHIFT_SIZE] = changed_by(own[:, :-SHIFT_SIZE], by)
+        self.parameters[rows, -SHIFT_SIZE:] += added
 
 
 def track_by_avatar(
@@ -301,7 +308,7 @@ class _Tracker:
         found = tracked
         first = None
         if self._change is not None and not self._is_again:
-            starts = tracked, tracked + self._change
+            starts = tracked, changed_by(tracked, self._change)
             losses = [self._loss(start, timestep, shots) for start in starts]
             best = min((0, 1), key=lambda number: losses[number][0])
             found = starts[best]
@@ -315,7 +322,7 @@ class _Tracker:
         found, known = self._minimize(
             timestep, shots, tracked, found, renderings, least_gain, first
         )
-        self._change = found - tracked
+        self._change = change_between(tracked, found)
         misfit = self._misfit(found, shots) if self._is_again else np.nan
         return found, known, misfit
 
