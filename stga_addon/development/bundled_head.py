@@ -55,6 +55,11 @@ EYEBALL_RETRACTION_CM = 0.1
 """How far eyeballs lie behind ICT-FaceKit's, and how far lids that close push them back, as they do
 in life (Evinger et al. 1984): else, eyeballs of other identities poke through their lids, which
 move along straight lines."""
+LINING_NEIGHBORS = 12
+LINING_FOLLOWS_CM = (0.25, 0.6)
+LINING_STAYS_CM = (1.2, 1.8)
+"""Distances from the face between which the mouth's lining begins to move with it, and ceases to:
+ICT-FaceKit's, which is pushed forward by pursed lips, comes out of the chin of small faces."""
 MIN_EYE_SHARE = 0.15
 MIN_LIPS_SHARE = 0.45
 """Of a shape's largest displacement, at the edge of the region that it moves."""
@@ -69,7 +74,8 @@ def main(source: Path) -> None:
     moved = dict(zip(names, np.linalg.norm(shapes, axis=2), strict=True))
     kept, faces = _thinned(neutral, triangles, _detail(moved))
     identity = arrays["identity"][:IDENTITIES, kept].astype(np.float64)
-    displacements = METERS_PER_UNIT * np.concatenate([identity, shapes[:, kept]])
+    moved_skin = np.concatenate([identity, shapes[:, kept]])
+    displacements = METERS_PER_UNIT * with_lining(moved_skin, neutral[kept], kept)
     template = neutral_head(arrays)[kept]
     write_npz(
         BUNDLED_HEAD,
@@ -114,6 +120,34 @@ def arkit_displacements(arrays: Mapping[str, np.ndarray]) -> tuple[tuple[str, ..
         lids = [names.index(shape + side) for shape in ("eyeBlink", "eyeLookDown")]
         displacements[lids, slice(*part), 2] -= EYEBALL_RETRACTION_CM
     return names, displacements
+
+
+def with_lining(displacements: np.ndarray, neutral: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Displacements (K, N, 3) of vertices `kept` (N,), at `neutral` (N, 3) in centimeters, where
+    the mouth's lining behind lips, chin and cheeks moves with the skin before it. Their distance
+    is that of the neutral head then, whatever the coefficients; at the lips' edge, which it
+    continues, and around the teeth it moves as it did."""
+    from scipy.spatial import cKDTree
+
+    face, lining = (np.flatnonzero(_within(part, kept)) for part in (FACE, MOUTH_INSIDE))
+    distance, near = cKDTree(neutral[face]).query(neutral[lining], LINING_NEIGHBORS)
+    weights = distance**-2.0
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    followed = np.einsum("lk,clkx->clx", weights, displacements[:, face[near]])
+    begins, ceases = (
+        _smooth_step((distance[:, 0] - low) / (high - low))
+        for low, high in (LINING_FOLLOWS_CM, LINING_STAYS_CM)
+    )
+    share = (begins * (1 - ceases))[:, None]
+    found = displacements.copy()
+    found[:, lining] = share * followed + (1 - share) * displacements[:, lining]
+    return found
+
+
+def _smooth_step(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1, without a slope at both ends."""
+    share = np.clip(share, 0, 1)
+    return np.asarray(share * share * (3 - 2 * share))
 
 
 def _within(part: tuple[int, int], ids: np.ndarray) -> np.ndarray:
@@ -265,8 +299,8 @@ def skinning_weights(template: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
     Root, neck and eyeballs; the jaw is a shape.
     """
-    share = np.clip((_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM), 0, 1)
-    share = np.where(_within(SKIN, kept), share * share * (3 - 2 * share), 1.0)
+    share = (_height(template) - NECK_BOTTOM_CM) / (NECK_TOP_CM - NECK_BOTTOM_CM)
+    share = np.where(_within(SKIN, kept), _smooth_step(share), 1.0)
     weights = np.zeros((len(kept), len(JOINTS)))
     weights[:, JOINTS.index("root")] = 1 - share
     weights[:, JOINTS.index("neck")] = share
