@@ -17,9 +17,10 @@ from stga_addon.driving.inverse import (
 from stga_addon.driving.open_motion import MotionOptions, performed
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
 from stga_addon.driving.read_performance import read_performance
-from stga_addon.driving.shapes import _Surface, effective_weights, face_points
+from stga_addon.driving.shapes import EYE_JOINTS, _Surface, effective_weights, face_points
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward
+from stga_addon.flame.model import JOINTS
 from stga_addon.flame.sequence import FlameSequence
 from stga_addon.flame.teeth import flame_model
 
@@ -33,6 +34,7 @@ RIGHT_EYE = 33
 LEFT_EYE = 263
 MOUTH_LEFT = 291
 MOUTH_RIGHT = 61
+NECK = JOINTS.index("neck")
 
 
 def sequence_of(model, shape=None) -> FlameSequence:
@@ -86,6 +88,19 @@ def test_points_lie_where_the_masks_are(demo):
         assert away.min() < 0.006, mask
     assert at[LEFT_EYE, 0] > 0.02 and at[RIGHT_EYE, 0] < -0.02  # noqa: PT018
     assert at[CHIN, 1] < at[LOWER_LIP, 1] < at[NOSE_TIP, 1]
+
+
+def test_a_head_without_eyeballs_has_its_pupils_before_the_eyes_joints(demo):
+    """Catches eyes that are taken to lie in or behind their joints: the face is drawn in there."""
+    model = demo[0].model
+    weights = model.weights.copy()
+    weights[:, NECK] += weights[:, EYE_JOINTS].sum(1)
+    weights[:, EYE_JOINTS] = 0
+    both = [face_points(own, "demo") for own in (model, replace(model, weights=weights))]
+    points = [places.on(model.v_template, model.faces) for places, _ in both]
+    used = both[0][1] & both[1][1]
+    assert used.sum() > 440
+    assert np.median(np.linalg.norm(points[0] - points[1], axis=1)[used]) < 0.0005
 
 
 @pytest.mark.slow

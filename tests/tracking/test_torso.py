@@ -45,6 +45,7 @@ from stga_addon.tracking.torso_take import (
     NECK,
     ROOT,
     BothWays,
+    Carrier,
     PosedTorso,
     TorsoPose,
     TorsoTake,
@@ -310,6 +311,23 @@ def test_turning_the_root_leaves_the_head_in_its_place(head):
     np.testing.assert_allclose(after[apart], before[apart], atol=1e-12)
     turned = axis_angle_matrices(frame_of(changed).rotation[None])[0]
     np.testing.assert_allclose(turned, rotation, atol=1e-12)
+
+
+def test_points_are_carried_by_the_triangles_that_they_lie_on(fine_head):
+    """Catches points that the wrong triangle carries: near the neck, each moves otherwise."""
+    one = person(fine_head, np.zeros(fine_head.model.n_identity))
+    first, last = np.zeros((2, one.model.n_expression + 18))
+    last[-18:-15] = [0.1, 0.5, 0.0]
+    last[-15:-12] = [0.0, -0.5, 0.1]
+    fit = HeadFit(one, np.zeros(0), {0: first, 1: last}, HERE)
+    torso = TorsoTake(fit, fit.parameters, [])
+    meshes = [posed_mesh(fit, own)[one.model.faces[torso.torso]] for own in (first, last)]
+    at, expected = (corners.mean(axis=1) for corners in meshes)
+    found = Carrier(torso, PosedTorso(first), at).carried(PosedTorso(last))(at)
+    away = np.linalg.norm(found - expected, axis=1)
+    assert np.linalg.norm(expected - at, axis=1).max() > 0.02
+    assert np.median(away) < 1e-4
+    assert away.max() < 2e-3
 
 
 @pytest.mark.parametrize(("earlier", "bends"), [(True, True), (False, True), (True, False)])
