@@ -5,8 +5,9 @@ What stands around the networks follows the graphs that MediaPipe publishes: anc
 the detector, the crop of the landmarks' network.
 """
 
+import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -24,6 +25,11 @@ MIN_PRESENCE = 0.5  # Of a face in the crop, as the landmarks' network sees it
 MAX_FACES = 2  # Faces that are looked for: a second one in a frame is reported
 MAX_BOX_OVERLAP = 0.5  # Intersection over union beyond which two detected boxes are of one face
 CROP_SCALE = 1.5  # Side of the landmarks' crop, in sides of the detected box
+NEAR_SCALE = 4.0  # Side of the part around another frame's face, in that of its landmarks
+PART_SHARES = (0.5, 0.25)
+MIN_PART_PX = 160
+"""Sides of parts of an image, of its longer side, that are searched for small faces; below
+MIN_PART_PX, landmarks would be guesses. The detector sees faces from an eighth of its side on."""
 DETECTOR_SIZE_PX = 128
 CROP_SIZE_PX = 256
 PERSON_SIZE_PX = 256
@@ -94,12 +100,18 @@ class FaceNetworks:
 
     def detect(self, image: np.ndarray) -> list[np.ndarray]:
         """Landmarks (478, 2) of at most two faces in an image (H, W, 3) uint8, in pixels, whose
-        centers lie at .5."""
-        return [points[:, :2] for points in self._landmarks(image, MAX_FACES)]
+        centers lie at .5: of those that are large enough in the whole image."""
+        return [points[:, :2] for points in self._landmarks(image, [_whole(image)], MAX_FACES)]
+
+    def find(self, image: np.ndarray, near: np.ndarray | None = None) -> list[np.ndarray]:
+        """As `detect`; where the whole image shows none, faces that are small in it, as of a person
+        two meters away: around the one that a frame before showed, landmarks `near` (N, 2), else
+        in parts of the image."""
+        return [points[:, :2] for points in self._found(image, MAX_FACES, near)]
 
     def score(self, image: np.ndarray) -> FaceScores | None:
         """The scores of the clearest face in an image (H, W, 3) uint8; None where none is found."""
-        found = self._landmarks(image, 1)
+        found = self._found(image, 1)
         if not found:
             return None
         self._scores.setInput(found[0][SCORE_POINTS, :2].astype(np.float32)[None])
@@ -107,26 +119,32 @@ class FaceNetworks:
         weights = dict(zip(SCORE_NAMES, map(float, scores), strict=True))
         return FaceScores(weights, found[0])
 
-    def _landmarks(self, image: np.ndarray, most: int) -> list[np.ndarray]:
-        """(478, 3) of each face: pixels, and depth in pixels, which grows away from the camera."""
+    def _found(
+        self, image: np.ndarray, most: int, near: np.ndarray | None = None
+    ) -> list[np.ndarray]:
+        """As `_landmarks`, of the first of these places that shows a face: the whole image, around
+        another's landmarks, parts of the image."""
+        for parts in _places(image, near):
+            if found := self._landmarks(image, parts, most):
+                return found
+        return []
+
+    def _landmarks(self, image: np.ndarray, parts: Sequence[_Crop], most: int) -> list[np.ndarray]:
+        """(478, 3) of each face in some parts of an image: pixels, and depth in pixels, which grows
+        away from the camera."""
         import cv2
         from scipy.special import expit
 
         found = []
-        (height, width) = image.shape[:2]
-        whole = _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
-        matrix = whole.matrix(DETECTOR_SIZE_PX)
-        scale = whole.side / DETECTOR_SIZE_PX
-        small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
-        self._faces.setInput(cv2.dnn.blobFromImage(small, 2 / 255, mean=(127.5,) * 3))  # −1 to 1
-        boxes, scores = self._faces.forward(["regressors", "classificators"])
-        for box in _faces_of(np.reshape(boxes, (-1, 16)), np.ravel(scores))[:most]:
+        boxes, shares = map(
+            np.concatenate, zip(*(self._boxes(image, part) for part in parts), strict=True)
+        )
+        for box in _distinct(boxes, shares)[:most]:
             center = box[:2]
             side = box[2:4].max()
             (right_eye, left_eye) = box[4:8].reshape(2, 2)
             angle = float(np.arctan2(*(left_eye - right_eye)[::-1]))
-            center = center @ matrix[:, :2].T + matrix[:, 2]
-            crop = _Crop(center, CROP_SCALE * scale * side, angle)
+            crop = _Crop(center, CROP_SCALE * side, angle)
             to_image = crop.matrix(CROP_SIZE_PX)
             square = _resampled(image, to_image, CROP_SIZE_PX)
             self._mesh.setInput(cv2.dnn.blobFromImage(square, 1 / 255))
@@ -137,6 +155,26 @@ class FaceNetworks:
             flat = points[:, :2] @ to_image[:, :2].T + to_image[:, 2]
             found.append(np.column_stack([flat, points[:, 2] * (crop.side / CROP_SIZE_PX)]))
         return found
+
+    def _boxes(self, image: np.ndarray, part: _Crop) -> tuple[np.ndarray, np.ndarray]:
+        """(M, 16) center, size and six points of what may be faces in an upright part of an image,
+        in its pixels; (M,) how likely, from MIN_DETECTION_SCORE on."""
+        import cv2
+        from scipy.special import expit
+
+        matrix = part.matrix(DETECTOR_SIZE_PX)
+        small = _resampled(image, matrix, DETECTOR_SIZE_PX, black_border=True)
+        self._faces.setInput(cv2.dnn.blobFromImage(small, 2 / 255, mean=(127.5,) * 3))  # −1 to 1
+        found, scores = self._faces.forward(["regressors", "classificators"])
+        shares = expit(np.ravel(scores).astype(np.float64))
+        likely = shares >= MIN_DETECTION_SCORE
+        boxes = np.reshape(found, (-1, 16))[likely].astype(np.float64)
+        boxes[:, :2] += _anchors()[likely]
+        boxes[:, 4:] += np.tile(_anchors()[likely], 6)
+        boxes *= part.side / DETECTOR_SIZE_PX
+        boxes[:, :2] += matrix[:, 2]
+        boxes[:, 4:] += np.tile(matrix[:, 2], 6)
+        return boxes, shares[likely]
 
     @cached_property
     def _faces(self) -> Any:
@@ -200,20 +238,12 @@ def _resampled(
     return np.asarray(warped)
 
 
-def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
-    """Detected faces, the clearest first: (16,) center, size and six points, in the detector's
-    pixels.
+def _distinct(boxes: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:
+    """Faces, the likeliest (M,) first, of what may be some (M, 16): center, size and six points.
 
-    Boxes that overlap are one face, their mean weighted by score.
+    Boxes that overlap are one face, their mean weighted by how likely they are.
     """
-    from scipy.special import expit
-
-    share = expit(scores.astype(np.float64))
-    boxes = boxes.copy()
-    boxes[:, :2] += _anchors()
-    boxes[:, 4:] += np.tile(_anchors(), 6)
-    left = np.argsort(-share, kind="stable")
-    left = left[share[left] >= MIN_DETECTION_SCORE]
+    left = np.argsort(-shares, kind="stable")
     faces = []
     while len(left):
         low = boxes[left, :2] - boxes[left, 2:4] / 2
@@ -222,10 +252,39 @@ def _faces_of(boxes: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
         area = boxes[left, 2:4].prod(axis=1)
         same = common / np.maximum(area + area[0] - common, 1e-9) > MAX_BOX_OVERLAP
         same[0] = True
-        weights = share[left[same]]
+        weights = shares[left[same]]
         faces.append(weights @ boxes[left[same]] / weights.sum())
         left = left[~same]
     return faces
+
+
+def _whole(image: np.ndarray) -> _Crop:
+    """The square around an image."""
+    height, width = image.shape[:2]
+    return _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
+
+
+def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
+    """Where a face is looked for, one after the other: see `FaceNetworks.find`."""
+    yield [_whole(image)]
+    if near is not None:
+        center = near.min(0) / 2 + near.max(0) / 2
+        size = float(np.ptp(near, axis=0).max())
+        yield [_Crop(center, NEAR_SCALE * size, 0.0)]
+    for share in PART_SHARES:
+        side = share * max(image.shape[:2])
+        if side >= MIN_PART_PX:
+            rows, columns = (_centers(length, side) for length in image.shape[:2])
+            yield [_Crop(np.array([x, y]), side, 0.0) for y in rows for x in columns]
+
+
+def _centers(length: int, side: float) -> np.ndarray:
+    """Of parts of that side along a length, which overlap by half of it, so that a face is whole in
+    one."""
+    if length <= side:
+        return np.array([length / 2])
+    count = 1 + math.ceil((length - side) / (side / 2))
+    return np.linspace(side / 2, length - side / 2, count)
 
 
 @cache

@@ -200,8 +200,9 @@ def _detect(
 ) -> list[list[np.ndarray]]:
     """The faces (N, 2) of each timestep; those whose bounding boxes overlap are one."""
     found = []
+    near = None
     for timestep in timesteps:
-        faces = detector.detect(camera.image(timestep))
+        faces = detector.find(camera.image(timestep), near)
         others = []
         for face in faces[1:]:
             low = np.maximum(faces[0].min(0), face.min(0))
@@ -211,5 +212,6 @@ def _detect(
             if union and common / union < MIN_OVERLAP:
                 others.append(face)
         found.append(faces[:1] + others)
+        near = faces[0] if len(found[-1]) == 1 else near
         step()
     return found

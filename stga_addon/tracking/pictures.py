@@ -62,7 +62,7 @@ def picture_of_first_frame(
     timestep = footage.timesteps[0]
     seeing = [camera for camera in footage.cameras if timestep in camera.timesteps]
     seeing = evenly_spread(seeing, FIRST_CAMERAS)
-    found = [(camera, detector.detect(camera.image(timestep))) for camera in seeing]
+    found = [(camera, detector.find(camera.image(timestep))) for camera in seeing]
     alone = [(camera.camera, faces[0]) for camera, faces in found if len(faces) == 1]
     if not alone:
         return None

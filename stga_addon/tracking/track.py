@@ -56,6 +56,8 @@ and by this share of the face's size."""
 MAX_USUAL_SHARE = 0.04
 """Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
 demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
+MIN_FACE_SHARE = 1 / 3  # Of the timesteps, at which a face has to be detected
+FACE_REMEDY = "where the face is too small in the frame, crop the video to head and shoulders"
 MIN_FACE_PIXELS = 1.0  # Extent of the landmarks in an image, below which they are but a point
 BIAS_ROUNDS = 3
 BIAS_TIMESTEPS = 12
@@ -278,6 +280,7 @@ def _detected(
     try:
         detected = detect_landmarks(footage, detector, kept, helpers, report)
         _check_faces(footage, detected)
+        _check_share(footage, detected)
     except StgaError:
         if not is_begun:  # what it holds is of no use for other footage
             helpers.end()  # which may be writing frames
@@ -499,9 +502,32 @@ def _pictures(
 def _check_faces(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
     """Raise StgaError where no camera ever sees a face."""
     if not any(camera.confidence.any() for camera in found.values()):
-        views = list(footage.views())
-        first = views[0][1].source(views[0][0])
-        raise StgaError(f"{first}: shows no face, nor does any other of {len(views)} frames")
+        raise StgaError(
+            f"{_first_frame(footage)}: shows no face, nor does any other of "
+            f"{len(list(footage.views()))} frames; {FACE_REMEDY}"
+        )
+
+
+def _check_share(footage: Footage, found: Mapping[str, CameraLandmarks]) -> None:
+    """Raise StgaError where faces are detected at so few timesteps that the take would be a
+    guess."""
+    seen = {
+        timestep
+        for camera in found.values()
+        for timestep in camera.timesteps[camera.confidence.any(axis=1)].tolist()
+    }
+    total = len(footage.timesteps)
+    if len(seen) < MIN_FACE_SHARE * total:
+        raise StgaError(
+            f"{_first_frame(footage)}: a face, and one alone, is found at {len(seen)} of {total} "
+            f"timesteps, expected {MIN_FACE_SHARE:.0%} of them at least; {FACE_REMEDY}, or choose "
+            "the frames that show it"
+        )
+
+
+def _first_frame(footage: Footage) -> str:
+    timestep, camera = next(iter(footage.views()))
+    return camera.source(timestep)
 
 
 def _check_cameras(errors: Errors) -> None:

@@ -58,6 +58,51 @@ def test_landmarks_and_scores_are_mediapipes(pictures):
     assert FaceNetworks().score(np.full_like(front, 128)) is None
 
 
+def test_small_faces_are_found(pictures):
+    """Catches a person two meters before a phone who is not found: the detector sees the whole
+    frame in 128 pixels; and landmarks that are placed in a part of the frame instead of the
+    frame."""
+    front = pictures[0]
+    face = cv2.resize(front, (200, 200), interpolation=cv2.INTER_AREA)
+    (whole,) = FaceNetworks().detect(face)
+    assert 90 < np.ptp(whole[:, 1]) < 130
+    for x, y in ((30, 60), (310, 640), (510, 1070)):
+        frame = np.full((1280, 720, 3), front[0, 0], np.uint8)
+        frame[y : y + 200, x : x + 200] = face
+        assert FaceNetworks().detect(frame) == []
+        (found,) = FaceNetworks().find(frame)
+        assert np.median(np.linalg.norm(found - [x, y] - whole, axis=1)) < 1.5
+        assert FaceNetworks().score(frame) is not None
+        (again,) = FaceNetworks().find(frame, found + 40)
+        assert np.median(np.linalg.norm(again - found, axis=1)) < 1.5
+        frame[850:1050, 10:210] = face
+        assert len(FaceNetworks().find(frame)) == 2
+
+
+def test_a_face_is_looked_for_in_parts_only_where_the_frame_shows_none(pictures, monkeypatch):
+    """Catches ordinary clips that take longer, and a face that is lost for a frame and sought
+    everywhere before it is sought where it was."""
+    looks = []
+    boxes = FaceNetworks._boxes
+
+    def count(self, image, part):
+        looks.append(part.side)
+        return boxes(self, image, part)
+
+    monkeypatch.setattr(FaceNetworks, "_boxes", count)
+    front = pictures[0]
+    FaceNetworks().find(front)
+    assert looks == [512]
+    frame = np.full((1280, 720, 3), front[0, 0], np.uint8)
+    frame[100:250, 100:250] = cv2.resize(front, (150, 150), interpolation=cv2.INTER_AREA)
+    (found,) = FaceNetworks().find(frame)
+    looks.clear()
+    assert len(FaceNetworks().find(frame, found)) == 1
+    assert looks[0] == 1280
+    assert len(looks) == 2
+    assert looks[1] < 640
+
+
 def test_landmarks_of_lips_and_lids_lie_on_what_moves_them():
     """Catches the lower lip's landmarks on the upper lip, which they touch while the mouth is
     closed, and those of lids on the eyeballs: an open mouth would be tracked as closed, and a blink

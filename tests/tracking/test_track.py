@@ -324,7 +324,7 @@ class Counting:
         self.faces = faces
         self.calls = 0
 
-    def detect(self, image):
+    def find(self, image, near=None):
         self.calls += 1
         return self.faces
 
@@ -363,7 +363,7 @@ class Remembering:
     def __init__(self, landmarks):
         self.landmarks = landmarks
 
-    def detect(self, image):
+    def find(self, image, near=None):
         return [self.landmarks[int(image[0, 0, 0])]]
 
 
@@ -475,6 +475,38 @@ def test_footage_without_a_face_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(StgaError, match=message):
         perform(Track(tmp_path / "landscape.mp4", None, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+class Glimpsing(Remembering):
+    """A detector that sees the face in some images alone."""
+
+    def __init__(self, landmarks, seen):
+        super().__init__(landmarks)
+        self.seen = seen
+
+    def find(self, image, near=None):
+        return super().find(image) if int(image[0, 0, 0]) % 5 in self.seen else []
+
+
+def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypatch):
+    """Catches a take of five timesteps that is written from one face, with exit code 0; and one
+    that shows the face half of the time and is refused."""
+    number = iter(range(25))
+    meshes = record(tmp_path, head, lambda *_: np.full((SIZE, SIZE, 3), next(number), np.uint8))
+    places = places_on(head, LANDMARKS)
+    points = [
+        camera.project(places.on(mesh, head.model.faces))[0] for camera in rig() for mesh in meshes
+    ]
+    footage = open_footage(tmp_path / "footage")
+    model = tmp_path / "head.npz"
+    use_detector(monkeypatch, Glimpsing(points, {3}), places)
+    message = r"is found at 1 of 5 timesteps, expected 33% .* crop the video to head and shoulders"
+    with pytest.raises(StgaError, match=message):
+        track(footage, model, tmp_path / "out", mattes=False)
+    assert not (tmp_path / "out").exists()
+    use_detector(monkeypatch, Glimpsing(points, {0, 4}), places)
+    found = track(footage, model, tmp_path / "out", mattes=False)
+    assert any("no face at 3 of 5 timesteps" in warning for warning in found.warnings)
 
 
 def test_pictures_of_a_head_are_tracked(tmp_path, head):
