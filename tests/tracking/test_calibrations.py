@@ -70,6 +70,28 @@ def test_one_image_per_pose_is_one_timestep(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "lens",
+    [
+        {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0},  # nerfstudio's
+        {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "aabb_scale": 16},  # instant-ngp's
+    ],
+)
+def test_a_timestep_does_not_mirror_the_principal_point(tmp_path, lens):
+    """Catches `timestep_index`, which an error advises to add, taken for VHAP's convention of `cy`:
+    the principal point moved to the other half of the image."""
+    frames = [entry(own, f"images/{n}.png", cy=12.0) for n, own in enumerate([*rig(2), rig(2)[0]])]
+    write_transforms(tmp_path, frames, **lens)
+    with pytest.raises(StgaError, match="expected a timestep_index"):
+        open_footage(tmp_path)
+    for frame, timestep in zip(frames, (0, 0, 1), strict=True):
+        frame["timestep_index"] = timestep
+    write_transforms(tmp_path, frames, **lens)
+    footage = open_footage(tmp_path)
+    assert footage.timesteps == (0, 1)
+    assert [camera.camera.cy for camera in footage.cameras] == [12.0, 12.0]
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"file_path": "images/none.png"}, r"frames\[1\]: .* has no image, folder or video of"),

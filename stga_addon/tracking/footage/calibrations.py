@@ -107,12 +107,15 @@ def read_calibration(path: Path, image_size: ImageSize) -> tuple[list[Shot], tup
 
 def read_nerfstudio(path: Path) -> list[Shot]:
     """Entries of a transforms file; `file_path` is the label. Raises StgaError. Their `cy` means
-    what VHAP's does where frames have `timestep_index`, else what OpenCV's does
-    (`read_transforms`)."""
+    what VHAP's does where frames have `timestep_index` and nothing says which lens they have, as
+    nerfstudio's and instant-ngp's do, else what OpenCV's does (`read_transforms`)."""
     frames = read_transforms(path, "opencv")
     shots = []
-    is_vhap = any(frame.record.has("timestep_index") for frame in frames)
-    is_timed = is_vhap or any(frame.record.has("keyframe") for frame in frames)
+    is_timed = any(
+        frame.record.has(key) for frame in frames for key in ("timestep_index", "keyframe")
+    )
+    has_lens = any(frame.record.has(key) for frame in frames for key in ("camera_model", "k1"))
+    is_vhap = not has_lens and any(frame.record.has("timestep_index") for frame in frames)
     for frame in frames:
         view = frame.view
         record = frame.record
