@@ -35,6 +35,11 @@ CROP_SIZE_PX = 256
 PERSON_SIZE_PX = 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
+SETTLING_STEPS = 2
+"""Crops around the landmarks of a small face: its box is a few of the detector's pixels wide, by
+which eyes were taken to be on the nose."""
+OUTER_EYE_CORNERS = (33, 263)
+"""Landmarks of right and left eye."""
 IRIS_CENTERS = (468, 473)
 FIRST_IRIS_POINT = 468
 MESH_POINTS = 478
@@ -122,39 +127,54 @@ class FaceNetworks:
     def _found(
         self, image: np.ndarray, most: int, near: np.ndarray | None = None
     ) -> list[np.ndarray]:
-        """As `_landmarks`, of the first of these places that shows a face: the whole image, around
-        another's landmarks, parts of the image."""
-        for parts in _places(image, near):
+        """(478, 3) of each face in the first of these places that shows one: the whole image,
+        around another's landmarks, parts of the image."""
+        if found := self._landmarks(image, [_whole(image)], most):
+            return found
+        for parts in _small_places(image, near):
             if found := self._landmarks(image, parts, most):
-                return found
+                return [self._settled(image, points) for points in found]
         return []
 
     def _landmarks(self, image: np.ndarray, parts: Sequence[_Crop], most: int) -> list[np.ndarray]:
         """(478, 3) of each face in some parts of an image: pixels, and depth in pixels, which grows
         away from the camera."""
+        found = [self._boxes(image, part) for part in parts]
+        boxes, shares = map(np.concatenate, zip(*found, strict=True))
+        crops = [
+            _Crop(box[:2], CROP_SCALE * box[2:4].max(), _tilt(box[4:6], box[6:8]))
+            for box in _distinct(boxes, shares)[:most]
+        ]
+        faces = (self._face(image, crop) for crop in crops)
+        return [points for points in faces if points is not None]
+
+    def _settled(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Landmarks (478, 3) of a small face, whose box is coarse, from crops around themselves."""
+        for _ in range(SETTLING_STEPS):
+            low = points[:, :2].min(0)
+            high = points[:, :2].max(0)
+            tilt = _tilt(*points[list(OUTER_EYE_CORNERS), :2])
+            crop = _Crop((low + high) / 2, CROP_SCALE * (high - low).max(), tilt)
+            found = self._face(image, crop)
+            if found is None:
+                break
+            points = found
+        return points
+
+    def _face(self, image: np.ndarray, crop: _Crop) -> np.ndarray | None:
+        """(478, 3) of the face in a crop; None where it shows none."""
         import cv2
         from scipy.special import expit
 
-        found = []
-        boxes, shares = map(
-            np.concatenate, zip(*(self._boxes(image, part) for part in parts), strict=True)
-        )
-        for box in _distinct(boxes, shares)[:most]:
-            center = box[:2]
-            side = box[2:4].max()
-            (right_eye, left_eye) = box[4:8].reshape(2, 2)
-            angle = float(np.arctan2(*(left_eye - right_eye)[::-1]))
-            crop = _Crop(center, CROP_SCALE * side, angle)
-            to_image = crop.matrix(CROP_SIZE_PX)
-            square = _resampled(image, to_image, CROP_SIZE_PX)
-            self._mesh.setInput(cv2.dnn.blobFromImage(square, 1 / 255))
-            points, presence = self._mesh.forward(["Identity", "Identity_1"])
-            if expit(float(np.ravel(presence)[0])) < MIN_PRESENCE:
-                continue
-            points = np.reshape(points, (MESH_POINTS, 3)).astype(np.float64)
-            flat = points[:, :2] @ to_image[:, :2].T + to_image[:, 2]
-            found.append(np.column_stack([flat, points[:, 2] * (crop.side / CROP_SIZE_PX)]))
-        return found
+        to_image = crop.matrix(CROP_SIZE_PX)
+        square = _resampled(image, to_image, CROP_SIZE_PX)
+        self._mesh.setInput(cv2.dnn.blobFromImage(square, 1 / 255))
+        points, presence = self._mesh.forward(["Identity", "Identity_1"])
+        if expit(float(np.ravel(presence)[0])) < MIN_PRESENCE:
+            return None
+        points = np.reshape(points, (MESH_POINTS, 3)).astype(np.float64)
+        flat = points[:, :2] @ to_image[:, :2].T + to_image[:, 2]
+        return np.column_stack([flat, points[:, 2] * (crop.side / CROP_SIZE_PX)])
 
     def _boxes(self, image: np.ndarray, part: _Crop) -> tuple[np.ndarray, np.ndarray]:
         """(M, 16) center, size and six points of what may be faces in an upright part of an image,
@@ -264,9 +284,13 @@ def _whole(image: np.ndarray) -> _Crop:
     return _Crop(np.array([width, height]) / 2, max(width, height), 0.0)
 
 
-def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
-    """Where a face is looked for, one after the other: see `FaceNetworks.find`."""
-    yield [_whole(image)]
+def _tilt(right_eye: np.ndarray, left_eye: np.ndarray) -> float:
+    """The angle, clockwise, of a face whose eyes are at these pixels (2,)."""
+    return float(np.arctan2(*(left_eye - right_eye)[::-1]))
+
+
+def _small_places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
+    """Where a small face is looked for, one after the other: see `FaceNetworks.find`."""
     if near is not None:
         center = near.min(0) / 2 + near.max(0) / 2
         size = float(np.ptp(near, axis=0).max())

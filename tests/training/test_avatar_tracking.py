@@ -28,6 +28,7 @@ from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.report import report_run
 from stga_addon.tracking.folder import is_in_order
 from stga_addon.training.evaluate.metrics import evaluate_avatar
+from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
     AvatarTracking,
     RefinedTracking,
@@ -109,6 +110,34 @@ def test_a_finished_avatar_finds_the_head(
         track_by_avatar(*person, capture, report=lambda done, total: done == 2)
     with pytest.raises(StgaError, match="another head"):
         track_by_avatar(*person, replace(capture, faces=capture.faces[:-1]))
+
+
+def test_a_timestep_begins_where_the_one_before_led(
+    person: tuple[Avatar, TrainingSettings], lost: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches tracking that begins anew at each timestep, and so never arrives where all of a take
+    is off alike; and a start that is worse than as tracked."""
+    capture, _ = lost
+    starts = {}
+    led = np.zeros(0)
+
+    def minimize(self, timestep, shots, tracked, start, *_):
+        starts[timestep] = start - tracked
+        return start + led, np.eye(len(start))
+
+    def loss(self, values, timestep, shots):
+        return float(np.abs(values[-1] - wanted)), np.zeros(len(values))
+
+    monkeypatch.setattr(avatar_tracking._Tracker, "_minimize", minimize)
+    monkeypatch.setattr(avatar_tracking._Tracker, "_loss", loss)
+    tracked = [capture.flame.frame(timestep).parameters for timestep in TIMESTEPS[:2]]
+    led = np.zeros(len(tracked[0]) + 3)
+    led[-1] = 0.004
+    for better in (True, False):
+        wanted = tracked[1][-1] + (0.004 if better else 0.0)
+        track_by_avatar(*person, capture, TIMESTEPS[:2])
+        assert not starts[TIMESTEPS[0]].any()
+        np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
 
 
 def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:
