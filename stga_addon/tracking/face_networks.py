@@ -35,9 +35,10 @@ CROP_SIZE_PX = 256
 PERSON_SIZE_PX = 256
 ANCHOR_GRIDS = ((16, 2), (8, 6))
 """Cells along a side of the detector's grids, and anchors of each, which are its center."""
+MAX_SMALL_SHARE = 0.18
 SETTLING_STEPS = 2
-"""Crops around the landmarks of a small face: its box is a few of the detector's pixels wide, by
-which eyes were taken to be on the nose."""
+"""Size of a small face, of the image's longer side; crops around its landmarks, as its box is a few
+of the detector's pixels wide, by which eyes were taken to be on the nose."""
 OUTER_EYE_CORNERS = (33, 263)
 """Landmarks of right and left eye."""
 IRIS_CENTERS = (468, 473)
@@ -129,11 +130,14 @@ class FaceNetworks:
     ) -> list[np.ndarray]:
         """(478, 3) of each face in the first of these places that shows one: the whole image,
         around another's landmarks, parts of the image."""
-        if found := self._landmarks(image, [_whole(image)], most):
-            return found
-        for parts in _small_places(image, near):
+        small = MAX_SMALL_SHARE * max(image.shape[:2])
+        for parts in _places(image, near):
             if found := self._landmarks(image, parts, most):
-                return [self._settled(image, points) for points in found]
+                sizes = [float(np.ptp(points[:, :2], axis=0).max()) for points in found]
+                return [
+                    self._settled(image, points) if size < small else points
+                    for points, size in zip(found, sizes, strict=True)
+                ]
         return []
 
     def _landmarks(self, image: np.ndarray, parts: Sequence[_Crop], most: int) -> list[np.ndarray]:
@@ -289,8 +293,9 @@ def _tilt(right_eye: np.ndarray, left_eye: np.ndarray) -> float:
     return float(np.arctan2(*(left_eye - right_eye)[::-1]))
 
 
-def _small_places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
-    """Where a small face is looked for, one after the other: see `FaceNetworks.find`."""
+def _places(image: np.ndarray, near: np.ndarray | None) -> Iterator[list[_Crop]]:
+    """Where a face is looked for, one after the other: see `FaceNetworks.find`."""
+    yield [_whole(image)]
     if near is not None:
         center = near.min(0) / 2 + near.max(0) / 2
         size = float(np.ptp(near, axis=0).max())

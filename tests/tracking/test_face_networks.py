@@ -77,6 +77,15 @@ def test_small_faces_are_found(pictures):
         assert np.median(np.linalg.norm(again - found, axis=1)) < 1.5
         frame[850:1050, 10:210] = face
         assert len(FaceNetworks().find(frame)) == 2
+    side = cv2.resize(pictures[1], (360, 360), interpolation=cv2.INTER_AREA)
+    frame = np.full((1280, 720, 3), side[0, 0], np.uint8)
+    frame[500:860, 200:560] = side
+    (whole,) = FaceNetworks().detect(side)
+    away = [
+        np.median(np.linalg.norm(found - [200, 500] - whole, axis=1))
+        for (found,) in (FaceNetworks().detect(frame), FaceNetworks().find(frame))
+    ]
+    assert away[1] < 0.6 * away[0]  # from a coarse box
 
 
 def test_a_face_is_looked_for_in_parts_only_where_the_frame_shows_none(pictures, monkeypatch):
