@@ -11,7 +11,7 @@ from ..stga_addon.driving import open_motion
 from ..stga_addon.driving.head_map import head_turns
 from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange
 from ..stga_addon.driving.performance import EXCHANGEABLE, amplified
-from ..stga_addon.driving.read_performance import is_performance, read_performance
+from ..stga_addon.driving.read_performance import READERS, is_performance, read_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
@@ -149,7 +149,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         default=True,
         options=ONCE,
     )
-    filter_glob: options.file_filter(".npz", ".csv", ".json", ".txt")
+    filter_glob: options.file_filter(".npz", *READERS)
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:
@@ -168,6 +168,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             chosen = "choose expression, jaw, eyes, neck or head"
             raise StgaError(f"Apply Motion: no part is chosen; {chosen}")
         path = None if self.source else file_path(self.filepath, "motion")
+        if path is not None:
+            open_motion.check_motion(path)
         is_face = path is not None and is_performance(path)
         apply = self._apply_performance if is_face else self._apply_frames
         name, count = apply(context, head, path, parts)
@@ -188,6 +190,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             model = common.flame_model_path(context, head.get(tags.FLAME_MODEL, ""))
             name = path.stem
             motion = common.flame_motion(str(path), path, model)
+            for sentence in motion.warnings:
+                self.warn(sentence)
         elif not is_head(other):
             raise StgaError(f"{self.source}: is not an imported head")
         elif other == head:
@@ -220,6 +224,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         name = path.stem
         rate = context.scene.render.fps / context.scene.render.fps_base / self.speed
         self._check_end(int(performance.times[-1] * rate) + 1)
+        for sentence in performance.warnings:
+            self.warn(sentence)
         if performance.lost:
             self.warn(f"{path.name}: {performance.lost} rows are missing and were interpolated")
         rig = rig_or_none(head)

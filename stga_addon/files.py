@@ -1,5 +1,7 @@
-"""Atomic file writes and bounded reads of JSON, TOML and npz."""
+"""Atomic file writes and bounded reads of JSON, TOML, tables and npz."""
 
+import codecs
+import csv
 import ctypes
 import errno
 import json
@@ -49,6 +51,16 @@ NO_FILE = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.E
 """What the system answers where there is nothing under a name."""
 NewFile = Callable[[Path], AbstractContextManager[Path]]
 SEQUENCE_FILE = ".stga_sequence"
+BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",  # before UTF-16's, with whose mark it begins
+    codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+DELIMITERS = ",;\t"
+DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*", re.ASCII)
+LINES_BEFORE_COLUMNS = 5  # Of comments, in which the row of a table's columns is searched
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 """Computers that share a disk cannot see each other's processes."""
 
@@ -380,8 +392,50 @@ def line_ends_changed(data: bytes) -> bool:
     return ends > 0 and ends == data.count(b"\r\n")
 
 
+def read_text(path: Path, limit: int = MAX_FILE_BYTES) -> str:
+    """A file of UTF-8 text, or of UTF-16 or UTF-32 with a byte order mark. Raises StgaError."""
+    try:
+        return decoded_text(read_bytes(path, limit))
+    except ValueError as error:
+        raise StgaError(f"{path}: is not UTF-8 text ({error})") from error
+
+
+def decoded_text(data: bytes, errors: str = "strict") -> str:
+    """Text in UTF-8, or in what its byte order mark says. Raises ValueError, if errors are
+    "strict"."""
+    marked = (name for mark, name in BYTE_ORDER_MARKS.items() if data.startswith(mark))
+    return data.decode(next(marked, "utf-8"), errors)
+
+
+def read_table(path: Path, limit: int = MAX_FILE_BYTES) -> list[tuple[int, list[str]]]:
+    """Rows of a CSV file as `table_rows` of its text. Raises StgaError."""
+    return table_rows(str(path), read_text(path, limit))
+
+
+def table_rows(where: str, text: str) -> list[tuple[int, list[str]]]:
+    """Rows of a CSV file that are not empty: (number of the line, cells). Columns are separated by
+    the one of `DELIMITERS` that the row of names has most of; decimal commas become points, as
+    spreadsheets write them in many countries. Raises StgaError, beginning with `where`."""
+    lines = text.splitlines()
+    if lines and lines[0].lower().startswith("sep="):  # of spreadsheets, which hide that line
+        lines[0] = ""
+    heads = lines[:LINES_BEFORE_COLUMNS]
+    counts = [{mark: line.count(mark) for mark in DELIMITERS} for line in heads]
+    named = next((count for count in counts if any(count.values())), {",": 0})
+    cells = csv.reader(lines, delimiter=max(named, key=named.__getitem__))
+    try:
+        rows = [(cells.line_num, row) for row in cells if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise StgaError(f"{where}: line {cells.line_num}: is not readable CSV ({error})") from error
+    return [(number, [_with_point(cell) for cell in row]) for number, row in rows]
+
+
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if "," in cell and DECIMAL_COMMA.fullmatch(cell) else cell
+
+
 def read_json(path: Path) -> Any:
-    """Parse a UTF-8 JSON file of up to 256 MiB. Raises StgaError naming the file."""
+    """Parse a JSON file of up to 256 MiB. Raises StgaError naming the file."""
     return _parsed(path, "JSON", MAX_JSON_BYTES, parse_json)
 
 
@@ -402,9 +456,11 @@ def _parsed(path: Path, form: str, limit: int, parse: Callable[[bytes], Any]) ->
 
 
 def parse_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ValueError where it is malformed, or holds lone surrogates."""
-    value = json.loads(data.decode("utf-8"))
-    if b"\\u" in data:  # the only way to write a lone surrogate
+    """Parse JSON, as `decoded_text`. Raises ValueError where it is malformed, or holds lone
+    surrogates."""
+    text = decoded_text(data)
+    value = json.loads(text)
+    if "\\u" in text:  # the only way to write a lone surrogate
         json.dumps(value, ensure_ascii=False).encode("utf-8")
     return value
 

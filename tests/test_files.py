@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from stga_addon import files
 from stga_addon.errors import StgaError
 from stga_addon.files import (
+    NumberedFiles,
     check_writable,
     read_json,
     read_npz,
@@ -314,3 +316,31 @@ def test_a_rename_that_fails_among_others(tmp_path, monkeypatch, links):
         write_together(tmp_path, "new/x.json", "a.json", "b.json", "c.json")
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
     assert [read_json(tmp_path / name) for name in before] == [1, 1]
+
+
+def test_a_numbered_file_that_somebody_painted_over(tmp_path):
+    """Catches a picture lost that was changed in another program since, and has as many bytes as
+    the one that was written."""
+    names = re.compile(r"\d{4}\.bmp")
+    numbered = NumberedFiles(tmp_path, names)
+    for name in ("0001.bmp", "0002.bmp"):
+        with replacing(tmp_path / name) as content:
+            content.write_bytes(b"drawn")
+            numbered.add(name, content)
+    numbered.finish()
+    NumberedFiles(tmp_path, names)  # as they were written, they are replaced
+    path = tmp_path / "0002.bmp"
+    written = path.stat()
+    path.write_bytes(b"edits")
+    os.utime(path, ns=(written.st_atime_ns, written.st_mtime_ns + 1_000_000_000))
+    with pytest.raises(StgaError, match=r"holds 0002.bmp, which was not written here"):
+        NumberedFiles(tmp_path, names)
+    assert path.read_bytes() == b"edits"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32"])
+def test_texts_with_a_byte_order_mark(tmp_path, encoding):
+    """Catches text of Windows programs that is refused, or read with its mark as a character."""
+    mark = "\ufeff" if encoding.endswith("-be") else ""
+    (tmp_path / "a.json").write_bytes((mark + '{"ä": 1}').encode(encoding))
+    assert read_json(tmp_path / "a.json") == {"ä": 1}

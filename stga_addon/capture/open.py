@@ -372,6 +372,7 @@ def sequence_capture(
     model = sequence.model
     regions = key_regions(sequence.model)
     missing = "the FLAME model has no vertex masks (FLAME_masks.pkl beside it)"
+    unmasked = () if regions else (f"{missing}: triangles are selected one by one",)
     return Capture(
         root=root,
         layout="flame",
@@ -381,7 +382,7 @@ def sequence_capture(
         timesteps=sequence.timesteps,
         regions=regions,
         flame_file=model_file,
-        warnings=() if regions else (f"{missing}: triangles are selected one by one",),
+        warnings=(*sequence.warnings, *unmasked),
         **_posed(root, sequence),
     )
 

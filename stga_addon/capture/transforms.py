@@ -145,7 +145,7 @@ def transforms_files(folder: Path) -> list[Path]:
 
 
 def read_transforms(
-    path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT
+    path: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT, moved: bool = False
 ) -> tuple[Frame, ...]:
     """Read the frames of one transforms file; neither images nor tracked files are opened, nor need
     they exist.
@@ -154,10 +154,10 @@ def read_transforms(
     `transform_matrix` is camera-to-world with OpenGL axes. `principal_point` says what `cy` means:
     "vhap" (H − cy from the top, as VHAP's exporter writes it), "opencv" (from the top) or "center"
     (cx and cy are ignored, as GaussianAvatars does). Paths are relative to the file's folder and
-    may leave it only for a sibling folder (union sets of VHAP). Raises StgaError naming the file
-    and the field.
+    may leave it only for a sibling folder (union sets of VHAP); moved: those of images that lead
+    elsewhere are sought by their names. Raises StgaError naming the file and the field.
     """
-    return _numbered(_timed(_read_frames(path, read_json(path), principal_point)))
+    return _numbered(_timed(_read_frames(path, read_json(path), principal_point, moved)))
 
 
 def read_splits(folder: Path, principal_point: str = DEFAULT_PRINCIPAL_POINT) -> Transforms:
@@ -193,6 +193,16 @@ def with_principal_point(camera: Camera, written: tuple[float, float], conventio
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2)
     cx, cy = written
     return replace(camera, cx=cx, cy=camera.height - cy if convention == "vhap" else cy)
+
+
+def repairs(frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Sentences about what was repaired, each of which names the first of the frames."""
+    counts = Counter(repair for frame in frames for repair in frame.repairs)
+    found = []
+    for repair, count in counts.items():
+        first = next(frame for frame in frames if repair in frame.repairs)
+        found.append(f"{first.where}: {repair} (in {count} of {len(frames)} frames)")
+    return tuple(found)
 
 
 def tracked_files(frames: Iterable[Frame], field: str) -> dict[int, Path]:
@@ -231,7 +241,7 @@ def inside(root: Path, relative: str, where: str) -> Path:
     return root.parent.joinpath(*parts[1:]) if parts[0] == ".." else root.joinpath(*parts)
 
 
-def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
+def _read_frames(path: Path, values: Any, principal_point: str, moved: bool = False) -> list[Frame]:
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise StgaError(f"{path}: frames: expected a list with one entry per image")
     shared = Record(path, path.parent.resolve(), "", values)
@@ -242,7 +252,7 @@ def _read_frames(path: Path, values: Any, principal_point: str) -> list[Frame]:
         if not isinstance(entry, dict):
             raise StgaError(f"{path}: frames[{number}]: expected an object, not {shorten(entry)}")
         record = replace(shared, place=f"frames[{number}].", values=entry)
-        image = record.path_of("file_path")
+        image = _image_path(record, moved)
         where = record.where
         if image is None:
             raise StgaError(f"{where('file_path')}: is missing; expected the path of the image")
@@ -293,6 +303,21 @@ def _with_suffix(path: Path) -> Path:
 def _timestep_key(values: dict[str, Any]) -> str | None:
     """The key of the timestep, None without one."""
     return next((key for key in TIMESTEP_KEYS if values.get(key) is not None), None)
+
+
+def _image_path(record: Record, moved: bool) -> Path | None:
+    """The image of an entry. moved: of paths of another computer, and from the folder in which a
+    program ran, what is behind their last "..", or the name."""
+    try:
+        return record.path_of("file_path")
+    except StgaError:
+        text = record.values["file_path"]
+        if not moved or not isinstance(text, str):
+            raise
+        path = PureWindowsPath(text)  # which takes either slash
+        inside_of = path.parts if not path.is_absolute() and not path.anchor else path.parts[-1:]
+        behind = [part for part in inside_of if part != ".."]
+        return inside(record.folder, "/".join(behind), record.where("file_path"))
 
 
 def _principal(record: Record, shared: Record, key: str, size: int) -> float:
@@ -393,11 +418,7 @@ def _timed(frames: Sequence[Frame]) -> list[Frame]:
 def transforms_warnings(frames: Sequence[Frame], principal_point: str) -> list[str]:
     """Sentences about what was repaired, about a principal point that may be another, and about
     files that the frames name and nobody reads; each names the first of the transforms files."""
-    found = []
-    counts = Counter(repair for frame in frames for repair in frame.repairs)
-    for repair, count in counts.items():
-        first = next(frame for frame in frames if repair in frame.repairs)
-        found.append(f"{first.where}: {repair} (in {count} of {len(frames)} frames)")
+    found = list(repairs(frames))
     doubtful = [f for f in frames if NUMBERED in f.repairs and f.view.mask is None]
     height = doubtful[0].view.camera.height if doubtful else 0
     if principal_point == "vhap" and doubtful and abs(2 * doubtful[0].principal[1] - height) > 1:

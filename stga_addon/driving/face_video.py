@@ -50,7 +50,8 @@ def watched_performance(path: Path, report: Report) -> Performance:
         raise StgaError(f"{path}: no face was found in any of its {len(frames.timesteps)} frames")
     turned = np.stack(rotations) @ rotations[0].T
     head = head_angles(to_axis_angle(from_matrices(turned)))
-    return Performance(np.array(times) - times[0], np.array(rows, np.float64), head, video.fps)
+    seconds = np.array(times) - times[0]
+    return Performance(seconds, np.array(rows, np.float64), head, video.fps, video.sentences)
 
 
 def head_rotation(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:

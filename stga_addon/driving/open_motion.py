@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from os.path import exists
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ from ..capture.model import evenly_spread
 from ..capture.open import open_capture
 from ..errors import StgaError
 from ..export.playback import playback_fps
+from ..files import is_file
 from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..flame.teeth import flame_model
 from ..options import option
+from ..tracking.footage.sources import is_video
 from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
@@ -28,7 +31,14 @@ from .performance import (
     resampled,
     smoothed,
 )
-from .read_performance import MAX_FPS, MAX_ROWS, MIN_FPS, is_performance, read_performance
+from .read_performance import (
+    MAX_FPS,
+    MAX_ROWS,
+    MIN_FPS,
+    READERS,
+    is_performance,
+    read_performance,
+)
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
@@ -230,12 +240,25 @@ class Motion:
     lost     rows that the file lacks between its first and last
     outside  part -> (T,) how far each frame was outside the trained range (`transfer.outside`);
              empty without a range
+    warnings  one sentence each: what was guessed
     """
 
     sequence: FlameSequence
     fps: float | None
     lost: int = 0
     outside: Mapping[str, np.ndarray] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def check_motion(path: Path) -> None:
+    """Raise StgaError where a path is neither a performance nor FLAME parameters by its name."""
+    if not exists(path):
+        raise StgaError(f"{path}: does not exist")
+    known = (*READERS, ".npz")
+    if is_file(path) and path.suffix.lower() not in known:
+        expected = f"{', '.join(known)}, the folder of a take or of a capture"
+        advice = "; stga drive makes a motion of a video" if is_video(path) else ""
+        raise StgaError(f"{path}: is no motion; expected {expected}{advice}")
 
 
 def open_motion(
@@ -258,6 +281,7 @@ def open_motion(
            as they are
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
+    check_motion(path)
     options = options or MotionOptions()
     if is_performance(path):
         model = flame_model(flame)
@@ -277,7 +301,7 @@ def open_motion(
     own = [sequence.frame(timestep) for timestep in sequence.timesteps]
     frames, beyond = adapted(own, options, trained)
     moved = _with_frames(sequence, sequence.timesteps, frames)
-    return Motion(moved, playback_fps(capture), 0, beyond)
+    return Motion(moved, playback_fps(capture), 0, beyond, capture.flame.warnings)
 
 
 def performed(
@@ -293,7 +317,8 @@ def performed(
     prepared = prepared_performance(performance, replace(options, strength=1.0), fps)
     frames, beyond = finished(head_map(person, name).frames(prepared), options, trained)
     timesteps = tuple(range(len(frames)))
-    return Motion(_with_frames(person, timesteps, frames), prepared.fps, performance.lost, beyond)
+    moved = _with_frames(person, timesteps, frames)
+    return Motion(moved, prepared.fps, performance.lost, beyond, performance.warnings)
 
 
 def adapted(

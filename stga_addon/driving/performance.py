@@ -87,12 +87,14 @@ class Performance:
     weights  (T, 52) in the order of `ARKIT_SHAPES`, 0 to 1 at the source
     head     (T, 3) yaw, pitch, roll in radians; zero where the source has none, or None is given
     fps      rows per second where none is lost
+    warnings  one sentence each: what was guessed
     """
 
     times: np.ndarray
     weights: np.ndarray
     head: np.ndarray
     fps: float
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         head = 0.0 if self.head is None else self.head
@@ -117,7 +119,7 @@ def resampled(performance: Performance, fps: float | None = None) -> Performance
 
     weights = interpolated(performance.weights)
     head = interpolated(performance.head)
-    return Performance(times, weights, head, rate)
+    return replace(performance, times=times, weights=weights, head=head, fps=rate)
 
 
 def mirrored(performance: Performance) -> Performance:

@@ -1,6 +1,5 @@
 """Performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap, weights in JSON."""
 
-import csv
 import math
 import re
 from contextlib import suppress
@@ -10,50 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import matching, read_bytes, read_json
+from ..files import matching, read_json, read_table, read_text
+from .clocks import DEFAULT_FPS, evened, seconds_of, seconds_of_numbers, time_column
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
-
-PATTERN = re.compile(r"(\d{1,3}):(\d{1,2}):(\d{1,2})([:;.])(\d{1,3})(?:\.(\d{1,6}))?", re.ASCII)
-BASES = (24, 25, 30, 48, 50, 60, 100, 120)  # Frames per second that timecodes count
-USUAL_BASE = 60  # Of a take of less than a second, whose frame numbers do not tell
-DAY_S = 86_400.0
-DROP_RATIO = 1000 / 1001  # Of drop-frame timecodes, with a semicolon, whose frames come slower
-
-
-def seconds_of(where: str, texts: list[str]) -> np.ndarray:
-    """(T,) seconds from the first of timecodes `HH:MM:SS:FF.sub`, over midnight too; the rate of FF
-    is found from the numbers. Raises StgaError, beginning with `where`, for other text."""
-    fields = []
-    for row, text in enumerate(texts):
-        found = PATTERN.fullmatch(text.strip())
-        if found is None:
-            problem = f"row {row + 1}: Timecode is {shorten(text)}, expected HH:MM:SS:FF.sub"
-            raise StgaError(f"{where}: {problem}")
-        *clock, separator, frame, part = found.groups()
-        fields.append((*map(int, clock), int(frame), float(f"0.{part or 0}"), separator == ";"))
-    hours, minutes, whole, frames, parts, dropping = np.array(fields, np.float64).T
-    second = 3600 * hours + 60 * minutes + whole
-    # the frame rate for which the rows come most evenly
-    possible = [base for base in BASES if base > (frames + parts).max()] or [int(frames.max()) + 1]
-    base = USUAL_BASE if USUAL_BASE in possible else possible[0]
-    if len(np.unique(second)) > 1:
-        base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
-    if dropping.any():
-        minute = 60 * hours + minutes
-        left_out = round(base / 15) * (minute - np.floor(minute / 10))
-        counted = second * base + frames + parts - left_out
-        elapsed = counted / (base * DROP_RATIO)
-    else:
-        elapsed = second + (frames + parts) / base
-    days = np.concatenate([[0], np.cumsum(np.diff(elapsed) < -DAY_S / 2)])
-    return np.asarray(elapsed + DAY_S * days - elapsed[0])
-
-
-def _unevenness(times: np.ndarray) -> float:
-    steps = np.diff(times)
-    steps = steps[(steps > 0) & (steps < 1)]
-    return round(float(np.abs(steps - np.median(steps)).mean()), 6) if len(steps) else 0.0
-
 
 REQUEST = b"iFacialMocap_sahuasouryya9218sauhuiayeta91555dy3719"
 """Makes the app send to the address that this comes from."""
@@ -93,16 +51,19 @@ def parse_packet(data: bytes) -> FacePacket | None:
 
 MAX_TEXT_BYTES = 256 << 20
 MAX_ROWS = 1 << 20
-DEFAULT_FPS = 60.0  # Of files that hold neither times nor a rate: ARKit's own
 MIN_FPS = 1.0
 MAX_FPS = 1000.0
 HEAD_COLUMNS = ("headyaw", "headpitch", "headroll")
 COUNT_COLUMN = "blendshapecount"
-TIMECODE_COLUMN = "timecode"
-SECONDS_COLUMNS = (TIMECODE_COLUMN, "time", "timestamp", "seconds")
+HALF_TURN = math.pi + 0.01
+WHOLE_TURN = 2 * math.pi + 0.01
+WHOLE_TURN_DEG = 360.0
+"""Of a head's angles: above the second, they are degrees."""
+MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
 TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
 """Endings of files that Live Link Face writes beside a take's own."""
 FRAME_KEYS = ("frames", "weightMat", "weights")
+RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
 WEIGHT_KEYS = ("weights", "blendshapes", "blendShapes", "face_blendshapes")
 NAMED = ("categoryName", "category_name", "name")
@@ -142,25 +103,13 @@ def _take_files(folder: Path) -> list[Path]:
     return [path for path in matching(folder, "*.[cC][sS][vV]") if path.is_file()]
 
 
-def _lines(path: Path) -> list[str]:
-    try:
-        return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise StgaError(f"{path}: is not UTF-8 text") from error
-
-
 def _read_csv(path: Path) -> Performance:
-    try:
-        rows = [row for row in csv.reader(_lines(path)) if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise StgaError(f"{path}: is not valid CSV ({error})") from error
+    rows = [row for _, row in read_table(path, MAX_TEXT_BYTES)]
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
     header = [cell.strip() for cell in rows[0]]
     columns = columns_of(str(path), header)
-    plain = {
-        name.rsplit(".", 1)[-1].lower(): index for index, name in reversed([*enumerate(header)])
-    }
+    plain = {_plain(name): index for index, name in reversed([*enumerate(header)])}
     count = plain.get(COUNT_COLUMN)  # 0 in rows without a face, or they end after it
     body = [
         [*row, *[""] * (len(header) - len(row))]
@@ -187,18 +136,26 @@ def _read_csv(path: Path) -> Performance:
     head = np.zeros(3)
     if all(name in plain for name in HEAD_COLUMNS):
         head = np.stack([values(plain[name]) for name in HEAD_COLUMNS], axis=1)
-    at = next((plain[name] for name in SECONDS_COLUMNS if name in plain), None)
-    codes = [row[plain[TIMECODE_COLUMN]] for row in body] if TIMECODE_COLUMN in plain else []
-    times: np.ndarray | None = None
-    if any(":" in code for code in codes):
-        times = seconds_of(str(path), codes)
-    elif at is not None:
-        times = values(at)
-    return _performance(path, times, weights, head)
+    times = None
+    guess = None
+    if clock := time_column(header):
+        place, unit = clock
+        codes = [row[place] for row in body]
+        if any(":" in code for code in codes):
+            times = seconds_of(str(path), codes)
+        else:
+            times, guess = seconds_of_numbers(f"column {header[place]}", values(place), unit)
+    return _performance(path, times, weights, head, guess=guess)
+
+
+def _plain(name: str) -> str:
+    """A column's name without prefix, separators and capitals."""
+    return re.sub(r"[_\- ]", "", name.rsplit(".", 1)[-1]).lower()
 
 
 def _read_packets(path: Path) -> Performance:
-    packets = [parse_packet(line.encode()) for line in _lines(path)]
+    lines = read_text(path, MAX_TEXT_BYTES).splitlines()
+    packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
     if not known:
         problem = "such as jawOpen-12|mouthSmile_L-5|=head#0,0,0,0,0,0|"
@@ -227,14 +184,36 @@ def _read_json(path: Path) -> Performance:
             if name not in row:
                 raise StgaError(f"{path}: frame {number + 1}: lacks {shorten(name)}")
             weights[number, column] = row[name]
-    times = None
-    if all(isinstance(frame, dict) and _is_number(frame.get("time")) for frame in frames):
-        times = np.array([float(frame["time"]) for frame in frames])
     inner = outer.get("metadata")
     about = {**(inner if isinstance(inner, dict) else {}), **outer}
-    key = next((key for key in ("exportFps", "fps") if key in about), "")
+    key = next((key for key in RATE_KEYS if key in about), "")
     fps = _number(f"{path}: {key}", about[key]) if key else None
-    return _performance(path, times, weights, np.zeros(3), fps)
+    times, guess = _json_times(path, frames, fps)
+    turns = {_plain(name): name for name in rows[0]}
+    head = np.zeros(3)
+    if all(turns.get(name) in row for row in rows for name in HEAD_COLUMNS):
+        head = np.array([[row[turns[name]] for name in HEAD_COLUMNS] for row in rows])
+    return _performance(path, times, weights, head, fps, guess)
+
+
+def _json_times(
+    path: Path, frames: list[Any], fps: float | None
+) -> tuple[np.ndarray | None, str | None]:
+    """Times of the frames that all say theirs, by the names and units of columns of a table."""
+    if not all(isinstance(frame, dict) for frame in frames):
+        return None, None
+    keys = list(frames[0])
+    clock = time_column(map(str, keys))
+    if clock is None:
+        return None, None
+    key = keys[clock[0]]
+    unit = clock[1]
+    told = [frame.get(key) for frame in frames]
+    if all(isinstance(value, str) and ":" in value for value in told):
+        return seconds_of(str(path), [str(value) for value in told]), None
+    if not all(_is_number(value) for value in told):
+        return None, None
+    return seconds_of_numbers(str(key), np.array(told, np.float64), unit, fps)
 
 
 def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
@@ -278,17 +257,30 @@ def _performance(
     weights: np.ndarray,
     head: np.ndarray,
     fps: float | None = None,
+    guess: str | None = None,
 ) -> Performance:
-    """The checked performance in the order of its times; of rows with the same time the first."""
+    """The checked performance in the order of its times; of rows with the same time the first.
+    guess: what was guessed of the times."""
+    guesses = [] if guess is None else [guess]
     if len(weights) > MAX_ROWS:
         raise StgaError(f"{path}: has {len(weights)} rows, expected at most {MAX_ROWS}")
+    if MAX_WEIGHT < np.abs(weights).max() <= MAX_PERCENT:
+        guesses.append(f"weights reach {np.abs(weights).max():.4g}; they are read as percent")
+        weights = weights / 100
     if not (np.abs(weights) <= MAX_WEIGHT).all():
         problem = f"holds weights beyond {MAX_WEIGHT:g}, or not finite; expected 0 to 1"
         raise StgaError(f"{path}: {problem}")
-    if not (np.abs(head) <= 4 * math.pi).all():
-        problem = "head rotation is beyond two turns, or not finite; expected radians"
+    turn = float(np.abs(head).max())
+    if not turn <= WHOLE_TURN_DEG:
+        problem = "head rotation is beyond a turn, or not finite; expected radians"
         raise StgaError(f"{path}: {problem}")
+    if turn > HALF_TURN:
+        unit = "degrees" if turn > WHOLE_TURN else "radians"
+        guesses.append(f"the head's angles reach {turn:.4g}; they are read as {unit}")
+        head = np.radians(head) if turn > WHOLE_TURN else head
     if times is None:
+        if fps is None:
+            guesses.append(f"says no times; its rows are taken as {DEFAULT_FPS:g} a second")
         rate = DEFAULT_FPS if fps is None else fps
         rate = rate if MIN_FPS <= rate <= MAX_FPS else np.nan
         times = np.arange(len(weights)) / rate
@@ -296,14 +288,15 @@ def _performance(
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g} a second"
         raise StgaError(f"{path}: its times or its rate are not usable; {expected}")
     times, first = np.unique(times - times.min(), return_index=True)
-    steps = np.diff(times)
-    rate = fps or (1 / float(np.median(steps)) if len(steps) else DEFAULT_FPS)
+    times, rate = evened(times)
+    rate = fps or rate
     if not MIN_FPS <= rate <= MAX_FPS or times[-1] * rate > MAX_ROWS:
         expected = f"expected {MIN_FPS:g} to {MAX_FPS:g}"
         raise StgaError(f"{path}: has {rate:.3g} rows a second over {times[-1]:.0f} s, {expected}")
     head = np.broadcast_to(head, (len(weights), 3))[first]
-    return Performance(times, weights[first], head, rate)
+    warnings = tuple(f"{path}: {text}" for text in guesses)
+    return Performance(times, weights[first], head, rate, warnings)
 
 
-READERS = {".csv": _read_csv, ".json": _read_json, ".txt": _read_packets}
+READERS = {".csv": _read_csv, ".tsv": _read_csv, ".json": _read_json, ".txt": _read_packets}
 """By the suffixes of performances."""

@@ -23,6 +23,7 @@ from .forward import (
     shaped_vertices,
 )
 from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
+from .quaternions import from_matrices, to_axis_angle
 from .teeth import TEETH_VERTICES
 
 Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
@@ -42,7 +43,20 @@ FIELD_ALIASES = {
     "eyes": "eyes_pose",
     "eye_pose": "eyes_pose",
     "betas": "shape",
+    "R": "rotation",
+    "t": "translation",
+    "pose_params": "rotation",
+    "expression_params": "expr",
+    "jaw_params": "jaw_pose",
+    "shape_params": "shape",
 }
+JOINT_COUNTS = {"rotation": 1, "neck_pose": 1, "jaw_pose": 1, "eyes_pose": 2}
+"""Fields that are rotations -> how many of them."""
+# Numbers of a rotation by two rows of its matrix, or the matrix
+ROWS_OF_SIX = 6
+MATRIX_SIZE = 9
+MATRIX_TOLERANCE = 1e-3  # Of exports with a few decimals
+UNREAD_PARTS = ("eyelids", "eyelid_params")  # Of models that FLAME was extended by
 # Columns of a `pose` that holds several joints -> the fields they are, three columns a joint.
 POSE_LAYOUTS = {6: ("rotation", "jaw_pose"), 15: ("rotation", "neck_pose", "jaw_pose", "eyes_pose")}
 MIN_JOINT_ANGLE_DEG = 0.5  # of a joint that moves
@@ -61,6 +75,7 @@ class FlameSequence:
     static_offset  (V, 3) meters or None
     timesteps      ascending
     frame          timestep -> its parameters, read on demand
+    warnings       one sentence each: what of a file was guessed or not read
     """
 
     model: FlameModel
@@ -68,6 +83,7 @@ class FlameSequence:
     static_offset: np.ndarray | None
     timesteps: tuple[int, ...]
     frame: Callable[[int], FlameFrame]
+    warnings: tuple[str, ...] = ()
 
     def mesh(self, frame: FlameFrame) -> np.ndarray:
         """The person's mesh (V, 3) in meters with a frame's parameters."""
@@ -163,9 +179,10 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 
     VHAP's `tracked_flame_params_*.npz` and `flame_param/*.npz`, the `flame_param.npz` of a
     GaussianAvatars avatar, and plain files of expression and pose, whose fields may have the names
-    in `FIELD_ALIASES` too. `pose` holds the joints of `POSE_LAYOUTS`, TORSO_SHIFT a shift of the
-    torso (`torso_shapes`). Timesteps count from 0,
-    unless `timesteps` (T,) names them. Raises StgaError naming the file and the field.
+    in `FIELD_ALIASES` too. Rotations are axis-angle, two rows of a matrix, or the matrix. `pose`
+    holds the joints of `POSE_LAYOUTS`, TORSO_SHIFT a shift of the torso (`torso_shapes`).
+    Timesteps count from 0, unless `timesteps` (T,) names them. Raises StgaError naming the file
+    and the field.
     """
     return motion_of(path, read_npz(path), model)
 
@@ -173,6 +190,7 @@ def read_motion(path: Path, model: FlameModel) -> FlameSequence:
 def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
     """The motion in the arrays of a file, as `read_motion` reads it; errors name `path`."""
     spelled = {FIELD_ALIASES[name]: own for name, own in arrays.items() if name in FIELD_ALIASES}
+    warnings = _guesses(path, arrays)
     arrays = spelled | dict(arrays)
     pose = arrays.pop("pose", None)
     if pose is not None:
@@ -216,7 +234,24 @@ def motion_of(path: Path, arrays: Arrays, model: FlameModel) -> FlameSequence:
 
     for timestep in timesteps:
         frame(timestep)  # report a wrong value when the file is opened, not minutes later
-    return FlameSequence(model, shape, static_offset, timesteps, frame)
+    return FlameSequence(model, shape, static_offset, timesteps, frame, warnings)
+
+
+def _guesses(path: Path, arrays: Arrays) -> tuple[str, ...]:
+    """Sentences about fields of a motion that other programs may mean otherwise, or lack here."""
+    sizes = {name: own[0].size for name, own in arrays.items() if own.ndim > 1 and len(own)}
+    joints = {name: JOINT_COUNTS.get(FIELD_ALIASES.get(name, name), 0) for name in sizes}
+    six = [name for name, count in joints.items() if count and sizes[name] == count * ROWS_OF_SIX]
+    sentences = []
+    if six:
+        rows = "rotations of six numbers are read as the first two rows of a matrix"
+        sentences.append(f"{path}: {', '.join(six)}: {rows}")
+    if "R" in sizes and "rotation" not in arrays:
+        meaning = "the head's rotation and translation (R x + t)"
+        sentences.append(f"{path}: R and t are read as {meaning}, not as a camera's")
+    unread = [name for name in UNREAD_PARTS if name in arrays and np.any(arrays[name])]
+    sentences += [f"{path}: {name} is not read: FLAME has no such shapes" for name in unread]
+    return tuple(sentences)
 
 
 def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dict[str, np.ndarray]:
@@ -239,7 +274,9 @@ def motion_arrays(sequence: FlameSequence, dtype: DTypeLike = np.float64) -> dic
 
 def _frame(path: Path, arrays: Arrays, model: FlameModel) -> FlameFrame:
     sizes = dict.fromkeys(FRAME_FIELDS, 3) | {"expr": model.n_expression, "eyes_pose": 6}
-    values = {name: _vector(path, arrays, name, size) for name, size in sizes.items()}
+    turns = {name: arrays[name] for name in JOINT_COUNTS if name in arrays}
+    plain = dict(arrays) | {name: _axis_angles(path, name, own) for name, own in turns.items()}
+    values = {name: _vector(path, plain, name, size) for name, size in sizes.items()}
     offset = _offset(path, arrays, "dynamic_offset", len(model.v_template))
     return FlameFrame(**values, dynamic_offset=offset)
 
@@ -260,6 +297,25 @@ def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
         beyond = f"that are not finite, or beyond {MAX_PARAMETER:g}"
         raise StgaError(f"{path}: {name} holds values {beyond}")
     return array
+
+
+def _axis_angles(path: Path, name: str, array: np.ndarray) -> np.ndarray:
+    """A timestep's rotations (3n,) as axis-angle, of n joints, from two rows of each one's matrix,
+    (6n,) as PyTorch3D has them, or from matrices (n, 3, 3); others as they are, also with a leading
+    1. Raises StgaError for what is no rotation."""
+    joints = JOINT_COUNTS[name]
+    if array.size not in (joints * ROWS_OF_SIX, joints * MATRIX_SIZE):
+        return array
+    rows = _finite(path, name, array).reshape(joints, -1, 3)
+    if rows.shape[1] == 2:
+        x = rows[:, 0] / np.maximum(np.linalg.norm(rows[:, 0], axis=1, keepdims=True), 1e-12)
+        y = rows[:, 1] - (x * rows[:, 1]).sum(axis=1, keepdims=True) * x
+        y = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-12)
+        rows = np.stack([x, y, np.cross(x, y)], axis=1)
+    off = np.abs(rows @ rows.swapaxes(1, 2) - np.eye(3)).max()
+    if not off < MATRIX_TOLERANCE or (np.linalg.det(rows) < 0).any():
+        raise StgaError(f"{path}: {name} has shape {array.shape}, but holds no rotations")
+    return np.asarray(to_axis_angle(from_matrices(rows)).reshape(-1))
 
 
 def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:

@@ -187,8 +187,11 @@ def motion_capture(request: Posed, avatar: Avatar, own: Capture | None, say: Say
 
 
 def findings(motion: Motion) -> list[str]:
-    """What to say about a motion: lost rows, and how far it goes beyond what was trained."""
-    lines = [f"{motion.lost} rows are missing and were interpolated"] if motion.lost else []
+    """What to say about a motion: guesses, lost rows, and how far it goes beyond what was
+    trained."""
+    lines = [f"warning: {sentence}" for sentence in motion.warnings]
+    if motion.lost:
+        lines.append(f"{motion.lost} rows are missing and were interpolated")
     for part, beyond in motion.outside.items():
         if beyond.any():
             share = float(np.mean(beyond > 0))

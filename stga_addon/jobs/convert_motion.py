@@ -10,7 +10,14 @@ from ..capture.model import Capture
 from ..capture.open import open_capture
 from ..driving.head_map import person_of
 from ..driving.inverse import captured_performance, head_angles, write_performance
-from ..driving.open_motion import Motion, MotionOptions, adapted, performed, prepared_performance
+from ..driving.open_motion import (
+    Motion,
+    MotionOptions,
+    adapted,
+    check_motion,
+    performed,
+    prepared_performance,
+)
 from ..driving.performance import Performance
 from ..driving.read_performance import is_performance, read_performance
 from ..errors import StgaError
@@ -99,10 +106,12 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
     elif is_performance(request.source):
         performance = read_performance(request.source)
     else:
+        check_motion(request.source)
         performance = _shapes_of_motion(request)
         options = replace(options, neutral="none")  # which the parameters were put on already
     lines: tuple[str, ...] = ()
     if request.writes_shapes:
+        lines = tuple(f"warning: {sentence}" for sentence in performance.warnings)
         write_performance(request.output, prepared_performance(performance, options, request.fps))
     else:
         if tracked is not None and request.head is None:

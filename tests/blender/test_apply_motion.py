@@ -159,9 +159,11 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
     before = at(1)
     np.savez(tmp_path / "wide.npz", expr=np.zeros((2, 50)))
     np.savez(tmp_path / "long.npz", expr=np.zeros((3, 2)))
+    (tmp_path / "take.bvh").write_text("HIERARCHY\n")
     meshes = write_mesh_capture(tmp_path / "meshes")
     for arguments, message in (
-        ({"filepath": str(tmp_path / "gone.npz")}, "gone.npz"),
+        ({"filepath": str(tmp_path / "gone.npz")}, "gone.npz: does not exist"),
+        ({"filepath": str(tmp_path / "take.bvh")}, "take.bvh: is no motion; expected .csv"),
         ({"filepath": str(scene.model_file)}, "has none of expr"),
         ({"filepath": str(tmp_path / "wide.npz")}, "expr has shape"),
         ({"filepath": str(meshes)}, "was not tracked with FLAME"),

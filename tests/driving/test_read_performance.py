@@ -128,7 +128,7 @@ def test_every_form_of_csv_json_and_text(tmp_path):
         (lambda text: text.replace("0.5", "half", 1), "expected a number"),
         (lambda text: text.replace("01:00:00:00.0", "noon"), "Timecode is 'noon'"),
         (lambda text: text.splitlines()[0], "has no row with a face"),
-        (lambda text: text.replace("0.1", "91.1"), "beyond"),
+        (lambda text: text.replace("0.1", "911.1"), "beyond"),
         (lambda text: "", "is empty"),
         (
             lambda text: re.sub("(?m)^(.*?),(.*)$", r"\2,\1", text).rpartition(",")[0],

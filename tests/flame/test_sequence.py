@@ -292,3 +292,56 @@ def test_driven_by_the_neutral_mesh_alone(tiny_flame):
     expected = flame_forward(tiny_flame, shape, random_frame(7, 4), offset)
     found = sequence_mesh(transferred_motion(motion, neutral), 7)
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+JOINTS_OF = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
+
+
+def _as_metrical_tracker_writes(frames: list[FlameFrame]) -> dict[str, np.ndarray]:
+    """Arrays by its names: two rows of the jaw's and eyes' matrices, R and t of the head."""
+
+    def matrices(name: str) -> np.ndarray:
+        vectors = np.stack([getattr(frame, name) for frame in frames])
+        turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+        return turns.reshape(len(frames), -1, 3, 3)
+
+    two_rows = {name: matrices(name)[:, :, :2].reshape(len(frames), -1) for name in JOINTS_OF}
+    return {
+        "exp": np.stack([frame.expr for frame in frames]),
+        "shape": np.zeros((len(frames), 4)),
+        "eyes": 1.5 * two_rows["eyes_pose"],  # networks give them without their length
+        "neck": matrices("neck_pose")[:, 0],
+        "jaw": two_rows["jaw_pose"],
+        "R": matrices("rotation")[:, 0],
+        "t": np.stack([frame.translation for frame in frames]),
+        "eyelids": np.ones((len(frames), 2)),
+    }
+
+
+def test_rotations_by_matrices_and_their_rows(tmp_path, tiny_flame):
+    """Catches a motion refused for how its rotations are written, one that is read transposed, and
+    a guess that nobody hears of."""
+    frames = [random_frame(seed, tiny_flame.n_expression) for seed in range(4)]
+    arrays = _as_metrical_tracker_writes(frames)
+    path = _write(tmp_path / "metrical.npz", arrays)
+    motion = read_motion(path, tiny_flame)
+    for timestep, frame in enumerate(frames):
+        found = motion.frame(timestep)
+        np.testing.assert_allclose(found.parameters, frame.parameters, atol=1e-6)
+    told = [text.removeprefix(f"{path}: ") for text in motion.warnings]
+    begin = ["eyes, jaw: rotations of six", "R and t are read as", "eyelids is not read"]
+    assert [text[: len(own)] for text, own in zip(told, begin, strict=True)] == begin
+    first = {name: own[0] for name, own in arrays.items()}
+    single = {"expr": first["exp"], "rotation": first["R"], "translation": first["t"]}
+    single |= {"neck_pose": first["neck"][None], "jaw_pose": first["jaw"][None]}
+    single |= {"eyes_pose": first["eyes"]}
+    found = read_frame(_write(tmp_path / "00000.npz", single), tiny_flame)
+    np.testing.assert_allclose(found.parameters, frames[0].parameters, atol=1e-6)
+
+
+@pytest.mark.parametrize("value", [2 * np.eye(3), np.diag([1, 1, -1]), np.zeros((3, 3))])
+def test_matrices_that_are_no_rotations(tmp_path, tiny_flame, value):
+    """Catches a scaled or mirrored matrix taken for a rotation."""
+    arrays = {"expr": np.zeros((2, 3)), "rotation": np.stack([np.eye(3), value])}
+    with pytest.raises(StgaError, match=r"rotation has shape .*, but holds no rotations"):
+        read_motion(_write(tmp_path / "a.npz", arrays), tiny_flame)

@@ -32,14 +32,14 @@ from stga_addon.export.spz import write_spz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.sequence import read_frame, read_identity, read_motion
 from stga_addon.flame.unpickle import read_pickled_arrays
-from stga_addon.tracking.footage.calibrations import (
-    read_metashape,
-    read_nerfstudio,
+from stga_addon.tracking.footage.colmap import read_colmap
+from stga_addon.tracking.footage.metashape import read_metashape
+from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
+from stga_addon.tracking.footage.nerfstudio import read_nerfstudio
+from stga_addon.tracking.footage.realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.colmap import read_colmap
-from stga_addon.tracking.footage.model import FootageCamera, ImageFrames
 from stga_addon.tracking.footage.shots import Shot, undistortion
 from stga_addon.tracking.footage.sources import Sources, sequence_names
 from stga_addon.tracking.head_model import read_head_model
@@ -139,7 +139,7 @@ def colmap_target(file: str) -> Target:
         with tempfile.TemporaryDirectory() as folder:
             write(Path(folder) / file, alone=False)
             shutil.copyfile(path, Path(folder) / file)
-            undistorted(read_colmap(Path(folder)))
+            undistorted(read_colmap(Path(folder))[0])
 
     return Target(file, write, read)
 
@@ -204,14 +204,14 @@ TARGETS = {
         "realitycapture csv": (
             "cameras.csv",
             lambda p: p.write_text("\n".join([test_calibrations.HEADER, *map(ROW.format, NAMES)])),
-            lambda p: undistorted(read_realitycapture_csv(p, size_of)),
+            lambda p: undistorted(read_realitycapture_csv(p, size_of)[0]),
         ),
         "realitycapture xmp": (
             "a.xmp",
             lambda p: test_calibrations.write_xmp(p, RIG[0]),
-            lambda p: undistorted(read_realitycapture_xmp([p], size_of)[0]),
+            lambda p: undistorted(read_realitycapture_xmp([p], size_of, p.parent)[0]),
         ),
-        "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p))),
+        "nerfstudio": ("transforms.json", nerfstudio, lambda p: undistorted(read_nerfstudio(p)[0])),
         "landmarks": ("cam0.npz", landmarks, lambda p: read_camera(p, LANDMARK_CAMERA)),
         "places": ("head_model.npz", places, lambda p: read_places(p, 4)),
         "head model npz": ("head.npz", linear_head, read_head_model),

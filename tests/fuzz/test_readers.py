@@ -652,7 +652,6 @@ WRONG: dict[str, list[tuple[Any, str]]] = {
         (('type="frame"', 'type="spherical"'), "sensor '0': type 'spherical' is not one of frame"),
         (('sensor_id="0" component', 'sensor_id="3" component'), "sensor_id '3' is no sensor of"),
         (("<p1>", "<p3>0.1</p3><p1>"), "sensor '0': p3 and p4 are not supported"),
-        (('component_id="0" label="cam1', 'component_id="1" label="cam1'), "are in 2 components"),
         (("<transform>", "<transform>-"), "expected a rotation without|its axes are mirrored"),
         (("<transform>", "<transform>1 "), "transform: expected 16 finite numbers, not"),
     ],

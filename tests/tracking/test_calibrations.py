@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.tracking.footage.calibrations import (
-    read_metashape,
+from stga_addon.tracking.footage.metashape import read_metashape
+from stga_addon.tracking.footage.open import open_footage
+from stga_addon.tracking.footage.realitycapture import (
     read_realitycapture_csv,
     read_realitycapture_xmp,
 )
-from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.shots import read_xml
 
 from .scenes import HEIGHT, WIDTH, rig, write_image
@@ -219,8 +219,8 @@ def test_projections_are_metashapes(tmp_path, kind, angle_of):
     calibration."""
     write_export(tmp_path / "cameras.xml", rig(), ["a", "b", "c"], kind)
     shots, left_out = read_metashape(tmp_path / "cameras.xml")
-    assert [shot.label for shot in shots] == ["a", "b", "c"]
-    assert left_out == ["spare"]
+    assert [shot.label for shot in shots] == ["Group 1/a", "Group 1/b", "Group 1/c"]
+    assert left_out == ("left out cameras without a pose: spare",)
     random = np.random.default_rng(5)
     local = np.c_[random.uniform(-0.4, 0.4, (20, 2)), np.ones(20)] * 2.0
     for shot, expected in zip(shots, rig(), strict=True):
@@ -271,7 +271,7 @@ def test_mirrored_axes(tmp_path):
     mirrored = f"<transform>{words(matrix)}<"
     text = re.sub("<transform>[^<]{40,}<", mirrored, text)
     (tmp_path / "cameras.xml").write_text(text, encoding="utf-8")
-    message = r"camera 'a': its axes are mirrored; expected a right-handed rotation"
+    message = r"camera 'Group 1/a': its axes are mirrored; expected a right-handed rotation"
     with pytest.raises(StgaError, match=message):
         read_metashape(tmp_path / "cameras.xml")
 
@@ -314,8 +314,9 @@ def test_xmp(tmp_path, as_attributes):
     """Catches either form of the pose, another side's focal length, and swapped coefficients."""
     camera = rig()[1]
     write_xmp(tmp_path / "b.xmp", camera, as_attributes=as_attributes)
-    (shot,), left_out = read_realitycapture_xmp(tmp_path.glob("*.xmp"), lambda label: (30, 40))
-    assert (shot.label, left_out) == ("b", [])
+    files = tmp_path.glob("*.xmp")
+    (shot,), left_out = read_realitycapture_xmp(files, lambda label: (30, 40), tmp_path)
+    assert (shot.label, left_out) == ("b", ())
     np.testing.assert_allclose(shot.camera.world_to_camera, camera.world_to_camera, atol=1e-12)
     focal = 24.3765359225552 / 36 * 40
     found = intrinsics(shot.camera)
@@ -342,7 +343,9 @@ def test_xmp_beside_the_images(tmp_path):
     path.write_text(text, encoding="utf-8")
     footage = open_footage(tmp_path)
     assert [camera.name for camera in footage.cameras] == ["a", "b"]
-    assert footage.warnings == (f"{tmp_path / 'images'}: left out cameras without a pose: c",)
+    left_out = f"{tmp_path / 'images'}: left out cameras without a pose: c"
+    unused = f"1 of 3 images have no camera in {tmp_path / 'images'}: images/c.jpg"
+    assert footage.warnings == (left_out, f"{tmp_path}: {unused}")
 
 
 def csv_line(name, camera, rest="18,0.01,-0.02,0,0,0,0,0,0"):
@@ -378,7 +381,7 @@ def test_level_camera_of_a_csv(tmp_path):
     text = f"{HEADER}\na.png,1,2,3,90,90,0,18,0,0,0,0,0,0,0,0\n"
     for name in ("first.csv", "second.csv"):
         (tmp_path / name).write_text(text, encoding="utf-8")
-    (shot,) = read_realitycapture_csv(tmp_path / "first.csv", lambda label: (40, 30))
+    (shot,), _ = read_realitycapture_csv(tmp_path / "first.csv", lambda label: (40, 30))
     expected = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # right, down, forward
     np.testing.assert_allclose(shot.camera.world_to_camera[:3, :3], expected, atol=1e-12)
     np.testing.assert_allclose(shot.camera.position, [1, 2, 3], atol=1e-12)

@@ -39,7 +39,7 @@ def test_projections_are_colmaps(tmp_path, kind):
     """Catches any model whose coefficients, pose or principal point are read as another's."""
     model = reconstruction()
     getattr(model, f"write_{kind}")(str(tmp_path))
-    shots = read_colmap(tmp_path)
+    shots, _ = read_colmap(tmp_path)
     assert [shot.label for shot in shots] == sorted(f"cam {name}.jpg" for name in LENSES)
     local = np.c_[RANDOM.uniform(-0.5, 0.5, (20, 2)), np.ones(20)] * RANDOM.uniform(1, 3, (20, 1))
     images = sorted(model.images.values(), key=lambda image: image.name)

@@ -220,14 +220,14 @@ def test_two_cameras_without_calibration(tmp_path):
     (tmp_path / "old.csv").mkdir()
     write_image(tmp_path / "a/1.png")
     write_image(tmp_path / "b/1.png")
-    message = r"has 2 cameras and no calibration; expected transforms.json, a COLMAP model"
+    message = r"has 2 cameras \(a, b\) and no calibration; expected transforms.json, a COLMAP model"
     with pytest.raises(StgaError, match=message):
         open_footage(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(StgaError, match=r"has neither images nor videos and no calibration"):
         open_footage(tmp_path / "empty")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    with pytest.raises(StgaError, match="is neither a folder nor a video"):
+    with pytest.raises(StgaError, match="loop: does not exist"):
         open_footage(tmp_path / "loop")
 
 

@@ -2,10 +2,13 @@
 
 import pickle
 import random
+import re
 import struct
+from fractions import Fraction
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stga_addon.errors import StgaError
 from stga_addon.tracking.footage.open import open_footage
@@ -47,6 +50,12 @@ VIDEOS = {
     "MPEG-2 in a transport stream": ("a.mts", "mpeg2video", MPEG4),
     "MPEG-2 in MXF": ("a.mxf", "mpeg2video", MPEG4),
     "Motion JPEG in AVI": ("a.avi", "mjpeg", {"qmin": "2", "qmax": "3"}),
+    "MPEG-1 in a program stream": ("a.mpg", "mpeg1video", MPEG4),
+    "MPEG-2 in a program stream": ("a.VOB", "mpeg2video", MPEG4),
+    "H.264 of a Blu-ray": ("a.m2ts", "libx264", X264),
+    "H.264 in 3GPP": ("a.3gp", "libx264", X264),
+    "H.264 in Flash": ("a.flv", "libx264", X264),
+    "Windows Media": ("a.wmv", "wmv2", {"g": "12", "b": "4000000"}),
     "VP9": (
         "a.webm",
         "libvpx-vp9",
@@ -136,6 +145,13 @@ def assert_numbers(path, expected):
     for number in range(0, len(expected), 11):
         camera = open_footage(path).cameras[0]
         assert shown(camera.image(number)) == expected[number], f"alone: {number}"
+
+
+def test_frames_of_a_gif(tmp_path):
+    """Catches an animation whose frames hold only what changes."""
+    images = [Image.fromarray(picture(number)) for number in range(FRAMES)]
+    images[0].save(tmp_path / "a.gif", save_all=True, append_images=images[1:], duration=40)
+    assert_numbers(tmp_path / "a.gif", list(range(FRAMES)))
 
 
 @pytest.mark.parametrize("kind", VIDEOS)
@@ -256,6 +272,82 @@ def test_display_matrices(tmp_path, turn):
     corners = shown_image[height // 4 :: height // 2, width // 4 :: width // 2]
     names = np.array(list("abcd"))[np.abs(corners[..., None] - list(levels.values())).argmin(-1)]
     assert " ".join("".join(row) for row in names) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "stored", "aspect", "size"),
+    [
+        ("a.mov", (60, 64), Fraction(16, 15), (64, 64)),
+        ("a.mkv", (96, 64), Fraction(4, 3), (128, 64)),
+        ("a.mpg", (96, 64), Fraction(32, 27), (114, 64)),  # 16:9, of which MPEG-2 has a code
+    ],
+)
+def test_pixels_that_are_not_square(tmp_path, name, stored, aspect, size):
+    """Catches faces that are too wide or narrow; frames that a calibration of stored ones does not
+    fit; and not a word of either."""
+    image = np.zeros((stored[1], stored[0], 3), np.uint8)
+    image[16:48, stored[0] // 4 : 3 * stored[0] // 4] = 255
+    codec = "mpeg2video" if name.endswith("mpg") else "libx264"
+
+    def set_up(stream):
+        stream.codec_context.sample_aspect_ratio = aspect
+
+    encode(tmp_path / name, [image] * 3, codec, {"b": "4000000", "crf": "5"}, set_up=set_up)
+    (camera,) = (footage := open_footage(tmp_path / name)).cameras
+    assert (camera.camera.width, camera.camera.height) == size
+    shown_image = camera.image(1)[..., 0].astype(int)
+    assert shown_image.shape == size[::-1]
+    columns = np.flatnonzero(shown_image[32] > 127)
+    assert abs(columns[0] - size[0] / 4) <= 2
+    assert abs(columns[-1] - 3 * size[0] / 4) <= 2
+    ratio = f"{aspect.numerator}:{aspect.denominator}"
+    told = f"its pixels are not square ({ratio}); frames are stretched to {size[0]} x {size[1]}"
+    assert footage.warnings == (f"{tmp_path / name}: {told}",)
+    (other,) = rig(1, *stored)
+    write_colmap_text(tmp_path / "sparse", [other], ["a.png"])
+    footage = open_footage(tmp_path)
+    assert footage.cameras[0].image(1).shape == image.shape
+    assert not any("stretched" in warning for warning in footage.warnings)
+
+
+def with_clean_aperture(path, width, height):
+    """Insert a box `clap` into the picture's entry of `stsd`, and let all boxes around it grow. The
+    file's boxes of samples lie before `moov`, so that no offset changes."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"avcC") - 4
+    parents = [data.rindex(name, 0, at) - 4 for name in (b"avc1", b"stsd", b"stbl", b"minf")]
+    parents += [data.rindex(name, 0, at) - 4 for name in (b"mdia", b"trak", b"moov")]
+    assert data.index(b"mdat") < parents[-1]
+    for parent in parents:
+        (length,) = struct.unpack_from(">I", data, parent)
+        struct.pack_into(">I", data, parent, length + 40)
+    data[at:at] = struct.pack(">I4s8I", 40, b"clap", width, 1, height, 1, 0, 1, 0, 1)
+    path.write_bytes(data)
+
+
+def test_what_a_video_asks_for_in_vain(tmp_path):
+    """Catches combs of interlaced frames, a frame to be cropped, and a turn by no right angle, of
+    which a player shows something else, without a word."""
+    frames = [np.full((64, 96, 3), 30 + 10 * n, np.uint8) for n in range(3)]
+    encode(tmp_path / "fields.mp4", frames, options={"x264-params": "tff=1"})
+    encode(tmp_path / "crop.mov", frames)
+    with_clean_aperture(tmp_path / "crop.mov", 80, 64)
+    encode(tmp_path / "turned.mp4", frames)
+    data = bytearray((tmp_path / "turned.mp4").read_bytes())
+    at = data.index(b"tkhd") + 44
+    sine, cosine = (round(65536 * value) for value in (np.sin(0.1), np.cos(0.1)))
+    data[at : at + 36] = struct.pack(">9i", cosine, sine, 0, -sine, cosine, 0, 0, 0, 1 << 30)
+    (tmp_path / "turned.mp4").write_bytes(data)
+    encode(tmp_path / "plain.mov", frames)
+    with_clean_aperture(tmp_path / "plain.mov", 96, 64)
+    for name, sentence in (
+        ("fields.mp4", "is interlaced: every second line is of another moment, and fast"),
+        ("crop.mov", r"asks for 80 x 64 of its 96 x 64 pixels \(clean aperture\); all are used"),
+        ("turned.mp4", "asks to be turned by 6°; only right angles are done"),
+    ):
+        (warning,) = open_footage(tmp_path / name).warnings
+        assert re.search(re.escape(f"{tmp_path / name}: ") + sentence, warning)
+    assert open_footage(tmp_path / "plain.mov").warnings == ()
 
 
 # Signals (R, G, B), 0 to 1, of a video, and the sRGB they are to be shown as. Gray card and white:

@@ -13,9 +13,10 @@ import numpy as np
 
 from ...errors import StgaError
 from .. import read_performance
+from ..clocks import DEFAULT_FPS
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
-from ..read_performance import DEFAULT_FPS, MAX_FPS, MAX_ROWS
+from ..read_performance import MAX_FPS, MAX_ROWS
 from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]

@@ -1,16 +1,18 @@
 """Cameras of a COLMAP model: `cameras` and `images`, as .bin or .txt."""
 
 import math
+import os
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import StgaError, shorten
-from ...files import read_bytes
+from ...files import is_file, read_bytes, read_text
 from ...flame.quaternions import to_matrices
-from .shots import Lens, Shot, numbers, pinhole, read_text
+from .shots import Calibrated, Lens, Shot, numbers, pinhole
 from .sources import natural_order
 
 _Camera = tuple[int, tuple[str, tuple[int, int], Sequence[float]]]
@@ -49,18 +51,59 @@ LENSES: dict[str, tuple[int, int, int, Callable[..., Lens]]] = {
 """Model -> its number in binary files, numbers of its focal lengths (of both axes, or of each) and
 of its distortion coefficients, and the lens that these make."""
 
-
-def find_colmap(folder: Path) -> Path | None:
-    """The folder of a model in one of footage: itself, or COLMAP's usual `sparse/0`."""
-    usual = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
-    return next((folder / name for name in usual if _suffix(folder / name)), None)
+USUAL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap")
+POSE_WORDS = 9  # Of an image's line before its name
+POINT_WORDS = 3  # Of a point: x, y and its number
 
 
-def read_colmap(folder: Path) -> list[Shot]:
+def colmap_models(folder: Path) -> list[Path]:
+    """Folders of models in one of footage, itself and down to three levels below, in the order in
+    which they are to be tried: those of most images first, then `USUAL_FOLDERS`, and last those
+    below `distorted`, where 3DGS's convert.py keeps the model of the images before undistortion."""
+    found = []
+    for path, names, _ in os.walk(folder):
+        below = Path(path).relative_to(folder)
+        names[:] = sorted(n for n in names if not n.startswith(".") and len(below.parts) < 3)
+        if model_suffix(Path(path)):
+            found.append(below)
+    counts = {own: _image_count(folder / own) if len(found) > 1 else 0 for own in found}
+
+    def order(own: Path) -> tuple[bool, int, int, list[tuple[int, str]]]:
+        name = own.as_posix()
+        usual = next((n for n, known in enumerate(USUAL_FOLDERS) if name == known), None)
+        rank = len(USUAL_FOLDERS) if usual is None else usual
+        return is_distorted(own), -counts[own], rank, natural_order(name)
+
+    return [folder / own for own in sorted(found, key=order)]
+
+
+def incomplete_models(folder: Path) -> list[Path]:
+    """Folders of one of footage that hold one of the two files of a model, as text or binary."""
+    usual = sorted({folder, *folder.glob("sparse"), *folder.glob("sparse/*")})
+    names = [f"{name}{suffix}" for name in ("cameras", "images") for suffix in (".bin", ".txt")]
+    damaged = (own for own in usual if not model_suffix(own))
+    return [own / name for own in damaged for name in names if is_file(own / name)]
+
+
+def is_distorted(folder: Path) -> bool:
+    """Whether a model is of the images before undistortion, by 3DGS's names of folders."""
+    return "distorted" in folder.parts
+
+
+def _image_count(folder: Path) -> int:
+    """Number of images of a model; 0 for one that is damaged, which is refused when it is read."""
+    with suppress(StgaError):
+        if model_suffix(folder) == ".bin":
+            return int(_Cursor(folder / "images.bin").unpack("Q")[0])
+        return sum(1 for _ in _text_images(folder / "images.txt"))
+    return 0
+
+
+def read_colmap(folder: Path) -> Calibrated:
     """One shot an image, in natural order of their names, which are the labels; COLMAP's numbers
     vary from run to run. World and unit are the model's. Raises StgaError that names file, camera
     and image."""
-    suffix = _suffix(folder)
+    suffix = model_suffix(folder)
     if suffix is None:
         expected = "expected cameras.bin and images.bin, or .txt"
         raise StgaError(f"{folder}: is no COLMAP model; {expected}")
@@ -92,12 +135,13 @@ def read_colmap(folder: Path) -> list[Shot]:
             position = -rotation.T @ np.array(pose[4:])
         posed = pinhole(size, (focal[0], focal[-1]), (cx, cy), rotation, position, where)
         shots.append(Shot(name, posed, lens(*values[focals + 2 :]), where))
-    return shots
+    return shots, ()
 
 
-def _suffix(folder: Path) -> str | None:
+def model_suffix(folder: Path) -> str | None:
+    """.bin or .txt, of a folder that is a model; None for others."""
     for suffix in (".bin", ".txt"):
-        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+        if all(is_file(folder / f"{name}{suffix}") for name in ("cameras", "images")):
             return suffix
     return None
 
@@ -127,18 +171,33 @@ def _text_cameras(path: Path) -> Iterator[_Camera]:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    """Two lines an image: `number qw qx qy qz tx ty tz camera name`, then its points."""
-    lines = _lines(path)
-    for number, line in lines:
-        words = line.split(maxsplit=9)
+    """A line an image, `number qw qx qy qz tx ty tz camera name`, and the line of its points, which
+    some programs leave out."""
+    points_may_follow = False
+    for number, line in _lines(path):
+        words = line.split(maxsplit=POSE_WORDS)
         where = f"{path}: line {number}"
-        if not words:
+        has_points = _is_of_points(line)
+        if not words or (points_may_follow and has_points):
+            points_may_follow = False
             continue
-        if len(words) < 10:
+        if len(words) <= POSE_WORDS or has_points:
             expected = "number, quaternion, translation, camera and name of an image"
-            raise StgaError(f"{where}: expected {expected}")
-        yield words[9], numbers(words[1:8], where, 7), _whole(words[8], where)
-        next(lines, None)
+            points = f", or its points by {POINT_WORDS} numbers each" * points_may_follow
+            raise StgaError(f"{where}: expected {expected}{points}")
+        yield words[POSE_WORDS], numbers(words[1:8], where, 7), _whole(words[8], where)
+        points_may_follow = True
+
+
+def _is_of_points(line: str) -> bool:
+    """Whether a line has three numbers a point, by its first points and the number of its words."""
+    words = line.split()
+    if len(words) % POINT_WORDS:
+        return False
+    try:
+        return all(math.isfinite(float(word)) for word in words[: 4 * POINT_WORDS])
+    except ValueError:
+        return False
 
 
 def _whole(word: str, where: str) -> int:

@@ -1,4 +1,5 @@
-"""Focal lengths that recordings state: photos' EXIF, metadata of QuickTime's and MP4's tracks."""
+"""What recordings state beside their pixels: focal lengths in photos' EXIF and in metadata of
+QuickTime's and MP4's tracks, whose clean aperture too."""
 
 import mmap
 import re
@@ -33,6 +34,9 @@ VALUE_FORMATS = {21: ">i", 22: ">I", 23: ">f", 24: ">d", 67: ">i", 77: ">I"}
 """Well-known types of QuickTime's metadata, but for text."""
 MAX_BOXES = 1000
 MAX_MOVIE_BYTES = 1 << 26
+# Bytes before the entries, and of a picture's before its boxes
+STSD_HEAD = 8
+SAMPLE_HEAD = 78
 
 
 def photo_focal(path: Path, width: int, height: int) -> float | None:
@@ -58,20 +62,43 @@ def video_focal(path: Path, width: int, height: int) -> float | None:
     """Focal length in pixels of a video of that size, as its metadata says; None where it does not.
     Phones write it into the video's track, where FFmpeg does not look."""
     try:
-        with (
-            path.open("rb") as stream,
-            mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
-        ):
-            boxes = islice(_boxes(data), MAX_BOXES)
-            first, end = next(
-                ((first, end) for kind, first, end in boxes if kind == b"moov"), (0, 0)
-            )
-            movie = data[first : min(end, first + MAX_MOVIE_BYTES)]
+        movie = _movie(path)
         tracks = [movie[first:end] for kind, first, end in _boxes(movie) if kind == b"trak"]
         found = [value for part in (*tracks, movie) if (value := _equivalent(part)) is not None]
     except (OSError, ValueError, struct.error):  # ValueError: of an empty file
         return None
     return _pixels(found[0], width, height) if found else None
+
+
+def clean_aperture(path: Path) -> tuple[int, int] | None:
+    """Width and height of the part of the stored picture that players show, as the first track of
+    QuickTime and MP4 states it with a `clap`; None without."""
+    try:
+        movie = _movie(path)
+        for kind, first, end in _boxes(movie):
+            entry = movie[first:end] if kind == b"trak" else b""
+            for inner in (b"mdia", b"minf", b"stbl", b"stsd"):
+                entry = next((entry[f:e] for name, f, e in _boxes(entry) if name == inner), b"")
+            for _, begin, stop in islice(_boxes(entry, STSD_HEAD), 1):
+                sample = entry[begin + SAMPLE_HEAD : stop]
+                for name, f, _ in _boxes(sample):
+                    if name == b"clap":
+                        wide, of_wide, high, of_high = struct.unpack_from(">4I", sample, f)
+                        return round(wide / of_wide), round(high / of_high)
+    except (OSError, ValueError, struct.error, ZeroDivisionError):
+        return None
+    return None
+
+
+def _movie(path: Path) -> bytes:
+    """The box `moov`, empty without one. Raises OSError, ValueError for an empty file."""
+    with (
+        path.open("rb") as stream,
+        mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data,
+    ):
+        boxes = islice(_boxes(data), MAX_BOXES)
+        first, end = next(((first, end) for kind, first, end in boxes if kind == b"moov"), (0, 0))
+        return bytes(data[first : min(end, first + MAX_MOVIE_BYTES)])
 
 
 def _pixels(equivalent_mm: float, width: int, height: int) -> float | None:

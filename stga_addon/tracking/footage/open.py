@@ -1,10 +1,11 @@
 """Opening footage: a calibration and the frames of its cameras."""
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from os.path import realpath
+from os.path import exists, realpath
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,21 @@ import numpy as np
 from ...capture.camera import camera_from_gl
 from ...capture.images import image_size
 from ...capture.model import View
+from ...capture.transforms import IMAGE_SUFFIXES
 from ...errors import StgaError
 from ...files import is_file, is_folder
 from .calibrations import EXPECTED, find_calibration, read_calibration
+from .colmap import is_distorted, model_suffix
 from .focal_tags import photo_focal, video_focal
 from .model import Footage, FootageCamera, Frames, ImageFrames
 from .sequences import FrameRange, Sequence, open_sequence, sequence_size, synchronized
-from .shots import Lens, Shot, undistortion
+from .shots import Lens, Shot, listed, undistortion
 from .sources import (
+    CONTAINERS,
+    ORIGINALS,
+    VIDEO_SUFFIXES,
     Sources,
+    calibration_images,
     find_sources,
     frame_number,
     is_video,
@@ -55,31 +62,63 @@ def open_footage(
     image.
     """
     root = Path(realpath(path))  # Path.resolve raises RuntimeError for a loop of links
+    warnings: tuple[str, ...] = ()
     if is_folder(path):
-        sources = find_sources(root)
-        cameras = find_calibration(root) if cameras is None else cameras
+        if cameras is None:
+            cameras, warnings = find_calibration(root)
+        root, containers = (root, CONTAINERS) if cameras is None else _workspace(root, cameras)
+        sources = find_sources(root, containers)
     elif is_file(path) and is_video(path):
-        sources = Sources(root.parent, videos={root.stem: [root]})
+        sources = Sources(root.parent, videos={root.stem: [root]}, files=[root])
     else:
-        raise StgaError(f"{path}: is neither a folder nor a video; put photos into a folder")
+        raise StgaError(f"{path}: {_no_footage(path)}")
     if cameras is None:
         footage = _single_camera(sources, frames, focal)
     elif focal is not None:
         raise StgaError(f"{cameras}: has focal lengths; expected none besides")
     else:
-        shots, warnings = read_calibration(cameras, partial(_image_size, sources))
+        shots, sentences = read_calibration(cameras, partial(_image_size, sources))
         footage = _calibrated(sources, cameras, shots, frames)
         keeps_world = all(shot.keeps_world for shot in shots)
-        warnings = (*warnings, *footage.warnings)
+        warnings = (*warnings, *sentences, *footage.warnings)
         footage = replace(footage, keeps_world=keeps_world, warnings=warnings)
+    if sources.unread:
+        names = [path.relative_to(root).as_posix() for path in sources.unread]
+        unread = f"{root}: does not read {listed(names)}; expected {', '.join(IMAGE_SUFFIXES)}"
+        footage = replace(footage, warnings=(*footage.warnings, unread))
     plated = tuple(replace(own, plate=sources.plates.get(own.name)) for own in footage.cameras)
+    footage = replace(footage, cameras=plated)
     if mattes is None:
-        return replace(footage, cameras=plated)
+        strays = _stray_masks(sources, plated)
+        return replace(footage, warnings=(*footage.warnings, *strays))
     if not is_folder(mattes):
         raise StgaError(f"{mattes}: is not a folder; expected one of mattes")
     given = find_sources(Path(realpath(mattes)))
     masked = tuple(_masked(camera, sources, given, len(plated) == 1) for camera in plated)
     return replace(footage, cameras=masked)
+
+
+def _no_footage(path: Path) -> str:
+    """What a path is that is neither a folder nor a video."""
+    if not exists(path):
+        return "does not exist"
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return "is one image; put photos into a folder"
+    suffixes = ", ".join(VIDEO_SUFFIXES)
+    return f"is neither a folder nor a video; expected a folder of photos or one of {suffixes}"
+
+
+def _workspace(root: Path, calibration: Path) -> tuple[Path, tuple[str, ...]]:
+    """The folder of a calibration's images, and which are used of several of the same names: beside
+    `sparse`, where COLMAP's undistortion writes them; of 3DGS's `distorted` the originals."""
+    calibration = Path(realpath(calibration))
+    if not calibration.is_relative_to(root) or not model_suffix(calibration):
+        return root, CONTAINERS
+    if is_distorted(calibration.relative_to(root)):
+        return root, (ORIGINALS, *CONTAINERS)
+    above = [calibration, *calibration.parents]
+    inside = above[: above.index(root)]
+    return next((own for own in inside if is_folder(own / CONTAINERS[0])), root), CONTAINERS
 
 
 def _calibrated(
@@ -97,15 +136,58 @@ def _calibrated(
                 same = f"are both of camera {name}; expected different names"
                 raise StgaError(f"{shot.where}: and {found[name].where} {same}")
             found[name] = shot
-        sequences = {name: open_sequence(sequence_files(sources, name)) for name in found}
-        return _rig(sources, found, sequences, frames)
+        files = {name: sequence_files(sources, name) for name in found}
+        sequences = {name: open_sequence(own) for name, own in files.items()}
+        used = [
+            path for own in files.values() for path in ([own] if isinstance(own, Path) else own)
+        ]
+        used += [path for shot in shots for path in calibration_images(sources, shot.label)]
+        footage = _rig(sources, found, sequences, frames)
+        return replace(footage, warnings=(*footage.warnings, *_unused(sources, calibration, used)))
     if frames.offsets or frames.sync != "none":
         lists = "lists images, which offsets do not apply to; expected none"
         raise StgaError(f"{calibration}: {lists}")
     fps = next((shot.fps for shot in shots if timed and shot.fps is not None), None)
+    shots = shots if timed else _with_stills(shots, sources)
+    unused = _unused(sources, calibration, [shot.image for shot in shots if shot.image is not None])
     chosen = [shot for shot in shots if frames.selects(shot.timestep or 0)]
-    listed = _listed_cameras(chosen if timed else _with_stills(shots, sources), calibration)
-    return Footage(sources.root, listed, fps)
+    return Footage(sources.root, _listed_cameras(chosen, calibration), fps, warnings=unused)
+
+
+def _unused(sources: Sources, calibration: Path, used: Iterable[Path]) -> tuple[str, ...]:
+    """A sentence about images and videos without a camera, by folder where none of it has one."""
+    rest = set(sources.files).difference(used)
+    if not rest:
+        return ()
+    folders = Counter(path.parent for path in sources.files)
+    left_out = Counter(path.parent for path in rest)
+    names = []
+    for folder, count in left_out.items():
+        if count > 1 and count == folders[folder] and folder != sources.root:
+            names.append(f"{folder.relative_to(sources.root).as_posix()} ({count})")
+        else:
+            own = sorted((path for path in rest if path.parent == folder), key=str)
+            names += [path.relative_to(sources.root).as_posix() for path in own]
+    kinds = {is_video(path) for path in rest}
+    what = "images" if kinds == {False} else "videos" if kinds == {True} else "images and videos"
+    counted = f"{len(rest)} of {len(sources.files)} {what} have no camera in {calibration}"
+    return (f"{sources.root}: {counted}: {listed(sorted(names))}",)
+
+
+def _stray_masks(sources: Sources, cameras: Iterable[FootageCamera]) -> tuple[str, ...]:
+    """Sentences about masks of no image and plates of no camera."""
+    frames = [camera.frames for camera in cameras]
+    views = (view for own in frames if isinstance(own, ImageFrames) for view in own.views.values())
+    used = {view.mask for view in views} | {sources.mask_of(path) for path in sources.files}
+    masks = [path for own in sources.masks.values() for path in own if path not in used]
+    known = {camera.name for camera in cameras}
+    plates = [path for name, path in sources.plates.items() if name not in known]
+    sentences = []
+    for kind, paths in (("masks are of no image", masks), ("plates are of no camera", plates)):
+        if paths:
+            names = [path.relative_to(sources.root).as_posix() for path in paths]
+            sentences.append(f"{sources.root}: {len(paths)} {kind}: {listed(names)}")
+    return tuple(sentences)
 
 
 def _masked(
@@ -140,11 +222,21 @@ def _rig(
     sequences: Mapping[str, Sequence],
     frames: FrameRange,
 ) -> Footage:
+    sequences = {name: _as_calibrated(own, shots[name]) for name, own in sequences.items()}
     videos = [own for own in sequences.values() if isinstance(own, Video)]
-    warnings = [warning for video in videos for warning in video.warnings]
+    warnings = [warning for video in videos for warning in video.sentences]
     recorded, fps, sentences = synchronized(sequences, shots, sources, frames)
     cameras = tuple(_camera(name, shots[name], recorded[name]) for name in shots)
     return Footage(sources.root, cameras, fps, warnings=(*warnings, *sentences))
+
+
+def _as_calibrated(sequence: Sequence, shot: Shot) -> Sequence:
+    """A video as it is stored, where its camera was calibrated so: programs that save its frames as
+    images ignore that pixels are not square."""
+    size = shot.camera.width, shot.camera.height
+    if isinstance(sequence, Video) and size == sequence.stored != sequence.size:
+        return sequence.as_stored()
+    return sequence
 
 
 def _camera(name: str, shot: Shot, frames: Frames) -> FootageCamera:
@@ -163,7 +255,12 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
     names = sorted({*sources.videos, *sources.folders})
     root = sources.root
     if len(names) != 1:
-        found = f"{len(names)} cameras" if names else "neither images nor videos"
+        found = "neither images nor videos"
+        if names:
+            several = [name or "those at the top" for name in names]
+            found = f"{len(names)} cameras ({listed(several)})"
+        elif sources.unread:
+            found += f" that are read (not {sources.unread[0].name})"
         expected = f"expected {EXPECTED}, or one camera"
         raise StgaError(f"{root}: has {found} and no calibration; {expected}")
     sequence = open_sequence(sequence_files(sources, names[0]))
@@ -220,7 +317,7 @@ def _image_size(sources: Sources, label: str) -> tuple[int, int]:
     if name is None:
         return image_size(still_image(sources, label, f"camera {label}"))
     files = sequence_files(sources, name)
-    return first_frames(files)[0] if isinstance(files, Path) else image_size(files[0])
+    return first_frames(files).size if isinstance(files, Path) else image_size(files[0])
 
 
 def _listed_cameras(shots: list[Shot], calibration: Path) -> tuple[FootageCamera, ...]:

@@ -2,7 +2,7 @@
 and undistortion."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +23,7 @@ ZOOM_STEPS = 30
 BORDER_POINTS = 33
 """Points along a side of the image at which it is checked that all of it was recorded."""
 CACHED_MAPS = 32  # Lenses whose maps are kept: 6 bytes a pixel each
+NAMES_IN_SENTENCE = 5
 ROTATION_TOLERANCE = 1e-3  # some exports round rotations to a few decimals
 MAX_POSITION = 1e12
 """Of a camera, in the calibration's unit: millimeters from the center of the earth are 1e10."""
@@ -34,8 +35,8 @@ class Lens:
     """Distortion of normalized image points, applied in this order.
 
     projection  how the angle θ off the axis becomes a radius: "perspective" (tan θ), "fisheye" (θ),
-                "field of view" (2 tan θ tan ω/2 → its arc tangent / ω) or "division" (r with r / (1
-                + k r²) = tan θ)
+                "equisolid fisheye" (2 sin θ/2), "field of view" (2 tan θ tan ω/2 → its arc tangent
+                / ω) or "division" (r with r / (1 + k r²) = tan θ)
     parameter   ω (radians) of "field of view", k of "division"
     radial      k1, k2, … of 1 + k1 r² + k2 r⁴ + …, any number
     rational    the same for the denominator (k4 to k6 of OpenCV's rational model)
@@ -74,6 +75,8 @@ class Lens:
     def _radius(self, tangent: np.ndarray) -> np.ndarray:
         if self.projection == "fisheye":
             return np.asarray(np.arctan(tangent))
+        if self.projection == "equisolid fisheye":
+            return np.asarray(2 * np.sin(np.arctan(tangent) / 2))
         if abs(self.parameter) < MIN_RADIUS:
             return tangent
         if self.projection == "field of view":
@@ -189,12 +192,10 @@ class Shot:
     keeps_world: bool = False
 
 
-def read_text(path: Path) -> str:
-    """The file, with or without a byte order mark. Raises StgaError, also where not UTF-8."""
-    try:
-        return read_bytes(path).decode("utf-8-sig")
-    except ValueError as error:
-        raise StgaError(f"{path}: is not UTF-8 text ({error})") from error
+Calibrated = tuple[list[Shot], tuple[str, ...]]
+"""Cameras with a pose; and a sentence for each kind of what was left out, guessed or repaired."""
+ImageSize = Callable[[str], tuple[int, int]]
+"""Label of a camera -> (width, height), which some files do not say. Raises StgaError."""
 
 
 def read_xml(path: Path) -> ElementTree.Element:
@@ -209,6 +210,12 @@ def read_xml(path: Path) -> ElementTree.Element:
         return ElementTree.fromstring(data, ElementTree.XMLParser(target=Builder()))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise StgaError(f"{path}: is not valid XML ({error})") from error
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - NAMES_IN_SENTENCE
+    return ", ".join(names[:NAMES_IN_SENTENCE]) + (f" and {more} more" if more > 0 else "")
 
 
 def numbers(words: Iterable[str], where: str, count: int | None = None) -> list[float]:

@@ -2,16 +2,29 @@
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
+from ...capture.transforms import IMAGE_SUFFIXES
 from ...errors import StgaError, shorten
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".mxf")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm", ".mts", ".m2ts", ".ts", ".mxf", ".mpg"),
+    *(".mpeg", ".m2v", ".vob", ".wmv", ".asf", ".flv", ".f4v", ".3gp", ".3g2", ".ogv", ".dv"),
+    ".gif",
+)
+UNREAD_SUFFIXES = (
+    *(".heic", ".heif", ".avif", ".jxl", ".jp2", ".tga", ".exr", ".hdr", ".psd", ".dng", ".cr2"),
+    *(".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".braw", ".r3d", ".ari", ".crm"),
+)
+"""Of pictures and videos that are not read."""
 CONTAINERS = ("images", "frames", "videos", "input")
-"""Folders that gather those of the cameras; their names are no part of a camera's."""
+"""Folders that gather those of the cameras; their names are no part of a camera's. Of pictures of
+the same names in several, the first are used."""
+ORIGINALS = "input"  # Container of the images before undistortion, by 3DGS's convert.py
 MASK_FOLDERS = ("masks", "fg_masks")
 PLATE_FOLDER = "plates"  # Holds an image without the person for each camera, of its name
 MAX_DEPTH = 4
@@ -33,6 +46,8 @@ class Sources:
     videos   "cam01" -> files
     plates   "cam01" -> file
     masks    as `images`; COLMAP's names ("0001.jpg.png") are "0001.jpg"
+    files    all images and videos, also those of the same names as others, which are not used
+    unread   pictures and videos in formats that are not read
     """
 
     root: Path
@@ -41,6 +56,16 @@ class Sources:
     videos: dict[str, list[Path]] = field(default_factory=dict)
     masks: dict[str, list[Path]] = field(default_factory=dict)
     plates: dict[str, Path] = field(default_factory=dict)
+    files: list[Path] = field(default_factory=list)
+    unread: list[Path] = field(default_factory=list)
+
+    @cached_property
+    def images_by_name(self) -> dict[str, list[Path]]:
+        """Images by their names without folders and suffix."""
+        named: dict[str, list[Path]] = {}
+        for path in chain.from_iterable(self.images.values()):
+            named.setdefault(path.stem, []).append(path)
+        return named
 
     def name_of(self, path: Path) -> str:
         """Path below the footage, without suffix and without a leading "images/" and the like."""
@@ -53,11 +78,13 @@ class Sources:
         return next(iter(self.masks.get(key) or self.masks.get(name, [])), None)
 
 
-def find_sources(root: Path) -> Sources:
-    """List the visible files, four levels deep. Raises StgaError for over a million files, OSError
-    for a folder that cannot be listed."""
+def find_sources(root: Path, containers: Sequence[str] = CONTAINERS) -> Sources:
+    """List the visible files, four levels deep. containers: which images are used where several of
+    them hold images of the same names. Raises StgaError for over a million files, OSError for a
+    folder that cannot be listed."""
     sources = Sources(root)
     count = 0
+    folders: dict[str, dict[str, list[Path]]] = {}
 
     def refuse(error: OSError) -> None:
         raise error
@@ -77,6 +104,9 @@ def find_sources(root: Path) -> Sources:
             name = rest.rpartition(".")[0]
             if suffix in VIDEO_SUFFIXES:
                 sources.videos.setdefault(key, []).append(path)
+                sources.files.append(path)
+            elif suffix in UNREAD_SUFFIXES:
+                sources.unread.append(path)
             elif suffix not in IMAGE_SUFFIXES:
                 continue
             elif first in MASK_FOLDERS:
@@ -84,9 +114,27 @@ def find_sources(root: Path) -> Sources:
             elif first == PLATE_FOLDER:
                 sources.plates.setdefault(name, path)
             else:
-                sources.images.setdefault(key, []).append(path)
-                sources.folders.setdefault(key.rpartition("/")[0], []).append(path)
+                own = folders.setdefault(key.rpartition("/")[0], {})
+                own.setdefault(first if first in CONTAINERS else "", []).append(path)
+                sources.files.append(path)
+    for name, parts in folders.items():
+        for path in _without_copies(parts, containers):
+            sources.images.setdefault(sources.name_of(path), []).append(path)
+            sources.folders.setdefault(name, []).append(path)
     return sources
+
+
+def _without_copies(parts: Mapping[str, list[Path]], containers: Sequence[str]) -> list[Path]:
+    """The images of a folder, by container, without containers that hold the same names as one
+    before them."""
+    used = {""}
+    seen = set[str]()
+    for container in containers:
+        names = {path.stem for path in parts.get(container, ())}
+        if seen.isdisjoint(names):
+            used.add(container)
+            seen |= names
+    return [path for container, paths in parts.items() if container in used for path in paths]
 
 
 def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
@@ -105,9 +153,18 @@ def sequence_names(sources: Sources, labels: Iterable[str]) -> list[str | None]:
     return found
 
 
+def calibration_images(sources: Sources, label: str) -> list[Path]:
+    """The images of a label, with which the camera of a recording was calibrated."""
+    return next((sources.images[name] for name in _tails(label) if name in sources.images), [])
+
+
 def still_image(sources: Sources, label: str, where: str) -> Path:
-    """The image of that name. Raises StgaError where there is none, or more than one."""
-    found = next((sources.images[name] for name in _tails(label) if name in sources.images), [])
+    """The image of that name, in that folder or, where only one has it, in another. Raises
+    StgaError where there is none, or more than one."""
+    tails = _tails(label)
+    found = calibration_images(sources, label)
+    if not found and tails:
+        found = sources.images_by_name.get(tails[-1], [])
     if not found:
         missing = f"no image, folder or video of the name {shorten(label)}"
         raise StgaError(f"{where}: {sources.root} has {missing}")

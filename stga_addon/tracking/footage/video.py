@@ -3,7 +3,8 @@
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ...capture.images import read_mask
 from ...capture.model import View
 from ...errors import StgaError
 from ...files import file_address
+from .focal_tags import clean_aperture
 
 MIN_HD_LINES = 720  # From here on, videos without a stated color matrix are in that of HD (BT.709)
 TIMED_CONTAINERS = ("mov", "matroska")
@@ -33,6 +35,7 @@ SEEK_BACK_FRAMES = (0, 16, 64, 256)
 """How far before a frame a seek is tried, in turn, before all is decoded from the beginning."""
 RATE_TOLERANCE = 0.01
 """Relative difference up to which a stated frame rate is that of the frames' times."""
+TURN_TOLERANCE = 0.02  # Of the sine of an angle, beyond which a turn is not by a right angle
 VARIABLE_RATE_FACTOR = 1.5
 """A frame that lasts this many times the median makes the rate a variable one."""
 
@@ -46,7 +49,9 @@ class Video:
     timesteps  of the frames, not descending: their numbers, but where the rate varies their times
                in units of 1 / fps
     fps       frames per second; without its gaps where it varies; 0 where unknown
-    size      (width, height) as displayed
+    size      (width, height) as displayed, of square pixels
+    stored    (width, height) before the pixels were made square, turned as displayed
+    aspect    width of a stored pixel over its height, by which frames are stretched
     seekable  whether a frame is recognized by its time; False: frames are counted from the
               beginning
     warnings  one sentence each
@@ -57,14 +62,45 @@ class Video:
     timesteps: tuple[int, ...]
     fps: float
     size: tuple[int, int]
+    stored: tuple[int, int] = (0, 0)
+    aspect: Fraction = Fraction(1)
     seekable: bool = True
     warnings: tuple[str, ...] = ()
+
+    def as_stored(self) -> "Video":
+        """With frames as they are stored, of pixels that are not square."""
+        return replace(self, size=self.stored, aspect=Fraction(1))
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The warnings, and that frames are stretched where they are."""
+        if self.aspect == 1:
+            return self.warnings
+        pixels = f"its pixels are not square ({self.aspect.numerator}:{self.aspect.denominator})"
+        stretched = f"frames are stretched to {self.size[0]} x {self.size[1]}"
+        return (*self.warnings, f"{self.path}: {pixels}; {stretched}")
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """The first frames of a video.
+
+    times     when they are shown, in the order shown
+    others    as of `Video`
+    """
+
+    times: tuple[int | None, ...]
+    size: tuple[int, int]
+    stored: tuple[int, int]
+    aspect: Fraction
+    warnings: tuple[str, ...]
 
 
 def read_video(path: Path) -> Video:
     """Index a video. Raises StgaError where it cannot be read, or without PyAV. Where the container
     says when packets are shown, only the first frames are decoded; otherwise, all are."""
-    size, first = first_frames(path)
+    begin = first_frames(path)
+    first = list(begin.times)
     times, is_cut_off = _packet_times(path)
     left_out = times.index(first[0]) if first[0] in times else 0
     with opened_video(path) as container:
@@ -77,17 +113,20 @@ def read_video(path: Path) -> Video:
         seekable = _ascending(times) and exact
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate) if rate]
         time_base = float(stream.time_base)
+    looks = begin.size, begin.stored, begin.aspect
     if not seekable:
         numbers = tuple(range(len(times)))
-        return Video(path, numbers, numbers, next(iter(rates), 0.0), size, seekable=False)
+        fps = next(iter(rates), 0.0)
+        return Video(path, numbers, numbers, fps, *looks, False, begin.warnings)
     shown = tuple(times[left_out:])
     timesteps, fps, warnings = _timed(path, shown, time_base, rates)
+    warnings = (*begin.warnings, *warnings)
     if left_out:
         fate = "cannot be decoded; they are left out, and not counted"
         warnings += (f"{path}: its first {left_out} frames {fate}",)
     if is_cut_off:
         warnings += (f"{path}: is cut off; it ends after {len(shown)} frames",)
-    return Video(path, shown, timesteps, fps, size, warnings=warnings)
+    return Video(path, shown, timesteps, fps, *looks, warnings=warnings)
 
 
 class VideoFrames:
@@ -122,7 +161,7 @@ class VideoFrames:
         number = self.numbers[timestep]
         av = _pyav(self.video.path)
         try:
-            pixels = _pixels(self._frame(number))
+            pixels = _pixels(self._frame(number), self.video.aspect)
         except (av.FFmpegError, ValueError) as error:
             self.close()
             failed = f"cannot be decoded ({_reason(error)})"
@@ -212,19 +251,57 @@ class VideoFrames:
             self._container.streams.video[0].thread_type = "AUTO"
 
 
-def first_frames(path: Path) -> tuple[tuple[int, int], list[int | None]]:
-    """(width, height) as displayed, and times of the first frames in the order shown. Raises
-    StgaError as `read_video` does."""
+def first_frames(path: Path) -> Beginning:
+    """Look at the beginning. Raises StgaError as `read_video` does."""
     with opened_video(path) as container:
+        aspect = container.streams.video[0].sample_aspect_ratio
+        aspect = Fraction(aspect) if aspect and aspect > 0 else Fraction(1)
         frames = _decoded_frames(container)
         first = next(frames, None)
         if first is None:
             raise ValueError("none of its frames can be decoded")
-        height, width = _pixels(first).shape[:2]
-        times = [first.pts, *(frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))]
-    if not is_image_size(width, height):
-        raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
-    return (width, height), times
+        stored = _shown_size(first, Fraction(1))
+        size = _shown_size(first, aspect)
+        rest = (frame.pts for frame in itertools.islice(frames, CHECKED_FRAMES - 1))
+        times = (first.pts, *rest)
+        problems = _unheard(path, first)
+    for width, height in (stored, size):
+        if not is_image_size(width, height):
+            raise StgaError(f"{path}: has {width} x {height} pixels, more than are read")
+    return Beginning(times, size, stored, aspect, tuple(f"{path}: {text}" for text in problems))
+
+
+def _shown_size(frame: Any, aspect: Fraction) -> tuple[int, int]:
+    """(width, height) as displayed, of pixels of that aspect."""
+    size = _square_width(frame, aspect), frame.height
+    turn = _turn(frame)
+    return size[::-1] if turn is not None and turn[0, 0] == 0 else size
+
+
+def _square_width(frame: Any, aspect: Fraction) -> int:
+    width: int = frame.width
+    return max(1, round(width * aspect))
+
+
+def _unheard(path: Path, frame: Any) -> list[str]:
+    """What a video asks for and does not get."""
+    sentences = []
+    matrix = _display_matrix(frame)
+    if matrix is not None:
+        length = max(np.hypot(*matrix[0]), 1e-9)
+        off = np.sort(np.abs(matrix[0]) / length)[0]
+        if off > TURN_TOLERANCE:
+            angle = np.degrees(np.arctan2(matrix[0, 1], matrix[0, 0]))
+            sentences.append(f"asks to be turned by {angle:.0f}°; only right angles are done")
+    if frame.interlaced_frame:
+        moments = "every second line is of another moment"
+        sentences.append(f"is interlaced: {moments}, and fast motion has combs; deinterlace it")
+    shown = clean_aperture(path)
+    if shown is not None and (shown[0] < frame.width or shown[1] < frame.height):
+        all_of = f"{frame.width} x {frame.height}"
+        crop = f"asks for {shown[0]} x {shown[1]} of its {all_of} pixels (clean aperture)"
+        sentences.append(f"{crop}; all are used")
+    return sentences
 
 
 @contextmanager
@@ -335,22 +412,20 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
-def _pixels(frame: Any) -> np.ndarray:
-    """(H, W, 3) uint8 sRGB, turned and mirrored as the video asks for."""
+def _pixels(frame: Any, aspect: Fraction) -> np.ndarray:
+    """(H, W, 3) uint8 sRGB, of square pixels, turned and mirrored as the video asks for."""
     matrix = frame.colorspace
     if matrix == 2 and frame.height >= MIN_HD_LINES:  # FFmpeg's "unspecified"
         matrix = 1  # BT.709
     codes = int(frame.color_primaries), int(frame.color_trc)
     deep = not is_srgb(*codes)  # 8 bits of HDR are too few for its dark colors
-    rgb = frame.reformat(format="rgb48le" if deep else "rgb24", src_colorspace=matrix).to_ndarray()
+    form = {"format": "rgb48le" if deep else "rgb24", "src_colorspace": matrix}
+    if aspect != 1:
+        form |= {"width": _square_width(frame, aspect), "interpolation": "BICUBIC"}
+    rgb = frame.reformat(**form).to_ndarray()
     pixels = to_srgb(rgb, *codes) if deep else rgb
-    data = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return np.ascontiguousarray(pixels)
-    # Row vector (x, y) of a stored pixel times the matrix (2, 2), y down, is where it is shown.
-    fixed = np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2)
-    turn = np.sign(np.round(fixed / DISPLAY_MATRIX_ONE))
-    if not np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]:
+    turn = _turn(frame)
+    if turn is None:
         return np.ascontiguousarray(pixels)
     if turn[0, 0] == 0:  # the stored x becomes y
         pixels = pixels.swapaxes(0, 1)
@@ -362,6 +437,25 @@ def _pixels(frame: Any) -> np.ndarray:
 def _open(path: Path) -> Any:
     """A container; raises what PyAV does, and StgaError without it."""
     return _pyav(path).open(file_address(path))
+
+
+def _display_matrix(frame: Any) -> np.ndarray | None:
+    """(2, 2): row vector (x, y) of a stored pixel times it, y down, is where it is shown."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return None
+    fixed = np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2)
+    return np.asarray(fixed / DISPLAY_MATRIX_ONE)
+
+
+def _turn(frame: Any) -> np.ndarray | None:
+    """The display matrix as a turn by right angles, of 1, 0 and -1; None for others."""
+    matrix = _display_matrix(frame)
+    if matrix is None:
+        return None
+    turn = np.sign(np.round(matrix))
+    is_right = np.abs(turn).sum(0).tolist() == np.abs(turn).sum(1).tolist() == [1, 1]
+    return turn if is_right else None
 
 
 def _pyav(path: Path) -> Any:

@@ -1,0 +1,69 @@
+"""Cameras of transforms files: nerfstudio, instant-ngp, VHAP, Blender's exports."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from ...capture.model import FPS_LIMIT
+from ...capture.transforms import Record, read_transforms, repairs, with_principal_point
+from ...errors import StgaError, shorten
+from .shots import Calibrated, Lens, Shot
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+PERSPECTIVE_MODELS = (*PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+MARKS = b'"frames"', b'"transform_matrix"'
+HEAD_BYTES = 1 << 16
+
+
+def is_transforms(path: Path) -> bool:
+    """Whether a file of any name is a transforms file, by its beginning."""
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    return all(mark in head for mark in MARKS)
+
+
+def read_nerfstudio(path: Path) -> Calibrated:
+    """Entries of a transforms file; `file_path` is the label. Raises StgaError. Their `cy` means
+    what VHAP's does where frames have `timestep_index` and nothing says which lens they have, as
+    nerfstudio's and instant-ngp's do, else what OpenCV's does (`read_transforms`)."""
+    frames = read_transforms(path, "opencv", moved=True)
+    shots = []
+    is_timed = any(
+        frame.record.has(key) for frame in frames for key in ("timestep_index", "keyframe")
+    )
+    has_lens = any(frame.record.has(key) for frame in frames for key in ("camera_model", "k1"))
+    is_vhap = not has_lens and any(frame.record.has("timestep_index") for frame in frames)
+    for frame in frames:
+        view = frame.view
+        record = frame.record
+        name = frame.camera_id
+        camera = with_principal_point(view.camera, frame.principal, "vhap" if is_vhap else "opencv")
+        if name is None and record.has("camera_index"):
+            name = f"{view.camera_index:02d}"
+        timestep = view.timestep if is_timed else None
+        mask = view.mask
+        mask = mask or record.path_of("mask_path")  # nerfstudio's
+        fps = record.number("fps", 0, FPS_LIMIT) if record.has("fps") else None
+        keeps_world = record.values.get("world") == "keep"
+        shot = Shot(view.name, camera, _lens(record), frame.where, view.image, timestep, mask, name)
+        shots.append(replace(shot, fps=fps, keeps_world=keeps_world))
+    return shots, repairs(frames)
+
+
+def _lens(record: Record) -> Lens:
+    """The lens of a frame."""
+    usual = "OPENCV_FISHEYE" if record.values.get("is_fisheye") else "OPENCV"
+    model = record.values.get("camera_model") or usual
+    known = PERSPECTIVE_MODELS + FISHEYE_MODELS
+    if model not in known:
+        one = f"{shorten(model)} is not one of {', '.join(known)}"
+        raise StgaError(f"{record.where('camera_model')}: {one}")
+    if model in PINHOLE_MODELS:
+        return Lens()
+    names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+    *k, p1, p2 = (record.number(name) if record.has(name) else 0.0 for name in names)
+    if model in FISHEYE_MODELS:
+        return Lens("fisheye", radial=tuple(k[:4]))
+    if model == "FULL_OPENCV":
+        return Lens(radial=tuple(k[:3]), rational=tuple(k[3:]), tangential=(p1, p2))
+    return Lens(radial=tuple(k[:4]), tangential=(p1, p2))  # nerfstudio's k4 is that of r⁸

@@ -1,0 +1,215 @@
+"""Performances as programs and spreadsheets of the field leave them: times, angles, tables."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from command_line import stga
+
+from stga_addon.driving.open_motion import open_motion
+from stga_addon.driving.performance import ARKIT_SHAPES
+from stga_addon.driving.read_performance import is_performance, read_performance
+from stga_addon.errors import StgaError
+
+from .test_read_performance import HEADER, write_csv
+
+COUNT = 60
+WEIGHTS = np.random.default_rng(2).random((COUNT, 52)).round(4)
+HEAD = [f"Head{turn}" for turn in ("Yaw", "Pitch", "Roll")]
+
+
+def write_rows(path, column, times, weights=WEIGHTS, head=(0.1, 0.2, 0.3)):
+    """A table of shapes by their plain names; without a column of times where that is None."""
+    header = [*([column] if column else []), *ARKIT_SHAPES, *HEAD]
+    lines = [",".join(header)]
+    for number, row in enumerate(weights):
+        cells = [*([times(number)] if column else []), *row.tolist(), *head]
+        lines.append(",".join(map(str, cells)))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_milliseconds_behind_frame_numbers(tmp_path):
+    """Catches rows lost and another rate where the part behind the frame's number is of the second:
+    NeuroSync's …:04.066, :04.083, :06.100."""
+    codes = []
+    for number in range(610):
+        whole, frame = divmod(number, 60)
+        milliseconds = frame * 1000 // 60
+        frame -= frame in (5, 10)  # which its floating-point numbers round down
+        codes.append(f"00:00:{whole:02d}:{frame:02d}.{milliseconds:03d}")
+    assert codes[4:7] == ["00:00:00:04.066", "00:00:00:04.083", "00:00:00:06.100"]
+    found = read_performance(write_csv(tmp_path / "a.csv", codes, np.tile(WEIGHTS, (11, 1))[:610]))
+    assert (len(found.times), found.lost, found.fps) == (610, 0, 60)
+    np.testing.assert_allclose(found.times, np.arange(610) / 60, atol=1e-9)
+
+
+NANOSECONDS = 1_714_563_900_000_000_000  # of an epoch: more digits than a float has
+CLOCKS = {
+    "milliseconds": ("timestamp_ms", lambda n: n * 1000 // 30, 30, None),
+    "camel case": ("timestampMs", lambda n: 17 + n * 40, 25, None),
+    "brackets": ("Time (ms)", lambda n: n * 20.0, 50, None),
+    "microseconds": ("time_us", lambda n: n * 1_000_000 // 60, 60, None),
+    "nanoseconds": ("Timestamp [ns]", lambda n: NANOSECONDS + n * 10**9 // 30, 30, None),
+    "seconds": ("elapsed_seconds", lambda n: n / 24, 24, None),
+    "short seconds": ("time_s", lambda n: n / 24, 24, None),
+    "seconds without a unit": ("time", lambda n: round(n / 30, 3), 30, None),
+    "milliseconds without a unit": ("timestamp", lambda n: n * 1000 // 30, 30, "milliseconds"),
+    "nanoseconds without a unit": ("t", lambda n: NANOSECONDS + n * 10**7, 100, "nanoseconds"),
+    "frame numbers": ("Timecode", lambda n: n + 1, 60, "Timecode counts frames; they are taken as"),
+    "every second frame": ("timecode", lambda n: 2 * n, 30, "counts frames"),
+    "none": (None, None, 60, "says no times; its rows are taken as 60 a second"),
+    "clock": ("Timecode", lambda n: f"10:59:59.{n * 16:03d}", 62.5, None),
+    "clock with a comma": ("time", lambda n: f'"10:59:59,{n * 16:03d}"', 62.5, None),
+    "whole second": (
+        "time",
+        lambda n: f"10:59:{n // 10:02d}" + f".{n % 10}00" * (n % 10 > 0),
+        10,
+        None,
+    ),
+    "date": ("timestamp", lambda n: f"2026-05-01T10:59:59.{n * 10_000:06d}Z", 100, None),
+}
+
+
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_times_with_and_without_a_unit(tmp_path, kind):
+    """Catches a take that plays at another speed than it was recorded, and a guess that nobody
+    hears of."""
+    column, times, fps, sentence = CLOCKS[kind]
+    path = write_rows(tmp_path / "a.csv", column, times)
+    found = read_performance(path)
+    assert found.lost == 0
+    assert found.fps == pytest.approx(fps, abs=1e-6)
+    np.testing.assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-6)
+    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-6)
+    assert len(found.warnings) == (sentence is not None)
+    assert sentence is None or sentence in found.warnings[0]
+
+
+def test_a_row_lost_between_frame_numbers(tmp_path):
+    """Catches a gap closed where frames are numbered, and times rounded to even rows that are
+    none."""
+    path = write_rows(tmp_path / "a.csv", "Timecode", lambda n: n + 2 * (n > 20))
+    found = read_performance(path)
+    assert (found.lost, found.fps) == (2, 60)
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.025, 0.042, COUNT)).round(4)
+    found = read_performance(write_rows(tmp_path / "b.csv", "time", lambda n: times[n]))
+    np.testing.assert_allclose(found.times, times - times[0], atol=1e-9)
+
+
+def test_drop_frame_numbers_over_ten_minutes(tmp_path):
+    """Catches numbers 0 and 1 taken as left out in every tenth minute too, which has them."""
+    codes = [f"00:09:59;{n:02d}" for n in range(20, 30)]
+    codes += [f"00:10:00;{n:02d}" for n in range(10)]
+    found = read_performance(write_csv(tmp_path / "take.csv", codes, np.zeros((20, 52))))
+    np.testing.assert_allclose(found.times, np.arange(20) * 1001 / 30000, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["german", "named delimiter", "tabs", "mark", "quoted"])
+def test_takes_saved_again_by_a_spreadsheet(tmp_path, kind):
+    """Catches columns that are not found, or numbers cut off at a decimal comma."""
+    codes = [f"01:00:00:{n:02d}.000" for n in range(COUNT)]
+    path = write_csv(tmp_path / "take.csv", codes, WEIGHTS)
+    expected = read_performance(path)
+    text = path.read_text()
+    comma = re.sub(r"(?<=\d)\.(?=\d{6})", ",", text.replace(",", ";"))
+    files = {
+        "german": comma.encode("utf-8-sig"),
+        "named delimiter": ("sep=;\r\n" + comma.replace("\n", "\r\n")).encode(),
+        "tabs": comma.replace(";", "\t").encode("utf-16"),
+        "mark": text.encode("utf-16"),
+        "quoted": re.sub(r"(\d),(\d{6})", r'"\1,\2"', comma).replace(";", ",").encode(),
+    }
+    path.write_bytes(files[kind])
+    found = read_performance(path)
+    np.testing.assert_allclose(found.weights, expected.weights)
+    np.testing.assert_allclose(found.head, expected.head)
+    np.testing.assert_allclose(found.times, expected.times)
+
+
+def test_tab_separated_suffix(tmp_path):
+    """Catches a table that is refused for its name."""
+    path = write_rows(tmp_path / "a.csv", "time", lambda n: n / 30)
+    (tmp_path / "a.tsv").write_text(path.read_text().replace(",", "\t"))
+    assert is_performance(tmp_path / "a.tsv")
+    np.testing.assert_allclose(read_performance(tmp_path / "a.tsv").weights, WEIGHTS)
+
+
+def test_degrees_and_percent(tmp_path):
+    """Catches a head that spins, shapes a hundred times too strong, and a guess without a word."""
+    path = write_rows(tmp_path / "a.csv", "time", lambda n: n / 30, WEIGHTS * 100, (20.0, -7.5, 3))
+    found = read_performance(path)
+    np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)
+    np.testing.assert_allclose(found.head, np.radians([[20.0, -7.5, 3]] * COUNT))
+    assert [re.sub("reach .*;", "reach;", text) for text in found.warnings] == [
+        f"{path}: weights reach; they are read as percent",
+        f"{path}: the head's angles reach; they are read as degrees",
+    ]
+    path = write_rows(tmp_path / "b.csv", "time", lambda n: n / 30, head=(5.5, 0, 0))
+    found = read_performance(path)
+    assert found.head[0, 0] == 5.5
+    assert "they are read as radians" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("key", "times", "about", "fps", "sentence"),
+    [
+        ("timestamp_ms", lambda n: n * 1000 // 30, {}, 30, None),
+        ("timestampMs", lambda n: n * 1000 // 30, {}, 30, None),
+        ("timestamp", lambda n: n * 40, {}, 25, "timestamp holds milliseconds"),
+        ("time", lambda n: n / 24, {}, 24, None),
+        ("timecode", lambda n: f"00:00:{n // 30:02d}:{n % 30:02d}", {}, 30, None),
+        ("frame", lambda n: n, {"frame_rate": 30}, 30, None),
+        ("frame", lambda n: n, {}, 60, "says no times"),
+    ],
+)
+def test_times_in_json(tmp_path, key, times, about, fps, sentence):
+    """Catches the same in JSON, in UTF-16 too, and head angles that are dropped."""
+    turns = dict(zip(("headYaw", "headPitch", "headRoll"), (0.1, 0.2, 0.3), strict=True))
+    named = [dict(zip(ARKIT_SHAPES, row, strict=True)) | turns for row in WEIGHTS.tolist()]
+    frames = [{key: times(n), "blendShapes": row} for n, row in enumerate(named)]
+    text = json.dumps({**about, "frames": frames})
+    (tmp_path / "a.json").write_bytes(text.encode("utf-16" if about else "utf-8-sig"))
+    found = read_performance(tmp_path / "a.json")
+    assert (found.fps, found.lost) == (pytest.approx(fps), 0)
+    np.testing.assert_allclose(found.times, np.arange(COUNT) / fps, atol=1e-3)
+    np.testing.assert_allclose(found.head, [[0.1, 0.2, 0.3]] * COUNT)
+    assert len(found.warnings) == (sentence is not None)
+    assert sentence is None or sentence in found.warnings[0]
+
+
+def test_guesses_reach_the_terminal(tmp_path, capsys):
+    """Catches a guess that the reader makes and no command says."""
+    path = write_rows(tmp_path / "a.csv", "Timecode", lambda n: n + 1)
+    for name in ("a.npz", "b.csv"):
+        assert stga("drive", path, "--out", tmp_path / name) == 0
+        told = capsys.readouterr()
+        assert f"warning: {path}: column Timecode counts frames" in told.out + told.err
+
+
+@pytest.mark.parametrize("out", ["o.npz", "o.csv"])
+def test_what_is_no_motion(tmp_path, capsys, out):
+    """Catches "holds FLAME parameters already" for a BVH and for a file that does not exist."""
+    (tmp_path / "take.bvh").write_text("HIERARCHY\nROOT Hips\n{\n}\nMOTION\n")
+    (tmp_path / "face.mp4").touch()
+    expected = ".csv, .tsv, .json, .txt, .npz, the folder of a take or of a capture"
+    for name, sentence in (
+        ("take.bvh", f"take.bvh: is no motion; expected {expected}"),
+        ("none.bvh", "none.bvh: does not exist"),
+        ("none.csv", "none.csv: cannot be read"),
+        ("none", "none: does not exist"),
+    ):
+        assert stga("drive", tmp_path / name, "--out", tmp_path / out) == 2
+        assert sentence in capsys.readouterr().err
+        sentence = sentence.replace("cannot be read", "does not exist")
+        with pytest.raises(StgaError, match=re.escape(sentence)):
+            open_motion(tmp_path / name, None, np.zeros((4, 3)), np.zeros((4, 3), int))
+    with pytest.raises(StgaError, match="stga drive makes a motion of a video"):
+        open_motion(tmp_path / "face.mp4", None, np.zeros((4, 3)), np.zeros((4, 3), int))
+
+
+def test_header_of_live_link_face():
+    """Catches a test of tables that have other columns than the app's."""
+    assert HEADER[-9:-6] == HEAD
