@@ -110,4 +110,5 @@ def add_driver(
             target.id_type = source.id_type
         target.id = source
         target.data_path = source_path
+        target.use_fallback_value = True  # 0 for a shape key that was removed
     driver.expression = expression

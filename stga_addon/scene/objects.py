@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,68 @@ def set_frames_per_second(scene: Any, rate: float) -> None:
     scene.render.fps_base = whole / rate
 
 
+class Identity:
+    """A scene or an object for what lives across events: it is looked up each time, as undo and a
+    loaded file make references invalid, and it may be renamed or removed."""
+
+    def __init__(self, block: Any) -> None:
+        self.uid = block.session_uid
+        self.name = block.name
+        """name: as it was last found"""
+        self._is_scene = block.id_type == "SCENE"
+
+    def find(self) -> Any:
+        """The scene or object; None where it is gone, as an object that is in no collection."""
+        blocks = bpy.data.scenes if self._is_scene else bpy.data.objects
+        found = blocks.get(self.name)
+        if found is None or found.session_uid != self.uid:
+            found = next((each for each in blocks if each.session_uid == self.uid), None)
+        # A deleted object stays in the file as long as a panel's property points to it.
+        if found is None or not (self._is_scene or found.users_collection):
+            return None
+        self.name = found.name
+        return found
+
+    def get(self) -> Any:
+        """The scene or object. Raises StgaError where it is gone."""
+        found = self.find()
+        if found is None:
+            raise StgaError(f"{self.name}: was removed meanwhile")
+        return found
+
+
+class SceneView:
+    """A scene and its view layer for what lives across events."""
+
+    def __init__(self, context: Any) -> None:
+        self.scene = Identity(context.scene)
+        self._layer = context.view_layer.name
+
+    @contextmanager
+    def shown(self) -> Iterator[Any]:
+        """The scene, which is that of `bpy.context` in the block, whatever the window shows. Raises
+        StgaError where scene or view layer is gone."""
+        scene = self.scene.get()
+        layer = scene.view_layers.get(self._layer)
+        if layer is None:
+            raise StgaError(f"{scene.name}: its view layer {self._layer} was removed meanwhile")
+        with bpy.context.temp_override(scene=scene, view_layer=layer):
+            yield scene
+
+
+@contextmanager
+def frame_kept(scene: Identity) -> Iterator[None]:
+    """Go back to the scene's frame at the end of the block, unless the scene is gone."""
+    now = scene.get()
+    frame = now.frame_current
+    subframe = now.frame_subframe
+    try:
+        yield
+    finally:
+        if (found := scene.find()) is not None:
+            found.frame_set(frame, subframe=subframe)
+
+
 def go_to_frame(frame: int) -> None:
     """Move the open scene to a frame and evaluate it."""
     bpy.context.scene.frame_set(frame)
@@ -199,17 +262,14 @@ def show_progress(share: float) -> None:
 
 def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
     """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
-    scene = bpy.context.scene
-    manager = bpy.context.window_manager
+    scene = Identity(bpy.context.scene)
     numbers = list(numbers)
-    frame = scene.frame_current
-    subframe = scene.frame_subframe
-    manager.progress_begin(0, 1)
-    try:
-        for index, number in enumerate(numbers):
-            scene.frame_set(number)
-            show_progress(index / len(numbers))
-            yield number
-    finally:
-        manager.progress_end()
-        scene.frame_set(frame, subframe=subframe)
+    bpy.context.window_manager.progress_begin(0, 1)
+    with frame_kept(scene):
+        try:
+            for index, number in enumerate(numbers):
+                scene.get().frame_set(number)
+                show_progress(index / len(numbers))
+                yield number
+        finally:
+            bpy.context.window_manager.progress_end()

@@ -11,7 +11,9 @@ from stga_addon.errors import StgaError
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.sequence import PARTS, FlameSequence, retimed, sequence_mesh
 from stga_addon.scene import compat
+from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.compat import SLOTTED_ACTIONS
+from stga_addon.scene.rig import keyframes
 from stga_addon.scene.rig.head import import_head, rig_of
 from stga_addon.scene.rig.motion import apply_motion, sample_motion
 
@@ -92,6 +94,46 @@ def test_strips_override_only_their_frames(head, own, other):
     for owner in owners(head):
         assert [len(track.strips) for track in owner.animation_data.nla_tracks] == [1, 1, 1]
         assert owner.animation_data.action is None
+
+
+def test_a_strip_keeps_the_animation_below_where_it_is(head, own, other):
+    """Fails when keyframes between frames, or outside an action's manual range, are moved or lost
+    below a strip."""
+    rig = rig_of(head)
+    rig.animation_data.action = None
+    for frame, x in ((2.5, 0.1), (10.25, -0.2), (20.75, 0.4)):
+        rig.pose.bones["root"].location.x = x
+        rig.pose.bones["root"].keyframe_insert("location", frame=frame)
+    rig.animation_data.action.use_frame_range = True
+    rig.animation_data.action.frame_start = 4
+    rig.animation_data.action.frame_end = 12.5
+    times = (0.0, 2.5, 6.0, 10.25, 13.5, 25.0)
+    before = [at_frame(head, time) for time in times]
+    apply_motion(head, retimed(other), 40, "other", ("jaw",), as_strip=True)
+    for time, expected in zip(times, before, strict=True):
+        np.testing.assert_allclose(at_frame(head, time), expected, atol=TOLERANCE)
+
+
+def test_moved_and_removed_sliders(head, own, other):
+    """Fails when components are counted in Blender's list of shape keys, which users move, or the
+    keyframes of a removed one end Mark as Key."""
+    keys = head.data.shape_keys.key_blocks
+    frames = [replace(frame, expr=frame.expr * (np.arange(30) != 4)) for frame in retimed(other)]
+    head.shape_key_remove(keys["expr_004"])
+    for name, way in (("expr_002", "BOTTOM"), ("expr_029", "UP"), ("expr_011", "TOP")):
+        head.active_shape_key_index = keys.find(name)
+        with bpy.context.temp_override(object=head):
+            bpy.ops.object.shape_key_move(type=way)
+    apply_motion(head, frames, 20, "other")
+    for index, frame in enumerate(frames):
+        np.testing.assert_allclose(at_frame(head, 20 + index), mesh(own, frame), atol=TOLERANCE)
+    keyframes.write_curves(head.data.shape_keys, 'key_blocks["expr_004"].value', [1, 9], [1, 2])
+    bpy.context.view_layer.update()
+    keys["expr_029"].value += 0.5
+    posed = evaluated_vertices(head)
+    keyframes.key_current_pose(head, rig_of(head), 23)
+    np.testing.assert_allclose(at_frame(head, 23), posed, atol=1e-5)
+    assert np.abs(posed - mesh(own, frames[3])).max() > 1e-3
 
 
 def test_applying_to_a_head_without_animation(head, own, other):

@@ -30,6 +30,7 @@ EXPRESSION_NAMES = "stga_expressions"
 # The joints that each part of a motion (`flame.motion.PARTS`) rotates.
 EYES = ("left_eye", "right_eye")
 PART_JOINTS = {"jaw": ("jaw",), "eyes": EYES, "neck": ("neck",), "head": ("root",)}
+numbered_key = f"{EXPRESSION_KEY}{{:03d}}".format
 offset_key = f"{OFFSET_KEY}{{:05d}}".format
 # The hidden bones of a displaced joint: that moves its bone, and that its vertices follow.
 parent_bone = "{}_joint".format
@@ -45,9 +46,9 @@ location_path = 'pose.bones["{}"].location'.format
 
 
 def expression_key(head: Any, component: int) -> str:
-    """The head's shape key of an expression component."""
+    """The name of the head's shape key of an expression component, which may have been removed."""
     named = head.get(EXPRESSION_NAMES)
-    return named.split(",")[component] if named else f"{EXPRESSION_KEY}{component:03d}"
+    return named.split(",")[component] if named else numbered_key(component)
 
 
 def posing_bone(head: Any) -> str:
@@ -55,16 +56,21 @@ def posing_bone(head: Any) -> str:
     return "neck" if EXPRESSION_NAMES in head else "jaw"
 
 
-def expression_keys(head: Any) -> list[str]:
-    """The shape keys that a head has of its expression components, in their order."""
-    named = head.get(EXPRESSION_NAMES, "").split(",")
-    names = [block.name for block in head.data.shape_keys.key_blocks]
-    return [name for name in names if name.startswith(EXPRESSION_KEY) or name in named]
+def expression_keys(head: Any) -> dict[int, str]:
+    """Component -> shape key, of the expression components that a head has a shape key of. By name:
+    users move and remove shape keys."""
+    names = set(head.data.shape_keys.key_blocks.keys())
+    named = head.get(EXPRESSION_NAMES)
+    if named:
+        return {k: name for k, name in enumerate(named.split(",")) if name in names}
+    numbers = [name.removeprefix(EXPRESSION_KEY) for name in names]
+    components = sorted(int(number) for number in numbers if number.isdecimal())
+    return {k: numbered_key(k) for k in components if numbered_key(k) in names}
 
 
 def slider_components(model: FlameModel) -> dict[str, int]:
     """Shape key -> component of `model.shapedirs`: expressions, and the first of identity."""
-    numbered = [f"{EXPRESSION_KEY}{k:03d}" for k in range(model.n_expression)]
+    numbered = map(numbered_key, range(model.n_expression))
     names = enumerate(model.expression_names or numbered, model.n_identity)
     identity = range(min(IDENTITY_SLIDERS, model.n_identity))
     return {name: k for k, name in names} | {f"{IDENTITY_KEY}{k:03d}": k for k in identity}
@@ -106,8 +112,9 @@ def key_motion(
     frame of each, ascending. A slider that never moves gets one keyframe."""
     if "expression" in parts:
         values = np.stack([frame.expr for frame in frames])
-        names = (expression_key(head, component) for component in range(values.shape[1]))
-        key_values(head.data.shape_keys, dict(enumerate(map(key_value_path, names))), at, values)
+        names = expression_keys(head).items()
+        paths = {k: key_value_path(name) for k, name in names if k < values.shape[1]}
+        key_values(head.data.shape_keys, paths, at, values)
         if np.abs(values).max(initial=0.0) > MAX_SLIDER:
             row, component = np.unravel_index(np.abs(values).argmax(), values.shape)
             warn(
@@ -185,10 +192,12 @@ def key_current_pose(head: Any, rig: Any, frame: int) -> None:
     rig.pose.bones["root"].keyframe_insert("location", frame=frame)
     for curve in action_curves(head.data.shape_keys):
         name = curve.data_path.partition('"')[2].partition('"')[0]
-        value = head.data.shape_keys.key_blocks[name].value
+        key = head.data.shape_keys.key_blocks.get(name)  # removing one leaves its keyframes
+        if key is None or not (name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES):
+            continue
+        value = key.value
         before = curve.evaluate(frame)
-        is_expression = name.startswith(EXPRESSION_KEY) or name in ARKIT_SHAPES
-        if not is_expression or abs(value - before) < UNCHANGED:
+        if abs(value - before) < UNCHANGED:
             continue
         if len(curve.keyframe_points) == 1:  # the motion never moves this slider
             for neighbor in (frame - 1, frame + 1):

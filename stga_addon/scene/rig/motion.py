@@ -1,6 +1,6 @@
 """Motion of a FLAME head: applied, sampled, set live, and compared with its training."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -17,11 +17,10 @@ from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
 from ...flame.sequence import PARTS, FlameSequence
-from ..arrays import evaluated_vertices, key_points, write_curves
-from ..objects import Warn, iterate_frames, log_warning
+from ..arrays import evaluated_vertices, key_points, read_values, write_curves
+from ..objects import Identity, Warn, iterate_frames, log_warning
 from . import keyframes
 from .head import rig_of
-from .keyframes import OFFSET_KEY
 
 MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sampled parameters
 
@@ -48,16 +47,14 @@ def apply_motion(
     keyframes.check_keyable(rig, JOINTS)
     keyframes.check_keyable(head.data.shape_keys)
     used = np.any([frame.expr != 0 for frame in frames], axis=0)
+    sliders = keyframes.expression_keys(head)
     for component in np.flatnonzero(used).tolist() if "expression" in parts else ():
-        key = keyframes.expression_key(head, component)
-        if key not in head.data.shape_keys.key_blocks:
+        if component not in sliders:
+            key = keyframes.expression_key(head, component)
             raise StgaError(f"{head.name}: has no slider {key}; import the head again to get all")
     # Coefficients of the sliders that the motion lacks are zero.
-    sliders = len(keyframes.expression_keys(head))
-    frames = [
-        replace(each, expr=np.pad(each.expr, (0, max(0, sliders - len(each.expr))))[:sliders])
-        for each in frames
-    ]
+    count = max(len(used), 1 + max(sliders, default=-1))
+    frames = [replace(each, expr=np.pad(each.expr, (0, count - len(each.expr)))) for each in frames]
     keys = head.data.shape_keys
     has_expression = "expression" in parts
     offsets = keyframes.offset_keys(head) if has_expression else []
@@ -164,44 +161,41 @@ WEIGHT_RANGE = (-1.0, 2.0)
 
 class LivePose:
     """What a head's sliders, bones and controls held before, and how live values are set on them.
-    Objects are looked up by name each time: references to them do not survive undo."""
+    Sliders are known by name: meanwhile they may be moved, removed or added."""
 
     def __init__(self, head: Any, rig: Any) -> None:
         """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
-        self._head = head.name
-        self._rig = None if rig is None else rig.name
+        self.head = Identity(head)
+        self._rig = None if rig is None else Identity(rig)
         self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
-        self._sliders = np.empty(len(keys), np.float32)
-        keys.foreach_get("value", self._sliders)
-        self._values = self._sliders.copy()
-        names = [key.name for key in keys]
-        if rig is None:
-            named = keyframes.shape_key_names(head).items()
-            self._rows = {column: names.index(name) for column, name in named}
-            return
-        own = keyframes.expression_keys(head)
-        still = {*own, *(ARKIT_SHAPES if keyframes.has_shapes(head) else ())}
-        self._values[[name in still or name.startswith(OFFSET_KEY) for name in names]] = 0.0
-        self._rows = dict(enumerate(map(names.index, own)))
-        bones = rig.pose.bones
-        self._turns = {joint: tuple(bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
-        offsets = [name for name in map(keyframes.offset_property, JOINTS) if name in rig]
-        self._offsets: dict[str, Any] = {name: tuple(rig[name]) for name in offsets}
+        self._names = keyframes.shape_key_names(head)
+        """Component, or column of the 52 -> slider."""
+        still: list[str] = []
+        if rig is not None:
+            self._names = keyframes.expression_keys(head)
+            bones = rig.pose.bones
+            self._turns = {joint: tuple(bones[joint].rotation_quaternion) for joint in LIVE_JOINTS}
+            offsets = [name for name in map(keyframes.offset_property, JOINTS) if name in rig]
+            self._offsets: dict[str, Any] = {name: tuple(rig[name]) for name in offsets}
+            shapes = ARKIT_SHAPES if keyframes.has_shapes(head) else ()
+            still = [name for name in shapes if name in keys]
+            still += [key.name for key in keyframes.offset_keys(head)]
+        self._sliders = {name: keys[name].value for name in (*self._names.values(), *still)}
 
     @property
     def is_there(self) -> bool:
-        """Whether the head, and its rig, are still in the file, with as many sliders."""
-        head = bpy.data.objects.get(self._head)
-        keys = head.data.shape_keys if head is not None and head.type == "MESH" else None
-        has_rig = self._rig is None or self._rig in bpy.data.objects
-        return keys is not None and has_rig and len(keys.key_blocks) == len(self._sliders)
+        """Whether the head, and its rig, are still in the file."""
+        head = self.head.find()
+        has_rig = self._rig is None or self._rig.find() is not None
+        return head is not None and has_rig and getattr(head.data, "shape_keys", None) is not None
 
     def set_frame(self, frame: FlameFrame) -> None:
         """Pose a FLAME head but for its place; tracked per-frame offsets are switched off."""
-        for component, row in self._rows.items():
-            self._values[row] = frame.expr[component] if component < len(frame.expr) else 0.0
-        self._set_sliders(self._values)
+        values = dict.fromkeys(self._sliders, 0.0)
+        names = self._names.items()
+        values |= {name: frame.expr[k] for k, name in names if k < len(frame.expr)}
+        self._set_sliders(values)
         turns = [frame.neck_pose, frame.jaw_pose, frame.eyes_pose[:3], frame.eyes_pose[3:]]
         turned = dict(zip(LIVE_JOINTS, from_axis_angle(np.stack(turns)), strict=True))
         self._set_bones(turned, dict.fromkeys(self._offsets, (0.0, 0.0, 0.0)))
@@ -209,9 +203,7 @@ class LivePose:
     def set_weights(self, weights: Sequence[float] | np.ndarray) -> None:
         """Set the 52 weights on the shape keys of a head without a rig."""
         limited = np.clip(weights, *WEIGHT_RANGE)
-        for column, row in self._rows.items():
-            self._values[row] = limited[column]
-        self._set_sliders(self._values)
+        self._set_sliders({name: limited[column] for column, name in self._names.items()})
 
     def restore(self) -> None:
         """Give back what was there before the first live pose."""
@@ -219,14 +211,19 @@ class LivePose:
         if self._rig is not None:
             self._set_bones(self._turns, self._offsets)
 
-    def _set_sliders(self, values: np.ndarray) -> None:
-        mesh = bpy.data.objects[self._head].data
-        mesh.shape_keys.key_blocks.foreach_set("value", values)
+    def _set_sliders(self, values: Mapping[str, float]) -> None:
+        mesh = self.head.get().data
+        blocks = mesh.shape_keys.key_blocks
+        held = read_values(blocks, "value", 1)
+        for row, name in enumerate(blocks.keys()):
+            if name in values:
+                held[row] = values[name]
+        blocks.foreach_set("value", held.ravel())
         mesh.shape_keys.update_tag()
         mesh.update_tag()
 
     def _set_bones(self, turns: dict[str, Any], offsets: dict[str, Any]) -> None:
-        rig = bpy.data.objects[self._rig]
+        rig = self._rig.get()
         for joint, quaternion in turns.items():
             rig.pose.bones[joint].rotation_quaternion = quaternion
         for name, value in offsets.items():
