@@ -18,7 +18,7 @@ from . import (
     track,
     train,
 )
-from .common import AtEnd, register_classes
+from .common import AtEnd, close_steps, register_classes
 
 MODULES = (track, import_capture, select, train, request, pose, show, render_video, apply_motion)
 MODULES += (drive, export)
@@ -72,3 +72,4 @@ def register(at_end: AtEnd) -> None:
     for part in (request, monitor, pose, render_video):
         part.register(at_end)
     at_end(drive.stop_session)
+    at_end(close_steps)

@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+import traceback
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -94,49 +95,100 @@ class Edit(Action):
     bl_options = frozenset({"REGISTER", "UNDO"})
 
 
+StepGenerator = Generator[None, None, None]
+
+
+class Steps:
+    """Work beside the interface that lives across events: a generator, a step at each event of a
+    timer. It keeps `Identity` and `SceneView`, never references, from one step to the next.
+
+    However it ends, the generator ends once, with what it cleans up, and so does the timer: by its
+    last step, an error, `close`, or where the extension ends.
+    """
+
+    def __init__(self, steps: StepGenerator, interval_s: float) -> None:
+        context = bpy.context
+        self._steps = steps
+        self._is_cancelled = False
+        self._timer = context.window_manager.event_timer_add(interval_s, window=context.window)
+        _begun.append(self)
+
+    def step(self, cancel: bool = False) -> bool:
+        """Do a step; whether others follow. cancel: raise Cancelled in it, once; the steps that it
+        still takes end what cannot end at once. Raises what the step raises."""
+        throws = cancel and not self._is_cancelled
+        self._is_cancelled = cancel or self._is_cancelled
+        goes_on = False
+        try:
+            if throws:
+                self._steps.throw(Cancelled())
+            else:
+                next(self._steps)
+            goes_on = True
+        except StopIteration:
+            pass
+        finally:
+            if not goes_on:
+                self.close()
+        return goes_on
+
+    def close(self) -> None:
+        """End it now."""
+        if self in _begun:
+            _begun.remove(self)
+            bpy.context.window_manager.event_timer_remove(self._timer)
+            self._steps.close()
+
+
+_begun: list[Steps] = []
+
+
+def close_steps() -> None:
+    """End all that is done in steps: Blender calls no `cancel` of an operator that it unregisters."""
+    for steps in list(_begun):
+        steps.close()
+
+
 class Stepwise(Action):
-    """Mixin of operators that work beside the interface, a step each timer event, until Esc or the
-    window's end.
+    """Mixin of operators that work in steps beside the interface, until Esc or the window's end.
 
     others: what becomes of other events meanwhile
     """
 
     others = "RUNNING_MODAL"
-    _steps: Any = None
+    _steps: Steps | None = None
 
-    def begin(self, context: Any, steps: Iterator[Any], interval_s: float) -> set[str]:
-        """Do the steps, each one until the iterator yields. Closed before its end, it cleans up."""
-        manager = context.window_manager
-        self._steps = steps
-        self._timer = manager.event_timer_add(interval_s, window=context.window)
-        manager.modal_handler_add(self)
+    def begin(self, context: Any, steps: StepGenerator, interval_s: float) -> set[str]:
+        self._steps = Steps(steps, interval_s)
+        context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def modal(self, context: Any, event: Any) -> set[str]:
-        if event.type not in ("ESC", "TIMER"):
+    def modal(self: Any, context: Any, event: Any) -> set[str]:
+        cancels = event.type == "ESC" and event.value == "PRESS"
+        if not cancels and event.type != "TIMER":
             return {self.others}
-        is_running = False
         try:
-            if event.type == "ESC":
-                self._steps.close()
             with telling_refusals():
-                is_running = next(self._steps, self) is not self
-        except Cancelled:
-            return {"CANCELLED"}
+                is_running = self._steps.step(cancels)
+            return {"RUNNING_MODAL" if is_running else "FINISHED"}
+        except Cancelled as error:
+            if str(error):
+                self.report({"WARNING"}, str(error))
         except StgaError as error:
             self.tell("ERROR", str(error))
-            return {"CANCELLED"}
-        finally:
-            if not is_running:
-                context.window_manager.event_timer_remove(self._timer)
-        if is_running:
-            return {"RUNNING_MODAL"}
-        return {"FINISHED" if event.type == "TIMER" else "CANCELLED"}
+        except Exception as error:
+            self.tell("ERROR", f"Ended by an unexpected {describe(error)}")
+        return {"CANCELLED"}
 
     def cancel(self, context: Any) -> None:
         if self._steps is not None:
-            context.window_manager.event_timer_remove(self._timer)
             self._steps.close()
+
+
+def describe(error: Exception) -> str:
+    """Print the traceback of an error that is being handled; its description for a sentence."""
+    traceback.print_exc()
+    return f"error ({type(error).__name__}: {error}); see the console"
 
 
 def call(operator: Any, *arguments: Any, **options: Any) -> set[str]:

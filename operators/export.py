@@ -1,13 +1,14 @@
 """Exports an avatar to the files of other viewers and tools; what the head plays, the cameras and a
 head model for tracking."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from queue import Empty, Queue
+from queue import SimpleQueue
+from threading import Lock
 from typing import Any
 
 import bpy
@@ -22,6 +23,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export import formats
 from ..stga_addon.export.formats import FORMATS, Meshes
 from ..stga_addon.export.playback import Playback
+from ..stga_addon.files import confirming
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
@@ -29,13 +31,29 @@ from ..stga_addon.progress import Cancelled
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_object import check_head
-from ..stga_addon.scene.objects import Warn, frames_per_second, iterate_frames
+from ..stga_addon.scene.objects import (
+    Identity,
+    SceneView,
+    Warn,
+    frames_per_second,
+    iterate_frames,
+)
 from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.tracking.head_model import shape_arrays, write_linear_model
 from . import common, options
-from .common import Action, Stepwise, file_path, head_of, need, needs_head, own_motion, scene_frames
+from .common import (
+    Action,
+    StepGenerator,
+    Stepwise,
+    file_path,
+    head_of,
+    need,
+    needs_head,
+    own_motion,
+    scene_frames,
+)
 from .options import ONCE
 
 STEP_INTERVAL_S = 0.005
@@ -133,57 +151,120 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         if format.source != "range":
             frames = range(scene.frame_current, scene.frame_current + 1)
         if self._is_invoked:
-            steps = self.export(context, path, head, frames, write)
+            steps = self.export(SceneView(context), Identity(head), path, frames, write)
             return self.begin(context, steps, STEP_INTERVAL_S)
         write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
         self.inform(f"Exported to {path}")
         return None
 
     def export(
-        self, context: Any, path: Path, head: Any, frames: range, write: Callable[[Meshes], Any]
-    ) -> Iterator[None]:
+        self,
+        view: SceneView,
+        head: Identity,
+        path: Path,
+        frames: range,
+        write: Callable[[Meshes], Any],
+    ) -> StepGenerator:
         """Pose the head, a frame a step, for `write`, which takes the numbered meshes in a thread;
-        restore the scene's frame at the end, and say what has become of the export."""
-        waiting: Queue[Any] = Queue(MAX_WAITING_MESHES)
-
-        def meshes() -> Meshes:
-            while (item := waiting.get()) is not None:
-                if isinstance(item, Cancelled):
-                    raise item
-                yield item
-
-        posing = iterate_frames(frames)
-        is_fed = False
+        restore the scene's frame at the end, and say what has become of the export. Raises
+        Cancelled, and StgaError as where the head is gone."""
+        writer = _Writer(write)
         done = 0
+        was_named = False
+        with ExitStack() as ends:
+            ends.callback(_show_status, None)
+            ends.callback(writer.stop)  # also where posing fails, or Blender closes the file
+            posing = ends.enter_context(closing(iterate_frames(frames)))
+            try:
+                while not writer.has_ended:
+                    if writer.takes_meshes:
+                        with view.shown():
+                            frame = next(posing, None)
+                            mesh = None if frame is None else evaluated_vertices(head.get())
+                        writer.give(frame, mesh)
+                        done += frame is not None
+                    posed = f" frame {done} of {len(frames)}" if len(frames) > 1 else ""
+                    _show_status(f"Exporting{posed}   Esc: Cancel")
+                    yield
+            except Cancelled:
+                was_named = not writer.stop()
+                posing.close()
+                self.others = "PASS_THROUGH"
+                while not writer.has_ended:
+                    _show_status("Finishing the export" if was_named else "Cancelling the export")
+                    yield
+            try:
+                writer.result()
+            except Cancelled as error:
+                sentence = f"Export cancelled after {done} of {len(frames)} frames"
+                raise Cancelled(sentence) from error
+        late = "; it was complete when Esc was pressed" if was_named else ""
+        self.inform(f"Exported to {path}{late}")
+
+
+class _Writer:
+    """A thread that writes a file of meshes, which it is given one by one. Once stopped, it ends by
+    itself and leaves nothing."""
+
+    def __init__(self, write: Callable[[Meshes], Any]) -> None:
+        self._waiting: SimpleQueue[Any] = SimpleQueue()
+        self._lock = Lock()
+        self._is_stopped = False
+        self._is_named = False
+        self._has_all = False
         pool = ThreadPoolExecutor(1, "stga export")
-        written = pool.submit(write, meshes())
+        self._written = pool.submit(self._write, write)
         pool.shutdown(wait=False)
-        try:
-            while not written.done():
-                if not is_fed and not waiting.full():
-                    frame = next(posing, None)
-                    is_fed = frame is None
-                    waiting.put(None if is_fed else (frame, evaluated_vertices(head)))
-                    done += not is_fed
-                posed = f" frame {done} of {len(frames)}" if len(frames) > 1 else ""
-                context.workspace.status_text_set(f"Exporting{posed}   Esc: Cancel")
-                yield
-        except GeneratorExit:  # what is posed as a whole is written as a whole
-            pass
-        finally:
-            posing.close()
-            context.workspace.status_text_set(None)
-        if not is_fed:
-            with suppress(Empty):
-                while True:
-                    waiting.get_nowait()
-            waiting.put(Cancelled())
-        try:
-            written.result()
-            self.inform(f"Exported to {path}")
-        except Cancelled:
-            sentence = f"Export cancelled after {done} of {len(frames)} frames"
-            self.report({"WARNING"}, sentence)
+
+    @property
+    def has_ended(self) -> bool:
+        return self._written.done()
+
+    @property
+    def takes_meshes(self) -> bool:
+        return not self._has_all and self._waiting.qsize() < MAX_WAITING_MESHES
+
+    def give(self, frame: int | None, mesh: np.ndarray | None) -> None:
+        """The next mesh and its number; None: there are no more."""
+        self._has_all = frame is None
+        self._waiting.put(None if frame is None else (frame, mesh))
+
+    def stop(self) -> bool:
+        """Let the thread end without a file; False where the file has its name already."""
+        with self._lock:
+            self._is_stopped = not self._is_named
+        self._waiting.put(None)
+        return self._is_stopped
+
+    def result(self) -> None:
+        """Raises what `write` raised, and Cancelled where it was stopped."""
+        self._written.result()
+
+    def _write(self, write: Callable[[Meshes], Any]) -> None:
+        with confirming(self._confirm):
+            write(self._meshes())
+
+    def _confirm(self) -> None:
+        with self._lock:
+            if self._is_stopped:
+                raise Cancelled
+            self._is_named = True
+
+    def _meshes(self) -> Meshes:
+        while True:
+            item = self._waiting.get()
+            if self._is_stopped:
+                raise Cancelled
+            if item is None:
+                return
+            yield item
+
+
+def _show_status(text: str | None) -> None:
+    """In the window's status bar; None: Blender's own again."""
+    workspace = bpy.context.workspace
+    if workspace is not None:
+        workspace.status_text_set(text)
 
 
 @lru_cache(maxsize=8)

@@ -7,7 +7,6 @@ carries out effects, those that depend on the kind of request by the tables in `
 
 import os
 import shutil
-import traceback
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
@@ -42,7 +41,7 @@ from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker import status
-from .common import TAB, AtEnd, is_head, register_handlers
+from .common import TAB, AtEnd, describe, is_head, register_handlers
 from .results import (
     HEADS,
     PLACES,
@@ -85,7 +84,7 @@ def watch(thing: Any) -> None:
             try:
                 interval = thing.tick()
             except Exception as error:
-                print(_describe(error))
+                print(describe(error))
                 thing.close()
         if interval is None:
             unwatch(thing)
@@ -187,15 +186,9 @@ def _check(scene: Any, kind: Kind) -> float | None:
                 state = handle(scene, kind, states.SceneFree())
         return state.interval_s
     except Exception as error:
-        sentence = f"Monitoring stopped after an unexpected {_describe(error)}"
+        sentence = f"Monitoring stopped after an unexpected {describe(error)}"
         handle(scene, kind, states.Failed(sentence, stops=True))
         return None
-
-
-def _describe(error: Exception) -> str:
-    """Print the traceback of an error that is being handled; its description for a sentence."""
-    traceback.print_exc()
-    return f"error ({type(error).__name__}: {error}); see the console"
 
 
 def _start_timer() -> None:
@@ -317,7 +310,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
             except (StgaError, RuntimeError) as error:
                 return states.Failed(str(error).strip().removeprefix("Error: "))
             except Exception as error:
-                return states.Failed(f"Unexpected {_describe(error)}")
+                return states.Failed(f"Unexpected {describe(error)}")
         case states.ReadCurve(run):
             curves[run] = _read_curve(run, state.folder)
         case states.StopWorker(folder):

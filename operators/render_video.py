@@ -3,8 +3,8 @@ each image shows; a worker renders and encodes it."""
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,23 @@ from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
-from ..stga_addon.scene.objects import frames_per_second
+from ..stga_addon.scene.objects import Identity, SceneView, frame_kept, frames_per_second
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
 from ..stga_addon.scene.render.scene_splats import SplatCache, visible_layers
 from ..stga_addon.scene.render.view_transform import srgb_background
 from ..stga_addon.worker.status import status_writer
 from . import monitor, options
-from .common import AtEnd, Stepwise, file_path, is_head, need, preferences, scene_frames
+from .common import (
+    AtEnd,
+    StepGenerator,
+    Stepwise,
+    file_path,
+    is_head,
+    need,
+    preferences,
+    scene_frames,
+)
 from .options import ONCE
 from .request import has_training_python, idle, start, training_python
 
@@ -118,15 +127,16 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
         self.inform(f"Rendered {output}")
         return None
 
-    def record(self, context: Any, output: Path, python: str | None) -> Iterator[None]:
+    def record(self, context: Any, output: Path, python: str | None) -> StepGenerator:
         """Record the images, one a step; then a worker renders and encodes them, or, without a
         Python, Blender encodes what it has drawn. The scene's frame is restored.
 
         Until the worker takes over, this process is that of the request in the folder, and writes
-        its status. Raises StgaError, as on a full disk or where the head is gone, and Cancelled.
+        its status. Raises StgaError, as on a full disk or where head or scene are gone, and
+        Cancelled.
         """
         scene = context.scene
-        view_layer = context.view_layer
+        view = SceneView(context)
         frames = list(scene_frames(scene))
         cameras: Sequence[Camera] | None = None  # the scene's own
         if self.path == "turntable":
@@ -143,25 +153,23 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
             folder = _temporary_folder()
             kept.callback(shutil.rmtree, folder, ignore_errors=True)
             with ExitStack() as recording:
-                shown = scene.frame_current
-                subframe = scene.frame_subframe
-                recording.callback(_unless_closed, scene.frame_set, shown, subframe=subframe)
+                recording.enter_context(frame_kept(view.scene))
                 status = recording.enter_context(status_writer(folder))
                 recorder = Recorder(folder / RECORDING)
                 recording.callback(recorder.close)
                 drawn = DrawnVideo(folder, output, background) if python is None else None
                 status.report(Progress(stage="Recording"))
                 monitor.follow(scene, Kind.VIDEO, output, folder)
-                kept.callback(_unless_closed, monitor.handle, scene, Kind.VIDEO, Dismissed())
+                kept.callback(_dismiss, view.scene)
                 monitor.check_now(scene, Kind.VIDEO)
                 yield
                 cache = SplatCache()
                 posed = list[PosedSplats]()
                 before = None
                 for number, frame in enumerate(frames):
-                    # The recorded scene, which the window may no longer show.
-                    with bpy.context.temp_override(scene=scene, view_layer=view_layer):
-                        if frame != before:
+                    with view.shown() as scene:
+                        is_new = frame != before or frame != scene.frame_current
+                        if is_new:
                             scene.frame_set(frame)
                             cache.light.forget_casters()
                             layers = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
@@ -170,7 +178,7 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
                     if drawn is not None:
                         drawn.add(layers, camera)
                     else:
-                        if frame != before or any(layer.relit for layer in layers):
+                        if is_new or any(layer.relit for layer in layers):
                             posed = [layer.posed(camera.position) for layer in layers]
                         recorder.add(posed, camera)
                     before = frame
@@ -182,17 +190,16 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
             if drawn is None:
                 how = (len(frames), fps, background, render_device())
                 request = RenderRecording(recorder.path, output, *how)
-                start(scene, request, python, folder)
+                start(view.scene.get(), request, python, folder)
             else:
-                monitor.check_now(scene, Kind.VIDEO)
+                monitor.check_now(view.scene.get(), Kind.VIDEO)
             if not bpy.app.background:
                 kept.pop_all()
 
 
-def _unless_closed(work: Callable[..., Any], *arguments: Any, **options: Any) -> None:
-    """Call it, unless the file of its scene was closed."""
-    with suppress(ReferenceError):
-        work(*arguments, **options)
+def _dismiss(scene: Identity) -> None:
+    if (found := scene.find()) is not None:
+        monitor.handle(found, Kind.VIDEO, Dismissed())
 
 
 def _temporary_folder() -> Path:

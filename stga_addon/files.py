@@ -18,6 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
+from contextvars import ContextVar
 from fnmatch import fnmatch
 from functools import cache, partial
 from pathlib import Path
@@ -113,6 +114,7 @@ def replacing_together(patience_s: float = RENAME_PATIENCE_S) -> Iterator[NewFil
 
     try:
         yield new_file
+        _confirm.get()()
         _rename_together(partials, patience_s)
     except BaseException:
         for content in partials.values():
@@ -181,6 +183,20 @@ def temporary_folder(parent: Path, name: str) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+_confirm: ContextVar[Callable[[], None]] = ContextVar("confirm", default=lambda: None)
+
+
+@contextmanager
+def confirming(confirm: Callable[[], None]) -> Iterator[None]:
+    """Call `confirm` before files that this thread writes in the block get their names; where it
+    raises, none is left."""
+    token = _confirm.set(confirm)
+    try:
+        yield
+    finally:
+        _confirm.reset(token)
 
 
 class NumberedFiles:

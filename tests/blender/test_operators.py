@@ -1,5 +1,7 @@
 """The operators, called as a script calls them, from the checkout registered as an extension."""
 
+import re
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -212,27 +214,61 @@ def test_exports(shown, tmp_path):
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-5)
 
 
-def range_export(extension, write, frames: range, stop_after: int | None = None) -> Any:
-    """What a range exported as the dialog does ends with; cancelled after some steps."""
-    operator = extension.operators.export.ExportAvatar
-    said = []
-    shown = []
-    context = SimpleNamespace(
-        window_manager=SimpleNamespace(event_timer_remove=shown.append),
-        workspace=SimpleNamespace(status_text_set=shown.append),
-    )
-    dialog = SimpleNamespace(_timer="timer", others="", inform=said.append)
-    dialog.report = dialog.tell = lambda kind, text: said.append(text)
-    head = bpy.context.scene.stga.head
-    dialog._steps = operator.export(dialog, context, Path(), head, frames, write)
-    result = {"RUNNING_MODAL"}
-    while result == {"RUNNING_MODAL"}:
-        is_over = stop_after is not None and any(f" {stop_after} of" in text for text in shown)
-        event = SimpleNamespace(type="ESC" if is_over else "TIMER")
-        result = operator.modal(dialog, context, event)
+class RangeExport:
+    """A range that is exported as the dialog does, event by event."""
+
+    def __init__(self, extension, write, frames: range) -> None:
+        operator = extension.operators.export.ExportAvatar
+        objects = extension.stga_addon.scene.objects
+        view = objects.SceneView(bpy.context)
+        head = objects.Identity(bpy.context.scene.stga.head)
+        self.said: list[str] = []
+        self.dialog = SimpleNamespace(others="", inform=self.said.append)
+        self.dialog.report = self.dialog.tell = lambda kind, text: self.said.append(text)
+        self._modal = operator.modal
+        steps = operator.export(self.dialog, view, head, Path(), frames, write)
+        self.dialog._steps = extension.operators.common.Steps(steps, 1.0)
+
+    def event(self, kind: str = "TIMER") -> str:
+        value = "PRESS" if kind == "ESC" else "NOTHING"
+        event = SimpleNamespace(type=kind, value=value)
+        (result,) = self._modal(self.dialog, bpy.context, event)
         time.sleep(0.001)
-    assert shown[-2:] == [None, "timer"]
-    return result, said[-1]
+        return result
+
+    def until(self, is_over=lambda: False) -> str:
+        """Timer events until the export ends, or `is_over`."""
+        result = "RUNNING_MODAL"
+        while result == "RUNNING_MODAL" and not is_over():
+            result = self.event()
+        return result
+
+
+def export_threads() -> list[threading.Thread]:
+    return [each for each in threading.enumerate() if each.name.startswith("stga export")]
+
+
+def wait_for_threads() -> None:
+    """Threads of exports end by themselves, soon."""
+    deadline = time.monotonic() + 20
+    while export_threads() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert not export_threads()
+
+
+def frames_to(folder: Path, avatar: Avatar, events: list[str] | None = None):
+    """A write of a sequence into a folder, which notes the frames that it has been given."""
+
+    def write(meshes):
+        def noted():
+            for number, mesh in meshes:
+                if events is not None:
+                    events.append(f"frame {number}")
+                yield number, mesh
+
+        return export_avatar(folder, avatar, "ply-sequence", noted())
+
+    return write
 
 
 def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
@@ -240,23 +276,103 @@ def test_a_range_is_exported_step_by_step(extension, shown, tmp_path):
     capture, avatar = shown
     bpy.context.scene.frame_set(1)
 
-    def to(folder: Path):
-        return lambda meshes: export_avatar(folder, avatar, "ply-sequence", meshes)
-
     def fail(meshes):
         next(iter(meshes))
         raise extension.stga_addon.errors.StgaError("no room")
 
-    assert range_export(extension, to(tmp_path / "whole"), range(4))[0] == {"FINISHED"}
+    whole = RangeExport(extension, frames_to(tmp_path / "whole", avatar), range(4))
+    assert whole.until() == "FINISHED"
     files = sorted((tmp_path / "whole").glob("*.ply"))
     assert [path.name for path in files] == [f"{frame:05d}.ply" for frame in range(4)]
     expected = expected_world(avatar, capture.mesh(3)).xyz
     np.testing.assert_allclose(read_ply(files[3]).xyz, expected, atol=1e-5)
-    result, said = range_export(extension, to(tmp_path / "cut"), range(4), stop_after=2)
-    assert (result, said) == ({"CANCELLED"}, "Export cancelled after 2 of 4 frames")
-    assert len([*(tmp_path / "cut").glob("*")]) <= 2
-    assert range_export(extension, fail, range(50)) == ({"CANCELLED"}, "no room")
+    given: list[str] = []
+    cut = RangeExport(extension, frames_to(tmp_path / "cut", avatar, given), range(40))
+    assert cut.until(lambda: "frame 2" in given) == "RUNNING_MODAL"
+    result = cut.event("ESC")
+    assert (result if result != "RUNNING_MODAL" else cut.until()) == "CANCELLED"
+    assert re.fullmatch(r"Export cancelled after \d+ of 40 frames", cut.said[-1])
+    assert not (tmp_path / "cut").exists()
+    failed = RangeExport(extension, fail, range(50))
+    assert (failed.until(), failed.said) == ("CANCELLED", ["no room"])
     assert bpy.context.scene.frame_current == 1
+    wait_for_threads()
+
+
+@pytest.mark.parametrize("end", ["no head", "bug", "new file", "disabled"])
+def test_an_export_always_ends(extension, shown, tmp_path, monkeypatch, end):
+    """Catches a thread that keeps Blender from quitting, and partial files, where an export ends
+    early: its head is deleted, in another window too, an unexpected error, a file that is opened,
+    or the extension disabled; and an error told as a traceback."""
+    given: list[str] = []
+    running = RangeExport(extension, frames_to(tmp_path / "out", shown[1], given), range(40))
+    assert running.until(lambda: "frame 2" in given) == "RUNNING_MODAL"
+    if end == "no head":
+        bpy.data.objects.remove(bpy.context.scene.stga.head)
+        assert running.until() == "CANCELLED"
+        assert running.said[-1].endswith("head: was removed meanwhile")
+    elif end == "bug":
+        monkeypatch.setattr(extension.operators.export, "evaluated_vertices", lambda head: 1 / 0)
+        assert running.until() == "CANCELLED"
+        assert "unexpected error (ZeroDivisionError" in running.said[-1]
+    elif end == "new file":  # before which Blender cancels what is running in the window
+        extension.operators.export.ExportAvatar.cancel(running.dialog, bpy.context)
+        bpy.ops.wm.read_homefile(use_empty=True)
+    else:
+        extension.unregister()
+        extension.register()
+    wait_for_threads()
+    assert not (tmp_path / "out").exists()
+    assert not extension.operators.common._begun
+
+
+def test_undo_and_new_names_do_not_end_an_export(extension, shown, tmp_path):
+    """Catches references to scene and head, which undo in a second window makes invalid."""
+    capture, avatar = shown
+    scene = bpy.context.scene
+    given = []
+    bpy.ops.ed.undo_push(message="before")
+    scene.stga.head.location.x = 1
+    bpy.ops.ed.undo_push(message="moved")
+    running = RangeExport(extension, frames_to(tmp_path / "out", avatar, given), range(4))
+    running.until(lambda: "frame 1" in given)
+    bpy.ops.ed.undo()
+    bpy.context.scene.name = "renamed"
+    bpy.context.scene.stga.head.name = "Anna"
+    assert (running.until(), running.said) == ("FINISHED", ["Exported to ."])
+    expected = expected_world(avatar, capture.mesh(3)).xyz
+    np.testing.assert_allclose(read_ply(tmp_path / "out/00003.ply").xyz, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("is_named", [False, True])
+def test_escape_while_an_export_is_written(extension, shown, tmp_path, is_named):
+    """Catches Esc after the last frame that freezes Blender until all is written, and exports all
+    the same; where the file is there already, that is said."""
+    reached = threading.Event()
+    goes_on = threading.Event()
+    path = tmp_path / "out.bin"
+
+    def write(meshes):
+        list(meshes)
+        with replacing(path) as partial:
+            partial.write_bytes(b"all")
+            if not is_named:
+                reached.set()
+                assert goes_on.wait(20)
+        reached.set()
+        assert goes_on.wait(20)
+
+    replacing = extension.stga_addon.files.replacing
+    running = RangeExport(extension, write, range(2))
+    assert running.until(reached.is_set) == "RUNNING_MODAL"
+    assert running.event("ESC") == "RUNNING_MODAL"  # and not only once all is written
+    assert running.event("MOUSEMOVE") == "PASS_THROUGH"
+    assert running.event("ESC") == "RUNNING_MODAL"
+    goes_on.set()
+    assert running.until() == ("FINISHED" if is_named else "CANCELLED")
+    assert ("Exported" in running.said[-1], path.exists()) == (is_named, is_named)
+    assert is_named == ("complete when Esc was pressed" in running.said[-1])
+    assert not list(tmp_path.glob(".*partial"))
 
 
 def test_import_ply(tmp_path):

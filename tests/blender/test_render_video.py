@@ -128,6 +128,46 @@ def test_image_sequence_of_the_scene(extension, shown, monkeypatch):
         assert np.abs(image[..., 3] - expected[..., 3]).max() <= 1
 
 
+def test_undo_and_a_removed_scene_meanwhile(extension, shown, monkeypatch, temporary):
+    """Catches references to scene, view layer or head, which undo makes invalid: a video that ends
+    with an error, its recorded images deleted; and files of one whose scene is gone."""
+    operator = extension.operators.render_video
+    recorded = []
+    started = []
+
+    class Recorder(operator.Recorder):
+        def add(self, layers, camera):
+            recorded.append(layers[0].frames.origin[:, 0].mean())
+
+    monkeypatch.setattr(operator, "Recorder", Recorder)
+    monkeypatch.setattr(operator, "start", lambda *arguments: started.append(arguments[1].images))
+    bpy.ops.ed.undo_push(message="before")
+    bpy.context.scene.stga.head.location.x = 5
+    bpy.ops.ed.undo_push(message="moved")
+
+    def undo() -> None:
+        if bpy.context.scene.stga.head.location.x:
+            bpy.ops.ed.undo()
+            bpy.context.scene.name = "renamed"
+
+    with monkeypatch.context() as patch:
+        around_each_image(extension, patch, lambda: None, undo)
+        bpy.ops.stga.render_video(filepath=str(shown / "meanwhile"), path="scene", format="png")
+    assert np.round(recorded).tolist() == [5, 0, 0]
+    assert started == [3]
+    assert bpy.context.scene.frame_current == 1
+    other = bpy.data.scenes.new("other")
+
+    def remove() -> None:
+        if "renamed" in bpy.data.scenes:
+            bpy.context.window_manager.windows[0].scene = other
+            bpy.data.scenes.remove(bpy.data.scenes["renamed"])
+
+    around_each_image(extension, monkeypatch, lambda: None, remove)
+    with pytest.raises(RuntimeError, match="renamed: was removed meanwhile"):
+        bpy.ops.stga.render_video(filepath=str(shown / "gone"), path="scene", format="png")
+
+
 def test_turntable_video(shown):
     """Catches a turntable that stands still, lasts another time, or ends without its file."""
     bpy.ops.stga.render_video(filepath=str(shown / "turn"), seconds=1.5)
