@@ -107,17 +107,17 @@ class Steps:
     """
 
     def __init__(self, steps: StepGenerator, interval_s: float) -> None:
-        context = bpy.context
         self._steps = steps
         self._is_cancelled = False
-        self._timer = context.window_manager.event_timer_add(interval_s, window=context.window)
+        manager = bpy.context.window_manager
+        self._timer = manager.event_timer_add(interval_s, window=bpy.context.window)
         _begun.append(self)
 
     def step(self, cancel: bool = False) -> bool:
         """Do a step; whether others follow. cancel: raise Cancelled in it, once; the steps that it
         still takes end what cannot end at once. Raises what the step raises."""
         throws = cancel and not self._is_cancelled
-        self._is_cancelled = cancel or self._is_cancelled
+        self._is_cancelled |= cancel
         goes_on = False
         try:
             if throws:
@@ -144,7 +144,7 @@ _begun: list[Steps] = []
 
 
 def close_steps() -> None:
-    """End all that is done in steps: Blender calls no `cancel` of an operator that it unregisters."""
+    """End all that is done in steps: Blender cancels no operator that it unregisters."""
     for steps in list(_begun):
         steps.close()
 

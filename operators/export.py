@@ -209,9 +209,7 @@ class _Writer:
     def __init__(self, write: Callable[[Meshes], Any]) -> None:
         self._waiting: SimpleQueue[Any] = SimpleQueue()
         self._lock = Lock()
-        self._is_stopped = False
-        self._is_named = False
-        self._has_all = False
+        self._has_all = self._is_stopped = self._is_named = False
         pool = ThreadPoolExecutor(1, "stga export")
         self._written = pool.submit(self._write, write)
         pool.shutdown(wait=False)

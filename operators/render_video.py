@@ -3,7 +3,7 @@ each image shows; a worker renders and encodes it."""
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from math import pi
 from pathlib import Path
@@ -24,6 +24,7 @@ from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
+from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.objects import Identity, SceneView, frame_kept, frames_per_second
 from ..stga_addon.scene.render import engine, viewport_display
 from ..stga_addon.scene.render.drawn_video import DrawnVideo
@@ -163,25 +164,15 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
                 kept.callback(_dismiss, view.scene)
                 monitor.check_now(scene, Kind.VIDEO)
                 yield
-                cache = SplatCache()
                 posed = list[PosedSplats]()
-                before = None
-                for number, frame in enumerate(frames):
-                    with view.shown() as scene:
-                        is_new = frame != before or frame != scene.frame_current
-                        if is_new:
-                            scene.frame_set(frame)
-                            cache.light.forget_casters()
-                            layers = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
-                        depsgraph = bpy.context.evaluated_depsgraph_get()
-                        camera = cameras[number] if cameras else scene_camera(depsgraph)
+                images = _images(view, frames, cameras)
+                for number, (layers, camera, is_new) in enumerate(images):
                     if drawn is not None:
                         drawn.add(layers, camera)
                     else:
                         if is_new or any(layer.relit for layer in layers):
                             posed = [layer.posed(camera.position) for layer in layers]
                         recorder.add(posed, camera)
-                    before = frame
                     if status.report(Progress((number + 1) / len(frames), "Recording")):
                         raise Cancelled(f"{output}: cancelled")
                     yield
@@ -195,6 +186,26 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
                 monitor.check_now(view.scene.get(), Kind.VIDEO)
             if not bpy.app.background:
                 kept.pop_all()
+
+
+def _images(
+    view: SceneView, frames: Sequence[int], cameras: Sequence[Camera] | None
+) -> Iterator[tuple[list[SceneLayer], Camera, bool]]:
+    """What each image shows: layers and camera, None: the scene's; and whether the layers are
+    new."""
+    cache = SplatCache()
+    before = None
+    for number, frame in enumerate(frames):
+        with view.shown() as scene:
+            is_new = frame != before or frame != scene.frame_current
+            if is_new:
+                scene.frame_set(frame)
+                cache.light.forget_casters()
+                layers = visible_layers(bpy.context.evaluated_depsgraph_get(), cache)
+            depsgraph = bpy.context.evaluated_depsgraph_get()
+            camera = cameras[number] if cameras else scene_camera(depsgraph)
+        before = frame
+        yield layers, camera, is_new
 
 
 def _dismiss(scene: Identity) -> None:

@@ -74,9 +74,7 @@ def push_down_action(owner: Any, extrapolation: str = "HOLD") -> None:
     track = animation.nla_tracks.new()
     track.name = action.name
     has_manual_range = action.use_frame_range
-    action.use_frame_range = (
-        False  # a strip of that range alone would leave out the other keyframes
-    )
+    action.use_frame_range = False  # a strip of that range leaves out the other keyframes
     strip = track.strips.new(action.name, int(np.floor(action.frame_range[0])), action)
     action.use_frame_range = has_manual_range
     # That start is a whole frame; the keyframes stay where they are.

@@ -192,7 +192,7 @@ class Identity:
     def __init__(self, block: Any) -> None:
         self.uid = block.session_uid
         self.name = block.name
-        """name: as it was last found"""
+        """As it was last found."""
         self._is_scene = block.id_type == "SCENE"
 
     def find(self) -> Any:
