@@ -69,7 +69,6 @@ def register(at_end: AtEnd) -> None:
     for name, space, operator, key in KEYS if keys is not None else ():  # none without a window
         items = keys.keymaps.new(name=name, space_type=space).keymap_items
         at_end(items.remove, items.new(operator, key, "PRESS"))
-    for part in (request, monitor, pose, render_video):
+    for part in (request, monitor, pose, render_video, drive):
         part.register(at_end)
-    at_end(drive.stop_session)
     at_end(close_steps)

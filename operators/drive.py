@@ -2,7 +2,9 @@
 recording; and by a video of a face."""
 
 import gc
+import tempfile
 from collections import deque
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from time import monotonic
@@ -19,10 +21,11 @@ from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
 from ..stga_addon.driving.open_motion import MotionOptions
 from ..stga_addon.driving.performance import FacePacket, Performance
 from ..stga_addon.errors import StgaError
+from ..stga_addon.files import naming
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.objects import show_progress
+from ..stga_addon.scene.objects import Identity, show_progress
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
 from ..stga_addon.training.run.folder import has_run, read_run
@@ -39,6 +42,8 @@ PANEL_INTERVAL_S = 0.2
 """At which the panel's figures are drawn anew."""
 SLOWEST_TICKS = 600
 """Those of the last ten seconds."""
+LEFT_TAKES = "stga_takes"
+"""Folder beside other temporary files for takes that have no other place as a session ends."""
 
 
 class DriveSettings(bpy.types.PropertyGroup):
@@ -101,7 +106,7 @@ class LiveSession:
 
     def __init__(
         self,
-        scene: str,
+        scene: Identity,
         pose: LivePose,
         found: HeadMap | None,
         trained: open_motion.TrainedRange | None,
@@ -112,7 +117,8 @@ class LiveSession:
         self.stream = sources.Stream(receiver.source)
         self.rest: Performance | None = None
         self.recording: sources.Recording | None = None
-        self._head = pose
+        self._said = ""
+        self._pose = pose
         self._map = found
         self._trained = trained
         self._recent: deque[FacePacket] = deque(maxlen=sources.RESTING_PACKETS)
@@ -121,10 +127,10 @@ class LiveSession:
         self.ticks_s: deque[float] = deque(maxlen=SLOWEST_TICKS)
 
     def tick(self) -> float | None:
-        """Read what has arrived and pose the head; seconds until the next call, None where the head
-        is gone."""
+        """Read what has arrived and pose the head; seconds until the next call, None where head or
+        scene are gone."""
         begin = monotonic()
-        if not self._head.is_there or self.scene not in bpy.data.scenes:
+        if not self._pose.is_there or self.scene.find() is None:
             self.close()
             return None
         silent = self.stream.silent_s(begin)
@@ -163,15 +169,15 @@ class LiveSession:
 
     def show_again(self) -> None:
         """Pose the head as it was shown last, after an animation has posed it."""
-        if self._shown is None or not self._head.is_there:
+        if self._shown is None or not self._pose.is_there:
             return
         options = self.options()
         if self._map is None:
-            self._head.set_weights(open_motion.at_strength(self._shown, options).weights[0])
+            self._pose.set_weights(open_motion.at_strength(self._shown, options).weights[0])
         else:
             frames = self._map.frames(self._shown)
             frames, _ = open_motion.finished(frames, options, self._trained)
-            self._head.set_frame(frames[0])
+            self._pose.set_frame(frames[0])
         for window in bpy.context.window_manager.windows:
             for area in window.screen.areas:
                 if area.type == "VIEW_3D":
@@ -179,31 +185,96 @@ class LiveSession:
 
     def options(self) -> MotionOptions:
         """The panel's; the resting face is taken off where it is calibrated."""
-        settings = bpy.data.scenes[self.scene].stga.drive
+        settings = self.scene.get().stga.drive
         names = ("strength", "smoothing", "mirror", "stay_trained")
         chosen = {name: getattr(settings, name) for name in names}
         neutral = "none" if self.rest is None else "calibrated"
         return MotionOptions(neutral=neutral, exchange=exchanged_pairs(settings), **chosen)
 
+    def write_take(self, folder: Path) -> Path:
+        """Write what is being recorded as the next take in the folder, and record no more. Raises
+        StgaError, and records on, where it cannot be written."""
+        assert self.recording is not None
+        performance = self.recording.performance()
+        if performance is None:
+            self.recording = None
+            raise StgaError("Record: fewer than two faces were received; nothing was recorded")
+        names = (f"take_{number:03d}.csv" for number in count(1))
+        with naming(folder):
+            path = next(folder / name for name in names if not (folder / name).exists())
+        write_performance(path, performance)
+        self.recording = None
+        return path
+
+    def save_recording(self) -> None:
+        """Write what is being recorded into the takes, else where it lasts, and say where: its head
+        or file are going."""
+        faces = len(self.recording or ())
+        if faces < 2:
+            return
+        scene = self.scene.find()
+        folders = [Path(tempfile.gettempdir()) / LEFT_TAKES]
+        with suppress(StgaError):
+            folder, warning = takes_folder(scene) if scene is not None else (folders[0], "")
+            folders[:0] = [] if warning else [folder]
+        for folder in folders:
+            try:
+                path = self.write_take(folder)
+                kept = f"is kept, but not applied, as driving has ended: {path}"
+                self._said = f"The take of {faces} faces {kept}"
+                break
+            except StgaError as error:
+                self._said = f"The take of {faces} faces is lost: {error}"
+        print(self._said)
+        self._show_said()
+
+    def _show_said(self) -> None:
+        manager = bpy.context.window_manager
+        if manager is not None and self._said:
+            manager.stga_message = self._said
+
     def close(self) -> None:
-        """Stop listening; the head stays as it is."""
+        """Stop listening, and save what is being recorded; the head stays as it is."""
         global _session
+        if _session is not self:
+            return
+        _session = None
+        gc.unfreeze()
         self.receiver.close()
         monitor.unwatch(self)
-        if _session is self:
-            _session = None
-            gc.unfreeze()
-        if _show_again in bpy.app.handlers.frame_change_post:
-            bpy.app.handlers.frame_change_post.remove(_show_again)
+        bpy.app.handlers.frame_change_post.remove(_show_again)
+        self.save_recording()
+        self._show_said()  # also in the window of a file that was opened
 
     def stop(self) -> None:
         """Stop listening and give the head back to its own animation."""
         self.close()
-        if self._head.is_there:
-            self._head.restore()
-            scene = bpy.data.scenes.get(self.scene)
+        if self._pose.is_there:
+            self._pose.restore()
+            scene = self.scene.find()
             if scene is not None:
                 scene.frame_set(scene.frame_current)
+
+    def apply_take(self, path: Path, recording: sources.Recording) -> None:
+        """Apply a take to the head that was driven, a step to undo. Raises StgaError."""
+        try:
+            self._apply_take(path, recording)
+        except StgaError as error:
+            raise StgaError(f"Recorded {path}, but it was not applied: {error}") from error
+
+    def _apply_take(self, path: Path, recording: sources.Recording) -> None:
+        scene = self.scene.get()
+        if scene.stga.head != self._pose.head.get():
+            raise StgaError("the panel holds another head than the one that was driven")
+        names = ("strength", "smoothing", "mirror", "stay_trained")
+        chosen = {name: getattr(scene.stga.drive, name) for name in names}
+        chosen["neutral"] = "none" if recording.rest is None else "calibrated"
+        place = {} if bpy.context.scene == scene else {"scene": scene}
+        with bpy.context.temp_override(**place):
+            apply = bpy.ops.stga.apply_motion
+            undoable = bpy.context.window is not None
+            start = recording.start
+            common.call(apply, "EXEC_DEFAULT", undoable, filepath=str(path), start=start, **chosen)
 
 
 _session: LiveSession | None = None
@@ -220,13 +291,21 @@ def stop_session() -> None:
 
 
 @persistent
+def _before_load(*_: Any) -> None:
+    """The takes lie beside the file that is still open."""
+    if _session is not None:
+        _session.save_recording()
+
+
+@persistent
 def _show_again(scene: Any, depsgraph: Any) -> None:
     """The scene's own animation posed the head: pose it live again, so that it does not flicker
     between two packets.
 
     Rendered animations keep their own pose.
     """
-    if _session is not None and scene.name == _session.scene and depsgraph.mode == "VIEWPORT":
+    is_viewport = _session is not None and depsgraph.mode == "VIEWPORT"
+    if is_viewport and scene.session_uid == _session.scene.uid:
         _session.show_again()
 
 
@@ -257,7 +336,7 @@ class DriveLive(Action, bpy.types.Operator):
             trained = stored_range(head) or own_range(head, own)
         receiver = sources.Receiver(source, settings.address, settings.port, settings.phone)
         stop_session()
-        _session = LiveSession(context.scene.name, pose, found, trained, receiver)
+        _session = LiveSession(Identity(context.scene), pose, found, trained, receiver)
         bpy.app.handlers.frame_change_post.append(_show_again)
         gc.freeze()  # a collection of all that Blender's add-ons hold takes longer than a frame
         monitor.watch(_session)
@@ -268,28 +347,21 @@ class _OfSession(Action):
 
     needs = (need(lambda _: _session, "No source is listened to; choose Drive Live first"),)
 
-    def keep_recording(self: Any, context: Any, running: LiveSession, min_faces: int) -> None:
-        """End the recording: write the take and apply it. Raises StgaError."""
-        recording = running.recording
-        running.recording = None
-        if recording is None or len(recording) < min_faces:
-            return
-        folder, warning = takes_folder(context)
+    def write_take(self: Any, running: LiveSession) -> Path:
+        """End the recording with a file. Raises StgaError, and records on, where it cannot be
+        written."""
+        faces = len(running.recording)
+        try:
+            folder, warning = takes_folder(running.scene.get())
+            path = running.write_take(folder)
+        except StgaError as error:
+            if running.recording is None:
+                raise
+            raise StgaError(f"{error}; the recording goes on, choose another folder") from error
         if warning:
             self.warn(warning)
-        performance = recording.performance()
-        if performance is None:
-            raise StgaError("Record: fewer than two faces were received; nothing was recorded")
-        names = (f"take_{number:03d}.csv" for number in count(1))
-        path = next(folder / name for name in names if not (folder / name).exists())
-        write_performance(path, performance)
-        options = context.scene.stga.drive
-        rested = recording.rest is not None
-        names = ("strength", "smoothing", "mirror", "stay_trained")
-        chosen = {name: getattr(options, name) for name in names}
-        chosen |= {"start": recording.start, "neutral": "calibrated" if rested else "none"}
-        common.call(bpy.ops.stga.apply_motion, filepath=str(path), **chosen)
-        self.inform(f"Recorded {len(recording)} faces: {path}")
+        self.inform(f"Recorded {faces} faces: {path}")
+        return path
 
 
 class StopLive(_OfSession, bpy.types.Operator):
@@ -299,8 +371,11 @@ class StopLive(_OfSession, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         running = _session
+        recording = _session.recording
+        path = self.write_take(running) if len(recording or ()) > 1 else None
         running.stop()
-        self.keep_recording(context, running, min_faces=2)
+        if path is not None:
+            running.apply_take(path, recording)
 
 
 class CalibrateLive(_OfSession, bpy.types.Operator):
@@ -313,7 +388,7 @@ class CalibrateLive(_OfSession, bpy.types.Operator):
         _session.calibrate()
 
 
-class RecordLive(_OfSession, Edit, bpy.types.Operator):
+class RecordLive(_OfSession, bpy.types.Operator):
     """Record what is received; again: write the take as CSV and apply it to the head as a new
     action"""
 
@@ -321,12 +396,13 @@ class RecordLive(_OfSession, Edit, bpy.types.Operator):
 
     def run(self, context: Any) -> None:
         running = _session
-        if running.recording is None:
+        recording = _session.recording
+        if recording is None:
             frame = context.scene.frame_current
             exchange = running.options().exchange
             running.recording = sources.Recording(frame, running.rest, exchange)
             return
-        self.keep_recording(context, running, min_faces=0)
+        running.apply_take(self.write_take(running), recording)
         running.show_again()
 
 
@@ -342,9 +418,9 @@ class FollowLive(_OfSession, bpy.types.Operator):
         _session.stream.follow((self.address, self.subject))
 
 
-def takes_folder(context: Any) -> tuple[Path, str]:
+def takes_folder(scene: Any) -> tuple[Path, str]:
     """The folder of takes, made here, and a warning where it does not last, or ""."""
-    folder = context.scene.stga.drive.takes
+    folder = scene.stga.drive.takes
     warning = ""
     if folder.startswith("//") and not bpy.data.filepath:
         path = Path(bpy.app.tempdir)
@@ -385,7 +461,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         head = head_of(context)
         if not is_video(video):
             raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
-        folder, _ = takes_folder(context)
+        folder, _ = takes_folder(context.scene)
         given = common.given_values(self, ConvertMotion, "avatar")
         suffix = SHAPES_SUFFIX
         is_trained_on = bool(given) and rig_or_none(head) is not None
@@ -397,3 +473,8 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
         names = (video.stem, *(f"{video.stem}_{number}" for number in count(2)))
         output = next(path for name in names if not (path := folder / f"{name}{suffix}").exists())
         start(context.scene, ConvertMotion(video, output, **given), training_python(context))
+
+
+def register(at_end: common.AtEnd) -> None:
+    at_end(stop_session)
+    common.register_handlers(at_end, (bpy.app.handlers.load_pre, _before_load))

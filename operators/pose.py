@@ -11,10 +11,10 @@ from ..stga_addon.driving.head_map import head_map
 from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import select_bones
-from ..stga_addon.scene.objects import leave_edit_mode, show_kind
+from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig import keyframes
 from ..stga_addon.scene.rig.head import rig_of
-from . import common, drive, monitor
+from . import common, monitor
 from .common import AtEnd, Edit, head_of, need, needs_rig, rig_or_none
 
 POLL_INTERVAL_S = 0.3
@@ -117,35 +117,34 @@ def begin_sliders(head: Any) -> None:
         monitor.watch(_Sliders(head))
 
 
-preparing: set[str] = set()
-"""Names of heads whose sliders are being computed."""
+preparing: set[int] = set()
+"""Session ids of heads whose sliders are being computed."""
 
 
 class _Sliders:
-    """What a thread computes for a head, which is looked up by its name: undo moves it."""
+    """What a thread computes for a head."""
 
     def __init__(self, head: Any) -> None:
-        self._head = head.name
+        self._head = Identity(head)
         self._made = list[Any]()
         arguments = common.capture_source(head), needs_sliders(head)
         self._thread = Thread(target=self._make, args=arguments, daemon=True)
         self._thread.start()
         if needs_sliders(head):
-            preparing.add(self._head)
+            preparing.add(self._head.uid)
 
     def _make(self, source: tuple[Any, ...], has_none: bool) -> None:
         with suppress(StgaError):  # the operator says what is wrong
             if has_none:
-                self._made.append(_compute_shapes(source, self._head))
+                self._made.append(_compute_shapes(source, self._head.name))
             else:
-                head_map(common.flame_motion(self._head, *source), self._head)
+                head_map(common.flame_motion(self._head.name, *source), self._head.name)
 
     def tick(self) -> float | None:
-        is_driven = drive.session() is not None  # which further sliders would end
-        if self._thread.is_alive() or is_driven or bpy.app.is_job_running("RENDER"):
+        if self._thread.is_alive() or bpy.app.is_job_running("RENDER"):
             return POLL_INTERVAL_S
-        preparing.discard(self._head)
-        head = bpy.data.objects.get(self._head)
+        preparing.discard(self._head.uid)
+        head = self._head.find()
         if self._made and needs_sliders(head):
             if head.mode == "EDIT":
                 return POLL_INTERVAL_S
@@ -155,7 +154,7 @@ class _Sliders:
         return None
 
     def close(self) -> None:
-        preparing.discard(self._head)
+        preparing.discard(self._head.uid)
 
 
 @persistent

@@ -44,7 +44,7 @@ class FacePanel(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: Any) -> None:
         head = context.scene.stga.head
-        if head.name in preparing:
+        if head.session_uid in preparing:
             self.layout.label(text="Sliders follow in a moment", icon="TIME")
             return
         if needs_sliders(head):

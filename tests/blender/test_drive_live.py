@@ -2,6 +2,7 @@
 
 import gc
 import socket
+import tempfile
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
@@ -173,6 +174,137 @@ def test_record_with_a_calibrated_face(live):
         live.send({"jawOpen": 0.3 * number}, number)
     bpy.ops.stga.stop_live()
     assert (live.takes / "take_002.csv").is_file()
+
+
+def record(live, faces: int = 60) -> None:
+    """Begin to record, and receive some faces."""
+    if live.sessions.session() is None:
+        bpy.ops.stga.drive_live()
+    bpy.ops.stga.record_live()
+    for number in range(faces):
+        live.send({"jawOpen": 0.5}, number)
+
+
+def taken(folder: Path) -> list[int]:
+    """Faces of each take in the folder."""
+    return [len(read_performance(path).times) for path in sorted(folder.glob("*.csv"))]
+
+
+@pytest.mark.parametrize("end", ["stop_live", "record_live"])
+def test_a_take_that_cannot_be_written_is_not_lost(live, tmp_path, end):
+    """Catches a recording that is forgotten where its folder cannot be made."""
+    (tmp_path / "file").write_text("")
+    live.settings.takes = str(tmp_path / "file/takes")
+    record(live)
+    with pytest.raises(RuntimeError, match=r"file/takes: .*; the recording goes on"):
+        getattr(bpy.ops.stga, end)()
+    live.settings.takes = str(live.takes)
+    getattr(bpy.ops.stga, end)()
+    assert taken(live.takes) == [60]
+    assert rig_of(the_head()).animation_data.action.name.endswith("take_001")
+
+
+def test_a_take_follows_new_names_and_its_own_head(live, tmp_path):
+    """Catches a take that is lost where scene or head is renamed, or that another head gets."""
+    bpy.context.scene.stga.drive.takes = str(live.takes)
+    record(live, 30)
+    bpy.context.scene.name = "Shot 12"
+    the_head().name = "Anna"
+    for number in range(30, 60):
+        assert live.send({"jawOpen": 0.5}, number) is not None
+    bpy.ops.stga.stop_live()
+    assert taken(live.takes) == [60]
+    anna = the_head()
+    assert rig_of(anna).animation_data.action.name.endswith("take_001")
+    record(live)
+    (tmp_path / "ben").mkdir()
+    import_small_head(tmp_path / "ben", expr=np.zeros((5, 10)))
+    assert the_head() != anna
+    with pytest.raises(RuntimeError, match=r"Recorded .*take_002.csv, but it was not applied"):
+        bpy.ops.stga.stop_live()
+    assert taken(live.takes) == [60, 60]
+    assert "take_002" not in rig_of(the_head()).animation_data.action.name
+
+
+@pytest.mark.parametrize("end", ["head", "scene", "file", "unsaved", "disabled", "error"])
+def test_a_take_is_kept_however_driving_ends(live, extension, tmp_path, monkeypatch, capsys, end):
+    """Catches a take that is lost, or kept nobody knows where, as its head or scene is removed, a
+    file opened, the extension disabled, as when Blender quits, or a step fails."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    if end == "unsaved":  # where Blender's own folder of temporary files would go with it
+        live.settings.takes = "//stga_takes"
+    record(live)
+    running = live.sessions.session()
+    if end == "head":
+        bpy.data.objects.remove(the_head())
+    elif end == "scene":
+        driven = bpy.context.scene
+        bpy.context.window_manager.windows[0].scene = bpy.data.scenes.new("other")
+        bpy.data.scenes.remove(driven)
+    elif end in ("file", "unsaved"):
+        bpy.ops.wm.read_homefile(use_empty=True)
+    elif end == "disabled":
+        extension.unregister()
+        extension.register()
+    elif end == "error":
+        monkeypatch.setattr(running.receiver, "read", lambda: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            running.tick()
+        running.close()  # as the timer does
+    if live.sessions.session() is not None:
+        assert running.tick() is None
+    assert live.sessions.session() is None
+    folder = tmp_path / "stga_takes" if end in ("scene", "unsaved") else live.takes
+    assert taken(folder) == [60]
+    said = f"{folder}/take_001.csv"
+    assert capsys.readouterr().out.count(said) == 1
+    if end != "disabled":
+        assert said in bpy.context.window_manager.stga_message
+
+
+def test_a_recording_is_a_step_to_undo(live):
+    """Catches Stop after a recording whose action undo cannot take back, or only with more."""
+    bpy.ops.ed.undo_push(message="before")
+    bpy.context.scene.stga.drive.strength = 0.5
+    bpy.ops.ed.undo_push(message="strength")
+    actions = sorted(bpy.data.actions.keys())
+    record(live)
+    bpy.ops.stga.stop_live("EXEC_DEFAULT", True)
+    assert sorted(bpy.data.actions.keys()) != actions
+    bpy.ops.ed.undo()
+    assert sorted(bpy.data.actions.keys()) == actions
+    assert bpy.context.scene.stga.drive.strength == 0.5
+
+
+def test_sliders_that_are_moved_meanwhile(live):
+    """Catches components by place in Blender's list of shape keys, a session that ends where one is
+    added, and sliders of others that are held."""
+    head = the_head()
+    keys = head.data.shape_keys.key_blocks
+
+    def move(name: str, way: str) -> None:
+        head.active_shape_key_index = keys.find(name)
+        with bpy.context.temp_override(object=head):
+            bpy.ops.object.shape_key_move(type=way)
+
+    move("expr_002", "BOTTOM")
+    bpy.ops.stga.drive_live()
+    assert live.send(half(0), 0, head=TURN) is not None
+    assert_shows(live, half(0))
+    move("expr_005", "UP")
+    head.shape_key_add(name="wrinkle", from_mix=False).value = 0.7
+    assert live.send(half(1), 1, head=TURN) is not None
+    assert_shows(live, half(1))
+    assert keys["wrinkle"].value == pytest.approx(0.7)
+    head.shape_key_remove(keys["expr_003"])
+    assert live.send({"jawOpen": 0.5}, 2) is not None
+    row = np.array([[0.5 * (name == "jawOpen") for name in ARKIT_SHAPES]])
+    wanted = live.map.parameters(row)[0]
+    for component in (2, 4, 5, 9):
+        value = keys[f"expr_{component:03d}"].value
+        assert value == pytest.approx(wanted[component], abs=1e-6)
+    bpy.ops.stga.stop_live()
+    assert keys["wrinkle"].value == pytest.approx(0.7)
 
 
 def test_the_trained_range(live):
