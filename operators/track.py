@@ -18,6 +18,7 @@ from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, Track
 from ..stga_addon.jobs.train import Train
 from ..stga_addon.scene import tags
+from ..stga_addon.scene.cameras import look_away, look_through
 from ..stga_addon.scene.objects import show_kind
 from ..stga_addon.scene.rig.head import rig_of
 from ..stga_addon.scene.rig.keyframes import key_current_pose
@@ -111,10 +112,10 @@ class ViewFootage(Edit, bpy.types.Operator):
         if leave:
             space.region_3d.view_perspective = "PERSP"
             space.shading.show_xray = False
+            look_away(scene)
             return
         row = cameras.index(scene.camera) if scene.camera in cameras else 0
-        scene.camera = cameras[(row + self.step) % len(cameras)]
-        scene.render.resolution_x, scene.render.resolution_y = scene.camera[tags.IMAGE_SIZE]
+        look_through(scene, cameras[(row + self.step) % len(cameras)])
         space.region_3d.view_perspective = "CAMERA"
         space.shading.type = "SOLID"
         space.shading.show_xray = True

@@ -189,6 +189,30 @@ def configure_scene(scene: Any, capture: Capture, camera: Any, warn: Warn = log_
             )
 
 
+def look_through(scene: Any, camera: Any) -> None:
+    """Give the scene a camera of `import_cameras`, and its image size; `look_away` takes the size
+    back."""
+    render = scene.render
+    if tags.OWN_RESOLUTION not in scene or not _has_camera_size(scene):
+        scene[tags.OWN_RESOLUTION] = [render.resolution_x, render.resolution_y]
+    scene.camera = camera
+    render.resolution_x, render.resolution_y = camera[tags.IMAGE_SIZE]
+
+
+def look_away(scene: Any) -> None:
+    """Give the scene its own resolution again, unless it has been changed meanwhile."""
+    own = scene.get(tags.OWN_RESOLUTION)
+    if own is not None and _has_camera_size(scene):
+        scene.render.resolution_x, scene.render.resolution_y = own
+    scene.pop(tags.OWN_RESOLUTION, None)
+
+
+def _has_camera_size(scene: Any) -> bool:
+    size = scene.camera.get(tags.IMAGE_SIZE) if scene.camera else None
+    shown = scene.render.resolution_x, scene.render.resolution_y
+    return size is not None and tuple(size) == shown
+
+
 def central(cameras: list[Any]) -> Any:
     """Of cameras of `import_cameras`, the one that sees the face; None of none."""
     if not cameras:

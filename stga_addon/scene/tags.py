@@ -25,6 +25,8 @@ AVATAR = "stga_avatar"  # on splats that follow a head: the file of their avatar
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file
 
+OWN_RESOLUTION = "stga_own_resolution"  # on a scene, while a capture's camera is looked through
+
 # Kinds of object.
 ROOT = "root"
 HEAD = "head"

@@ -176,6 +176,34 @@ def test_scene_is_configured_on_request_only(tmp_path):
         configure_scene(scene, capture, mine)
 
 
+def test_looking_through_cameras_gives_the_resolution_back(extension, head):
+    """Catches renders at a camera's size after it was looked through, and a size of the user's own
+    that was chosen meanwhile, or after orbiting away, replaced."""
+    render = bpy.context.scene.render
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    view = area.spaces.active.region_3d
+
+    def press(step: int = 0) -> tuple[int, int]:
+        with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
+            bpy.ops.stga.view_footage(step=step)
+        return render.resolution_x, render.resolution_y
+
+    render.resolution_x = 1920
+    render.resolution_y = 1080
+    assert (press(), press(1), press()) == ((40, 60), (40, 60), (1920, 1080))
+    press()
+    view.view_perspective = "PERSP"  # orbited away
+    assert (press(), press()) == ((40, 60), (1920, 1080))
+    press()
+    view.view_perspective = "PERSP"
+    render.resolution_x = 1280
+    assert (press(), press()) == ((40, 60), (1280, 60))
+    press()
+    render.resolution_x = 640
+    assert press() == (640, 60)
+
+
 def test_bones_and_cameras_are_in_collections_of_their_own(tmp_path):
     """Catches a head covered by cameras or hidden with them, and another central camera."""
     capture = open_capture(write_mesh_capture(tmp_path / "capture", range(2), range(3)))
