@@ -166,7 +166,7 @@ class LivePose:
     def __init__(self, head: Any, rig: Any) -> None:
         """rig: the head's FLAME rig; None for a head that has shape keys with ARKit's names."""
         self.head = Identity(head)
-        self._rig = None if rig is None else Identity(rig)
+        self._rig: Any = None if rig is None else Identity(rig)
         self.takes_frames = rig is not None
         keys = head.data.shape_keys.key_blocks
         self._names = keyframes.shape_key_names(head)
