@@ -28,6 +28,8 @@ from ..training.run.identity import file_digest, identity_of
 from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 
 MAX_NAMED_VIEWS = 6  # Views that a warning names
+AFTERWARDS = (StgaError, Cancelled, MemoryError)
+"""What may end the work after a training, whose avatar is whole without it."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 
@@ -245,8 +247,12 @@ def _light_of(prepared: Prepared, avatar: Path, report: Report) -> tuple[str, ..
     capture = run_folder.with_refined_tracking(prepared.capture, prepared.request.run)
     try:
         return add_light(avatar, capture, report=report)
-    except StgaError as error:  # an avatar without it is whole
-        return (f"light: not estimated ({error})",)
+    except AFTERWARDS as error:
+        return (f"light: not estimated ({_reason(error)})",)
+
+
+def _reason(error: BaseException) -> str:
+    return "not enough memory" if isinstance(error, MemoryError) else str(error) or "stopped"
 
 
 def _world_of(prepared: Prepared, report: Report) -> str:
@@ -256,8 +262,8 @@ def _world_of(prepared: Prepared, report: Report) -> str:
     path = prepared.request.run / run_folder.WORLD_FILE
     try:
         splats = world_of(prepared.capture, prepared.run.settings, report)
-    except Cancelled:
-        return "world: not made (stopped)"
+    except AFTERWARDS as error:
+        return f"world: not made ({_reason(error)})"
     write_ply(path, splats)
     return f"world: {path} ({len(splats)} splats)"
 

@@ -45,6 +45,8 @@ def transfer_of(
 
 
 CELL_M = 0.02  # Side of the cells in which irradiance is averaged, with the 26 around a vertex's
+MAX_CELLS = 40
+"""Along an axis; a mesh that is larger, as one in centimeters, has larger cells."""
 SKIN = np.array([0.5, 0.33, 0.25])  # Albedo of the skin that light is reflected by
 MIN_OPEN = 0.3
 """Share of the sky that a vertex must see to count as lit skin: those inside the head do not."""
@@ -54,7 +56,9 @@ class Bounce:
     """For a neutral mesh (V, 3) meters with its ambient occlusion (V,)."""
 
     def __init__(self, neutral: np.ndarray, faces: np.ndarray, occlusion: np.ndarray) -> None:
-        place = np.floor((neutral - neutral.min(0)) / CELL_M).astype(np.int64) + 1
+        beyond = neutral - neutral.min(0)
+        side = max(CELL_M, float(beyond.max()) / MAX_CELLS)
+        place = np.floor(beyond / side).astype(np.int64) + 1
         self._shape = tuple(int(n) + 2 for n in place.max(0))
         self._cell = np.ravel_multi_index(tuple(place.T), self._shape)
         area = np.bincount(faces.ravel(), np.repeat(face_areas(neutral, faces), 3), len(neutral))

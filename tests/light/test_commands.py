@@ -17,6 +17,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
+from stga_addon.jobs import train as train_job
 from stga_addon.jobs.finished_run import add_light
 from stga_addon.light.estimate import estimate_light
 from stga_addon.light.relight import Relighter, albedo_avatar
@@ -69,6 +70,23 @@ def test_a_run_ends_with_its_light(run, capsys, root, tmp_path):
     arguments = ["train", str(root), "--out", str(tmp_path / "run"), "--iterations", "2"]
     assert main([*arguments, "--effect", "relight=off"]) == 0
     assert read_avatar(tmp_path / "run/avatar.npz").light is None
+
+
+@pytest.mark.parametrize("error", [MemoryError(), StgaError("no light")])
+def test_a_training_is_whole_without_what_follows_it(error, root, tmp_path, monkeypatch, capsys):
+    """Catches a run of an hour that ends with a traceback because its light could not be found."""
+
+    def fail(*_: object) -> None:
+        raise error
+
+    for name in ("light.estimate.estimate_light", "training.world.world_of"):
+        monkeypatch.setattr(f"stga_addon.{name}", fail)
+    monkeypatch.setattr(train_job, "WORLD", "relight")  # an effect that is on
+    assert stga("train", root, "--out", tmp_path / "run", "--iterations 2") == 0
+    why = str(error) or "not enough memory"
+    said = capsys.readouterr().out
+    assert f"light: not estimated ({why})" in said
+    assert f"world: not made ({why})" in said
 
 
 def test_a_gray_card_sets_the_level_and_a_running_trainings_avatar_is_kept(

@@ -79,6 +79,20 @@ def test_what_is_rarely_seen_is_lit_as_when_it_is_seen():
     np.testing.assert_allclose(found[at < -0.098], (0.1 + 2.0) / 2)  # never seen
 
 
+def test_light_that_skin_reflects_has_no_unit():
+    """Catches cells over a mesh in millimeters that would fill all memory, and skin there that
+    reflects none of the light of its neighbors."""
+    vertices, faces = ball_and_plate(4)
+    half_open = np.full(len(vertices), 0.5)
+    above = vertices[:, 1:2] > 0
+    arriving = np.where(above, 1.0, 0.2) * np.ones(3)
+    meters, large = (Bounce(scale * vertices, faces, half_open) for scale in (1, 1000))
+    found = large.light(arriving)
+    assert found.sum() == pytest.approx(meters.light(arriving).sum(), rel=0.05)
+    edge = (np.abs(vertices[:, 1]) < 0.002) & (vertices[:, 1] <= 0)
+    assert (found[edge] > 1.2 * found.min(0)).all()
+
+
 def test_eyeballs_are_found(shared_data: Path):
     """Catches eyes without a highlight of their own, and skin that is taken for one."""
     from stga_addon.capture.open import open_capture
