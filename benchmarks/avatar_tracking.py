@@ -17,7 +17,7 @@ import numpy as np
 
 from stga_addon.avatar.file import read_avatar
 from stga_addon.capture.model import evenly_spread
-from stga_addon.training.optimize.avatar_tracking import track_by_avatar
+from stga_addon.training.optimize.avatar_tracking import OtherRecording, track_by_avatar
 from stga_addon.training.run.folder import AVATAR, open_run
 
 
@@ -38,11 +38,12 @@ def main() -> None:
     track_by_avatar(avatar, settings, capture, chosen[:1])  # compiles
     size = f"{views[0].camera.width}x{views[0].camera.height}"
     print("| images | tracked | processor s | s | unexplained |\n| --- | --- | --- | --- | --- |")
-    ways = {"in training": (False, False), "a recording": (True, False), "again": (False, True)}
-    for how, (is_far, is_again) in ways.items():
+    first = OtherRecording()
+    again = OtherRecording(is_again=True)
+    for how, way in {"in training": None, "a recording": first, "again": again}.items():
         begin = perf_counter()
         busy = process_time()
-        found = track_by_avatar(avatar, settings, capture, chosen, is_far=is_far, is_again=is_again)
+        found = track_by_avatar(avatar, settings, capture, chosen, recording=way)
         busy = (process_time() - busy) / count
         taken = (perf_counter() - begin) / count
         missed = "" if np.isnan(found.misfit).any() else f"{np.median(found.misfit):.0%}"

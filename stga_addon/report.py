@@ -14,9 +14,16 @@ from .errors import StgaError
 from .files import replacing
 from .format import format_duration
 from .training.evaluate import forecast as forecasts
-from .training.evaluate.forecast import DETAIL, UNMATCHED, curve_of, detail_curve
+from .training.evaluate.forecast import (
+    DETAIL,
+    FITTED_HEADS,
+    UNMATCHED,
+    curve_of,
+    detail_curve,
+)
 from .training.run.folder import read_run
 from .training.run.metrics_log import METRICS, TRACKING_GAIN, read_metrics
+from .training.settings import TrainingSettings
 
 # imported when a chart is drawn: it takes half a second, and the command line starts without it
 if TYPE_CHECKING:
@@ -65,7 +72,7 @@ def report_run(folder: Path) -> list[str]:
     write_curve(folder)
     run = read_run(folder)
     metrics = read_metrics(folder)
-    lines = summarize_run(metrics, run.settings.target_psnr)
+    lines = summarize_run(metrics, run.settings)
     if run.continuation is not None:
         lines = summarize_continuation(metrics)
     if (folder / CURVE).exists():
@@ -76,16 +83,17 @@ def report_run(folder: Path) -> list[str]:
     return [*lines, f"{CURVE} was not drawn: {reason}"]
 
 
-def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) -> list[str]:
-    """Lines on accuracy, target (dB), checked forecasts, and cost of evaluation and memory."""
+def summarize_run(metrics: Sequence[Mapping[str, Any]], settings: TrainingSettings) -> list[str]:
+    """Lines on accuracy, target, checked forecasts, and cost of evaluation and memory."""
     if not metrics:
         return []
     lines = []
     curve = curve_of(metrics)
     last = metrics[-1]
+    target = settings.target_psnr
     if curve:
         evaluations = [line for line in metrics if "psnr" in line]
-        best = forecasts.saved_line(evaluations, target)
+        best = forecasts.kept_line(evaluations, settings)
         fitted = ""
         if UNMATCHED in best:
             fitted = f" (exposure fitted; {best[UNMATCHED]:.2f} dB without)"
@@ -94,7 +102,13 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
         parts += [f"{best[key]:.2f} dB {name}" for key, name in named if key in best]
         parts += [f"detail difference {best[DETAIL]:.4f}"] if DETAIL in best else []
         when = format_duration(best["seconds"])
-        lines.append(f"held-out views: {', '.join(parts)}, after {when} (the saved avatar)")
+        fitted_psnr = last.get(f"psnr{FITTED_HEADS}")
+        heads = "" if fitted_psnr is None else ", heads as tracked"
+        lines.append(f"held-out views{heads}: {', '.join(parts)}, after {when} (the saved avatar)")
+        if fitted_psnr is not None:
+            ssim = f"SSIM {last[f'ssim{FITTED_HEADS}']:.4f}"
+            heads = "heads of unseen timesteps fitted to them by the avatar"
+            lines.append(f"held-out views, {heads}: {fitted_psnr:.2f} dB, {ssim}")
     if target is not None and curve:
         text = f"{target:g} dB was reached"
         if all(psnr < target for _, psnr in curve):
@@ -103,7 +117,10 @@ def summarize_run(metrics: Sequence[Mapping[str, Any]], target: float | None) ->
     gain = next((line[TRACKING_GAIN] for line in metrics if TRACKING_GAIN in line), None)
     if gain is not None:
         verb, then = ("gain", "") if gain > 0 else ("lose", ", so heads stay as they were tracked")
-        lines.append(f"tracking by the avatar: views left out {verb} {abs(gain):.2f} dB{then}")
+        says = f"views left out {verb} {abs(gain):.2f} dB{then}"
+        if math.isnan(gain):
+            says = "kept unchecked: no view could be left out of it"
+        lines.append(f"tracking by the avatar: {says}")
     plateau = forecasts.flat_since(metrics)
     if plateau is not None:
         helps = "more time does not help with these settings"

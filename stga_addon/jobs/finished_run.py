@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..avatar.file import AvatarLight, read_avatar, write_avatar
+from ..avatar.file import Avatar, AvatarLight, read_avatar, write_avatar
 from ..capture.camera import central_camera
 from ..capture.color import srgb_to_linear
 from ..capture.model import Capture
@@ -109,35 +109,54 @@ class Evaluate:
     capture: Path | None = like(Relight, "capture")
 
 
+def measure_run(
+    folder: Path, avatar: Avatar, capture: Capture, split: str, matched: bool | None = None
+) -> "tuple[Quality, Quality | None]":
+    """Quality of a run's avatar on a split of its capture, as `open_run` opens it, with heads as
+    they were tracked; and with those of unseen timesteps fitted by the avatar to the very images
+    that it is measured by, None where none of the split's are. matched: as in `evaluate_avatar`.
+    Raises StgaError."""
+    from ..training.evaluate.metrics import evaluate_avatar
+
+    tracked = run_folder.with_refined_tracking(capture, folder, fitted=False)
+    quality = evaluate_avatar(avatar, tracked, split, True, matched)
+    fitted = run_folder.with_refined_tracking(tracked, folder)
+    if tracked.flame is None or fitted.flame is None:
+        return quality, None
+    before = tracked.flame.frame
+    after = fitted.flame.frame
+    shown = {view.timestep for view in capture.views[split]}
+    if all(np.array_equal(after(t).parameters, before(t).parameters) for t in shown):
+        return quality, None
+    return quality, evaluate_avatar(avatar, fitted, split, True, matched)
+
+
 def evaluate(request: Evaluate, report: Report, say: Say) -> Written:
-    """Measure PSNR, SSIM and LPIPS; also with the heads before the avatar tracked them, where it
-    did. Raises StgaError."""
-    from ..training.evaluate.metrics import evaluate_avatar, psnr_recorded
+    """Measure PSNR, SSIM and LPIPS; also with the heads that the avatar has fitted, where it did.
+    Raises StgaError."""
+    from ..training.evaluate.metrics import psnr_recorded, with_fitted_heads
 
     folder = request.run
     split = request.split
     report(Progress(stage="Evaluating"))
-    tracked = run_folder.open_run(folder, request.capture, request.flame).capture
-    capture = run_folder.with_refined_tracking(tracked, folder)
+    capture = run_folder.open_run(folder, request.capture, request.flame).capture
     views = capture.views.get(split, ())
     if not views:
         raise StgaError(f"{capture.root}: has no views in the split '{split}'")
     avatar = read_avatar(folder / AVATAR)
-    quality = evaluate_avatar(avatar, capture, split, perceptual=True)
+    quality, fitted = measure_run(folder, avatar, capture, split)
     if (folder / WORLD_FILE).is_file():
-        recorded = psnr_recorded(avatar, read_splats(folder / WORLD_FILE), capture, split)
+        world = read_splats(folder / WORLD_FILE)
+        shown = run_folder.with_refined_tracking(capture, folder, fitted=False)
+        recorded = psnr_recorded(avatar, world, shown, split)
         quality = replace(quality, psnr_recorded=recorded)
     path = folder / f"quality_{split}.json"
-    write_json(path, {"views": len(views), **quality.as_json()})
-    lines = [f"{split}: {len(views)} views, {_describe(quality)}"]
-    trained = {view.timestep for view in capture.views.get("train", ())}
-    if tracked.flame is not None and capture.flame is not None:
-        before = tracked.flame.frame
-        after = capture.flame.frame
-        unseen = {view.timestep for view in views} - trained
-        if any(not np.array_equal(after(t).parameters, before(t).parameters) for t in unseen):
-            how = "with heads tracked by the avatar, its splats fixed; as tracked before"
-            lines.append(f"  {how}: {_describe(evaluate_avatar(avatar, tracked, split))}")
+    figures = with_fitted_heads(quality.as_json(), {} if fitted is None else fitted.as_json())
+    write_json(path, {"views": len(views), **figures})
+    heads = "" if fitted is None else "heads as tracked, "
+    lines = [f"{split}: {len(views)} views, {heads}{_describe(quality)}"]
+    if fitted is not None:
+        lines.append(f"  heads fitted by the avatar to these images: {_describe(fitted)}")
     for region, name in (("mask", "inside the head mask"), ("moving", "in the moving region")):
         if region in quality.regions:
             lines.append(f"  {name}: {_describe(quality.regions[region])}")

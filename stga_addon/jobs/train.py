@@ -336,7 +336,7 @@ def _refinement(request: Refine, report: Report, say: Say) -> Prepared:
     weights = request.weights
     report(Progress(stage="Opening the run"))
     opened = run_folder.open_run(parent, flame=request.flame)
-    capture = run_folder.with_refined_tracking(opened.capture, parent)
+    capture = run_folder.with_refined_tracking(opened.capture, parent, fitted=False)
     count = len(capture.faces)
     if weights is None:
         region = find_region(capture, request.region)
@@ -412,7 +412,8 @@ def _joined_takes(request: Extend, say: Say) -> tuple[OpenedRun, Capture, Select
             raise StgaError(f"{take.root}: is given twice; expected each take once")
         new.append(take)
     everything = [*opened.takes, *new]
-    capture = run_folder.with_refined_tracking(capture_model.join_takes(everything), request.parent)
+    joined = capture_model.join_takes(everything)
+    capture = run_folder.with_refined_tracking(joined, request.parent, fitted=False)
     starts = capture_model.first_timesteps(everything)[len(opened.takes) :]
     added = [
         run_folder.Take(take.root, start, identity_of(take, run.principal_point, run.settings))

@@ -27,8 +27,10 @@ from stga_addon.errors import StgaError
 from stga_addon.export.ply import read_ply
 from stga_addon.jobs.render import unique_names
 from stga_addon.selection import SelectionOptions
+from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
+from stga_addon.training.run.metrics_log import read_metrics
 
 from .conftest import CAMERAS, TIMESTEPS, refused
 
@@ -78,9 +80,9 @@ def test_train_and_eval(trained, root, capsys):
         assert f"{split}: {views} views, PSNR " in capsys.readouterr().out
         quality = json.loads((trained / f"quality_{split}.json").read_text())
         assert quality["views"] == views
-    best = read_checkpoint(trained).best_difference
+    kept = kept_line(read_metrics(trained), read_run(trained).settings)
     measured = json.loads((trained / "quality_val.json").read_text())["detail_difference"]
-    assert measured == pytest.approx(best, rel=0.02)
+    assert measured == pytest.approx(kept["detail_difference"], rel=0.02)
 
 
 def test_train_in_wall_time_and_resume(root: Path, tmp_path: Path) -> None:

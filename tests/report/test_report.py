@@ -19,7 +19,7 @@ from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run, read_run
 from stga_addon.training.run.session import train
-from stga_addon.training.settings import make_settings
+from stga_addon.training.settings import TrainingSettings, make_settings
 
 
 def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
@@ -37,23 +37,29 @@ def metrics(values: list[float], **more: Any) -> list[dict[str, Any]]:
     ]
 
 
+def aiming(target: float | None) -> TrainingSettings:
+    return make_settings(iterations=1, target_psnr=target)
+
+
 def test_summary_of_a_run():
     """Catches the last evaluation given for the best, a fitted PSNR that is not called so, and a
     target that is reached and said to be missed, or the other way round."""
-    lines = summarize_run(metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), None)
+    lines = summarize_run(
+        metrics([20.0, 31.0, 30.0], psnr_mask=25.0, peak_memory_mb=1234.5), aiming(None)
+    )
     assert lines == [
         "held-out views: 31.00 dB, SSIM 0.9000, 25.00 dB in the head mask, detail difference "
         "0.0323, after 20 s (the saved avatar)",
         "evaluation took 1.3% of the training time, in addition to it, peak memory 1,234 MB",
     ]
-    assert summarize_run([], None) == []
+    assert summarize_run([], aiming(None)) == []
     values = metrics([20.0, 31.0, 30.0], psnr_unmatched=25.0)
-    summary = summarize_run(values, 30.5)
+    summary = summarize_run(values, aiming(30.5))
     assert summary[0].startswith(
         "held-out views: 31.00 dB (exposure fitted; 25.00 dB without), SSIM"
     )
     assert summary[1] == "30.5 dB was reached (exposure fitted)"
-    assert "(exposure fitted)" in summarize_run(values, 40.0)[1]
+    assert "(exposure fitted)" in summarize_run(values, aiming(40.0))[1]
     rising = metrics([20.0, 25.0, 27.0, 28.0, 28.5], psnr_unmatched=25.0)
     assert "PSNR with exposure fitted" in describe_forecast(rising, 50.0, 100.0, None)
     assert "at the end, exposure fitted" in describe_forecast(rising, 50.0, 100.0, 60.0)
@@ -61,17 +67,30 @@ def test_summary_of_a_run():
         {"psnr": 31.0, "psnr_unmatched": 25.0}
     )
     assert "PSNR 31.00 dB" in " ".join(describe_figures({"psnr": 31.0}))
-    assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), 30.0)
-    missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), 30.0)[1]
+    assert "30 dB was reached" in summarize_run(metrics([20.0, 31.0, 29.0]), aiming(30.0))
+    missed = summarize_run(metrics([20.0, 25.0, 27.0, 28.0]), aiming(30.0))[1]
     assert missed.startswith(
         "30 dB was not reached (best 28.00 dB): extrapolating the curve, it would take about"
     )
-    level = summarize_run(metrics([20.0, 25.0, *[24.0] * 10]), 30.0)
+    level = summarize_run(metrics([20.0, 25.0, *[24.0] * 10]), aiming(30.0))
     assert "nothing was gained after 20 s, so more time would not help" in level[1]
     assert "nothing was gained after 20 s" in level[2]
     late = metrics([29.0, 31.0])
     late[1]["detail_difference"] = 0.9  # worse than before, but it is the avatar that was asked for
-    assert summarize_run(late, 30.0)[0].startswith("held-out views: 31.00 dB")
+    assert summarize_run(late, aiming(30.0))[0].startswith("held-out views: 31.00 dB")
+
+
+def test_both_qualities_are_named() -> None:
+    """Catches heads fitted to the very images that are scored and not called so, and tracking that
+    nothing has checked without a word."""
+    values = metrics([20.0, 23.0])
+    values[1] |= {"psnr_fitted_heads": 26.0, "ssim_fitted_heads": 0.95}
+    values[1]["tracking_gain_db"] = float("nan")
+    first, second, third, *_ = summarize_run(values, aiming(None))
+    assert first.startswith("held-out views, heads as tracked: 23.00 dB")
+    assert second.startswith("held-out views, heads of unseen timesteps fitted to them by the ")
+    assert second.endswith(": 26.00 dB, SSIM 0.9500")
+    assert third == "tracking by the avatar: kept unchecked: no view could be left out of it"
 
 
 def test_summary_of_a_continuation() -> None:

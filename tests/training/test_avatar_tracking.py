@@ -1,5 +1,6 @@
 """A head tracked by its avatar, finished or in training: gradient, gain, who sees it."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -23,10 +24,12 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz, write_npz
 from stga_addon.flame.forward import parameters_gradient
 from stga_addon.flame.sequence import read_motion, sequence_mesh, with_identity
-from stga_addon.progress import Cancelled
+from stga_addon.jobs.finished_run import measure_run
+from stga_addon.progress import Cancelled, Progress, Report
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.report import report_run
 from stga_addon.tracking.folder import is_in_order
+from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
@@ -45,7 +48,8 @@ from stga_addon.training.schedule import view_order
 from stga_addon.training.settings import TrainingSettings
 
 from .heads import TIMESTEPS, write_head
-from .toys import quick_settings, stop_at
+from .test_run import without_times
+from .toys import assert_same_state, quick_settings, stop_at
 
 Made = tuple[Capture, dict[int, np.ndarray]]
 NAMES = ("origin", "rotation", "scale")
@@ -340,23 +344,100 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     assert read_checkpoint(tmp_path / "b").rounds == 2
 
 
+def stop_in_tracking(turn: int) -> Report:
+    """Stops a training in the middle of its avatar's tracking for the nth time: first of training
+    timesteps, then of unseen ones."""
+    begun = []
+
+    def report(progress: Progress) -> bool:
+        if progress.stage.startswith("Tracking by the avatar: 0 of"):
+            begun.append(progress)
+        in_the_middle = turn < 2 and "Tracking by the avatar: 2 of" in progress.stage
+        return len(begun) == turn and (turn == 2 or in_the_middle)
+
+    return report
+
+
+@pytest.mark.parametrize(
+    "stops",
+    [stop_at(31), stop_in_tracking(1), stop_in_tracking(2)],
+    ids=["training", "halfway", "at the end"],
+)
 def test_stopped_and_resumed_is_the_unbroken_run(
-    lost: Made, run_folder: Path, tmp_path: Path
+    stops: Report, lost: Made, run_folder: Path, tmp_path: Path
 ) -> None:
-    """Catches anything of the tracking that a step depends on and a checkpoint does not hold."""
+    """Catches anything of the tracking that a step depends on and a checkpoint does not hold, a
+    step on old meshes before they are tracked, unseen timesteps that stay untracked for ever, and
+    evaluations or avatars that an unbroken run would not have."""
     capture, _ = lost
-    train(capture, tmp_path, make_run(capture), report=stop_at(31))
-    assert read_checkpoint(tmp_path).rounds == 1
+    train(capture, tmp_path, make_run(capture), report=stops)
+    assert read_checkpoint(tmp_path).rounds < 2
+    assert not (tmp_path / "residuals.npz").exists()
     train(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
     assert ours.rounds == theirs.rounds == 2
     np.testing.assert_array_equal(ours.tracking, theirs.tracking)
-    np.testing.assert_array_equal(ours.state.parameters.xyz, theirs.state.parameters.xyz)
+    assert_same_state(tmp_path, run_folder)
     moved, expected = (
         checkpoint.state.driven_offsets["strain_position"] for checkpoint in (ours, theirs)
     )
     assert np.abs(expected.value).max() > 0
     np.testing.assert_array_equal(moved.value, expected.value)
+    for name in ("avatar.npz", "tracking.npz", "residuals.npz"):
+        left, right = (read_npz(folder / name) for folder in (tmp_path, run_folder))
+        for key, array in right.items():
+            np.testing.assert_array_equal(left[key], array, err_msg=f"{name}: {key}")
+    assert {path.name for path in tmp_path.iterdir()} == {p.name for p in run_folder.iterdir()}
+    lines, expected_lines = (without_times(read_metrics(f)) for f in (tmp_path, run_folder))
+    assert lines == expected_lines
+
+
+def test_quality_is_measured_with_and_without_fitted_heads(
+    lost: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches heads fitted to held-out images in a figure that is not called so, also by `stga
+    eval`, and fitted heads that are lost where the last state is not the kept one."""
+    capture = lost[0]
+    views = {"train": [], "test": [], "val": capture.views["val"]}
+    for view in capture.views["train"]:
+        views["test" if view.timestep == 3 else "train"].append(view)
+    capture = replace(capture, views={split: tuple(own) for split, own in views.items()})
+    kept = []
+    for number in (10, 9):
+        out = tmp_path / str(number)
+        monkeypatch.setattr(evaluator, "kept_line", lambda lines, _, n=number: lines[:n][-1])
+        train(capture, out, make_run(capture, iterations=20, driven_offsets=()))
+        *_, before, last = read_metrics(out)
+        assert "psnr_fitted_heads" not in before
+        assert {"ssim_fitted_heads", "detail_difference_fitted_heads"} <= last.keys()
+        refined, plain = (with_refined_tracking(capture, out, fitted=f) for f in (True, False))
+        np.testing.assert_array_equal(plain.mesh(3), capture.mesh(3))
+        assert np.abs(refined.mesh(3) - capture.mesh(3)).max() > 1e-4
+        avatar = read_avatar(out / "avatar.npz")
+        found, fitted = measure_run(out, avatar, capture, "val")
+        assert fitted is not None
+        assert fitted.psnr == pytest.approx(last["psnr_fitted_heads"], abs=0.005)
+        assert fitted.psnr > found.psnr
+        line = read_metrics(out)[number - 1]
+        assert found.psnr == pytest.approx(line["psnr"], abs=0.05)
+        kept.append(avatar.splats.xyz)
+    assert not np.array_equal(*kept)
+
+
+@pytest.mark.parametrize("timesteps", [(0, 2, 3), (0, 2)])
+def test_a_short_take_is_checked_or_called_unchecked(
+    timesteps: tuple[int, ...], right: Made, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Catches tracking that is kept without a check, and without a word, in short takes."""
+    views = right[0].views["train"]
+    shown = tuple(view for view in views if view.timestep in timesteps)
+    capture = replace(right[0], views={"train": shown})
+    train(capture, tmp_path, make_run(capture, iterations=4, driven_offsets=()))
+    (gain,) = [
+        line["tracking_gain_db"] for line in read_metrics(tmp_path) if "tracking_gain_db" in line
+    ]
+    assert np.isnan(gain) == (len(timesteps) < 3)
+    assert ("is kept unchecked" in caplog.text) == (len(timesteps) < 3)
 
 
 def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_path: Path) -> None:
@@ -440,8 +521,14 @@ def test_commands_use_the_refined_meshes(
     root = read_run(run_folder).capture
     tracked = open_capture(root, root / "model.npz")
     assert stga("eval", run_folder, "--split test") == 0
-    before = evaluate_avatar(read_avatar(run_folder / "avatar.npz"), tracked, "test").psnr
-    assert f"as tracked before: PSNR {before:.3f} dB" in capsys.readouterr().out
+    avatar = read_avatar(run_folder / "avatar.npz")
+    before = evaluate_avatar(avatar, tracked, "test").psnr
+    after = evaluate_avatar(avatar, with_refined_tracking(tracked, run_folder), "test").psnr
+    said = capsys.readouterr().out
+    assert f"heads as tracked, PSNR {before:.3f} dB" in said
+    assert f"heads fitted by the avatar to these images: PSNR {after:.3f} dB" in said
+    written = json.loads((run_folder / "quality_test.json").read_text())
+    assert (written["psnr"], written["psnr_fitted_heads"]) == (before, after)
     to = "--cameras", root / "transforms_val.json", "--out"
     assert stga("render", run_folder, *to, tmp_path / "run") == 0
     capture = "--capture", root, "--flame", root / "model.npz"

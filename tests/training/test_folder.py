@@ -31,7 +31,7 @@ def make_run(**changes: Any) -> Run:
 
 
 def make_checkpoint() -> Checkpoint:
-    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 31.25, 4, [0.5, 0.25])
+    return Checkpoint(random_state(12, FACES), 34, 7, 3, 10, 12.5, 4, [0.5, 0.25], 5, 0.5)
 
 
 def edit_json(path: Path, **changes: Any) -> None:
@@ -120,11 +120,10 @@ def test_checkpoint_round_trip(tmp_path):
     assert all(array.flags.c_contiguous for array in arrays_of(state).values())
     largest = (1 << 53) - 1
     for counts in ((0, -1, None), (0, -1, 0), (largest, largest, largest)):
-        extreme = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, np.inf, 0, [])
+        extreme = Checkpoint(random_state(3, FACES), *counts, 0, 0.0, 0, [])
         checkpoint_files.write_checkpoint(tmp_path, extreme)
         limited = checkpoint_files.read_checkpoint(tmp_path)
         assert (limited.iteration, limited.visit, limited.last_timestep) == counts
-        assert limited.best_difference == np.inf  # before any evaluation
 
 
 def meta(**changes: Any) -> np.ndarray:

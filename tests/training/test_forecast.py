@@ -1,5 +1,7 @@
 """What a run says about more time, against curves whose future is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,8 +14,10 @@ from stga_addon.training.evaluate.forecast import (
     flat_since,
     forecast,
     forecast_text,
+    kept_line,
     plateau_start,
 )
+from stga_addon.training.settings import make_settings
 
 TIMES = np.arange(1, 31) * 4.0
 
@@ -146,3 +150,30 @@ def test_why_a_target_was_missed():
         "40 dB was not reached (best 20.00 dB): there are too few evaluations to say how long it "
         "would take"
     )
+
+
+def test_no_state_is_kept_that_another_beats_in_both_figures():
+    """Catches a rule by pairs, under which a run creeps from its best state to one that is both
+    more blurred and of lower PSNR, and a report of another state than the one that was written."""
+    rng = np.random.default_rng(0)
+    settings = make_settings(iterations=1)
+    for _ in range(500):
+        states = [
+            {"psnr": psnr, "detail_difference": detail}
+            for psnr, detail in zip(rng.normal(25, 1, 12), rng.uniform(0.1, 0.4, 12), strict=True)
+        ]
+        written = states[0]
+        for count in range(1, len(states) + 1):
+            kept = kept_line(states[:count], settings)
+            written = kept if kept is states[count - 1] else written
+            assert kept is written
+        for state in states:
+            beaten = state["psnr"] > kept["psnr"]
+            assert not (beaten and state["detail_difference"] < kept["detail_difference"])
+    blurred, sharp = ({"psnr": 25.0, "detail_difference": d} for d in (0.3, 0.2))
+    assert kept_line([sharp, blurred], settings) is sharp
+    assert kept_line([sharp, {**sharp, "psnr": 25.1}, blurred], settings)["psnr"] == 25.1
+    lost = {"psnr": float("nan"), "detail_difference": 0.1}
+    assert kept_line([lost, blurred, lost], settings) is blurred
+    for strategy in ("refine", "extend"):
+        assert kept_line([sharp, blurred], replace(settings, strategy=strategy)) is blurred

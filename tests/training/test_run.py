@@ -14,7 +14,7 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.progress import Progress
 from stga_addon.training.evaluate import evaluator
-from stga_addon.training.evaluate.forecast import saved_line
+from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.evaluate.metrics import Quality
 from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
@@ -129,6 +129,59 @@ def test_crashed_and_resumed_is_the_unbroken_run(unbroken: Path, continued: Path
         )
 
 
+@pytest.mark.parametrize("iteration", [2, 11, 15])
+def test_stopped_and_resumed_is_the_unbroken_run(
+    iteration: int, toy: Capture, unbroken: Path, tmp_path: Path
+) -> None:
+    """Catches a line of metrics, or an avatar, of the moment of a Ctrl-C that stays after resuming;
+    15 is the iteration of an evaluation, 2 before the first."""
+    train(toy, tmp_path, make_run(toy), report=stop_at(iteration))
+    stopped = read_metrics(tmp_path)
+    assert stopped[-1]["iteration"] == iteration
+    assert (tmp_path / "avatar.npz").exists()
+    train(toy, tmp_path, make_run(toy), resume=True)
+    assert_same_state(tmp_path, unbroken)
+    ours, theirs = (without_times(read_metrics(folder)) for folder in (tmp_path, unbroken))
+    assert ours == theirs
+    assert {path.name for path in tmp_path.iterdir()} == {p.name for p in unbroken.iterdir()}
+
+
+def test_the_avatar_of_a_stop_is_not_that_of_the_resumed_run(
+    toy: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a stopped run without the best avatar so far, and a resumed one that keeps a state
+    which the unbroken run never evaluated."""
+    before = iter([Quality(20, 0.5), Quality(21, 0.5), Quality(25, 0.5)])
+    monkeypatch.setattr(evaluator, "evaluate", lambda *_: next(before))
+    train(toy, tmp_path, make_run(toy), report=stop_at(6))
+    now = read_avatar(tmp_path / "avatar.npz").splats.xyz
+    np.testing.assert_array_equal(now, read_checkpoint(tmp_path).state.average.xyz)
+    monkeypatch.setattr(evaluator, "evaluate", lambda *_: Quality(19, 0.5))
+    train(toy, tmp_path, make_run(toy), resume=True)
+    kept = read_avatar(tmp_path / "avatar.npz").splats.xyz
+    train(toy, tmp_path / "five", make_run(toy), report=stop_at(5))
+    five = read_checkpoint(tmp_path / "five").state.average.xyz
+    np.testing.assert_array_equal(kept, five)
+
+
+def test_residuals_that_could_not_be_measured(
+    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a run that failed after its last iteration, resumed with success and no residuals."""
+
+    def fail(*_: Any) -> None:
+        raise StgaError("image 7 cannot be read")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "triangle_residuals", fail)
+        with pytest.raises(StgaError, match="image 7"):
+            train(toy, tmp_path, make_run(toy))
+    train(toy, tmp_path, make_run(toy), resume=True)
+    count = len(toy.faces)
+    np.testing.assert_array_equal(read_residuals(tmp_path, count), read_residuals(unbroken, count))
+    assert len(read_metrics(tmp_path)) == len(read_metrics(unbroken))
+
+
 def test_checkpoints_as_often_as_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Catches a farm's wish ignored, and a traceback or no checkpoints of a nonsensical one."""
     for text, seconds in (("", None), ("0.5", 0.5), ("0", 0.0)):
@@ -239,8 +292,7 @@ def test_the_best_avatar_is_kept(
     train(toy, tmp_path, make_run(toy), report=stop_at(11))
     train(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 3
-    assert read_checkpoint(tmp_path).best_difference == 0.11
-    assert saved_line(read_metrics(tmp_path), None)["psnr"] == 31
+    assert kept_line(read_metrics(tmp_path), make_run(toy).settings)["psnr"] == 31
     best = read_avatar(tmp_path / "avatar.npz").splats
     np.testing.assert_array_equal(best.xyz, written[2].splats.xyz)
     assert not np.array_equal(written[0].splats.xyz, written[1].splats.xyz)

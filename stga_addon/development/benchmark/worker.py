@@ -69,10 +69,10 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
     """Train the folder's run in turns and measure its avatar, with fitted exposure of cameras that
     were not trained."""
     from ...avatar.file import read_avatar
+    from ...jobs.finished_run import measure_run
     from ...jobs.train import prepare
-    from ...training.evaluate.metrics import evaluate_avatar
+    from ...training.evaluate.metrics import with_fitted_heads
     from ...training.preset_timing import seconds_per_iteration
-    from ...training.run.folder import with_refined_tracking
 
     turns = Turns(requests, replies)
     try:
@@ -88,12 +88,11 @@ def work(folder: Path, requests: IO[str], replies: IO[str], fits_exposure: bool 
         avatar = read_avatar(prepared.train(turns.report))
         if not turns.stopped:
             splits = [split for split in ("val", "test") if capture.views.get(split)]
-            trained = with_refined_tracking(capture, folder)
-            found = {
-                split: evaluate_avatar(avatar, trained, split, True, fits_exposure)
-                for split in splits
-            }
-            quality = {split: figures.as_json() for split, figures in found.items()}
+            quality = {}
+            for split in splits:
+                found, fitted = measure_run(folder, avatar, capture, split, fits_exposure)
+                beside = {} if fitted is None else fitted.as_json()
+                quality[split] = with_fitted_heads(found.as_json(), beside)
             write_json(folder / QUALITY, quality)
         turns.reply({"done": not turns.stopped})
     except StgaError as error:

@@ -17,7 +17,7 @@ from ...capture.model import evenly_spread
 from ...errors import StgaError, one_line
 from ...files import replacing
 from ...format import format_duration
-from ...training.evaluate.forecast import curve_of, saved_line
+from ...training.evaluate.forecast import FITTED_HEADS, curve_of, kept_line
 from ...training.run.folder import has_run, read_run
 from ...training.run.metrics_log import read_metrics
 from ...worker.status import log_lines
@@ -183,8 +183,10 @@ def write_report(batch: Batch) -> Path:
                 figures = dict[str, Any]()
                 lines = [line for line in metrics if "psnr" in line]
                 with suppress(StgaError):
-                    target = read_run(folder).settings.target_psnr
-                    figures |= saved_line(lines, target) if lines else {}
+                    settings = read_run(folder).settings
+                    figures |= kept_line(lines, settings) if lines else {}
+                    last = [{}, *metrics][-1]
+                    figures |= {k: v for k, v in last.items() if k.endswith(FITTED_HEADS)}
                 runs.append(Run(entry, metrics, figures))
     runs.sort(key=lambda run: run.figures.get("psnr", -np.inf))
     parts = [_summary(batch), _failures(batch), _chart(runs), _pictures(runs), _table(batch, runs)]
@@ -298,7 +300,10 @@ def _held_out_pair(run: Path) -> "Image.Image | None":
 def _table(batch: Batch, runs: Iterable[Run]) -> str:
     figures = {run.entry.job.name: run.figures for run in runs}
     heads = ("job", "request", "state", "machine")
-    numbers = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
+    fitted = f"psnr{FITTED_HEADS}"
+    numbers: tuple[str, ...] = ("time", "forecast", "off by", "PSNR", "SSIM", "splats")
+    if any(fitted in known for known in figures.values()):
+        numbers = (*numbers, "PSNR, heads fitted")
     rows = [_cells("th", heads, numbers)]
     entries = list(batch.entries.values())
     for entry in entries[:MAX_ROWS]:
@@ -306,14 +311,15 @@ def _table(batch: Batch, runs: Iterable[Run]) -> str:
         known = figures.get(entry.job.name, {})
         name = entry.job.name
         kind = type(entry.job.request).__name__
-        found = (
+        found = [
             format_duration(entry.seconds) if entry.seconds else "",
             format_duration(entry.forecast_s) if entry.forecast_s else "",
             "" if off is None else f"{off:+.0%}",
             f"{known['psnr']:.2f}" if "psnr" in known else "",
             f"{known['ssim']:.4f}" if "ssim" in known else "",
             f"{known['splats']:,}" if "splats" in known else "",
-        )
+            f"{known[fitted]:.2f}" if fitted in known else "",
+        ][: len(numbers)]
         rows.append(_cells("td", (name, kind, str(entry.state), entry.machine), found))
         if entry.state in (JobState.FAILED, JobState.BLOCKED):
             rows[-1] = rows[-1].replace("<tr>", '<tr class="failed">')

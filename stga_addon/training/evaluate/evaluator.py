@@ -10,15 +10,14 @@ import numpy as np
 from ...capture.model import View, ViewExposure
 from ..settings import TrainingSettings
 from .forecast import (
-    DETAIL,
     curve_of,
     describe_forecast,
     flat_since,
     forecast,
     forecast_horizon,
-    saved_line,
+    kept_line,
 )
-from .metrics import EvaluationView, evaluate
+from .metrics import EvaluationView, Quality, evaluate
 
 EVALUATIONS = 10
 """Evaluations over a budget in iterations, at fixed shares of it, so that runs are reproducible."""
@@ -48,13 +47,11 @@ class Spent:
 class Evaluator:
     """Evaluates a run's avatar on its evaluation views, and remembers what was found.
 
-    keeps_latest     a continuation keeps the latest avatar: the one before is in the folder that it
-                     continues
+    keeps_latest     whatever `kept_line` says, as where the avatars before are lost
     lines            of the run's metrics.jsonl
     exposure         `known_exposure` of the training cameras; None where their images are not
                      corrected
     count            evaluations of the schedule that have been made
-    best_difference  `Quality.detail_difference` of the avatar that is kept; ∞ before there is one
     forecast_text    what more training is expected to bring
     """
 
@@ -64,7 +61,6 @@ class Evaluator:
     exposure: ViewExposure | None = None
     lines: list[dict[str, Any]] = field(default_factory=list)
     count: int = 0
-    best_difference: float = math.inf
     forecast_text: str = ""
 
     def is_due(self, spent: Spent) -> bool:
@@ -87,33 +83,25 @@ class Evaluator:
             return True
         return self.settings.stop_when_flat and flat_since(self.lines) is not None
 
+    def measure(self, render: Callable[[View], np.ndarray], perceptual: bool = False) -> Quality:
+        """Quality of `render(view)` on the evaluation views; perceptual: with LPIPS."""
+        return evaluate(render, self.views, perceptual, self.exposure)
+
     def evaluate(
         self, render: Callable[[View], np.ndarray], perceptual: bool = False
     ) -> tuple[dict[str, float], bool]:
-        """Fields of a metrics line (`Quality.as_json`) of `render(view)` on the evaluation views,
-        and whether the avatar is to be kept. perceptual: with LPIPS.
-
-        Kept is what reaches the target, which ends the run, and what is sharper than the one kept
-        before or has a higher PSNR (`saved_line`). PSNR alone prefers an early, blurred state to
-        detail that is a pixel off; sharpness alone one with haze beside the head.
-        """
+        """Fields of a metrics line (`measure`), and whether the avatar is to be kept
+        (`kept_line`)."""
         if not self.views:
             return {}, True
-        quality = evaluate(render, self.views, perceptual, self.exposure).as_json()
-        difference = quality.get(DETAIL)
-        target = self.settings.target_psnr
-        reached = target is not None and quality["psnr"] >= target
+        quality = self.measure(render, perceptual).as_json()
         scored = [line for line in self.lines if "psnr" in line]
-        kept_psnr = saved_line(scored, target)["psnr"] if scored else -math.inf
-        is_better = difference is None or difference <= self.best_difference
-        is_better = is_better or quality["psnr"] > kept_psnr
-        return quality, self.keeps_latest or reached or is_better
+        is_kept = kept_line([*scored, quality], self.settings) is quality
+        return quality, self.keeps_latest or is_kept
 
-    def record(self, is_kept: bool, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
+    def record(self, line: Mapping[str, Any], spent: Spent) -> dict[str, Any]:
         """Remember an evaluation; returns its metrics line with a forecast, to be checked later."""
         self.count = max(self.count, int(min(1.0, spent.share) * EVALUATIONS))
-        if is_kept:
-            self.best_difference = line.get(DETAIL, self.best_difference)
         self.lines.append(dict(line))
         lines = self.lines
         elapsed = spent.seconds

@@ -1,5 +1,6 @@
 """Forecast of held-out quality from the evaluations of a run so far."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -7,12 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...format import format_duration
+from ..settings import CONTINUATIONS, TrainingSettings
 
 Curve = Sequence[tuple[float, float]]
 """(seconds of training, PSNR in dB) of each evaluation, ascending."""
 
 DETAIL = "detail_difference"
 """Key, in a metrics.jsonl, of what the avatar that a run keeps is chosen by; lower is better."""
+MIN_DETAIL = 1e-6
+"""Smaller detail differences are rounding."""
+FITTED_HEADS = "_fitted_heads"
+"""Ending of keys of quality with the heads of unseen timesteps fitted by the avatar, to the images
+that it is measured by; without it, heads are as tracked."""
 UNMATCHED = "psnr_unmatched"
 """Key of PSNR without fitted exposure, in the lines whose "psnr" is with it."""
 MIN_EVALUATIONS = 4
@@ -110,15 +117,28 @@ def is_exposure_fitted(lines: Sequence[Mapping[str, Any]]) -> bool:
     return any(UNMATCHED in line for line in lines)
 
 
-def saved_line(lines: Sequence[Mapping[str, Any]], target: float | None) -> Mapping[str, Any]:
-    """The saved avatar's line, of those with a PSNR: the last at the target, or else the last that
-    was sharper, or had a higher PSNR, than the one saved before."""
+def quality_score(line: Mapping[str, Any]) -> float:
+    """dB of PSNR and of detail (`detail_curve`) together, by which states of a run are ranked: one
+    that another beats in both is never ahead of it. −∞ where they are not numbers."""
+    score = float(line["psnr"])
+    if DETAIL in line:
+        score -= 20 * math.log10(max(float(line[DETAIL]), MIN_DETAIL))
+    return -math.inf if math.isnan(score) else score
+
+
+def kept_line(lines: Sequence[Mapping[str, Any]], settings: TrainingSettings) -> Mapping[str, Any]:
+    """The line, of those with a PSNR, of the avatar that a run with these settings keeps.
+
+    A continuation keeps the latest: the one before is in the folder that it continues. Others keep
+    the last that reached the target, which ends the run, or else the one of highest
+    `quality_score`. PSNR alone prefers an early, blurred state to detail that is a pixel off;
+    sharpness alone one with haze beside the head.
+    """
+    target = settings.target_psnr
+    if settings.strategy in CONTINUATIONS:
+        return lines[-1]
     reached = [line for line in lines if target is not None and line["psnr"] >= target]
-    saved = lines[0]
-    for line in lines:
-        is_sharper = line.get(DETAIL, np.inf) <= saved.get(DETAIL, np.inf)
-        saved = line if is_sharper or line["psnr"] > saved["psnr"] else saved
-    return reached[-1] if reached else saved
+    return reached[-1] if reached else max(reversed(lines), key=quality_score)
 
 
 def curve_of(lines: Sequence[Mapping[str, Any]], key: str = "psnr") -> list[tuple[float, float]]:

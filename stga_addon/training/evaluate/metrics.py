@@ -28,6 +28,7 @@ from ...selection import SelectionOptions, select_capture
 from ..optimize.cpu_backend import mean_ssim
 from ..optimize.image_preparation import NO_CORRECTION, fit_lines, view_exposure, without_backdrop
 from . import lpips
+from .forecast import FITTED_HEADS
 
 MAX_EVALUATION_VIEWS = 16
 """Held-out views that an evaluation during training renders."""
@@ -192,6 +193,14 @@ class Quality:
         for region, quality in self.regions.items():
             flat.update({f"{name}_{region}": value for name, value in quality.as_json().items()})
         return flat
+
+
+def with_fitted_heads(
+    as_tracked: Mapping[str, float], fitted: Mapping[str, float]
+) -> dict[str, float]:
+    """Figures of `Quality.as_json` with heads as they were tracked and, named so, with those of
+    unseen timesteps fitted by the avatar to the images that it is measured by."""
+    return {**as_tracked, **{f"{name}{FITTED_HEADS}": value for name, value in fitted.items()}}
 
 
 def evaluate(

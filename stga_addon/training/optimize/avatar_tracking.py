@@ -61,6 +61,11 @@ PYRAMID_PX = (50, 100, 200)
 PYRAMID_RENDERINGS = 20
 """Heights of the images in which the first timestep of another recording is tracked before, as a
 pattern on clothes leads astray by more than its width, and renderings in each."""
+TRACKED_SHARE = 0.2
+MIN_TRACKED_TIMESTEPS = 12
+"""Images that an avatar tracks its head in while it trains, as a share of the run's iterations, so
+that a long take does not track for longer than it trains; and timesteps that are tracked however
+few iterations there are."""
 ROOT = JOINTS.index("root")
 CACHED_TIMESTEPS = 12
 """FLAME frames kept in memory, with their dynamic offsets."""
@@ -89,7 +94,8 @@ class AvatarTracking:
     """Parameters (T, E + 18) of timesteps; (T,) the share of the head's pixels whose colors the
     avatar misses by more than MISS_LEVELS, NaN where it tracks for the first time; (T, 3) by how
     much the torso is shifted, of `torso_shapes`; (T,) the head's scale, where it was sought; and
-    (T, P, P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose.
+    (T, P, P) inverse covariances of what was sought: expressions, the torso's shift, scale, pose;
+    (T, 0, 0) of the recording that the avatar was trained on.
     """
 
     timesteps: tuple[int, ...]
@@ -171,6 +177,35 @@ class RefinedTracking:
         self.parameters[rows, -SHIFT_SIZE:] += added
 
 
+@dataclass(frozen=True)
+class OtherRecording:
+    """How a recording is tracked that the avatar was not trained on.
+
+    scales    whether the head's size is sought too
+    shading   harmonics (9, 3) of a factor by the surface's normal, by which the light differs
+    is_again  the starts are what the avatar has tracked. Otherwise they are some way off: the first
+              timestep is sought in small images first
+    """
+
+    scales: bool = False
+    shading: np.ndarray | None = None
+    is_again: bool = False
+
+
+def tracked_timesteps(
+    settings: TrainingSettings, capture: Capture, timesteps: Sequence[int]
+) -> list[int]:
+    """Those that an avatar tracks while it is trained for a number of iterations, evenly spread: as
+    many as TRACKED_SHARE allows. With a budget in seconds, all: time decides."""
+    if settings.iterations is None:
+        return list(timesteps)
+    wanted = set(timesteps)
+    shown = sum(view.timestep in wanted for views in capture.views.values() for view in views)
+    views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
+    most = int(TRACKED_SHARE * settings.iterations / views)
+    return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
+
+
 def track_by_avatar(
     avatar: Avatar,
     settings: TrainingSettings,
@@ -178,42 +213,45 @@ def track_by_avatar(
     timesteps: Sequence[int] | None = None,
     seconds: float | None = None,
     report: Callable[[int, int], bool] = lambda done, total: False,
-    is_far: bool = False,
-    scales: bool = False,
-    shading: np.ndarray | None = None,
-    is_again: bool = False,
+    recording: OtherRecording | None = None,
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
     settings: with which the avatar was trained, whose background and exposures the images have.
-    timesteps: None: all; as many of them, evenly spread, as `seconds` allow. report: how many are
-    done; returns whether to stop. is_far: the starts are some way off, as of another recording: the
-    first timestep is sought in small images first. scales: whether the head's size is sought too.
-    shading: harmonics (9, 3) of a factor by the surface's normal, by which the light differs.
-    is_again: the starts are what the avatar has tracked. Each timestep begins where the one before
-    has led. Raises StgaError where the capture has no parameters or is of another head, and
-    Cancelled.
+    timesteps: None: all; as many of them, evenly spread, as `seconds` allow, but at least two.
+    report: how many are done; returns whether to stop. recording: None: the avatar was trained on
+    the capture; covariances are left out. Each timestep begins where the one before has led. Raises
+    StgaError where the capture has no parameters or is of another head, and Cancelled.
     """
-    tracker = _Tracker(avatar, settings, capture, is_far, scales, shading, is_again)
-    found = []
-    chosen = list(capture.timesteps if timesteps is None else timesteps)
+    tracker = _Tracker(avatar, settings, capture, recording)
+    left = list(capture.timesteps if timesteps is None else timesteps)
     begin = perf_counter()
-    number = 0
-    while number < len(chosen):
-        if report(number, len(chosen)):
+    done = list[int]()
+    found = []
+    first_s = 0.0
+    while left:
+        if report(len(done), len(done) + len(left)):
             raise Cancelled
-        found.append(tracker.solve(chosen[number]))
-        number += 1
-        if number == 1 and seconds is not None:
-            most = int(seconds / (perf_counter() - begin))
-            chosen = sorted({chosen[0], *evenly_spread(chosen, max(2, most))})
-    values, information, misfit = map(np.stack, zip(*found, strict=True))
+        values, information, misfit = tracker.solve(left[0])
+        if recording is None:
+            information = np.zeros((0, 0))
+        found.append((values, information.astype(np.float32), misfit))
+        done.append(left.pop(0))
+        if seconds is None:
+            continue
+        spent_s = perf_counter() - begin
+        # the first one has a single start, and so costs less than those after it
+        first_s = first_s or spent_s
+        each_s = (spent_s - first_s) / (len(done) - 1) if len(done) > 1 else first_s
+        most = max(int((seconds - spent_s) / max(each_s, 1e-9)), int(len(done) == 1))
+        left = evenly_spread(left[::-1], most)[::-1] if most > 0 else []
+    parameters, known, missed = map(np.stack, zip(*found, strict=True))
+    scales = recording is not None and recording.scales
     added = np.s_[-RIGID_SIZE - SHIFT_SIZE - scales : -RIGID_SIZE]
-    shift, scale = np.split(values[:, added], [SHIFT_SIZE], axis=1)
-    rows = np.delete(values, added, axis=1)
+    shift, scale = np.split(parameters[:, added], [SHIFT_SIZE], axis=1)
+    rows = np.delete(parameters, added, axis=1)
     scale = 1 + scale.ravel()
-    known = information.astype(np.float32)
-    return AvatarTracking(tuple(chosen), rows, misfit, shift, scale, known)
+    return AvatarTracking(tuple(done), rows, missed, shift, scale, known)
 
 
 def normal_images(mesh: np.ndarray, faces: np.ndarray, shown: ArrayPair) -> ArrayPair:
@@ -245,16 +283,14 @@ class _Tracker:
         avatar: Avatar,
         settings: TrainingSettings,
         capture: Capture,
-        is_far: bool,
-        scales: bool,
-        shading: np.ndarray | None,
-        is_again: bool,
+        recording: OtherRecording | None,
     ) -> None:
         sequence = capture.flame
         if sequence is None:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
         if not np.array_equal(avatar.faces, capture.faces):
             raise StgaError(f"{capture.root}: is of another head than the avatar")
+        other = OtherRecording() if recording is None else recording
         self._avatar = avatar
         self._capture = capture
         self._settings = settings
@@ -265,14 +301,14 @@ class _Tracker:
         self._prepare = image_preparation(capture, settings)
         person = with_identity(sequence).model
         root = person.j_regressor[ROOT] @ person.v_template
-        grown = (person.v_template - root)[:, :, None][:, :, : int(scales)]
+        grown = (person.v_template - root)[:, :, None][:, :, : int(other.scales)]
         # what is sought beside the expressions, as if they were some
         shapes = [person.shapedirs, torso_shapes(person), grown]
         person = replace(person, shapedirs=np.concatenate(shapes, axis=2))
-        self._is_far = is_far
-        self._added = SHIFT_SIZE + scales
-        self._shading = shading
-        self._is_again = is_again
+        self._is_again = other.is_again
+        self._is_far = recording is not None and not other.is_again
+        self._added = SHIFT_SIZE + other.scales
+        self._shading = other.shading
         self._change: np.ndarray | None = None
         self._shown: list[ArrayPair] = []  # `rasterize` of the timestep's views, as tracked
         self._head = HeadModel(person, "flame")

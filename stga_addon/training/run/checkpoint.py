@@ -44,7 +44,9 @@ OTHER_RUN = "belongs to another run than run.json; remove it, or train into anot
 class Checkpoint:
     """State of training between two iterations: of the trainer, the session and the evaluator.
 
-    best_difference  of avatar.npz (`Quality.detail_difference`); ∞ before the first evaluation
+    lines      of metrics.jsonl that were written so far; None in earlier checkpoints: those up to
+               the iteration
+    tracking_gain  that the next evaluation is to tell, if any
     tracking   (T, P + 3) float64 `RefinedTracking.parameters`; None where they are not refined
     rounds     in which they were
     identity   digest of the run's identity
@@ -56,9 +58,10 @@ class Checkpoint:
     last_timestep: int | None
     initial_count: int
     elapsed_s: float
-    best_difference: float
     evaluations: int
     losses: list[float]
+    lines: int | None = None
+    tracking_gain: float | None = None
     tracking: np.ndarray | None = None
     rounds: int = 0
     identity: str = ""
@@ -155,9 +158,12 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
     stored = json.loads(packed.tobytes())
     if not isinstance(stored, dict):
         raise ValueError("meta is no object")
-    meta = {"rounds": 0, **stored}
+    meta = {"rounds": 0, "lines": None, "tracking_gain": None, **stored}
+    meta.pop("best_difference", None)  # of earlier checkpoints
     lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
     last, seconds, losses = (meta[name] for name in ("last_timestep", "elapsed_s", "losses"))
+    lines = meta["lines"]
+    gain = meta["tracking_gain"]
 
     def is_count(value: Any, low: int = 0) -> bool:
         return type(value) is int and low <= value < MAX_COUNT
@@ -169,7 +175,8 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
         **{n: (is_count(meta[n], m), f"a whole number from {m} up") for n, m in lowest.items()},
         "last_timestep": (last is None or is_count(last), "a timestep"),
         "elapsed_s": (is_number(seconds) and 0 <= seconds < math.inf, "seconds from 0 up"),
-        "best_difference": (is_number(meta["best_difference"]), "a number"),
+        "lines": (lines is None or is_count(lines), "a whole number from 0 up"),
+        "tracking_gain": (gain is None or type(gain) is float, "a number"),
         "losses": (isinstance(losses, list) and all(map(is_number, losses)), "a list of numbers"),
         "identity": (isinstance(meta["identity"], str), "a text"),
     }

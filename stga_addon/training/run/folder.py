@@ -217,7 +217,7 @@ def open_run(
     opened = join_takes(takes)
     check_identity(folder, run, opened)
     if run.continuation is not None:  # it was trained on the meshes that the run before has refined
-        opened = with_refined_tracking(opened, folder)
+        opened = with_refined_tracking(opened, folder, fitted=False)
     return OpenedRun(run, opened, tuple(takes))
 
 
@@ -303,10 +303,25 @@ def write_tracking(
     write_npz(folder / TRACKING, arrays, compressed=True)
 
 
-def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
+def read_tracking(folder: Path, sequence: FlameSequence) -> np.ndarray:
+    """(T, P + 3) that `write_tracking` wrote for the sequence. Raises StgaError if damaged."""
+    path = folder / TRACKING
+    motion = read_motion(path, sequence.model)
+    shift = read_npz(path).get(TORSO_SHIFT)
+    if motion.timesteps != sequence.timesteps or shift is None:
+        raise StgaError(f"{path}: expected {TORSO_SHIFT} and the timesteps of the run's capture")
+    parameters = [motion.frame(timestep).parameters for timestep in motion.timesteps]
+    return np.concatenate([np.stack(parameters), shift], axis=1)
+
+
+def with_refined_tracking(capture: Capture, folder: Path, fitted: bool = True) -> Capture:
     """The capture with the parameters that the run in `folder` refined, in the timesteps whose
     tracked parameters are those that the run started from: another capture stays unchanged. Raises
-    StgaError if the run's file is damaged."""
+    StgaError if the run's file is damaged.
+
+    fitted: also in timesteps without training views, whose heads the avatar has fitted to the very
+    images that it is measured by.
+    """
     path = folder / TRACKING
     sequence = capture.flame
     if sequence is None or not path.exists():
@@ -320,6 +335,9 @@ def with_refined_tracking(capture: Capture, folder: Path) -> Capture:
             f"{path}: tracked has shape {tracked.shape}, expected {count} timesteps first"
         )
     before = dict(zip(motion.timesteps, tracked, strict=True))
+    if not fitted:
+        trained = {view.timestep for view in capture.views.get("train", ())}
+        before = {timestep: values for timestep, values in before.items() if timestep in trained}
 
     def frame(timestep: int) -> FlameFrame:
         found = sequence.frame(timestep)

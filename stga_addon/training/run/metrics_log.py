@@ -13,7 +13,7 @@ METRICS = "metrics.jsonl"
 REQUIRED = ("iteration", "seconds", "splats", "evaluation_s", "wall_s")
 """Fields of every line."""
 TRACKING_GAIN = "tracking_gain_db"
-"""Field of PSNR that views left out of tracking by the avatar gained by it."""
+"""Field of PSNR that views left out of tracking by the avatar gained by it; NaN where none was."""
 FORECAST = ("seconds", "psnr", "error", "ahead", "gain")
 """Fields of a line's forecast, where it has one."""
 
@@ -51,9 +51,10 @@ def append_metrics(folder: Path, line: Mapping[str, Any]) -> None:
         raise StgaError(f"{folder / METRICS}: cannot be written ({error.strerror})") from error
 
 
-def cut_metrics(folder: Path, iteration: int) -> None:
-    """Remove the evaluations after `iteration`, which a resumed run makes again."""
-    kept = [line for line in read_metrics(folder) if line["iteration"] <= iteration]
+def cut_metrics(folder: Path, iteration: int, count: int | None = None) -> None:
+    """Remove the evaluations after `iteration`, which a resumed run makes again, and those beyond
+    the first `count`, which a stopped run has made for itself."""
+    kept = [line for line in read_metrics(folder)[:count] if line["iteration"] <= iteration]
     with replacing(folder / METRICS) as partial:
         partial.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 

@@ -26,7 +26,12 @@ from ...tracking.folder import REPORT_FILE, SPLIT_FILES
 from ...tracking.head_model import HeadModel
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
-from ..optimize.avatar_tracking import AvatarTracking, normal_images, track_by_avatar
+from ..optimize.avatar_tracking import (
+    AvatarTracking,
+    OtherRecording,
+    normal_images,
+    track_by_avatar,
+)
 from ..optimize.image_preparation import EXPOSURE_SCALE, fit_exposure
 from ..settings import TrainingSettings
 from .folder import AVATAR, avatar_version, open_refined, open_run, read_run
@@ -154,10 +159,8 @@ def _track_part(
             step()
         return False
 
-    again = source[-1] > 0
-    found = track_by_avatar(
-        avatar, settings, capture, timesteps, None, report, not again, scales, shading, again
-    )
+    recording = OtherRecording(scales, shading, is_again=source[-1] > 0)
+    found = track_by_avatar(avatar, settings, capture, timesteps, None, report, recording)
     step()
     names = ("parameters", "misfit", "shift", "scale", "information")
     return {name: getattr(found, name) for name in names}

@@ -23,6 +23,7 @@ from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
+from ...render.render import render_avatar
 from ...schema import to_json
 from ...selection import select_capture
 from ...tracking.folder import is_in_order
@@ -32,9 +33,11 @@ from ..evaluate.forecast import UNMATCHED
 from ..evaluate.metrics import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import (
     MAX_HEIGHT_PX,
+    AvatarTracking,
     RefinedTracking,
     read_small,
     track_by_avatar,
+    tracked_timesteps,
 )
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
@@ -57,8 +60,15 @@ TRACKING_TIME_SHARE = 0.2
 """Of the budget, after which the avatar tracks its head; what that may take of seconds."""
 LEFT_OUT_INTERVAL = 12
 LEFT_OUT_VIEWS = 24
+MIN_NEIGHBORS = 3
 """Where no camera is held out, every how many timesteps one is left out of that tracking; views
-that say whether it is kept."""
+that say whether it is kept; timesteps of which one has neighbors."""
+UNCHECKED = (
+    "no held-out view shows a timestep that is trained, and none of these lies between others"
+)
+SET_ASIDE = {AVATAR: "avatar_to_resume.npz", TRACKING: "tracking_to_resume.npz"}
+"""Files of a stopped run that belong to an evaluation of its own -> those that an unbroken run
+would have, put back when it is resumed."""
 Selection = Mapping[int, np.ndarray]
 """timestep -> (F,) bool: triangles."""
 RECENT_LOSSES = 100
@@ -134,7 +144,7 @@ class _Session:
     losses        of the last global iterations
     began         the clock at which the run would have begun, had it never been interrupted
     speed         iterations per second since this process began to train
-    tracking_gain TRACKING_GAIN, of which the next evaluation is to tell
+    tracking_gain TRACKING_GAIN, of which the next evaluation is to tell; NaN: nothing was left out
     interrupts    the first Ctrl-C
     """
 
@@ -149,7 +159,7 @@ class _Session:
     losses: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT_LOSSES))
     began: float = 0.0
     speed: float = 0.0
-    tracking_gain: dict[str, float] = field(default_factory=dict)
+    tracking_gain: float | None = None
     interrupts: list[int] = field(default_factory=list)
 
     def work(self) -> None:
@@ -158,32 +168,17 @@ class _Session:
         self._tell("Compiling kernels")
         precompile_kernels(self.run.device)
         lines = self.evaluator.lines
-        path = self.folder / AVATAR
         self.began = perf_counter() - (lines[-1]["wall_s"] if lines else 0.0)
-        if self._is_finished():  # a finished run was resumed
-            if not path.exists():
-                text = "it is written anew from the checkpoint, the last state of training"
-                _log.warning("%s was missing; %s", path, text)
-                self._tell("Writing the missing avatar from the checkpoint")
-                self._write_avatar()
-                self._write_residuals()
+        if self._is_whole():
+            self._write_what_is_missing()
             return
         with interrupt_requests() as self.interrupts:
             if self.run.continuation is not None and not lines:
                 self._evaluate()  # the avatar before, which the others are compared with
             self._train()
-            if self._is_finished():
-                # the timesteps of other splits, whose splats they do not change
-                tracking = self.trainer.tracking
-                views = self.capture.views
-                every = {view.timestep for own in views.values() for view in own}
-                unseen = every - {view.timestep for view in views["train"]}
-                if tracking is not None and tracking.has_moved and tracking.rounds == 1 and unseen:
-                    self._track(tracking, self.capture, sorted(unseen), sorted(unseen))
-            # LPIPS takes long, so a run that is stopped goes without
-            self._evaluate(perceptual=self._is_finished())
-            self._write_checkpoint()
-            if self._is_finished():
+            if not self._is_trained():
+                self._stop()
+            elif self._evaluate_finally():
                 self._tell("Measuring residuals")
                 self._write_residuals()
         self._tell("Interrupted" if self.interrupts else "Finished")
@@ -198,15 +193,16 @@ class _Session:
         first = trainer.iteration
         interval_s = _asked_interval_s()
         with self._loader() as loader:
-            while not self._spent().share >= 1:
+            while self._refinement_is_due() or not self._spent().share >= 1:
                 begin = perf_counter()
-                view, image, mask, mesh = next(loader)
-                loss = trainer.step(view, image, self._spent().share, mask, mesh)
-                self.elapsed_s += perf_counter() - begin
-                if loss is not None:
-                    self.losses.append(loss)
-                is_due = self._spent().share >= TRACKING_START_SHARE
-                if tracking is not None and is_due and not tracking.rounds:
+                # a run that was stopped in the middle of it has made the step before
+                if not self._refinement_is_due():
+                    view, image, mask, mesh = next(loader)
+                    loss = trainer.step(view, image, self._spent().share, mask, mesh)
+                    self.elapsed_s += perf_counter() - begin
+                    if loss is not None:
+                        self.losses.append(loss)
+                if tracking is not None and self._refinement_is_due():
                     begin = perf_counter()
                     self._refine(tracking)
                     self.elapsed_s += perf_counter() - begin
@@ -223,6 +219,64 @@ class _Session:
                 self.speed = (trainer.iteration - first) / elapsed_s
                 if self._tell("Training") or self.interrupts:
                     break
+
+    def _refinement_is_due(self) -> bool:
+        """Whether the avatar is to track its head now, before anything else."""
+        tracking = self.trainer.tracking
+        share = self._spent().share
+        return tracking is not None and not tracking.rounds and share >= TRACKING_START_SHARE
+
+    def _is_trained(self) -> bool:
+        return self._is_finished() and not self._refinement_is_due()
+
+    def _is_whole(self) -> bool:
+        """Whether the run is trained and evaluated, its unseen heads included."""
+        lines = self.evaluator.lines
+        evaluated = bool(lines) and lines[-1]["iteration"] == self.trainer.iteration
+        return self._is_trained() and evaluated and not self._unseen_timesteps()
+
+    def _unseen_timesteps(self) -> list[int]:
+        """Timesteps without training views that the avatar is still to track."""
+        tracking = self.trainer.tracking
+        views = self.capture.views
+        if tracking is None or not tracking.has_moved or tracking.rounds != 1:
+            return []
+        every = {view.timestep for members in views.values() for view in members}
+        return sorted(every - {view.timestep for view in views["train"]})
+
+    def _stop(self) -> None:
+        """Save the run for its resumption, and evaluate the avatar of now, which is kept meanwhile
+        where it is better: what an unbroken run would not have done is undone by `_resume`."""
+        self._write_checkpoint()
+        lines = self.evaluator.lines
+        if lines and lines[-1]["iteration"] == self.trainer.iteration:
+            return
+        self._record(self._measure(sets_aside=True))
+
+    def _evaluate_finally(self) -> bool:
+        """Evaluate what was trained, also with the heads of unseen timesteps fitted; False where
+        the report says to stop meanwhile."""
+        measured = self._measure(perceptual=True)
+        fitted = self._fit_unseen_heads()
+        if fitted is None:
+            self._write_checkpoint()
+        self._record({**measured, **(fitted or {})})
+        if fitted is not None:
+            self._write_checkpoint()
+        return fitted is not None
+
+    def _write_what_is_missing(self) -> None:
+        """Of the files of a finished run that was resumed."""
+        avatar, residuals = (self.folder / name for name in (AVATAR, folders.RESIDUALS))
+        if not avatar.exists():
+            text = "it is written anew from the checkpoint, the last state of training"
+            _log.warning("%s was missing; %s", avatar, text)
+            self._tell("Writing the missing avatar from the checkpoint")
+            self._write_avatar()
+            residuals.unlink(missing_ok=True)
+        if not residuals.exists():
+            self._tell("Measuring residuals")
+            self._write_residuals()
 
     def _loader(self) -> ViewLoader:
         """The views to train from here on."""
@@ -253,25 +307,65 @@ class _Session:
         """Let the avatar track the training timesteps; undone where views that are left out of it
         do not gain."""
         views = self.capture.views["train"]
+        before = tracking.parameters
         timesteps = sorted({view.timestep for view in views})
         left_out = [
             view for view in self.capture.views.get("val", ()) if view.timestep in timesteps
         ]
         tracked = timesteps
-        before = tracking.parameters
-        if not left_out and is_in_order(self.capture.root) is not False:
-            between = timesteps[LEFT_OUT_INTERVAL // 2 :: LEFT_OUT_INTERVAL]
+        has_neighbors = len(timesteps) >= MIN_NEIGHBORS
+        if not left_out and has_neighbors and is_in_order(self.capture.root) is not False:
+            middle = min(LEFT_OUT_INTERVAL, len(timesteps)) // 2
+            between = timesteps[middle::LEFT_OUT_INTERVAL]
             left_out = [view for view in views if view.timestep in between]
             tracked = [timestep for timestep in timesteps if timestep not in between]
         left_out = evenly_spread(left_out, LEFT_OUT_VIEWS)
         error = self._squared_error(left_out)
-        self._track(tracking, replace(self.capture, views={"train": views}), tracked, timesteps)
-        if tracking.rounds and left_out:
-            gain = 10 * math.log10(error / self._squared_error(left_out))
-            self.tracking_gain = {TRACKING_GAIN: round(gain, 3)}
-            if gain <= 0:
-                tracking.parameters = before
-                self.trainer.frames.clear()
+        capture = replace(self.capture, views={"train": views})
+        if not self._track(self._avatar(), tracking, capture, tracked, timesteps):
+            return
+        self.trainer.frames.clear()
+        self.strain_range = None
+        tracking.rounds += 1
+        self.tracking_gain = math.nan
+        if not left_out:
+            _log.warning("Tracking by the avatar is kept unchecked: %s", UNCHECKED)
+            return
+        gain = 10 * math.log10(error / self._squared_error(left_out))
+        self.tracking_gain = round(gain, 3)
+        if gain <= 0:
+            tracking.parameters = before
+            self.trainer.frames.clear()
+
+    def _fit_unseen_heads(self) -> dict[str, float] | None:
+        """Let the kept avatar track timesteps without training views, which changes no splat; its
+        quality with heads fitted so, to the images that it is measured by. Empty where none is
+        fitted; None where the report says to stop."""
+        tracking = self.trainer.tracking
+        unseen = self._unseen_timesteps()
+        if tracking is None or not unseen:
+            return {}
+        avatar = read_avatar(self.folder / AVATAR)
+        settings = self.run.settings
+        kept = RefinedTracking(self.capture, settings.convention)
+        kept.parameters = folders.read_tracking(self.folder, tracking.sequence)
+        found = self._track(avatar, kept, self.capture, unseen, unseen)
+        if found is None:
+            return None
+        tracking.take(found, unseen)
+        self.trainer.frames.clear()
+        tracking.rounds += 1
+        folders.write_tracking(self.folder, kept.sequence, kept.parameters, kept.tracked)
+        if not any(each.view.timestep in unseen for each in self.evaluator.views):
+            return {}
+        capture = kept.refined(self.capture)
+
+        def render(view: View) -> np.ndarray:
+            mesh = capture.mesh(view.timestep)
+            return render_avatar(avatar, mesh, view.camera, avatar.background)
+
+        quality = self.evaluator.measure(render, perceptual=True)
+        return metrics.with_fitted_heads({}, quality.as_json())
 
     def _squared_error(self, views: Sequence[View]) -> float:
         """Mean over the views, of images as high as the avatar tracks in; never quite 0."""
@@ -287,13 +381,14 @@ class _Session:
 
     def _track(
         self,
+        avatar: Avatar,
         tracking: RefinedTracking,
         capture: Capture,
-        tracked: list[int],
-        changed: list[int],
-    ) -> None:
-        """Track timesteps of a capture by the avatar, one round more; none where the report says to
-        stop. changed: the same and those between them, which change as their neighbors do."""
+        tracked: Sequence[int],
+        changed: Sequence[int],
+    ) -> AvatarTracking | None:
+        """Track timesteps of a capture by the avatar; None where the report says to stop. changed:
+        the same and those between them, which change as their neighbors do."""
 
         def stops(done: int, total: int) -> bool:
             told = self._tell(f"Tracking by the avatar: {done} of {total}")
@@ -301,17 +396,22 @@ class _Session:
 
         settings = self.run.settings
         capture = tracking.refined(capture)
+        chosen = tracked_timesteps(settings, capture, tracked)
         seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
         try:
-            found = track_by_avatar(self._avatar(), settings, capture, tracked, seconds, stops)
+            found = track_by_avatar(avatar, settings, capture, chosen, seconds, stops)
         except Cancelled:
-            return
+            return None
         tracking.take(found, changed)
-        self.trainer.frames.clear()
-        tracking.rounds += 1
+        return found
 
-    def _evaluate(self, perceptual: bool = False) -> None:
+    def _evaluate(self) -> None:
         """Evaluate, keep the avatar where that says so, and append a line of metrics."""
+        self._record(self._measure())
+
+    def _measure(self, perceptual: bool = False, sets_aside: bool = False) -> dict[str, float]:
+        """Fields of a metrics line of the avatar of now, which is written where it is to be kept;
+        sets_aside: after the one before was."""
         begin = perf_counter()
         share = min(1.0, self._spent().share)
         limits = None
@@ -323,21 +423,26 @@ class _Session:
             quality, is_kept = self.evaluator.evaluate(render, perceptual)
         self._require_folder()
         if is_kept:
+            for name, aside in SET_ASIDE.items() if sets_aside else ():
+                if (self.folder / name).exists():
+                    os.replace(self.folder / name, self.folder / aside)
             self._write_avatar()
-        now = perf_counter()
+        return {**quality, "evaluation_s": round(perf_counter() - begin, 3)}
+
+    def _record(self, measured: Mapping[str, float]) -> None:
+        gain = self.tracking_gain
         line = {
             "iteration": self.trainer.iteration,
             "seconds": round(self.elapsed_s, 3),
             "splats": len(self.trainer),
             **({"loss": float(np.mean(self.losses))} if self.losses else {}),
-            **quality,
-            **self.tracking_gain,
-            "evaluation_s": round(now - begin, 3),
-            "wall_s": round(now - self.began, 3),
+            **measured,
+            **({} if gain is None else {TRACKING_GAIN: gain}),
+            "wall_s": round(perf_counter() - self.began, 3),
             "peak_memory_mb": metrics.peak_memory_mb(),
         }
-        append_metrics(self.folder, self.evaluator.record(is_kept, line, self._spent()))
-        self.tracking_gain = {}
+        append_metrics(self.folder, self.evaluator.record(line, self._spent()))
+        self.tracking_gain = None
 
     def _spent(self) -> Spent:
         settings = self.run.settings
@@ -428,9 +533,10 @@ class _Session:
             trainer.last_timestep,
             trainer.initial_count,
             self.elapsed_s,
-            evaluator.best_difference,
             evaluator.count,
             list(self.losses),
+            len(evaluator.lines),
+            self.tracking_gain,
             None if tracking is None else tracking.parameters,
             0 if tracking is None else tracking.rounds,
             self.run.digest,
@@ -466,7 +572,15 @@ def _begin(
         state = starting_state(continuation, settings, len(capture.faces))
         checkpoints.check_fits(folder, capture, settings, state)
     # of a run whose run.json was removed
-    for stale in (TRACKING, CHECKPOINT, METRICS, checkpoints.STRAIN_RANGE, folders.WORLD_FILE):
+    for stale in (
+        TRACKING,
+        CHECKPOINT,
+        METRICS,
+        *SET_ASIDE.values(),
+        checkpoints.STRAIN_RANGE,
+        folders.WORLD_FILE,
+        folders.RESIDUALS,
+    ):
         (folder / stale).unlink(missing_ok=True)
     session = _session(capture, folder, run, selection, state, report)
     if continuation is not None and (continuation.parent / TRACKING).exists():
@@ -508,12 +622,15 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
         tracking.rounds = found.rounds
     session.elapsed_s = found.elapsed_s
     session.losses.extend(found.losses)
-    cut_metrics(folder, found.iteration)
+    session.tracking_gain = found.tracking_gain
+    cut_metrics(folder, found.iteration, found.lines)
     evaluator.lines = read_metrics(folder)
     evaluator.count = found.evaluations
-    evaluator.best_difference = found.best_difference
+    for name, aside in SET_ASIDE.items():
+        if (folder / aside).exists():
+            os.replace(folder / aside, folder / name)
     if not (folder / AVATAR).exists():
-        evaluator.best_difference = math.inf  # so that the next evaluation writes one
+        evaluator.keeps_latest = True  # those before are lost
     elif not session._is_finished():
         checkpoints.require_trained_range(folder / AVATAR, read_avatar(folder / AVATAR))
     folders.write_run(folder, run)  # capture, model and device may be others now
@@ -544,7 +661,7 @@ def _session(
         ]
     rows = settings.exposure  # where images are corrected for it
     exposure = metrics.known_exposure(rows, capture.views["train"]) if rows else None
-    evaluator = Evaluator(settings, views, run.continuation is not None, exposure)
+    evaluator = Evaluator(settings, views, exposure=exposure)
     return _Session(capture, folder, run, report, trainer, evaluator, strain_range)
 
 
