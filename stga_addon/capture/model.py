@@ -1,7 +1,7 @@
 """A capture in memory, whatever its layout on disk; its summary; several takes as one capture."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -82,6 +82,15 @@ def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
     if len(items) <= limit:
         return list(items)
     return [items[n] for n in np.linspace(0, len(items) - 1, limit).round().astype(int)]
+
+
+def cameras_at_once(views: Iterable[View]) -> int:
+    """Most cameras that show one timestep. A phone is one also where it took several takes, from
+    other places: they do not show together how far away anything is."""
+    at_once: dict[int, set[int]] = {}
+    for view in views:
+        at_once.setdefault(view.timestep, set()).add(view.camera_index)
+    return max(map(len, at_once.values()), default=0)
 
 
 def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:

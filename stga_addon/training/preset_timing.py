@@ -8,10 +8,11 @@ from time import perf_counter
 import numpy as np
 
 from ..capture.loader import ViewLoader
-from ..capture.model import Capture
+from ..capture.model import Capture, evenly_spread
 from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
+from .optimize.avatar_tracking import track_by_avatar, tracked_timesteps
 from .optimize.image_preparation import image_preparation
 from .optimize.precompile import precompile_kernels
 from .optimize.trainer import Trainer
@@ -24,6 +25,8 @@ CALIBRATION_VIEWS = 8
 """Views that the calibration trains, in turn."""
 WARM_UP_ITERATIONS = 3
 """First iterations that are not measured: they allocate memory."""
+TRACKED_TIMESTEPS = 3
+"""By which the time of tracking by the avatar is measured."""
 MAX_ITERATIONS = 2000
 """Limit for captures of a few pixels."""
 
@@ -69,12 +72,16 @@ def seconds_per_iteration(
 
     The short run passes through the whole schedule in `seconds`, so that coarse images, spherical
     harmonics, local iterations and growing numbers of splats have the weight that they have in a
-    real run. Reading files is not measured: in a real run, the loader's thread does it.
+    real run. What a run does once, tracking by its avatar included, is shared out among its
+    iterations. Reading images is not measured: in a real run, the loader's thread does it.
     """
     precompile_kernels(device)
     selective = settings.strategy == "selective"
     selection = select_capture(capture, settings.selection) if selective else {}
     trainer = Trainer(capture, settings, selection, device=device)
+    begin = perf_counter()
+    trainer.prepare_turns()
+    once_s = perf_counter() - begin
     # shares of the run at which splats are split: by its own count, this one hardly ever would
     (start, end) = settings.density_span
     interval = settings.density_interval
@@ -115,4 +122,32 @@ def seconds_per_iteration(
     # are quick.
     measured = times[WARM_UP_ITERATIONS:]
     step_s = float(np.average(measured, weights=measured))
-    return step_s + max(0.0, sum(split_s) - len(split_s) * step_s) / iterations
+    once_s += max(0.0, sum(split_s) - len(split_s) * step_s)
+    if settings.tracking and settings.seconds is None:
+        once_s += _tracking_seconds(trainer, replace(settings, iterations=iterations))
+    return step_s + once_s / iterations
+
+
+def _tracking_seconds(trainer: Trainer, settings: TrainingSettings) -> float:
+    """What tracking by the avatar takes in a run with the settings, measured on some timesteps; the
+    first one, which begins from a single start, is not."""
+    capture = trainer.capture
+    alone = replace(capture, views={"train": capture.views["train"]})
+    trained, every = (
+        {view.timestep for views in own.views.values() for view in views}
+        for own in (alone, capture)
+    )
+    counts = [
+        len(tracked_timesteps(settings, own, sorted(timesteps)))
+        for own, timesteps in ((alone, trained), (capture, every - trained))
+    ]
+    laps: list[float] = []
+
+    def note(done: int, total: int) -> bool:
+        laps.append(perf_counter())
+        return False
+
+    some = evenly_spread(sorted(trained), TRACKED_TIMESTEPS)
+    track_by_avatar(trainer.avatar("", None), settings, alone, some, None, note)
+    laps.append(perf_counter())
+    return sum(counts) * float(np.mean(np.diff(laps)[min(1, len(some) - 1) :]))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...avatar.strain import range_with_margin
+from ...light.harmonics import basis
 from ..optimize.image_preparation import fit_lines
 from .samples import Samples
 
@@ -16,6 +17,10 @@ CAMERA_FIT_ITERATIONS = 30
 """Alternations between cameras and triangles, slow as opposite cameras share few triangles."""
 CAMERA_PRIOR_SAMPLES = 5.0
 """Weight, in samples, of the prior that a camera is like the others."""
+LIGHT_RIDGE = 1.0
+EXPOSURE_RIDGE = 50.0
+"""Weights in samples of an even light, and of an even exposure of each view: where both explain
+what is seen, the one light does."""
 TYPICAL_LEVEL = 100.0
 """Of a color, in levels of 255; scales the prior of a gain."""
 MIN_EXPOSURE_LEVELS = 1.5
@@ -133,6 +138,35 @@ def fit_drift(samples: Samples, color: np.ndarray) -> np.ndarray:
         usual = np.stack([gain[row == camera].mean(0) for camera in range(row.max() + 1)])
         gain /= usual[row]
     return gain
+
+
+def fit_turning_light(samples: Samples, color: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Factors (S, K, 3) by which light that stays falls on triangles as they turn, from color (S,
+    K, 3), NaN if unseen: one light for all of them, by the normal, which is rest (K, 3) in the
+    neutral mesh. What follows it is no drift of the exposure, which all triangles share wherever
+    they face."""
+    judged = np.flatnonzero((~np.isnan(color[..., 0])).sum(0) > 1)
+    normal = rest + samples.signals["normal"]
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-9)
+    rows = basis(normal.reshape(-1, 3))[:, 1:].reshape(*normal.shape[:2], -1)
+    # logarithms of a triangle's color, a view's gain and the light add up
+    gains = np.broadcast_to(np.eye(len(color))[:, None], (len(color), len(judged), len(color)))
+    parts = np.concatenate([rows[:, judged], gains], axis=2)
+    ridge = np.repeat([LIGHT_RIDGE, EXPOSURE_RIDGE], [rows.shape[2], len(color)])
+    light = np.ones(color.shape)
+    for channel in range(3):
+        level = color[:, judged, channel]
+        weight = np.where(np.isnan(level), 0, np.square(np.nan_to_num(level)))
+        logarithm = np.log(np.maximum(np.nan_to_num(level), 1.0))
+        total = np.maximum(weight.sum(0), 1e-9)
+        y = logarithm - (weight * logarithm).sum(0) / total
+        x = parts - np.einsum("sk,skd->kd", weight, parts) / total[:, None]
+        weighted = (weight[..., None] * x).reshape(-1, x.shape[2])
+        matrix = weighted.T @ x.reshape(weighted.shape)
+        matrix += np.diag(ridge * max(float(weight.mean()), 1e-9))
+        found = np.linalg.solve(matrix, weighted.T @ y.ravel())
+        light[..., channel] = np.exp(rows @ found[: rows.shape[2]])
+    return light
 
 
 def drift_evidence(samples: Samples, color: np.ndarray) -> Evidence:

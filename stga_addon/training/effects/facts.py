@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from ...avatar.lattice import splats_per_triangle
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, cameras_at_once, evenly_spread
 from ...flame.forward import FlameFrame
 from ...flame.sequence import joint_angles
 from ...flame.teeth import lip_pairs
@@ -24,7 +24,7 @@ MIN_WHITE_SHARE = 0.1
 
 class CaptureFacts:
     """A capture with training views, and the settings and the device (`choose_device`) it is to be
-    trained with; cameras, timesteps: how many there are to train on."""
+    trained with; cameras, timesteps: how many there are to train on; has_one_camera: at a time."""
 
     def __init__(self, capture: Capture, settings: TrainingSettings, device: str = "cpu") -> None:
         self.capture = capture
@@ -33,6 +33,7 @@ class CaptureFacts:
         self.views = capture.views["train"]
         self.cameras = len({view.camera_index for view in self.views})
         self.timesteps = len({view.timestep for view in self.views})
+        self.has_one_camera = cameras_at_once(self.views) == 1
 
     @cached_property
     def samples(self) -> Samples:
@@ -50,15 +51,21 @@ class CaptureFacts:
     @cached_property
     def drift(self) -> np.ndarray:
         """(S, 3) gains of the sampled views against their camera's mean."""
-        return evidence.fit_drift(self.samples, self._matched_cameras)
+        return evidence.fit_drift(self.samples, self._evenly_lit)
 
     @cached_property
     def drifts(self) -> Evidence:
-        return evidence.drift_evidence(self.samples, self._matched_cameras)
+        return evidence.drift_evidence(self.samples, self._evenly_lit)
 
     @cached_property
-    def _matched_cameras(self) -> np.ndarray:
-        return self.camera_colors.undo(self.stable_colors, self.samples.camera)
+    def _evenly_lit(self) -> np.ndarray:
+        """(S, K, 3) stable colors without the differences between cameras, and without what light
+        that stays does to a head that turns."""
+        colors = self.camera_colors.undo(self.stable_colors, self.samples.camera)
+        a, b, c = self.capture.neutral[self.capture.faces[self.samples.faces]].swapaxes(0, 1)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+        return np.asarray(colors / evidence.fit_turning_light(self.samples, colors, normal))
 
     @cached_property
     def matched_colors(self) -> np.ndarray:
@@ -75,7 +82,7 @@ class CaptureFacts:
         samples = self.samples
         strain = samples.signals["smoothed_strain"]
         folds = {"frames": evidence.consecutive_folds(samples.timestep)}
-        if self.cameras > 1:
+        if not self.has_one_camera:
             folds["cameras"] = evidence.scattered_folds(samples.camera)
         return {
             kind: evidence.linear_evidence(

@@ -158,16 +158,16 @@ def hull_points(facts: CaptureFacts) -> Verdict:
         return Verdict(facts.settings.hull_points, reason)
     uncovered = float(samples.uncovered.sum() / max(samples.foreground.sum(), 1))
     reason = f"{uncovered:.1%} of the foreground lies beside the mesh"
-    if facts.cameras == 1:
+    if facts.has_one_camera:
         reason += "; a single camera does not show how far away, so that it becomes a flat layer"
     return Verdict(uncovered > MIN_UNCOVERED_SHARE, reason)
 
 
 def depth_limits(facts: CaptureFacts) -> Verdict:
     reason = "a single camera does not show how far in front of or behind the mesh a splat is"
-    if facts.cameras > 1:
+    if not facts.has_one_camera:
         reason = f"{facts.cameras} cameras show how far away a splat is"
-    return Verdict(facts.cameras == 1, reason)
+    return Verdict(facts.has_one_camera, reason)
 
 
 def density(facts: CaptureFacts) -> Verdict:
@@ -287,6 +287,10 @@ def tracking(facts: CaptureFacts) -> Verdict | None:
         if facts.device != "cpu":
             reason = f"FLAME's parameters are refined on the CPU only, not on {facts.device}"
         return Verdict(False, reason, fixed=True)
+    replaced = (facts.settings.effects or {}).get("background") != "off"
+    if facts.shows_backdrop and replaced:
+        reason = "images without a mask are cut by the very mesh that would be tracked"
+        return Verdict(False, f"{reason} (`stga track --mattes auto` makes masks)", fixed=True)
     if is_tracked(facts.capture.root):
         sharper = "splats see motion more sharply than landmarks do"
         return Verdict(True, f"the capture is from `stga track`: {sharper}")

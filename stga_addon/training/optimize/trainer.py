@@ -1,16 +1,18 @@
 """One training step: a view in, updated splats out."""
 
 from collections.abc import Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...avatar.file import Avatar
 from ...avatar.lattice import splats_per_triangle
 from ...avatar.offsets import OFFSETS
-from ...capture.model import Capture, View
+from ...capture.model import Capture, View, cameras_at_once
 from ...errors import StgaError
 from ...render.device import adapter_name
+from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
 from ..settings import CONTINUATIONS, TrainingSettings
 from . import post_step
@@ -115,10 +117,7 @@ class Trainer:
             state = new_state(splats, unseen_share(capture, settings.convention, splats))
             state = with_offsets(state, settings.driven_offsets, len(capture.faces))
         self._backend = make_backend(device, settings, self.frames, state)
-        self._outlines: list[post_step.Outline] | None = None
-        self._sides: post_step.UnseenSides | None = None
-        cameras = {view.camera_index for view in capture.views["train"]}
-        self._has_one_camera = len(cameras) == 1
+        self._has_one_camera = cameras_at_once(capture.views["train"]) == 1
         self.initial_count = len(self)
         if begins:
             orders = settings.lattice_order, settings.first_lattice_order
@@ -186,6 +185,49 @@ class Trainer:
         """With the splats' moving average: a new (3, H, W) float32 image over the background."""
         return self._backend.render(view, self._background, sh_degree(self.settings, progress))
 
+    def avatar(self, principal_point: str, strain_range: np.ndarray | None) -> Avatar:
+        """The avatar of now, made of moving averages; the arguments become its fields."""
+        state = self.state
+        settings = self.settings
+        capture = self.capture
+        return Avatar(
+            splats=state.splats(averaged=True),
+            convention=settings.convention,
+            neutral=capture.neutral.astype(np.float32),
+            faces=capture.faces,
+            settings=to_json(settings),
+            regions=dict(capture.regions),
+            background=settings.background,
+            antialiased=settings.antialiased,
+            principal_point=principal_point,
+            strain_range=strain_range,
+            driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
+        ).without_invisible_offsets
+
+    def prepare_turns(self) -> None:
+        """Find out now what the first turns of changes to the splats would find out once."""
+        if self._prunes_outside:
+            self._outlines  # noqa: B018
+        if self._colors_unseen_sides:
+            self._sides  # noqa: B018
+
+    @property
+    def _prunes_outside(self) -> bool:
+        """Where alpha is learned from masks."""
+        return self.settings.random_background
+
+    @property
+    def _colors_unseen_sides(self) -> bool:
+        return self._has_one_camera and self.strategy.region is None
+
+    @cached_property
+    def _outlines(self) -> list[post_step.Outline]:
+        return post_step.read_outlines(self.capture, self.settings.seed)
+
+    @cached_property
+    def _sides(self) -> post_step.UnseenSides:
+        return post_step.unseen_sides(self.capture)
+
     def _post_step(self, progress: float) -> None:
         """Change the splats after an optimizer step, where it is the turn of one of the changes."""
         settings = self.settings
@@ -198,9 +240,8 @@ class Trainer:
         moves_strays = is_turn(settings.stray_reset_interval)
         start, end = settings.density_span
         splits = start <= progress < end and is_turn(settings.density_interval)
-        # where alpha is learned from masks
-        prunes = settings.random_background and is_turn(OUTLINE_INTERVAL)
-        colors = self._has_one_camera and region is None and is_turn(SIDE_INTERVAL)
+        prunes = self._prunes_outside and is_turn(OUTLINE_INTERVAL)
+        colors = self._colors_unseen_sides and is_turn(SIDE_INTERVAL)
         if not (moves_strays or splits or prunes or colors):
             return
         state = self.state
@@ -217,12 +258,8 @@ class Trainer:
         if prunes:
             coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
             frames = partial(self.frames.moved, coefficients=coefficients)
-            if self._outlines is None:
-                self._outlines = post_step.read_outlines(self.capture, settings.seed)
             state = post_step.prune_outside(state, frames, self._outlines, region)
         if colors:
-            if self._sides is None:
-                self._sides = post_step.unseen_sides(self.capture)
             state = self._sides.restore(state)
         self.state = state
 

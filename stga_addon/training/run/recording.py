@@ -12,7 +12,7 @@ from ...avatar.file import Avatar, read_avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.mesh_geometry import Similarity, rasterize
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View, cameras_at_once, evenly_spread
 from ...capture.open import PARAMETERS, open_capture
 from ...errors import StgaError
 from ...files import read_json, read_npz, write_json, write_npz
@@ -71,7 +71,7 @@ def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
         raise StgaError(f"{run}: its head is neither FLAME nor the bundled one; expected either")
     head = HeadModel(with_identity(sequence).model, "flame")
     fit = HeadFit(head, sequence.shape, {}, IDENTITY, sequence.static_offset)
-    cameras = list(_cameras(capture).values())
+    cameras = list(cameras_of(capture).values())
     stored = read_run(run)
     avatar = read_avatar(run / AVATAR)
 
@@ -82,8 +82,15 @@ def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
     return KnownPerson(fit, draw, camera), stored.flame
 
 
-def _cameras(capture: Capture) -> dict[int, Camera]:
-    return {v.camera_index: v.camera for split in capture.views.values() for v in split}
+def cameras_of(capture: Capture) -> dict[int, Camera]:
+    """By their index; where never two show one timestep, as a phone's in several takes, the first
+    take's stands for all."""
+    views = [view for split in capture.views.values() for view in split]
+    views.sort(key=lambda view: view.timestep)
+    found = {view.camera_index: view.camera for view in views}
+    if cameras_at_once(views) > 1:
+        return found
+    return {view.camera_index: found[view.camera_index] for view in views[:1]}
 
 
 def track_recording(
@@ -171,8 +178,7 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
     off by some percent. One camera does not see scale. Returns the factor."""
     source = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0, 0
     avatar, settings, capture = _open(*source)
-    cameras = {view.camera_index for views in capture.views.values() for view in views}
-    if len(cameras) < 2:
+    if cameras_at_once(view for views in capture.views.values() for view in views) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     light = _light(avatar, settings, capture)
@@ -189,8 +195,8 @@ def _fit_rotation(run: Path, root: Path) -> np.ndarray | None:
     where there are other cameras, or where the images are explained worse then."""
     stored = read_run(run)
     capture = open_capture(root, stored.flame)
-    cameras = _cameras(capture)
-    usual = _cameras(open_run(run).capture)
+    cameras = cameras_of(capture)
+    usual = cameras_of(open_run(run).capture)
     if set(cameras) != set(usual):
         return None
     rotations = [

@@ -24,7 +24,6 @@ from ...files import replacing
 from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
 from ...render.render import render_avatar
-from ...schema import to_json
 from ...selection import select_capture
 from ...tracking.folder import is_in_order
 from ..evaluate import lpips, metrics
@@ -484,21 +483,7 @@ class _Session:
     def _avatar(self) -> Avatar:
         if self.strain_range is None:
             self._measure_refined_strain()
-        state = self.trainer.state
-        settings = self.run.settings
-        return Avatar(
-            splats=state.splats(averaged=True),
-            convention=settings.convention,
-            neutral=self.capture.neutral.astype(np.float32),
-            faces=self.capture.faces,
-            settings=to_json(settings),
-            regions=dict(self.capture.regions),
-            background=settings.background,
-            antialiased=settings.antialiased,
-            principal_point=self.run.principal_point,
-            strain_range=self.strain_range,
-            driven_offsets={n: each.average.copy() for n, each in state.driven_offsets.items()},
-        ).without_invisible_offsets
+        return self.trainer.avatar(self.run.principal_point, self.strain_range)
 
     def _measure_refined_strain(self) -> None:
         """Of the training timesteps, whose meshes refined tracking has moved."""

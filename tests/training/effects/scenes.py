@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from PIL import Image, ImageDraw
+from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.strain import deformation, strain_basis
 from stga_addon.capture.camera import Camera, look_at
@@ -16,6 +17,8 @@ SIZE = 100
 FOCAL = 420.0
 SUPERSAMPLED = 3
 NOISE = 1.5  # levels
+WINDOW = np.array([0.9, 0.1, 0.42])
+"""Unit vector toward the window."""
 
 Paint = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """(deformation (F, 6), unit direction from the camera (F, 3), unit place on the ball (F, 3)) ->
@@ -54,8 +57,9 @@ def unlike_cameras() -> tuple[np.ndarray, np.ndarray]:
 @dataclass(frozen=True)
 class Scene:
     """What to paint: gain (cameras, 3) and offset (cameras, 3) in levels, gain over time
-    (timesteps, 3), what else colors depend on, the color behind the ball, and how far timesteps
-    deform it."""
+    (timesteps, 3), what else colors depend on, the color behind the ball, how far timesteps deform
+    it, by how many radians (timesteps,) they turn it, and by which share a window beside it lights
+    what faces it more."""
 
     cameras: int = 8
     timesteps: int = 8
@@ -67,6 +71,8 @@ class Scene:
     deformed: float = 1.0
     masks: bool = True
     seed: int = 0
+    turned: np.ndarray | None = None
+    window: float = 0.0
 
 
 def photograph(folder: Path, scene: Scene) -> Capture:
@@ -78,6 +84,9 @@ def photograph(folder: Path, scene: Scene) -> Capture:
     place = vertices[faces].mean(1) / 0.1
     colors = _own_colors(place, rng)
     meshes = {t: _deform(vertices, t, scene.deformed) for t in range(scene.timesteps)}
+    if scene.turned is not None:
+        turns = Rotation.from_rotvec(np.outer(scene.turned, [0, 1, 0])).as_matrix()
+        meshes = {t: mesh @ turns[t].T for t, mesh in meshes.items()}
     basis = strain_basis(vertices, faces)
     views = []
     for t, mesh in meshes.items():
@@ -87,6 +96,10 @@ def photograph(folder: Path, scene: Scene) -> Capture:
             away = mesh[faces].mean(1) - camera.position
             away /= np.linalg.norm(away, axis=1, keepdims=True)
             seen = colors + scene.paint(deformed, away, place)[:, None]
+            a, b, c3 = mesh[faces].swapaxes(0, 1)
+            normal = np.cross(b - a, c3 - a)
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            seen = seen * (1 + scene.window * normal @ WINDOW)[:, None]
             if scene.drift is not None:
                 seen = seen * scene.drift[t]
             if scene.gain is not None:
