@@ -16,13 +16,18 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.jobs.batch import engines
+from stga_addon.jobs.batch import run as batch_run
 from stga_addon.jobs.batch.engines import LocalEngine
 from stga_addon.jobs.batch.folder import LOCK, hold_batch, is_done, prepare, read_record
 from stga_addon.jobs.batch.plan import Ended, Job, Resources, make_plan
+from stga_addon.jobs.batch.report import write_report
 from stga_addon.jobs.batch.run import MAX_RETRIES, Batch, JobState
 from stga_addon.jobs.blender import RenderBlend
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.progress import Progress
+from stga_addon.training.run.folder import Run, write_run
+from stga_addon.training.run.metrics_log import append_metrics
+from stga_addon.training.settings import TrainingSettings
 from stga_addon.worker import lock, status
 from stga_addon.worker.status import StatusWriter, WorkerState, inspect_worker
 
@@ -175,6 +180,59 @@ def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch, takes_all):
     assert record is not None
     assert now == queue_s + work_s
     assert record.seconds == entry.seconds == work_s
+
+
+def test_the_pace_of_this_machine_is_measured_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a plan of 200 trainings whose forecast takes 200 calibrations, and one time that is
+    given to all of them whatever their iterations are."""
+    (tmp_path / "capture").mkdir()
+    iterations = {"standard": 1900, "draft": 500, "own": 40}
+    train = {"request": "train", "capture": "capture"}
+    jobs = {name: {**train, "settings": {"preset": name}} for name in ("standard", "draft")}
+    jobs["own"] = {**train, "settings": {"iterations": 40}}
+    batch = Batch(make_plan({"out": "runs", "job": jobs}, tmp_path, "plan"))
+    measured = []
+
+    def pace(job: Job, request: Any, iterations: int) -> float:
+        measured.append(job.name)
+        return 0.5
+
+    monkeypatch.setattr(batch_run, "pace", pace)
+    batch_run.set_forecasts(batch)
+    assert len(measured) == 1
+    found = {name: entry.forecast_s for name, entry in batch.entries.items()}
+    assert found == {name: 0.5 * count for name, count in iterations.items()}
+
+
+def test_the_report_shows_the_avatar_that_is_kept(tmp_path: Path) -> None:
+    """Catches figures of an earlier state for a continuation, which keeps its latest, and heads
+    fitted to held-out images in a column that is not called so."""
+    lines = [(25.0, 0.1, {}), (24.0, 0.2, {"psnr_fitted_heads": 27.25})]
+    for name, strategy in (("whole", "global"), ("refined", "refine")):
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        settings = TrainingSettings(iterations=2, strategy=strategy)
+        write_run(folder, Run(tmp_path, None, "vhap", settings))
+        for number, (psnr, detail, more) in enumerate(lines):
+            line = {"iteration": number, "seconds": float(number), "splats": 10 + number}
+            line |= {"evaluation_s": 0.1, "wall_s": 1.0, "psnr": psnr, "ssim": 0.9}
+            append_metrics(folder, {**line, "detail_difference": detail, **more})
+    train = {"request": "train", "capture": "capture", "settings": {"iterations": 2}}
+    jobs = dict.fromkeys(("whole", "refined"), train)
+    (tmp_path / "capture").mkdir()
+    batch = Batch(make_plan({"out": "runs", "job": jobs}, tmp_path, "plan"))
+    for entry in batch.entries.values():
+        entry.state = JobState.FINISHED
+    text = write_report(batch).read_text()
+    cells = text.split("<tr>")
+    rows = {name: next(row for row in cells if f"<td>{name}</td>" in row) for name in jobs}
+    assert "25.00" in rows["whole"]
+    assert "24.00" in rows["refined"]
+    assert "25.00" not in rows["refined"]
+    assert all("27.25" in row for row in rows.values())
+    assert "PSNR, heads fitted" in text
 
 
 def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:

@@ -34,8 +34,10 @@ from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
     AvatarTracking,
+    OtherRecording,
     RefinedTracking,
     track_by_avatar,
+    tracked_timesteps,
 )
 from stga_addon.training.optimize.cpu_backend import frame_gradient
 from stga_addon.training.optimize.trainer import Trainer
@@ -142,6 +144,60 @@ def test_a_timestep_begins_where_the_one_before_led(
         track_by_avatar(*person, capture, TIMESTEPS[:2])
         assert not starts[TIMESTEPS[0]].any()
         np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
+
+
+@pytest.mark.parametrize(("allowed_s", "most"), [(0.5, 2), (30.0, 6), (1000.0, 30)])
+def test_time_is_kept_to(
+    allowed_s: float,
+    most: int,
+    right: Made,
+    person: tuple[Avatar, TrainingSettings],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Catches a time that is judged by the first timestep, which costs a fifth of the others, and
+    matrices of each timestep that nobody reads."""
+    clock = [0.0]
+
+    class Slow:
+        solved = 0
+
+        def __init__(self, *_: Any) -> None:
+            clock[0] = Slow.solved = 0
+
+        def solve(self, timestep: int) -> tuple[np.ndarray, np.ndarray, float]:
+            clock[0] += 5.0 if Slow.solved else 1.0
+            Slow.solved += 1
+            return np.full(23, timestep, float), np.eye(23), 0.0
+
+    monkeypatch.setattr(avatar_tracking, "_Tracker", Slow)
+    monkeypatch.setattr(avatar_tracking, "perf_counter", lambda: clock[0])
+    found = track_by_avatar(*person, right[0], range(30), allowed_s)
+    assert found.timesteps[0] == 0
+    assert 1 < len(found.timesteps) <= most + 1
+    assert len(found.timesteps) >= min(most, 5)
+    assert clock[0] <= allowed_s + 6.0
+    assert found.information.size == 0
+    other = track_by_avatar(*person, right[0], range(30), recording=OtherRecording())
+    assert other.information.shape == (30, 23, 23)
+
+
+def test_a_long_take_tracks_no_longer_than_it_trains(right: Made) -> None:
+    """Catches 1,800 frames that a preset of 500 iterations tracks one by one, and short takes that
+    are no longer tracked as a whole."""
+    capture = right[0]
+    settings = quick_settings("global", iterations=500)
+    (view, *_) = capture.views["train"]
+    long = replace(capture, views={"train": [replace(view, timestep=t) for t in range(1800)]})
+    chosen = tracked_timesteps(settings, long, range(1800))
+    assert len(chosen) == 100
+    assert (chosen[0], chosen[-1]) == (0, 1799)
+    assert tracked_timesteps(settings, long, range(12)) == list(range(12))
+    assert len(tracked_timesteps(replace(settings, iterations=1), long, range(1800))) == 12
+    timed = replace(settings, iterations=None, seconds=5.0)
+    assert len(tracked_timesteps(timed, long, range(1800))) == 1800
+    four = [replace(view, timestep=t, camera_index=n) for t in range(90) for n in range(8)]
+    wide = replace(capture, views={"train": four})
+    assert len(tracked_timesteps(settings, wide, range(90))) == 25
 
 
 def test_timesteps_between_change_as_their_neighbors(lost: Made) -> None:

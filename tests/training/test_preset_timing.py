@@ -7,6 +7,7 @@ import pytest
 
 from stga_addon.errors import StgaError
 from stga_addon.training import preset_timing, schedule
+from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.preset_timing import (
     WARM_UP_ITERATIONS,
     seconds_per_iteration,
@@ -35,9 +36,13 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
         state = 1000
         settings = make_settings(iterations=1)
+        once_s = 0.0
 
         def __init__(self, *_: Any, **__: Any) -> None:
             pass
+
+        def prepare_turns(self) -> None:
+            watch.now += self.once_s
 
         def step(self, view: Any, image: Any, share: float, mask: Any, mesh: Any) -> None:
             assert not image.flags.writeable
@@ -96,3 +101,42 @@ def test_iterations_grow_with_the_capture():
     for name in PRESETS:
         changed = make_settings(preset=name, seconds=1.0, lattice=3)
         assert (changed.preset, changed.lattice) == (name, 3)
+
+
+def test_what_is_done_once_is_no_step(toy, shares, monkeypatch):
+    """Catches the search for outlines and unseen sides taken for a step of every iteration, and
+    presets without the time in which the avatar tracks its head."""
+    settings = make_settings(iterations=1000, coarse_share=0, density_interval=0)
+    before = seconds_per_iteration(toy, settings, 1000, 2.4)
+    monkeypatch.setattr(preset_timing.Trainer, "once_s", 5.0)
+    assert seconds_per_iteration(toy, settings, 1000, 2.4) == pytest.approx(before + 0.005)
+    asked: list[int] = []
+
+    def track(*arguments: Any) -> None:
+        some = arguments[3]
+        note = arguments[5]
+        for number in range(len(some)):
+            note(number, len(some))
+            preset_timing.perf_counter.now += 0.3 if number else 0.1
+        asked.append(len(some))
+
+    trainer = preset_timing.Trainer
+    monkeypatch.setattr(trainer, "capture", toy, raising=False)
+    monkeypatch.setattr(trainer, "avatar", lambda *_: None, raising=False)
+    monkeypatch.setattr(preset_timing, "track_by_avatar", track)
+    tracked = seconds_per_iteration(toy, replace(settings, tracking=True), 1000, 2.4)
+    # three timesteps to train on, and one that is not
+    assert tracked == pytest.approx(before + 0.005 + 4 * 0.3 / 1000)
+    assert asked == [3]
+    timed = replace(settings, tracking=True, iterations=None, seconds=60.0)
+    assert seconds_per_iteration(toy, timed, 1000, 2.4) == pytest.approx(before + 0.005)
+
+
+def test_one_phones_sides_are_found_before_they_are_timed(toy):
+    """Catches one-off work that a trainer would still do in a step."""
+    first = toy.views["train"][0].camera_index
+    views = tuple(view for view in toy.views["train"] if view.camera_index == first)
+    settings = make_settings(iterations=1, hull_points=False, lattice=0)
+    trainer = Trainer(replace(toy, views={"train": views}), settings, {})
+    trainer.prepare_turns()
+    assert {"_outlines", "_sides"} <= vars(trainer).keys()

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.file import write_avatar
 from stga_addon.capture.mesh_geometry import Similarity, rasterize
+from stga_addon.capture.model import cameras_at_once, join_takes
 from stga_addon.capture.open import open_capture
 from stga_addon.files import read_json, write_json
 from stga_addon.progress import Cancelled
@@ -23,16 +24,25 @@ from stga_addon.tracking.folder import (
     read_torso_points,
     write_torso_points,
 )
+from stga_addon.training.effects.facts import CaptureFacts
+from stga_addon.training.effects.plan import depth_limits
 from stga_addon.training.optimize.avatar_tracking import (
     normal_images,
     track_by_avatar,
 )
+from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.folder import AVATAR, Run, write_run
-from stga_addon.training.run.recording import avatar_person, move_capture, track_recording
+from stga_addon.training.run.recording import (
+    avatar_person,
+    cameras_of,
+    move_capture,
+    track_recording,
+)
 from stga_addon.worker.helpers import Helpers
 
 from .heads import TIMESTEPS
 from .test_avatar_tracking import lost, millimeters, person, right  # noqa: F401
+from .toys import quick_settings
 
 SCALE = 1.02
 GAIN = 0.85
@@ -172,3 +182,31 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
         calls.clear()
         track_recording(run, root, Helpers(1, tmp_path / "kept"), ignore)
         assert calls == expected
+
+
+def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa: F811
+    """Catches an avatar of one phone that, extended by a second take, no longer tells the focal
+    length of its camera and how the world is turned, and whose depth is left free."""
+    first = lost[0]
+    index = first.views["train"][0].camera_index
+    views = {"train": tuple(v for v in first.views["train"] if v.camera_index == index)}
+    phone = replace(first, views=views)
+    place = np.eye(4)
+    place[:3, 3] = 0.02
+    poses = [view.camera.world_to_camera @ place for view in views["train"]]
+    again = tuple(
+        replace(view, camera=replace(view.camera, fl_x=99.0, world_to_camera=pose))
+        for view, pose in zip(views["train"], poses, strict=True)
+    )
+    joined = join_takes([phone, replace(phone, views={"train": again})])
+    every = joined.views["train"]
+    assert len({view.camera_index for view in every}) == 2
+    assert cameras_at_once(every) == 1
+    assert cameras_at_once(first.views["train"]) == 4
+    (camera,) = cameras_of(joined).values()
+    assert camera == views["train"][0].camera
+    assert len(cameras_of(first)) > 1
+    settings = quick_settings("global", lattice=0)
+    for capture, is_one in ((joined, True), (first, False)):
+        assert depth_limits(CaptureFacts(capture, settings)).on == is_one
+        assert Trainer(capture, settings, {})._colors_unseen_sides == is_one

@@ -328,6 +328,8 @@ def test_mesh_and_mask_disagree(painted, tmp_path):
     assert 0.5 < float(found.reason.split("%")[0]) < 5.0
     unknown = rules.tracking(off_track(painted(masks=False), 0.012))
     assert (unknown.on, unknown.fixed) == (False, False)
+    cut = rules.tracking(off_track(painted(masks=False, background=(90, 120, 60)), 0.012))
+    assert (cut.on, cut.fixed) == (False, True)  # by the mesh that would be tracked
     for impossible in (
         off_track(painted(timesteps=1), 0.012),
         off_track(painted(), 0.012, "cuda:0"),
