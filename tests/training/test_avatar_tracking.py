@@ -146,6 +146,27 @@ def test_a_timestep_begins_where_the_one_before_led(
         np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
 
 
+def test_without_masks_the_mesh_that_is_tried_cuts(
+    person: tuple[Avatar, TrainingSettings], lost: Made, tmp_path: Path
+) -> None:
+    """Catches images cut by the very mesh whose place is sought, which say that it is right."""
+    capture, true = lost
+    views = []
+    for view in capture.views["train"]:
+        assert view.mask is not None
+        mask, image = (np.asarray(Image.open(path)) for path in (view.mask, view.image))
+        path = tmp_path / f"{view.timestep}_{view.camera_index}.png"
+        Image.fromarray(np.where(mask[..., None] > 0, image, np.uint8(90))).save(path)
+        views.append(replace(view, mask=None, image=path))
+    bare = replace(capture, views={"train": tuple(views)})
+    tracking = RefinedTracking(capture, "stga")
+    settings = replace(person[1], backdrop="mesh")
+    tracking.take(track_by_avatar(person[0], settings, bare, TIMESTEPS[:-1]), TIMESTEPS[:-1])
+    before = millimeters(capture, true)
+    after = millimeters(tracking.refined(capture), true)
+    assert np.median(after[:-1] / before[:-1]) < 0.6
+
+
 @pytest.mark.parametrize(("allowed_s", "most"), [(0.5, 2), (30.0, 6), (1000.0, 30)])
 def test_time_is_kept_to(
     allowed_s: float,

@@ -14,13 +14,14 @@ from time import perf_counter
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.ndimage import binary_erosion
 from scipy.optimize import minimize
 
 from ...avatar.file import Avatar
 from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.loader import Preparation
-from ...capture.mesh_geometry import ArrayPair, rasterize, vertex_normals
+from ...capture.mesh_geometry import ArrayPair, rasterize, silhouette, vertex_normals
 from ...capture.model import Capture, View, evenly_spread
 from ...capture.open import with_sequence
 from ...errors import StgaError
@@ -38,7 +39,7 @@ from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import SHIFT_SIZE, sequence_mesh, torso_offset, torso_shapes, with_identity
 from ...light.harmonics import basis
 from ...progress import Cancelled
-from ...render.render import render_avatar
+from ...render.render import render_avatar, to_uint8
 from ...tracking import appearance, solve
 from ...tracking.appearance import NOISE_LEVELS, POINT_SHARE
 from ...tracking.head_model import HeadModel
@@ -49,6 +50,7 @@ from ..settings import TrainingSettings
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
+from .post_step import TOLERANCE_SHARE
 from .state import state_of_avatar
 
 RENDERINGS = 7
@@ -298,7 +300,9 @@ class _Tracker:
         self._views: dict[int, list[View]] = {}
         for view in (view for views in capture.views.values() for view in views):
             self._views.setdefault(view.timestep, []).append(view)
-        self._prepare = image_preparation(capture, settings)
+        self._cuts = settings.backdrop == "mesh"
+        whole = replace(settings, backdrop="masked") if self._cuts else settings
+        self._prepare = image_preparation(capture, whole)
         person = with_identity(sequence).model
         root = person.j_regressor[ROOT] @ person.v_template
         grown = (person.v_template - root)[:, :, None][:, :, : int(other.scales)]
@@ -429,6 +433,21 @@ class _Tracker:
             shots.append((view, image))
         return shots
 
+    def _cut(self, view: View, image: np.ndarray) -> np.ndarray:
+        """The image (H, W, 3) uint8 and, where no mask tells what lies behind the head, the avatar
+        itself beyond the mesh that is being tried: what is not known pulls nowhere. Cut by the mesh
+        that was tracked, the image would say that the head has not moved."""
+        if not self._cuts or view.mask is not None:
+            return image
+        margin = max(1, round(TOLERANCE_SHARE * len(image)))
+        inside = silhouette(self._mesh(view.timestep), self._capture.faces, view.camera)
+        inside = binary_erosion(inside, iterations=margin)
+        background = np.array(self._settings.background, np.float32)
+        drawn = to_uint8(self._backend.render(view, background, sh_degree(self._settings, 1.0)))
+        shown = np.where(inside[..., None], image, drawn)
+        shown.setflags(write=False)
+        return shown
+
     def _precision(self) -> np.ndarray:
         """(E + 18,) inverse variances of the change; joints that the model lacks do not turn."""
         count = self._head.model.n_expression
@@ -461,6 +480,7 @@ class _Tracker:
         self._values = values
         self._frames.clear()
         background = np.array(self._settings.background, np.float32)
+        shots = [(view, self._cut(view, image)) for view, image in shots]
         weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
         degree = sh_degree(self._settings, 1.0)
         total, by_vertex = self._backend.mesh_gradient(shots, weights, background, degree)
