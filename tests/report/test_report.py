@@ -11,8 +11,8 @@ from command_line import stga
 from PIL import Image
 
 from stga_addon import report
-from stga_addon.development.benchmark.benchmark import benchmark_chart
-from stga_addon.development.benchmark.statistics import MeanCurve
+from stga_addon.development.benchmark.benchmark import benchmark_chart, report_text
+from stga_addon.development.benchmark.statistics import MeanCurve, Outcome
 from stga_addon.format import describe_figures
 from stga_addon.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training import preset_timing
@@ -91,6 +91,13 @@ def test_both_qualities_are_named() -> None:
     assert second.startswith("held-out views, heads of unseen timesteps fitted to them by the ")
     assert second.endswith(": 26.00 dB, SSIM 0.9500")
     assert third == "tracking by the avatar: kept unchecked: no view could be left out of it"
+    quality = {"val": {"psnr": 23.0, "ssim": 0.9, "psnr_fitted_heads": 26.0}}
+    lines = [{**line, "splats": 7, "wall_s": 1.0} for line in values]
+    table = report_text([Outcome("standard", 0, lines, quality)], {}, 60.0, Path("anna"))
+    titles, _, row = (line.split("|") for line in table.splitlines() if line.startswith("| "))
+    figures = dict(zip(map(str.strip, titles), map(str.strip, row), strict=True))
+    assert (figures["val"], figures["val fitted heads"]) == ("23.00", "26.00")
+    assert "the avatar has fitted those of unseen timesteps to the images" in table
 
 
 def test_summary_of_a_continuation() -> None:
