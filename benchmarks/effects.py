@@ -162,7 +162,7 @@ def trained(
             train(capture, Path(folder), Run(capture.root, flame, "vhap", settings, plan))
         )
         seconds = read_metrics(Path(folder))[-1]["seconds"]
-        shown = with_refined_tracking(capture, Path(folder))
+        shown = with_refined_tracking(capture, Path(folder), fitted=False)
     splits = [split for split in ("val", "test") if shown.views.get(split)]
     found = {split: evaluate_avatar(avatar, shown, split, True, matched) for split in splits}
     return (
