@@ -16,6 +16,7 @@ from stga_addon.avatar.strain import (
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
 from stga_addon.files import write_npz
+from stga_addon.training.evaluate.forecast import kept_line
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.run.checkpoint import STRAIN_RANGE, trained_strain_range
@@ -150,7 +151,7 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_
     settings = quick_settings("global", driven_offsets=COLORS, rates=rates, **plain)
     capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
     path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
-    best = min(read_metrics(tmp_path / "run"), key=lambda line: line["detail_difference"])
+    best = kept_line(read_metrics(tmp_path / "run"), settings)
     found = evaluate_avatar(read_avatar(path), capture, "val").psnr
     assert found == pytest.approx(best["psnr"], abs=1e-3)
 
