@@ -163,7 +163,7 @@ def fit_turning_light(samples: Samples, color: np.ndarray, rest: np.ndarray) -> 
         x = parts - np.einsum("sk,skd->kd", weight, parts) / total[:, None]
         weighted = (weight[..., None] * x).reshape(-1, x.shape[2])
         matrix = weighted.T @ x.reshape(weighted.shape)
-        matrix += np.diag(ridge * max(float(weight.mean()), 1e-9))
+        matrix += np.diag(ridge * max(float(weight.sum()) / max(weight.size, 1), 1e-9))
         found = np.linalg.solve(matrix, weighted.T @ y.ravel())
         light[..., channel] = np.exp(rows @ found[: rows.shape[2]])
     return light

@@ -1,11 +1,13 @@
 """Exposure of a camera that drifts while it records, as a phone's does."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stga_addon.avatar.file import read_avatar
+from stga_addon.training.effects.evidence import fit_turning_light
 from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.image_preparation import view_exposure
@@ -89,3 +91,13 @@ def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path)
         assert quality.psnr_unmatched is None
         psnr[choice] = quality.psnr
     assert psnr["on"] > psnr["off"] + 1.5
+
+
+def test_light_of_a_head_that_is_never_seen_twice():
+    """Catches a warning, or a light that is not a number, where nothing can be compared."""
+    rest = np.tile([0.0, 0.0, 1.0], (5, 1))
+    color = np.full((3, 5, 3), np.nan)
+    samples = SimpleNamespace(signals={"normal": np.zeros((3, 5, 3), np.float32)})
+    for shown in (color, np.where(np.eye(3, 5)[..., None] > 0, 100.0, color)):
+        with np.errstate(all="raise"):
+            np.testing.assert_array_equal(fit_turning_light(samples, shown, rest), 1.0)
