@@ -1,13 +1,14 @@
 """How long each preset would train on this machine, measured on the capture itself."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import cycle, islice
 from time import perf_counter
 
 import numpy as np
 
-from ..capture.loader import ViewLoader
+from ..capture.loader import LoadedView, ViewLoader
 from ..capture.model import Capture, evenly_spread
 from ..errors import StgaError
 from ..selection import select_capture
@@ -90,20 +91,8 @@ def seconds_per_iteration(
     left = deque(turns)
     split_s = list[float]()
     trainer.settings = replace(settings, density_interval=0)
-    trained = capture.views["train"]
-    order = view_order(trained, settings.views_per_visit, settings.seed)
-    views = list(islice(order, CALIBRATION_VIEWS))
-    scales = image_scales(settings, trained)
-    red, green, blue = (round(255 * c) for c in settings.background)
-    loader = ViewLoader(
-        [*views, *views],
-        lambda position: scales[position // len(views)],
-        (red, green, blue),
-        prepare=image_preparation(capture, settings),
-        mesh=capture.mesh,
-    )
-    with loader:
-        loaded = {scale: cycle([*islice(loader, len(views))]) for scale in scales}
+    scales = image_scales(settings, capture.views["train"])
+    loaded = _loaded_views(capture, settings, scales)
     times: list[float] = []
     while sum(times[WARM_UP_ITERATIONS:]) < seconds and len(times) < MAX_ITERATIONS:
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
@@ -126,6 +115,24 @@ def seconds_per_iteration(
     if settings.tracking and settings.seconds is None:
         once_s += _tracking_seconds(trainer, replace(settings, iterations=iterations))
     return step_s + once_s / iterations
+
+
+def _loaded_views(
+    capture: Capture, settings: TrainingSettings, scales: tuple[float, float]
+) -> dict[float, Iterator[LoadedView]]:
+    """Scale -> CALIBRATION_VIEWS as the loader gives them, in turn without end."""
+    order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
+    views = list(islice(order, CALIBRATION_VIEWS))
+    red, green, blue = (round(255 * c) for c in settings.background)
+    loader = ViewLoader(
+        [*views, *views],
+        lambda position: scales[position // len(views)],
+        (red, green, blue),
+        prepare=image_preparation(capture, settings),
+        mesh=capture.mesh,
+    )
+    with loader:
+        return {scale: cycle([*islice(loader, len(views))]) for scale in scales}
 
 
 def _tracking_seconds(trainer: Trainer, settings: TrainingSettings) -> float:
