@@ -149,7 +149,7 @@ def test_spz_that_was_written_here(tmp_path):
         (b"NGSP\4\0\0\0\1\0\0\0\0\0\0\0", "version 4; read are 1 to 3"),
         (gzip.compress(b"NGSP\3\0\0\0\xff\xff\xff\xff" + bytes(4), mtime=0), "4294967295 splats"),
         (gzip.compress(b"NGSP\3\0\0\0\x80\x96\x98" + bytes(14), mtime=0), "9 bytes of 10000000"),
-        (packed(2).replace(b"\xff", b"\r\n"), "SPZ file"),
+        (packed(2).replace(b"\x00", b"\r\n"), "SPZ file"),
     ],
     ids=["text", "truncated", "version 4", "splats without end", "too few bytes", "as text"],
 )
