@@ -2,11 +2,8 @@
 dist`."""
 
 import argparse
-import hashlib
 import shlex
 import subprocess
-import sys
-import tempfile
 import tomllib
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -20,23 +17,24 @@ from ..files import replacing
 from .compiled_kernels import compile_kernels
 from .demo.capture import unpack_capture
 from .editions import DEMO_FOLDER, SMALL, Edition, complete, edition_manifest
-from .wheels import TARGETS, Target, collect_wheels, this_platform
+from .wheels import (
+    TARGETS,
+    Target,
+    collect_wheels,
+    download_locked,
+    is_locked,
+    this_platform,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 MANIFEST = "blender_manifest.toml"
 # Pure Python: one wheel serves every platform and Blender version. The manifest names the same
 # files.
-WHEELS = {
-    "filelock-4.2.11-py3-none-any.whl": (
-        "020e229e4bb9d410fc799c07ddf45fa217cba970278f40b30751d94f309b69e2"
-    ),
-    "trimesh-5.2.0-py3-none-any.whl": (
-        "04db2c7ec62afdd7763fb04c82bb5f257ddd984993a19ee83697f475fc58fd29"
-    ),
-    "tqdm-4.70.1-py3-none-any.whl": (
-        "c293e525e6fef9c20e8728fd4612df02a0aa31bb5fe91ecd93e123b1b7bffa73"
-    ),
-}
+WHEELS = (
+    "filelock-4.2.11-py3-none-any.whl",
+    "trimesh-5.2.0-py3-none-any.whl",
+    "tqdm-4.70.1-py3-none-any.whl",
+)
 KERNELS_FOLDER = "stga_addon/raster/cpu/compiled"
 """In the zip; `raster.cpu.bundled.BUNDLE`."""
 ENTRY_TIME = (1980, 1, 1, 0, 0, 0)
@@ -126,43 +124,9 @@ def extension_files(root: Path, manifest: dict[str, Any]) -> list[Path]:
 def fetch_wheels(folder: Path) -> None:
     """Download WHEELS with pip into `folder` where they are missing. Raises StgaError where pip
     fails."""
-    missing = [name for name in WHEELS if not _is_intact(folder / name)]
-    if not missing:
-        return
-    with tempfile.TemporaryDirectory() as scratch:
-        wanted = Path(scratch) / "wheels.txt"
-        wanted.write_text("".join(_requirement(name) for name in missing), encoding="utf-8")
-        options = [
-            "--no-deps",
-            "--only-binary=:all:",
-            "--require-hashes",
-            "-r",
-            str(wanted),
-            "-d",
-            str(folder),
-        ]
-        command = [
-            sys.executable,
-            "-m",
-            "pip",
-            "download",
-            "--quiet",
-            "--disable-pip-version-check",
-            *options,
-        ]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
-        raise StgaError(f"{folder}: pip could not download {', '.join(missing)} ({reason[0]})")
-
-
-def _requirement(wheel: str) -> str:
-    name, version = wheel.split("-")[:2]
-    return f"{name}=={version} --hash=sha256:{WHEELS[wheel]}\n"
-
-
-def _is_intact(wheel: Path) -> bool:
-    return wheel.is_file() and hashlib.sha256(wheel.read_bytes()).hexdigest() == WHEELS[wheel.name]
+    missing = [name for name in WHEELS if not is_locked(folder / name)]
+    if missing:
+        download_locked(folder, missing)
 
 
 def _walk(folder: Path, root: Path, patterns: Sequence[str]) -> Iterator[Path]:

@@ -2,17 +2,19 @@
 came.
 
 pip evaluates environment markers for the system it runs on, so dependencies are followed here, with
-the markers of the target, and pip only picks and downloads one wheel per package.
+the markers of the target, and pip only downloads one wheel per package, by its hash.
 """
 
+import hashlib
 import platform
 import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from email.parser import HeaderParser
+from functools import cache
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -68,25 +70,9 @@ BLENDER_RANGES = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", "")}
 """Python -> first Blender that brings it, and the first that no longer does."""
 PROVIDED = frozenset({"numpy"})
 """Packages that Blender brings."""
-PINS = {
-    "": (
-        "filelock==4.2.11",
-        "trimesh==5.2.0",
-        "tqdm==4.70.1",
-        "torch==2.13.0",
-        "numba==0.68.1",
-        "llvmlite==0.50.0",
-        "pillow==13.0.0",
-        "platformdirs==4.14.7",
-        "av==18.1.0",
-        "wgpu==0.32.0",
-        "opencv-python-headless==4.14.0.94",
-    ),
-    # The last that run with numpy 1.24, which Blender 4.2 and 4.3 bring.
-    "3.11": ("scipy==1.15.3", "matplotlib==3.10.8", "contourpy==1.3.2"),
-}
-"""Versions that the complete edition bundles, on every Python and on one; what these need
-follows."""
+LOCK = Path(__file__).with_name("wheels.lock")
+"""SHA-256 and file name of each wheel that an edition may hold, as `sha256sum` writes them. SciPy
+and Matplotlib of Python 3.11 are the last that run with numpy 1.24, as in Blender 4.2 and 4.3."""
 
 
 @dataclass(frozen=True)
@@ -223,20 +209,67 @@ def needs(wheel: Path, target: Target, extras: Iterable[str] = ()) -> list[str]:
     return found
 
 
-def _present(folder: Path, requirement: Requirement, target: Target) -> Path | None:
-    """The wheel that is already in the folder; its version is the pinned one, or any that fits."""
-    pins = {Requirement(text).name: Requirement(text).specifier for text in pins_of(target)}
-    specifier = requirement.specifier & pins.get(requirement.name, requirement.specifier)
+@cache
+def locked_wheels() -> Mapping[str, str]:
+    """File name -> SHA-256 of the wheels in LOCK."""
+    lines = LOCK.read_text(encoding="ascii").splitlines()
+    return {name: digest for digest, name in (line.split() for line in lines)}
+
+
+def is_locked(wheel: Path) -> bool:
+    """Whether a file is there, and the wheel of its name that LOCK has."""
+    if not wheel.is_file():
+        return False
+    with wheel.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest() == locked_wheels()[wheel.name]
+
+
+def download_locked(folder: Path, names: Sequence[str], options: Sequence[str] = ()) -> None:
+    """Download wheels of LOCK with pip, one of each package, into `folder`. options: more of pip's.
+    Raises StgaError where pip fails, or comes back with other bytes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted: dict[str, list[str]] = {}
+    for name in names:
+        package, version = name.split("-")[:2]
+        wanted.setdefault(f"{package}=={version}", []).append(locked_wheels()[name])
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        lines = (f"{what} --hash=sha256:{' --hash=sha256:'.join(h)}" for what, h in wanted.items())
+        requirements = Path(scratch) / "wheels.txt"
+        requirements.write_text("\n".join(lines), encoding="utf-8")
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps"]
+        command += ["--disable-pip-version-check", "--only-binary=:all:", "--require-hashes"]
+        command += ["-r", str(requirements), "-d", scratch, *options]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            # The first error: the last one of several is about how to ask for help.
+            errors = (line for line in done.stderr.splitlines() if line.startswith("ERROR: "))
+            reason = next(errors, "pip failed").removeprefix("ERROR: ")
+            raise StgaError(f"{folder}: pip could not download {', '.join(wanted)} ({reason})")
+        for wheel in sorted(Path(scratch).glob("*.whl")):
+            wheel.replace(folder / wheel.name)
+
+
+def _locked(requirement: Requirement, target: Target) -> list[str]:
+    """Names of the wheels in LOCK that fit a requirement and run on the target; of torch on Linux,
+    the CPU build's first."""
     tags = target.tags()
-    for wheel in sorted(folder.glob("*.whl"), reverse=True):
-        name, version, _, own = parse_wheel_filename(wheel.name)
-        fits = name == canonicalize_name(requirement.name) and specifier.contains(
-            version, prereleases=True
-        )
-        if (
-            fits
-            and own & tags
-            and (target.cuda or name != "torch" or not _needs_cuda(wheel, target))
+    found = []
+    for wheel in locked_wheels():
+        name, version, _, own = parse_wheel_filename(wheel)
+        fits = requirement.specifier.contains(version, prereleases=True)
+        if name == canonicalize_name(requirement.name) and fits and own & tags:
+            found.append((version.local is None, wheel))
+    if not found:
+        raise StgaError(f"{target.name}: {LOCK.name} has no wheel of {requirement}")
+    return [wheel for _, wheel in sorted(found)]
+
+
+def _present(folder: Path, requirement: Requirement, target: Target) -> Path | None:
+    """The wheel that is already in the folder, with the hash that LOCK has."""
+    for name in _locked(requirement, target):
+        wheel = folder / name
+        if is_locked(wheel) and (
+            target.cuda or requirement.name != "torch" or not _needs_cuda(wheel, target)
         ):
             return wheel
     return None
@@ -246,69 +279,34 @@ def _needs_cuda(wheel: Path, target: Target) -> bool:
     return any(text.startswith(("nvidia-", "cuda-")) for text in needs(wheel, target))
 
 
-def pins_of(target: Target) -> list[str]:
-    return [*PINS[""], *PINS.get(target.python, ())]
-
-
 def _download(folder: Path, requirement: Requirement, target: Target) -> Path:
     """Download one wheel as it is; on Linux PyTorch's CPU build, unless the target may have
     another."""
-    folder.mkdir(parents=True, exist_ok=True)
-    bare = f"{requirement.name}{requirement.specifier}"
+    names = _locked(requirement, target)
     if requirement.name != "torch" or target.platform != "linux-x64":
-        return _pip_download(folder, bare, target)
-    build = next(pin for pin in pins_of(target) if pin.startswith("torch==")) + "+cpu"
-    for more in ([], ["--index-url", TORCH_CPU_INDEX, "--retries", "0"]):
+        return _downloaded(folder, names, target)
+    cpu = [name for name in names if "+cpu" in name]
+    failure = f"{LOCK.name} has no CPU build of torch for {target.name}"
+    for more in ([], ["--index-url", TORCH_CPU_INDEX, "--retries", "0"]) if cpu else ():
         try:
-            return _pip_download(folder, build, target, more)
+            return _downloaded(folder, cpu, target, more)
         except StgaError as error:
-            failure = error
+            failure = str(error)
     if target.cuda:
-        return _pip_download(folder, bare, target)
+        return _downloaded(folder, [name for name in names if name not in cpu], target)
     raise StgaError(
-        f"{failure}; expected {build} where pip is configured to look, at {TORCH_CPU_INDEX}, or in "
-        f"{folder}; with --allow-cuda (make: CUDA=1) the zip has the CUDA build, and gigabytes "
-        "that nothing uses"
+        f"{failure}; expected the CPU build where pip is configured to look, at {TORCH_CPU_INDEX}, "
+        f"or in {folder}; with --allow-cuda (make: CUDA=1) the zip has the CUDA build, and "
+        "gigabytes that nothing uses"
     )
 
 
-def _pip_download(folder: Path, wanted: str, target: Target, more: Sequence[str] = ()) -> Path:
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        pins = Path(scratch) / "pins.txt"
-        pins.write_text("\n".join(pins_of(target)), encoding="utf-8")
-        tags = [part for tag in PLATFORM_TAGS[target.platform] for part in ("--platform", tag)]
-        options = [
-            "--no-deps",
-            "--only-binary=:all:",
-            "--python-version",
-            target.python,
-            "--implementation",
-            "cp",
-            *tags,
-        ]
-        command = [
-            sys.executable,
-            "-m",
-            "pip",
-            "download",
-            "--quiet",
-            "--disable-pip-version-check",
-            *options,
-        ]
-        done = subprocess.run(
-            [*command, "-c", str(pins), "-d", scratch, *more, wanted],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        found = sorted(Path(scratch).glob("*.whl"))
-        if done.returncode or len(found) != 1:
-            # The first error: the last one of several is about how to ask for help.
-            reason = next(
-                (line for line in done.stderr.splitlines() if line.startswith("ERROR: ")),
-                "pip failed",
-            )
-            raise StgaError(
-                f"{target.name}: pip could not download {wanted} ({reason.removeprefix('ERROR: ')})"
-            )
-        return found[0].replace(folder / found[0].name)
+def _downloaded(
+    folder: Path, names: Sequence[str], target: Target, more: Sequence[str] = ()
+) -> Path:
+    """The one of these wheels of a package that pip takes for the target."""
+    options = ["--python-version", target.python, "--implementation", "cp", *more]
+    for tag in PLATFORM_TAGS[target.platform]:
+        options += ["--platform", tag]
+    download_locked(folder, names, options)
+    return next(folder / name for name in names if (folder / name).is_file())

@@ -1,5 +1,6 @@
 """The editions' wheels, manifests and files; Blender's part is in tests/blender."""
 
+import hashlib
 import os
 import re
 import sys
@@ -8,12 +9,22 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from stga_addon.development.editions import SMALL, complete, edition_manifest
 from stga_addon.development.package import ROOT, build_zip, main, read_manifest, wheel_folder
-from stga_addon.development.wheels import PINS, TARGETS, Target, check_wheels, needs
+from stga_addon.development.wheels import (
+    TARGETS,
+    Target,
+    check_wheels,
+    collect_wheels,
+    download_locked,
+    locked_wheels,
+    needs,
+)
 from stga_addon.errors import StgaError
-from stga_addon.worker.training_python import REQUIREMENTS
+from stga_addon.worker.training_python import GPU_REQUIREMENT, REQUIREMENTS
 
 LINUX = Target("linux-x64", "3.11", ("4.2.0", "5.1.0"))
 WINDOWS = Target("windows-x64", "3.13", ("5.1.0", ""))
@@ -35,9 +46,21 @@ def make_wheel(folder: Path, name: str, version: str, tag: str, *requirements: s
     return path
 
 
+@pytest.fixture
+def lock(monkeypatch):
+    """Folder -> its wheels become those that an edition may hold."""
+
+    def lock_folders(*folders: Path) -> None:
+        wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
+        found = {wheel.name: hashlib.sha256(wheel.read_bytes()).hexdigest() for wheel in wheels}
+        monkeypatch.setattr("stga_addon.development.wheels.locked_wheels", lambda: found)
+
+    return lock_folders
+
+
 def wheel_set(folder: Path, target: Target) -> list[Path]:
     """A wheel of the pinned version for each package that training needs."""
-    pins = {pin.split("==")[0]: pin.split("==")[1] for key in ("", "3.11") for pin in PINS[key]}
+    pins = {name.split("-")[0].replace("_", "-"): name.split("-")[1] for name in locked_wheels()}
     tag = NATIVE[target.platform].format(target.python.replace(".", ""))
     extra = {
         "torch": ("sympy", 'nvidia-things; platform_system == "Linux" and extra == "cuda"'),
@@ -69,9 +92,53 @@ def test_wheels_of_a_target(target: Target, tmp_path: Path) -> None:
         check_wheels([wheel for wheel in wheels if wheel != torch] + [old], target)
 
 
+@pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)
+def test_the_lock_has_what_each_target_needs(target: Target) -> None:
+    """Catches a target that was forgotten when versions were changed, and two versions at once of
+    what training asks for."""
+    tags = target.tags()
+    versions: dict[str, set[str]] = {}
+    for wheel, digest in locked_wheels().items():
+        assert re.fullmatch("[0-9a-f]{64}", digest)
+        name, version, _, own = parse_wheel_filename(wheel)
+        if own & tags:
+            versions.setdefault(name, set()).add(version.public)
+    for text in (*REQUIREMENTS.values(), GPU_REQUIREMENT):
+        requirement = Requirement(text)
+        if requirement.name != "numpy":
+            (version,) = versions[canonicalize_name(requirement.name)]
+            assert requirement.specifier.contains(version)
+    assert all(len(found) == 1 for found in versions.values())
+
+
+def test_wheels_are_known_by_their_hash(tmp_path, monkeypatch, lock) -> None:
+    """Catches a wheel of the right name and other content, in the folder or where pip looks, which
+    every user of the edition would run."""
+    offered = tmp_path / "offered"
+    folder = tmp_path / "wheels"
+    for path in (offered, folder):
+        path.mkdir()
+    wheel = make_wheel(offered, "filelock", "4.2.11", "py3-none-any")
+    lock(offered)
+    make_wheel(offered, "filelock", "4.2.11", "py3-none-any", "malware")
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
+    monkeypatch.setenv("PIP_INDEX_URL", folder.as_uri())
+    monkeypatch.setenv("PIP_FIND_LINKS", str(offered))
+    with pytest.raises(StgaError, match="could not download filelock"):
+        download_locked(folder, [wheel.name])
+    assert not list(folder.iterdir())
+    monkeypatch.setattr(
+        "stga_addon.development.wheels.REQUIREMENTS", {"filelock": "filelock>=4,<5"}
+    )
+    monkeypatch.setattr("stga_addon.development.wheels.GPU_REQUIREMENT", "filelock>=4,<5")
+    make_wheel(folder, "filelock", "4.2.11", "py3-none-any", "malware")
+    with pytest.raises(StgaError, match="could not download filelock"):
+        collect_wheels(folder, LINUX)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only PyPI's torch for Linux needs CUDA")
-def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys):
+def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys, lock):
     """Catches gigabytes that nothing uses, and a refusal without a remedy."""
     monkeypatch.setattr("stga_addon.development.package.ROOT", tmp_path)
     wheels = wheel_folder(LINUX)
@@ -88,6 +155,7 @@ def test_only_when_told_to_does_a_zip_have_cuda(tmp_path, monkeypatch, capsys):
         make_wheel(offered, "torch", "2.13.0", tag, "sympy", "nvidia-things").name,
         make_wheel(offered, "nvidia-things", "1.0", "py3-none-any").name,
     }
+    lock(wheels, offered)
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.setenv("PIP_INDEX_URL", index.as_uri())
     monkeypatch.setenv("PIP_FIND_LINKS", str(offered))
