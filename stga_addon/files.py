@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from .errors import StgaError
 
@@ -552,6 +553,14 @@ def _reading(path: Path, kind: str) -> Iterator[None]:
             f"is not a readable {kind} file ({error or type(error).__name__})"
         )
         raise StgaError(f"{path}: {problem}") from error
+
+
+def converted(values: ArrayLike, dtype: DTypeLike) -> np.ndarray:
+    """A copy of what a file holds in another dtype, without NumPy's warnings: any bits may stand
+    there for a number (a signaling NaN), and text may be larger than the dtype. What does not fit
+    is not finite afterwards, of a whole number anything; the caller checks."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.array(values, dtype)
 
 
 def damage_of(path: Path) -> str | None:

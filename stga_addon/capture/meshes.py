@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError
-from ..files import parse_json, read_bytes, read_json, read_npz
+from ..files import converted, parse_json, read_bytes, read_json, read_npz
 from ..flame.model import faces_within
 from .camera import MAX_COORDINATE_M
 from .model import Capture
@@ -240,11 +240,11 @@ def _parse_ply(path: Path, data: bytes) -> Mesh:
     if corners is None:
         kind = "triangle strips" if "tristrips" in rows else "no polygons"
         raise StgaError(f"{path}: holds {kind}; expected faces with vertex_indices")
-    points = np.stack([vertices.scalars[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    points = np.stack([converted(vertices.scalars[axis], np.float64) for axis in "xyz"], axis=1)
     if (corners.lengths < 3).any():
         row = int((corners.lengths < 3).argmax())
         raise StgaError(f"{path}: face {row} has fewer than three corners")
-    return points, corners.values.astype(np.int64)[_fans(corners.lengths)]
+    return points, converted(corners.values, np.int64)[_fans(corners.lengths)]
 
 
 def _fans(counts: np.ndarray) -> np.ndarray:

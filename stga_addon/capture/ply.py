@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import StgaError, shorten
-from ..files import CHANGED_LINE_ENDS, line_ends_changed
+from ..files import CHANGED_LINE_ENDS, converted, line_ends_changed
 
 MAX_HEADER_BYTES = 1 << 16
 _TYPES = {
@@ -246,11 +246,10 @@ def _as_rows(
     """The rows of columns of numbers, in the order of the element's properties."""
     table = np.empty(element.count, list(element.scalars.items()))
     lists = {}
-    with np.errstate(invalid="ignore"):  # text that is no whole number, for a whole number
-        for name, numbers, sizes in zip(element.order, values, lengths, strict=True):
-            if name in element.scalars:
-                table[name] = np.asarray(numbers)
-            else:
-                own = np.asarray(numbers).astype(element.lists[name][1])
-                lists[name] = Lists(np.array(sizes, np.int64), own)
+    for name, numbers, sizes in zip(element.order, values, lengths, strict=True):
+        if name in element.scalars:
+            table[name] = converted(numbers, element.scalars[name])
+        else:
+            own = converted(numbers, element.lists[name][1])
+            lists[name] = Lists(np.array(sizes, np.int64), own)
     return Rows(table, lists)

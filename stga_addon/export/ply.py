@@ -13,7 +13,14 @@ from ..avatar.file import Avatar
 from ..avatar.splats import MAX_SH_DEGREE, SH_C0, Splats, in_world
 from ..capture.ply import ply_rows
 from ..errors import StgaError
-from ..files import NumberedFiles, read_bytes, replacing, replacing_together, save_npz
+from ..files import (
+    NumberedFiles,
+    converted,
+    read_bytes,
+    replacing,
+    replacing_together,
+    save_npz,
+)
 from ..flame.sequence import FlameSequence, motion_arrays
 from ..progress import Say, warn
 
@@ -141,8 +148,7 @@ def _columns(path: Path, vertices: np.ndarray, names: Sequence[str]) -> np.ndarr
         if name not in given:
             problem = f"has no property {name!r}, as a PLY of 3D Gaussians must"
             raise StgaError(f"{path}: {problem}; it has {', '.join(given):.200}")
-        with np.errstate(over="ignore"):  # of doubles; what is not finite is left out
-            columns[:, i] = vertices[name]
+        columns[:, i] = converted(vertices[name], np.float32)
     return columns
 
 

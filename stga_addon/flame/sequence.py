@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ..errors import StgaError
-from ..files import read_npz
+from ..files import converted, read_npz
 from .forward import (
     RIGID_SIZE,
     FlameFrame,
@@ -291,8 +291,7 @@ def _identity(path: Path, arrays: Arrays, model: FlameModel) -> Identity:
 def _finite(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in "iuf":
         raise StgaError(f"{path}: {name} holds {array.dtype}, expected numbers")
-    with np.errstate(over="ignore", invalid="ignore"):
-        array = array.astype(np.float64)
+    array = converted(array, np.float64)
     if not (np.abs(array) <= MAX_PARAMETER).all():
         beyond = f"that are not finite, or beyond {MAX_PARAMETER:g}"
         raise StgaError(f"{path}: {name} holds values {beyond}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..capture.camera import MAX_COORDINATE_M
 from ..errors import StgaError
-from ..files import read_npz, write_npz
+from ..files import converted, read_npz, write_npz
 from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
 from ..flame.teeth import flame_model
 from .glb import read_glb
@@ -179,8 +179,7 @@ def floats(
         raise StgaError(f"{path}: {key} has shape {array.shape}, expected ({wanted})")
     if array.dtype.kind not in kinds:
         raise StgaError(f"{path}: {key} holds {array.dtype}, expected {numbers}")
-    with np.errstate(over="ignore"):
-        return np.ascontiguousarray(array, np.float64)
+    return np.ascontiguousarray(converted(array, np.float64))
 
 
 def _finite(

@@ -35,6 +35,8 @@ from stga_addon.capture.meshes import read_mesh
 from stga_addon.capture.model import summarize_capture
 from stga_addon.capture.open import open_capture, read_face_ids
 from stga_addon.errors import StgaError
+from stga_addon.export.ply import PROPERTIES
+from stga_addon.export.splat_files import read_splats
 from stga_addon.files import read_json, read_npz
 from stga_addon.flame.model import read_flame
 from stga_addon.flame.unpickle import read_pickled_arrays
@@ -218,6 +220,35 @@ def test_damaged_packing(tmp_path, packing):
         behaves(lambda: read_npz(path), tmp_path)
 
 
+SIGNALING_NAN = {"f4": 0x7F841000, "f8": 0x7FF0000010000001}
+"""Bits of a NaN that NumPy warns of where it is made a number of another size."""
+FLOATING_POINT_TARGETS = [
+    "landmarks",
+    "places",
+    "head model npz",
+    "avatar",
+    "flame npz",
+    "flame frame",
+    "flame motion",
+]
+
+
+@pytest.mark.parametrize("name", FLOATING_POINT_TARGETS)
+def test_bits_that_are_no_number(tmp_path, name):
+    """Catches a warning of NumPy in place of an answer for bits that are rarely met."""
+    target = TARGETS[name]
+    path = tmp_path / target.name
+    target.write(path)
+    whole = read_npz(path)
+    kinds = {key: array for key, array in whole.items() if array.dtype.kind == "f" and array.size}
+    assert kinds
+    for (key, array), (size, bits) in itertools.product(kinds.items(), SIGNALING_NAN.items()):
+        changed = array.astype(size)
+        changed.reshape(-1).view(f"u{size[1:]}")[0] = bits
+        np.savez(path, **{**whole, key: changed})
+        behaves(lambda: target.read(path), tmp_path)
+
+
 # Meshes
 
 
@@ -247,6 +278,9 @@ def accessors(**changes: Any) -> list[dict[str, Any]]:
 
 PLY_LIST = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
 LONG = PLY_LIST.replace("uchar", "uint").format(2).encode() + bytes(36) + b"\xff\xff\xff\x7f"
+FLOAT_LIST = PLY_LIST.replace(" int ", " float ").format(1).encode()
+CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+SIGNAL = struct.pack("<I", SIGNALING_NAN["f4"])
 OBJ = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
@@ -279,6 +313,10 @@ BROKEN_MESHES = {
     "billion lines.ply": ply(GIGA, PLY_LIST.format(GIGA).encode() + b"0 0 0\n" * 3, "ascii"),
     "billion faces.ply": ply(3, PLY_LIST.format(GIGA).encode() + bytes(36) + b"\x03" + bytes(12)),
     "long polygons.ply": ply(3, LONG),
+    "signaling corner.ply": ply(3, FLOAT_LIST + CORNERS + b"\x03" + bytes(8) + SIGNAL),
+    "corner beyond numbers.ply": ply(3, FLOAT_LIST + b"0 0 0\n" * 3 + b"3 0 1 1e39\n", "ascii"),
+    "signaling vertex.ply": ply(1, FLOAT_LIST + bytes(8) + SIGNAL + b"\x03" + bytes(12)),
+    "vertex beyond numbers.ply": ply(1, FLOAT_LIST + b"0 0 1e39\n3 0 0 0\n", "ascii"),
     "billion triangles.stl": bytes(80) + struct.pack("<L", GIGA) + bytes(50),
     "text.stl": b"solid x\n" + b"facet normal 0 0 1\nouter loop\n" * 1000,
     "huge indices.obj": OBJ + b"f 1 2 " + b"9" * 5000 + b"\n",
@@ -308,6 +346,22 @@ def test_meshes(tmp_path, name):
     path.write_bytes((MESHES | BROKEN_MESHES)[name])
     message = behaves(lambda: read_mesh(path), tmp_path)
     assert message == "" if name in MESHES else message.startswith(f"{path}: ")
+
+
+def test_splats_beyond_their_numbers(tmp_path):
+    """Catches a warning of NumPy, and splats lost, where doubles or text hold what is no float."""
+    path = tmp_path / "a.ply"
+    columns = "".join(f"property double {name}\n" for name in PROPERTIES)
+    header = f"ply\nformat {{}} 1.0\nelement vertex 2\n{columns}end_header\n"
+    rows = np.zeros((2, len(PROPERTIES)))
+    rows[:, PROPERTIES.index("rot_0")] = 1.0
+    rows[1].view(np.uint64)[:] = SIGNALING_NAN["f8"]
+    path.write_bytes(header.format("binary_little_endian").encode() + rows.tobytes())
+    assert behaves(lambda: read_splats(path), tmp_path) == ""
+    rows[1] = 1e39
+    text = "\n".join(" ".join(f"{value:g}" for value in row) for row in rows)
+    path.write_text(header.format("ascii").replace("double", "float") + text)
+    assert behaves(lambda: read_splats(path), tmp_path) == ""
 
 
 def primitives(count: int, targets: int) -> list[dict[str, Any]]:
