@@ -1,7 +1,10 @@
-"""README and docs: what they refer to exists, and the commands they show parse."""
+"""README, docs, comments and docstrings: what they refer to exists, and the commands they show
+parse."""
 
 import re
 import shlex
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +20,50 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
     ROOT / "THIRD_PARTY.md",
+    ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
 ]
+FOR_DEVELOPERS = ("CONTRIBUTING.md", "architecture.md", "dependencies.md")
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
-PATH_FOLDERS = ("", "stga_addon/", "tests/", "stga_addon/training/")
-"""Folders that the docs leave out when they name a file."""
+FOLDERS = ("stga_addon", "operators", "ui", "tests", "benchmarks", "docs", ".ci")
+FILES = [
+    *ROOT.glob("*.*"),
+    *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix != ".pyc"),
+]
+PROSE = {".py": r'(?:^|\s)#\s.*|"""[\s\S]*?"""'} | dict.fromkeys(
+    (".wgsl", ".glsl", ".js", ".ts"), r"//.*|/\*[\s\S]*?\*/"
+)
+"""Suffix of a source -> its comments and docstrings."""
+SOURCES = {path: path.read_text(encoding="utf-8") for path in FILES if path.suffix in PROSE}
+BY_PATH: dict[str, list[Path]] = defaultdict(list)
+"""What is meant by a path whose folders may be left out, "run.py" or "jobs/batch/run.py"."""
+for _path in FILES:
+    _parts = _path.relative_to(ROOT).parts
+    for _start in range(len(_parts)):
+        BY_PATH["/".join(_parts[_start:])].append(_path)
+REFERENCE = r"`([^`\s]+)`"
+SOURCE_PATH = (
+    r"(?<![\w/.{}$<>*-])((?:\w[\w.-]*/)*\w[\w-]*\.(?:py|wgsl|glsl|js)\b)(?:::?([A-Za-z_]\w*))?"
+)
+DEFINITION = (
+    r"(?:\b(?:def|class|struct|fn|function|const|let)|^)\s+{0}\b|^{0}\s*[:=]|self\.{0}\s*[:=]"
+)
+EVERY_WORD = {
+    word for text in SOURCES.values() for word in re.findall(r"\w+", re.sub(REFERENCE, "", text))
+}
+"""Of sources, but for references."""
+OTHERS = {
+    "_torch_impl.py": "gsplat's",
+    "read_buffer": "wgpu's",
+    "smplx": "a package that is not used",
+    "t00012": "a shape key",
+    "numba": "its compiler's",
+    "blendShapes": "Live Link Face's",
+    "cc_psnr": "nerfstudio's",
+    "truth_A": "a folder",
+    "truth_E": "a folder",
+}
+"""References to what is not ours, though it looks so."""
 
 
 def name_of(page: Path) -> str:
@@ -32,6 +74,74 @@ def anchors(text: str) -> set[str]:
     """Anchors of a page's headings, as Git hosts make them."""
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def prose(path: Path) -> str:
+    """Comments and docstrings of a source."""
+    return "\n".join(re.findall(PROSE[path.suffix], SOURCES[path]))
+
+
+def defines(path: Path, name: str) -> bool:
+    return re.search(DEFINITION.format(name), SOURCES.get(path, ""), re.MULTILINE) is not None
+
+
+def stale_paths(text: str) -> Iterator[str]:
+    """Sources that are named with a folder or in backticks and are not there, and functions
+    (`test_docs.py:stale_paths`) that are not in theirs."""
+    quoted = set(re.findall(REFERENCE, text))
+    for found in re.finditer(SOURCE_PATH, text):
+        path, name = found.groups()
+        if path.rpartition("/")[2] in OTHERS or ("/" not in path and found[0] not in quoted):
+            continue
+        files = BY_PATH.get(path, [])
+        if not files or (name and not any(defines(file, name) for file in files)):
+            yield found[0]
+
+
+def stale_names(text: str, code: str = "") -> Iterator[str]:
+    """Names in backticks that no source has: alone, of a module or class of ours
+    (`module.function`), or of what the code beside the text uses."""
+    used = set(re.findall(r"\w+", code))
+    for reference in re.findall(REFERENCE, text):
+        is_name = re.fullmatch(r"\w*[a-zA-Z]\w*(\.\w+)*(\(\))?", reference)
+        if not is_name or reference.endswith((".json", ".npz")) or reference in BY_PATH:
+            continue
+        names = reference.removesuffix("()").split(".")
+        if used.issuperset(names) or not OTHERS.keys().isdisjoint(names):
+            continue
+        if len(names) == 1:
+            if names[0] not in EVERY_WORD and not names[0].endswith("_"):
+                yield reference
+        elif not is_there(names, used):
+            yield reference
+
+
+def is_there(names: list[str], used: set[str]) -> bool:
+    """Whether `module.function` or `Class.member` is there, or begins with what the code uses and
+    is not ours."""
+    for count in range(len(names), 0, -1):
+        module = "/".join(names[:count])
+        files = BY_PATH.get(f"{module}.py", []) + BY_PATH.get(f"{module}/__init__.py", [])
+        if files:
+            return count == len(names) or any(defines(file, names[count]) for file in files)
+    classes = [text for text in SOURCES.values() if f"class {names[0]}" in text]
+    if classes:
+        return any(re.search(rf"\b{names[1]}\b", text) for text in classes)
+    return names[0] in used or names[0][0].isupper()
+
+
+@pytest.mark.parametrize("folder", ["stga_addon", "operators", "ui", "tests", "benchmarks"])
+def test_what_comments_and_docstrings_name_is_there(folder):
+    """Catches references that a move or another name made stale."""
+    sources = [path for path in SOURCES if path.is_relative_to(ROOT / folder)]
+    assert sources
+    stale = []
+    for path in sources:
+        text = prose(path)
+        code = re.sub(PROSE[path.suffix], "", SOURCES[path])
+        found = (*stale_paths(text), *stale_names(text, code))
+        stale += [f"{name_of(path)}: {reference}" for reference in found]
+    assert not stale
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -47,19 +157,10 @@ def test_what_a_page_names_is_there(page):
             assert anchor in anchors(linked.read_text(encoding="utf-8")), (
                 f"{name_of(page)}: {target}"
             )
-    for path in re.findall(r"`([\w./]+/[\w.]+\.py)", TEXTS[page]):
-        assert any((ROOT / folder / path).is_file() for folder in PATH_FOLDERS), (
-            f"{name_of(page)}: {path}"
-        )
-    sources = {
-        path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py")
-    }
-    for path, test in re.findall(r"`([\w./]+\.py)::(test_\w+)`", TEXTS[page]):
-        source = next(text for file, text in sources.items() if file.as_posix().endswith(path))
-        assert f"def {test}" in source, f"{name_of(page)}: {path}::{test}"
-    every = "\n".join(sources.values())
-    for test in re.findall(r"`(test_\w+)`", TEXTS[page]):
-        assert f"def {test}(" in every, f"{name_of(page)}: {test}"
+    stale = [*stale_paths(TEXTS[page])]
+    if page.name in FOR_DEVELOPERS:
+        stale += stale_names(TEXTS[page])
+    assert not stale, name_of(page)
     for line in re.findall(r"^stga .*$", TEXTS[page], re.MULTILINE):
         words = shlex.split(line.partition("#")[0])[1:]
         make_parser().parse_args(words)  # exits where a word is unknown

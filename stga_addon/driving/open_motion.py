@@ -238,7 +238,7 @@ class Motion:
 
     fps      timesteps per second; None where unknown
     lost     rows that the file lacks between its first and last
-    outside  part -> (T,) how far each frame was outside the trained range (`transfer.outside`);
+    outside  part -> (T,) how far each frame was outside the trained range (`outside`);
              empty without a range
     warnings  one sentence each: what was guessed
     """

@@ -1,5 +1,5 @@
 // Camera-space frames and deformation of a posed mesh's triangles, as `avatar/embedding.py` and `avatar/strain.py` define
-// them, and their move by driven offsets (`avatar/offsets/offset.py`). A thread is a triangle.
+// them, and their move by driven offsets (`avatar/offsets.py`). A thread is a triangle.
 //
 // Shaders have no float64. A position is therefore a sum of two float32 numbers, relative to the mesh's first vertex, of
 // which only differences and means are formed: an edge is as exact as float32 can hold it.

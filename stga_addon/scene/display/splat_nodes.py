@@ -190,7 +190,7 @@ def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, nat
     """The splats in the display mode of the menu socket `mode`. visible: field, which splats; size:
     factor; native: points from NATIVE_GROUPS, None in a Blender without native splats."""
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
-    # Nothing in viewports, where `gpu.viewport_display` draws; in images by EEVEE and Cycles, quads
+    # Nothing in viewports, where `viewport_display.py` draws; in images by EEVEE and Cycles, quads
     # that face the camera.
     choice = {"Switch": nodes.out("GeometryNodeIsViewport"), "False": made[QUADS]}
     in_images = nodes.out("GeometryNodeSwitch", choice, input_type="GEOMETRY")

@@ -27,7 +27,7 @@ IDENTITY_KEY = "identity_"
 OFFSET_KEY = "offset_t"
 EXPRESSION_NAMES = "stga_expressions"
 """Property of a head whose expressions have ARKit's names: these, separated by commas."""
-# The joints that each part of a motion (`flame.motion.PARTS`) rotates.
+# The joints that each part of a motion (`PARTS`) rotates.
 EYES = ("left_eye", "right_eye")
 PART_JOINTS = {"jaw": ("jaw",), "eyes": EYES, "neck": ("neck",), "head": ("root",)}
 numbered_key = f"{EXPRESSION_KEY}{{:03d}}".format
@@ -82,7 +82,7 @@ def offset_keys(head: Any) -> list[Any]:
 
 
 def is_of_parts(data_path: str, parts: Sequence[str]) -> bool:
-    """Whether an f-curve of rig or shape keys animates one of the parts (`flame.motion.PARTS`)."""
+    """Whether an f-curve of rig or shape keys animates one of the parts (`PARTS`)."""
     prefixes = [f'pose.bones["{bone}"].rotation_' for bone in bones_of(parts)]
     prefixes += [location_path("root")] if "head" in parts else []
     # The tracked per-frame offsets belong to the tracked expressions.

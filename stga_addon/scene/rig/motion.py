@@ -254,7 +254,7 @@ def stored_range(head: Any) -> TrainedRange | None:
 
 
 def outside_now(head: Any, rig: Any, trained: TrainedRange) -> dict[str, float]:
-    """Part -> how far outside the range the head is as it is posed now (`transfer.outside`)."""
+    """Part -> how far outside the range the head is as it is posed now (`open_motion.outside`)."""
     turns = {
         bone: to_axis_angle(np.array(rig.pose.bones[bone].rotation_quaternion))
         for bone in ("jaw", "left_eye", "right_eye")
