@@ -20,8 +20,19 @@ from . import (
 )
 from .common import AtEnd, close_steps, register_classes
 
-MODULES = (track, import_capture, select, train, request, pose, show, render_video, apply_motion)
-MODULES += (drive, export)
+MODULES = (
+    track,
+    import_capture,
+    select,
+    train,
+    request,
+    pose,
+    show,
+    render_video,
+    apply_motion,
+    drive,
+    export,
+)
 KEYS = (("Pose", "EMPTY", "stga.turn_jaw", "R"), ("3D View", "VIEW_3D", "stga.stop_live", "ESC"))
 """Keymap, its space, operator and key: R turns a jaw about its hinge, Esc over a 3D viewport stops
 the live session."""

@@ -170,9 +170,10 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         path = None if self.source else file_path(self.filepath, "motion")
         if path is not None:
             open_motion.check_motion(path)
-        is_face = path is not None and is_performance(path)
-        apply = self._apply_performance if is_face else self._apply_frames
-        name, count = apply(context, head, path, parts)
+        if path is not None and is_performance(path):
+            name, count = self._apply_performance(context, head, path, parts)
+        else:
+            name, count = self._apply_frames(context, head, path, parts)
         end = self.start + count - 1
         if self.fit_range:
             scene.frame_end = max(scene.frame_end, end)
@@ -198,8 +199,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             raise StgaError(f"{self.source}: is this head itself; choose another one, or a file")
         else:
             name = other.name
-            frames = common.scene_frames(context.scene)
-            motion = rig_motion.sample_motion(other, own_motion(other), frames, self.warn)
+            sampled = common.scene_frames(context.scene)
+            motion = rig_motion.sample_motion(other, own_motion(other), sampled, self.warn)
         rate = self.fps * render.fps_base / render.fps if self.fps else 1.0
         step = float(self.speed * rate)  # timesteps of the recording in a frame of the scene
         frames = retimed(motion, step)

@@ -74,7 +74,8 @@ def _delegate(arguments: list[str], head: OpenHead | None, played: bool) -> int:
 
 def _make_avatar(arguments: list[str], options: Any) -> int:
     """Track and train in the Python for it, which needs no bpy, and write the .blend file here."""
-    from ..stga_addon.cli.commands import RUN_FOLDER, write_blend
+    from ..stga_addon.cli.commands import write_blend
+    from ..stga_addon.jobs.track import RUN_FOLDER
 
     code = _delegate([*arguments, "--no-blend"], None, played=False)
     if code or options.no_blend:

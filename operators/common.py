@@ -39,6 +39,8 @@ class Action:
     it has no other, label are the name of the class: `SolveAgain` is "stga.solve_again"."""
 
     bl_options = frozenset({"REGISTER"})
+    bl_idname: str
+    bl_label: str
     needs: tuple[Poll, ...] = ()
     run: Any
 

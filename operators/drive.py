@@ -285,6 +285,12 @@ def session() -> LiveSession | None:
     return _session
 
 
+def running_session() -> LiveSession:
+    """The session of operators that poll for one."""
+    assert _session is not None
+    return _session
+
+
 def stop_session() -> None:
     if _session is not None:
         _session.stop()
@@ -304,8 +310,9 @@ def _show_again(scene: Any, depsgraph: Any) -> None:
 
     Rendered animations keep their own pose.
     """
-    is_viewport = _session is not None and depsgraph.mode == "VIEWPORT"
-    if is_viewport and scene.session_uid == _session.scene.uid:
+    if _session is None or depsgraph.mode != "VIEWPORT":
+        return
+    if scene.session_uid == _session.scene.uid:
         _session.show_again()
 
 
@@ -350,7 +357,7 @@ class _OfSession(Action):
     def write_take(self: Any, running: LiveSession) -> Path:
         """End the recording with a file. Raises StgaError, and records on, where it cannot be
         written."""
-        faces = len(running.recording)
+        faces = len(running.recording or ())
         try:
             folder, warning = takes_folder(running.scene.get())
             path = running.write_take(folder)
@@ -370,12 +377,14 @@ class StopLive(_OfSession, bpy.types.Operator):
     bl_label = "Stop"
 
     def run(self, context: Any) -> None:
-        running = _session
-        recording = _session.recording
-        path = self.write_take(running) if len(recording or ()) > 1 else None
+        running = running_session()
+        recording = running.recording
+        if recording is None or len(recording) < 2:
+            running.stop()
+            return
+        path = self.write_take(running)
         running.stop()
-        if path is not None:
-            running.apply_take(path, recording)
+        running.apply_take(path, recording)
 
 
 class CalibrateLive(_OfSession, bpy.types.Operator):
@@ -385,7 +394,7 @@ class CalibrateLive(_OfSession, bpy.types.Operator):
     bl_label = "Set Neutral"
 
     def run(self, context: Any) -> None:
-        _session.calibrate()
+        running_session().calibrate()
 
 
 class RecordLive(_OfSession, bpy.types.Operator):
@@ -395,8 +404,8 @@ class RecordLive(_OfSession, bpy.types.Operator):
     bl_label = "Record"
 
     def run(self, context: Any) -> None:
-        running = _session
-        recording = _session.recording
+        running = running_session()
+        recording = running.recording
         if recording is None:
             frame = context.scene.frame_current
             exchange = running.options().exchange
@@ -415,7 +424,7 @@ class FollowLive(_OfSession, bpy.types.Operator):
     subject: options.text("Subject", "Its name for itself")
 
     def run(self, context: Any) -> None:
-        _session.stream.follow((self.address, self.subject))
+        running_session().stream.follow((self.address, self.subject))
 
 
 def takes_folder(scene: Any) -> tuple[Path, str]:

@@ -242,7 +242,7 @@ def _handler(name: str, label: str, operator: str, *suffixes: str) -> type:
     def poll_drop(cls: type, context: Any) -> bool:
         return context.area is not None and context.area.type == "VIEW_3D"
 
-    about = {"bl_idname": f"STGA_FH_{name}", "bl_label": f"{label} (STGA)"}
+    about: dict[str, Any] = {"bl_idname": f"STGA_FH_{name}", "bl_label": f"{label} (STGA)"}
     about |= {"bl_import_operator": f"stga.{operator}", "bl_file_extensions": ";".join(suffixes)}
     about |= {"poll_drop": classmethod(poll_drop), "__module__": __name__}
     return type(f"{name.title()}Drop", (bpy.types.FileHandler,), about)

@@ -23,7 +23,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
 from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, RequestState, transition
-from ..stga_addon.jobs.perform import PICTURE, PREVIEW, remove_request, request_folder
+from ..stga_addon.jobs.perform import remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
@@ -41,6 +41,7 @@ from ..stga_addon.tracking.folder import SPLIT_FILES
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker import status
+from ..stga_addon.worker.status import PICTURE, PREVIEW
 from .common import TAB, AtEnd, describe, is_head, register_handlers
 from .results import (
     HEADS,
@@ -111,7 +112,7 @@ def state_of(scene: Any, kind: Kind) -> RequestState:
     state = _last_state(scene, kind)
     if state.folder is None:
         return state
-    folder = _locate(scene, state)
+    folder = _locate(scene, state) or state.folder
     return replace(state, folder=folder, snapshot=inspect_status(folder))
 
 
@@ -236,7 +237,7 @@ def _locate(scene: Any, state: RequestState) -> Path | None:
 
 
 def _read_status(scene: Any, state: RequestState) -> states.StatusRead:
-    folder = _locate(scene, state)
+    folder = _locate(scene, state) or state.folder_path
     settings = scene.stga
     snapshot = inspect_status(folder)
     if state.kind not in STORED:

@@ -88,7 +88,8 @@ def field(
     if hint is Path:
         return path(about.pop("name"), about.pop("description"), **about)
     if asked["offered"]:
-        named = {each: each.replace("-", " ").title() for each in asked["offered"]} | (labels or {})
+        named = {each: each.replace("-", " ").title() for each in asked["offered"]}
+        named |= labels or {}
         items = [
             (choice, named[choice], text[0].upper() + text[1:])
             for choice, text in asked["offered"].items()

@@ -58,6 +58,7 @@ def start(
     """
     job = table.JOBS[type(request)]
     kind = job.kind
+    assert kind is not None, f"Blender asks for no {type(request).__name__}"
     subject = getattr(request, job.subject)
     if folder is None and kind in table.STORED:
         folder = perform.request_folder(subject)
@@ -172,9 +173,9 @@ class CopyReport(Action, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        training = monitor.state_of(context.scene, Kind.TRAINING).folder
-        is_given = self.directory or training is None
-        folder = file_path(self.directory, "folder") if is_given else training
+        folder = monitor.state_of(context.scene, Kind.TRAINING).folder
+        if self.directory or folder is None:
+            folder = file_path(self.directory, "folder")
         versions = f"STGA {__version__}, Blender {bpy.app.version_string}, {platform.platform()}"
         report = failure_report(folder, monitor.inspect_status(folder))
         context.window_manager.clipboard = f"{versions}\n{report}"
@@ -213,7 +214,7 @@ class _Test:
 
     python = error = ""
     found: Checked | None = None
-    process: "Popen[bytes] | None" = None
+    process: "Popen[str] | None" = None
 
     def begin(self, python: str) -> None:
         """Raises StgaError where the interpreter cannot be started."""
@@ -224,7 +225,9 @@ class _Test:
         self.error = ""
 
     def end(self, timeout_s: float = 1.0) -> None:
-        """Wait for what the test finds."""
+        """Wait for what the test finds, unless it has ended."""
+        if self.process is None:
+            return
         try:
             self.found = finish_check(self.python, self.process, timeout_s)
         except StgaError as error:
@@ -232,7 +235,8 @@ class _Test:
         self.process = None
 
     def tick(self) -> float | None:
-        if self.process.poll() is None and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
+        is_running = self.process is not None and self.process.poll() is None
+        if is_running and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
             return POLL_INTERVAL_S
         self.end()
         monitor.redraw()

@@ -138,7 +138,8 @@ def stop_loading() -> None:
 
 def _run(state: RequestState) -> Path:
     """The run that is trained, as the scene names it."""
-    return state.subject / RUN_FOLDER if state.kind == Kind.AVATAR else state.subject
+    subject = state.subject_path
+    return subject / RUN_FOLDER if state.kind == Kind.AVATAR else subject
 
 
 def shown_splats(scene: Any, head: Any) -> Any:
@@ -185,7 +186,7 @@ def store_avatar(scene: Any, state: RequestState, path: Path) -> None:
         return
     settings.avatar = str(path)
     with suppress(StgaError):  # the request was removed
-        parent = getattr(read_request(state.folder), "parent", None)
+        parent = getattr(read_request(state.folder_path), "parent", None)
         if parent == Path(bpy.path.abspath(settings.run_folder)).resolve():
             settings.run_folder = str(_run(state))
 
@@ -198,7 +199,7 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
     if not loading.done():
         return None
     head = request_head(scene, state)
-    is_result = state.loading.name == AVATAR
+    is_result = state.loading_path.name == AVATAR
     if head is None:
         gone = "the head that it was trained for is no longer in the scene"
         raise StgaError(f"{run}: {gone}; choose a head, then Show Avatar")
@@ -226,7 +227,7 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
             splat_object.hide_object(head, scene)
     shown[tags.RUN] = str(run)
     if is_result:
-        shown[tags.AVATAR] = str(state.loading)
+        shown[tags.AVATAR] = str(state.loading_path)
     if scene.stga.head == head:
         scene.stga.splats = shown
     show_world(run / AVATAR, head, scene)
@@ -236,16 +237,16 @@ def _show_avatar(scene: Any, state: RequestState) -> Answer:
 def _show_made(scene: Any, state: RequestState) -> Answer:
     """Import the capture once it is tracked; then show the previews and the avatar, at last on the
     head that training refined."""
-    if state.loading.name == CAPTURE_FOLDER:
-        is_there = _head_of_capture(scene, state.loading) is not None
-        answer = Shown() if is_there else _import(scene, state)
-        head = _head_of_capture(scene, state.loading)
+    if state.loading_path.name == CAPTURE_FOLDER:
+        is_there = _head_of_capture(scene, state.loading_path) is not None
+        imported = Shown() if is_there else _import(scene, state)
+        head = _head_of_capture(scene, state.loading_path)
         record_head(scene, state.kind, head)
         if scene.stga.head == head:
             scene.stga.run_folder = str(_run(state))
-        return answer
+        return imported
     answer = _show_avatar(scene, state)
-    is_refined = state.loading.name == AVATAR and state.files.tracking is not None
+    is_refined = state.loading_path.name == AVATAR and state.files.tracking is not None
     if isinstance(answer, Shown) and is_refined:
         head = request_head(scene, state)
         refined = str(state.run / TRACKING)
@@ -272,7 +273,8 @@ def _in_panel(scene: Any, head: Any) -> Iterator[None]:
 def _store_light(scene: Any, state: RequestState) -> Answer:
     """Give the scene's splats the light that is now in the avatar of the run."""
     shown = shown_splats(scene, request_head(scene, state))
-    if shown is None or not splat_object.store_light(shown, read_avatar(state.subject / AVATAR)):
+    path = state.subject_path / AVATAR
+    if shown is None or not splat_object.store_light(shown, read_avatar(path)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
     return Shown(undoable=True)
@@ -283,8 +285,8 @@ def _store_light(scene: Any, state: RequestState) -> Answer:
 
 def _import(scene: Any, state: RequestState) -> Shown:
     """Import the capture with the model that it was tracked with, or that which lies in it."""
-    request: Any = read_request(state.folder)
-    capture = state.loading if state.kind == Kind.AVATAR else state.place
+    request: Any = read_request(state.folder_path)
+    capture = state.loading_path if state.kind == Kind.AVATAR else state.place
     model = getattr(getattr(request, "track", request), "model", None)
     flame = str(model) if model is not None and is_flame(capture) else ""
     return _operate(scene, bpy.ops.stga.import_capture, directory=str(capture), flame=flame)
@@ -292,7 +294,7 @@ def _import(scene: Any, state: RequestState) -> Shown:
 
 def _fill_effects(scene: Any, state: RequestState) -> Answer:
     settings = scene.stga
-    found: Any = read_result(state.folder)
+    found: Any = read_result(state.folder_path)
     settings.preset_timing = json.dumps(dict(found.seconds))
     settings.effects.clear()
     for decision in found.plan:
@@ -306,7 +308,7 @@ def _fill_effects(scene: Any, state: RequestState) -> Answer:
 def _select_for_take(scene: Any, state: RequestState) -> Answer:
     """Select what extending the run by the head's take would train."""
     head = request_head(scene, state)
-    found = read_result(state.folder)
+    found: Any = read_result(state.folder_path)
     if head is None or head != scene.stga.head:
         raise StgaError(f"{state.subject}: its head is no longer that of the scene")
     write_selection(head, dict(found.selection))

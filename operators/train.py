@@ -168,15 +168,16 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
     def run(self, context: Any) -> None:
         head = head_of(context)
         run = file_path(self.directory, "run folder").resolve()
-        capture, *source = capture_source(head)
+        capture, flame, point = capture_source(head)
         if not capture.is_dir():
             expected = "expected the capture that the head was imported from"
             raise StgaError(f"{capture}: is not a folder; {expected}")
-        how = {"device": self.chosen_device, "selection": groups.training_selection(head)}
+        selection = groups.training_selection(head)
         if self.resume:
             # with takes, the head may be that of any of them
             moved = None if read_run(run).takes else capture
-            self.start(context, jobs.Resume(run, moved, *source, **how))
+            device = self.chosen_device
+            self.start(context, jobs.Resume(run, moved, flame, point, device, selection))
             return
         preset = None if self.preset == "none" else self.preset
         effects = None
@@ -186,7 +187,8 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         settings = make_settings(
             self.strategy, preset=preset, seed=self.seed, effects=effects, **budget
         )
-        self.start(context, jobs.Train(run, capture, settings, *source, **how))
+        request = jobs.Train(run, capture, settings, flame, point, self.chosen_device, selection)
+        self.start(context, request)
 
 
 class ContinueOperator(TrainingOperator, Edit):

@@ -21,8 +21,8 @@ from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.renderer import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
 from ..stga_addon.scene.render import viewport_display
-from ..stga_addon.scene.render.engine import ENGINE
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint
+from ..stga_addon.scene.render.viewport_display import ENGINE
 from .sidebar import SidebarPanel, draw_running, draw_text
 
 DISPLAY_INPUTS = (

@@ -31,6 +31,7 @@ _shown: dict[Path, monitor.Curve] = {}
 class SidebarPanel:
     """Mixin of panels: the identifier of `TrainPanel` is "STGA_PT_train"."""
 
+    bl_idname: str
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = TAB

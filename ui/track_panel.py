@@ -73,10 +73,11 @@ class TrackCheckPanel(SidebarPanel, bpy.types.Panel):
         now = context.scene.frame_current
         text, icon = ("Unmark Key", "KEYFRAME_HLT") if now in keys else ("Mark as Key", "KEYFRAME")
         layout.operator("stga.mark_key", text=text, icon=icon, depress=now in keys)
-        flow = layout.grid_flow(columns=5, align=True) if keys else None
-        for timestep in sorted(keys):
-            at = {"text": str(timestep), "depress": timestep == now}
-            jump = flow.operator("wm.context_set_int", **at)
-            jump.data_path = "scene.frame_current"
-            jump.value = timestep
+        if keys:
+            flow = layout.grid_flow(columns=5, align=True)
+            for timestep in sorted(keys):
+                at = {"text": str(timestep), "depress": timestep == now}
+                jump = flow.operator("wm.context_set_int", **at)
+                jump.data_path = "scene.frame_current"
+                jump.value = timestep
         layout.operator("stga.solve_again", icon="FILE_REFRESH")

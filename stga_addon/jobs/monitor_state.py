@@ -57,11 +57,27 @@ class RequestState:
     error: str = ""
     stopped: bool = False
 
+    # What is there once a request was asked for, or is being shown
+
+    @property
+    def folder_path(self) -> Path:
+        assert self.folder is not None
+        return self.folder
+
+    @property
+    def subject_path(self) -> Path:
+        assert self.subject is not None
+        return self.subject
+
+    @property
+    def loading_path(self) -> Path:
+        assert self.loading is not None
+        return self.loading
+
     @property
     def place(self) -> Path:
         """Where what the request makes is now."""
-        assert self.folder is not None
-        return self.folder.parent
+        return self.folder_path.parent
 
     @property
     def run(self) -> Path:

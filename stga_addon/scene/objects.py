@@ -1,7 +1,7 @@
 """The open .blend file, its scene and frames, and the objects of captures in it."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from math import radians
 from pathlib import Path
@@ -260,7 +260,7 @@ def show_progress(share: float) -> None:
         bpy.context.window_manager.progress_update(share)
 
 
-def iterate_frames(numbers: Iterable[int]) -> Iterator[int]:
+def iterate_frames(numbers: Iterable[int]) -> Generator[int, None, None]:
     """Set each frame in turn, with progress at the mouse pointer; restore the current one last."""
     scene = Identity(bpy.context.scene)
     numbers = list(numbers)
