@@ -43,7 +43,68 @@ DEMO_MINUTES = 1.0
 MOTION_FIELDS = {*FRAME_FIELDS, *FIELD_ALIASES, "pose"}
 
 
-class ImportCapture(Edit, bpy.types.Operator, FileImport):
+class HeadImport(Edit):
+    """Mixin of operators that import a head."""
+
+    def bring_in(
+        self: Any,
+        context: Any,
+        source: Path,
+        flame: str = "",
+        principal_point: str = DEFAULT_PRINCIPAL_POINT,
+        set_up_scene: bool = False,
+        correctives: str = "all",
+    ) -> None:
+        """Import what `open_capture` reads, and make it the scene's head. Raises StgaError."""
+        warn = self.warn
+        scene = context.scene
+        objects = context.view_layer.objects
+        has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
+        model = None if has_model else flame_model_path(context, flame)
+        capture = open_capture(source, flame=model, principal_point=principal_point)
+        show_progress(0.5)
+        is_first = not any(is_head(thing) for thing in scene.objects)
+        head = import_head(capture, warn=warn, correctives=correctives)
+        show_progress(0.8)
+        cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
+        head[tags.FLAME_MODEL] = str(capture.flame_file or "")
+        head[tags.PRINCIPAL_POINT] = principal_point
+        head[tags.TRACKED] = is_tracked(capture.root)
+        scene.stga.head = head
+        scene.frame_start = capture.timesteps[0]
+        scene.frame_end = capture.timesteps[-1]
+        scene.frame_set(capture.timesteps[0])
+        leave_edit_mode()
+        for thing in objects.selected:
+            thing.select_set(False)
+        if objects.get(head.name) is head:
+            head.select_set(True)
+            objects.active = head
+        cube = objects.get("Cube") if is_first else None  # later on, the user shows it
+        if cube is not None and not cube.library and cube.type == "MESH":
+            # hidden where it is as it came with Blender: 2 m wide, it would enclose the head
+            is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
+            is_whole = len(cube.data.vertices) == 8 and tuple(cube.dimensions) == (2.0, 2.0, 2.0)
+            if is_whole and not is_moved:
+                cube.hide_set(True)
+                cube.hide_render = True
+        middle = central(cameras)
+        for kind in COLLECTIONS:
+            show_kind(head.parent, kind, context.view_layer, False)
+        if context.window is not None and not bpy.app.background:
+            frame_head(head, middle, [context.window.screen])
+        if set_up_scene and cameras:
+            configure_scene(scene, capture, middle, warn=warn)
+        for sentence in capture.warnings:
+            warn(sentence)
+        counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
+        self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
+        begin_sliders(head)
+        monitor.show_panel()
+        begin_preparing()
+
+
+class ImportCapture(HeadImport, bpy.types.Operator, FileImport):
     """Import a multi-view capture: the tracked head, animated over its frames, and its cameras with
     images"""
 
@@ -87,10 +148,10 @@ class ImportCapture(Edit, bpy.types.Operator, FileImport):
         point = self.principal_point
         set_up = self.set_up_scene
         correctives = self.correctives
-        bring_in(self, context, folder, self.flame, point, set_up, correctives)
+        self.bring_in(context, folder, self.flame, point, set_up, correctives)
 
 
-class ImportMotion(Edit, bpy.types.Operator, FileImport):
+class ImportMotion(HeadImport, bpy.types.Operator, FileImport):
     """Import FLAME parameters (VHAP, GaussianAvatars, plain expression and pose) as a rigged,
     animated head"""
 
@@ -104,10 +165,10 @@ class ImportMotion(Edit, bpy.types.Operator, FileImport):
         if flame_model_path(context, self.flame) is None:
             remedy = "choose your FLAME model in the add-on's preferences"
             raise StgaError(f"{path}: holds FLAME parameters; {remedy}")
-        bring_in(self, context, path, self.flame)
+        self.bring_in(context, path, self.flame)
 
 
-class ImportMeshes(Edit, bpy.types.Operator, FileImport):
+class ImportMeshes(HeadImport, bpy.types.Operator, FileImport):
     """Import a folder of meshes with the same triangles, one for each frame, as an animated head"""
 
     bl_label = "Import Mesh Sequence"
@@ -119,10 +180,10 @@ class ImportMeshes(Edit, bpy.types.Operator, FileImport):
 
     def run(self, context: Any) -> None:
         path = file_path(self.filepath, "mesh sequence")
-        bring_in(self, context, path if path.is_dir() else path.parent)
+        self.bring_in(context, path if path.is_dir() else path.parent)
 
 
-class OpenDemo(Edit, bpy.types.Operator):
+class OpenDemo(HeadImport, bpy.types.Operator):
     """Open a small capture of a generated person, to try training in a minute"""
 
     bl_label = "Open Demo Capture"
@@ -137,70 +198,12 @@ class OpenDemo(Edit, bpy.types.Operator):
         except (OSError, shutil.Error) as error:
             problem = getattr(error, "strerror", None) or error
             raise StgaError(f"{own}: cannot be written ({problem})") from error
-        bring_in(self, context, own, set_up_scene=True)
+        self.bring_in(context, own, set_up_scene=True)
         runs = Path.home() / "STGA Demo"
         names = ("run", *(f"run {number}" for number in range(2, 1000)))
         free = next(runs / name for name in names if not has_run(runs / name))
         context.scene.stga.run_folder = str(free)
         context.scene.stga.minutes = DEMO_MINUTES
-
-
-def bring_in(
-    operator: Any,
-    context: Any,
-    source: Path,
-    flame: str = "",
-    principal_point: str = DEFAULT_PRINCIPAL_POINT,
-    set_up_scene: bool = False,
-    correctives: str = "all",
-) -> None:
-    """Import what `open_capture` reads, and make it the scene's head. Raises StgaError."""
-    warn = operator.warn
-    scene = context.scene
-    objects = context.view_layer.objects
-    has_model = not flame and any((source / name).is_file() for name in OWN_MODELS)
-    model = None if has_model else flame_model_path(context, flame)
-    capture = open_capture(source, flame=model, principal_point=principal_point)
-    show_progress(0.5)
-    is_first = not any(is_head(thing) for thing in scene.objects)
-    head = import_head(capture, warn=warn, correctives=correctives)
-    show_progress(0.8)
-    cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
-    head[tags.FLAME_MODEL] = str(capture.flame_file or "")
-    head[tags.PRINCIPAL_POINT] = principal_point
-    head[tags.TRACKED] = is_tracked(capture.root)
-    scene.stga.head = head
-    scene.frame_start = capture.timesteps[0]
-    scene.frame_end = capture.timesteps[-1]
-    scene.frame_set(capture.timesteps[0])
-    leave_edit_mode()
-    for thing in objects.selected:
-        thing.select_set(False)
-    if objects.get(head.name) is head:
-        head.select_set(True)
-        objects.active = head
-    cube = objects.get("Cube") if is_first else None  # later on, the user shows it
-    if cube is not None and not cube.library and cube.type == "MESH":
-        # hidden where it is as it came with Blender: 2 m wide, it would enclose the head
-        is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
-        is_whole = len(cube.data.vertices) == 8 and tuple(cube.dimensions) == (2.0, 2.0, 2.0)
-        if is_whole and not is_moved:
-            cube.hide_set(True)
-            cube.hide_render = True
-    middle = central(cameras)
-    for kind in COLLECTIONS:
-        show_kind(head.parent, kind, context.view_layer, False)
-    if context.window is not None and not bpy.app.background:
-        frame_head(head, middle, [context.window.screen])
-    if set_up_scene and cameras:
-        configure_scene(scene, capture, middle, warn=warn)
-    for sentence in capture.warnings:
-        warn(sentence)
-    counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
-    operator.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
-    begin_sliders(head)
-    monitor.show_panel()
-    begin_preparing()
 
 
 # Files that are dropped

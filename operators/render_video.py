@@ -128,6 +128,19 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
         self.inform(f"Rendered {output}")
         return None
 
+    def _shots(self, context: Any) -> tuple[list[int], Sequence[Camera] | None]:
+        """The frame and the camera of each image; no cameras: the scene's own."""
+        scene = context.scene
+        frames = list(scene_frames(scene))
+        if self.path != "turntable":
+            return frames, None
+        asked = round(self.seconds * frames_per_second(scene))
+        stga = scene.stga
+        frames = to_and_fro(frames, max(len(frames), asked))
+        subject = stga.head if is_head(stga.head) else stga.splats
+        depsgraph = context.evaluated_depsgraph_get()
+        return frames, turntable_cameras(subject, depsgraph, len(frames), self.angle)
+
     def record(self, context: Any, output: Path, python: str | None) -> StepGenerator:
         """Record the images, one a step; then a worker renders and encodes them, or, without a
         Python, Blender encodes what it has drawn. The scene's frame is restored.
@@ -138,15 +151,7 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
         """
         scene = context.scene
         view = SceneView(context)
-        frames = list(scene_frames(scene))
-        cameras: Sequence[Camera] | None = None  # the scene's own
-        if self.path == "turntable":
-            asked = round(self.seconds * frames_per_second(scene))
-            stga = scene.stga
-            frames = to_and_fro(frames, max(len(frames), asked))
-            subject = stga.head if is_head(stga.head) else stga.splats
-            depsgraph = context.evaluated_depsgraph_get()
-            cameras = turntable_cameras(subject, depsgraph, len(frames), self.angle)
+        frames, cameras = self._shots(context)
         check_output(output)
         fps = frames_per_second(scene)
         background = srgb_background(scene)
@@ -165,8 +170,7 @@ class RenderVideo(Stepwise, bpy.types.Operator, ExportHelper):
                 monitor.check_now(scene, Kind.VIDEO)
                 yield
                 posed = list[PosedSplats]()
-                images = _images(view, frames, cameras)
-                for number, (layers, camera, is_new) in enumerate(images):
+                for number, (layers, camera, is_new) in enumerate(_images(view, frames, cameras)):
                     if drawn is not None:
                         drawn.add(layers, camera)
                     else:

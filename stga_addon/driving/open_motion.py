@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..capture.meshes import Mesh
 from ..capture.model import evenly_spread
 from ..capture.open import open_capture
 from ..errors import StgaError
@@ -264,14 +265,12 @@ def check_motion(path: Path) -> None:
 def open_motion(
     path: Path,
     flame: Path | None,
-    neutral: np.ndarray,
-    faces: np.ndarray,
+    head: Mesh,
     options: MotionOptions | None = None,
     trained: TrainedRange | None = None,
     fps: float | None = None,
 ) -> Motion:
-    """The motion of a file on the head whose neutral mesh is `neutral` (V, 3) with triangles
-    `faces` (F, 3).
+    """The motion of a file on the head of this neutral mesh.
 
     path   FLAME parameters (.npz), the folder of a capture tracked with FLAME, or a performance
            (`read_performance`)
@@ -282,6 +281,7 @@ def open_motion(
     Raises StgaError where the file is no motion, or its model has other triangles.
     """
     check_motion(path)
+    neutral, faces = head
     options = options or MotionOptions()
     if is_performance(path):
         model = flame_model(flame)

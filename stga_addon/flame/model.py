@@ -84,6 +84,27 @@ def read_flame(path: Path) -> FlameModel:
     posedirs. Raises StgaError naming the file and key that is missing, of the wrong shape or not
     finite, and any class in a pickle that is not an array.
     """
+    arrays = _model_arrays(path)
+    template = _floats(path, arrays, "v_template", (None, 3))
+    vertices = len(template)
+    shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
+    n_identity = _identity_count(path, arrays, shapedirs.shape[2])
+    return FlameModel(
+        v_template=template,
+        shapedirs=shapedirs,
+        n_identity=n_identity,
+        posedirs=_floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES)),
+        j_regressor=_floats(path, arrays, "J_regressor", (len(JOINTS), vertices)),
+        parents=_parents(path, arrays),
+        weights=_floats(path, arrays, "weights", (vertices, len(JOINTS))),
+        faces=_faces(path, arrays, vertices),
+        expression_names=_expression_names(path, arrays, shapedirs.shape[2] - n_identity),
+        masks=_masks(path, arrays, vertices),
+    )
+
+
+def _model_arrays(path: Path) -> Arrays:
+    """Those of MODEL_KEYS, and what else the file has of a model."""
     if path.suffix.lower() == ".npz":
         own = (*MODEL_KEYS, "n_identity", "shape_steps", EXPRESSION_NAMES)
         stored = npz_outlines(path)
@@ -98,50 +119,48 @@ def read_flame(path: Path) -> FlameModel:
     for key in MODEL_KEYS:
         if key not in arrays:
             raise StgaError(f"{path}: has no {key}, which a FLAME model needs")
-    template = _floats(path, arrays, "v_template", (None, 3))
-    vertices = len(template)
-    shapedirs = _floats(path, arrays, "shapedirs", (vertices, 3, None))
-    components = shapedirs.shape[2]
-    n_identity = FULL_IDENTITY if components == FULL_COMPONENTS else components * 3 // 4
-    if components != FULL_COMPONENTS and "n_identity" in arrays:
-        given = _integers(path, "n_identity", arrays["n_identity"]).ravel().tolist()
-        if len(given) != 1 or not 0 <= given[0] <= components:
-            expected = f"one number from 0 to {components}"
-            found = arrays["n_identity"].tolist()
-            raise StgaError(f"{path}: n_identity is {found}, expected {expected}")
-        n_identity = given[0]
-    posedirs = _floats(path, arrays, "posedirs", (vertices, 3, POSE_FEATURES))
-    regressor = _floats(path, arrays, "J_regressor", (len(JOINTS), vertices))
+    return arrays
+
+
+def _identity_count(path: Path, arrays: Arrays, components: int) -> int:
+    if components == FULL_COMPONENTS:
+        return FULL_IDENTITY
+    if "n_identity" not in arrays:
+        return components * 3 // 4
+    given = _integers(path, "n_identity", arrays["n_identity"]).ravel().tolist()
+    if len(given) != 1 or not 0 <= given[0] <= components:
+        expected = f"one number from 0 to {components}"
+        found = arrays["n_identity"].tolist()
+        raise StgaError(f"{path}: n_identity is {found}, expected {expected}")
+    return int(given[0])
+
+
+def _parents(path: Path, arrays: Arrays) -> np.ndarray:
     _check_shape(path, "kintree_table", arrays["kintree_table"], (2, len(JOINTS)))
-    parents = _integers(path, "kintree_table", arrays["kintree_table"])[0].astype(np.int64)
+    parents = np.array(_integers(path, "kintree_table", arrays["kintree_table"])[0], np.int64)
     parents[0] = -1  # the published files write the root's parent as 2**32 - 1
     if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
         wrong = f"names the parents {parents.tolist()}, expected each before its child"
         raise StgaError(f"{path}: kintree_table {wrong}")
-    weights = _floats(path, arrays, "weights", (vertices, len(JOINTS)))
+    return parents
+
+
+def _faces(path: Path, arrays: Arrays, vertices: int) -> np.ndarray:
     _check_shape(path, "f", arrays["f"], (None, 3))
     faces = _integers(path, "f", arrays["f"]).astype(np.int64)
     if faces.min() < 0 or faces.max() >= vertices:
         expected = f"expected 0 to {vertices - 1}"
         raise StgaError(f"{path}: f names vertices {faces.min()} to {faces.max()}, {expected}")
-    count = components - n_identity
+    return faces.astype(np.int32)
+
+
+def _expression_names(path: Path, arrays: Arrays, count: int) -> tuple[str, ...]:
     names = arrays.get(EXPRESSION_NAMES, np.zeros(0, "U1"))
     named = names.dtype.kind == "U" and len(set(names.ravel().tolist())) == count
     if EXPRESSION_NAMES in arrays and not (named and names.shape == (count,)):
         expected = f"expected {count} different names, one per expression"
         raise StgaError(f"{path}: {EXPRESSION_NAMES}: {expected}")
-    return FlameModel(
-        v_template=template,
-        shapedirs=shapedirs,
-        n_identity=n_identity,
-        posedirs=posedirs,
-        j_regressor=regressor,
-        parents=parents,
-        weights=weights,
-        faces=faces.astype(np.int32),
-        masks=_masks(path, arrays, vertices),
-        expression_names=tuple(names.tolist()),
-    )
+    return tuple(names.tolist())
 
 
 def _check_shape(path: Path, key: str, array: np.ndarray, expected: Shape) -> None:

@@ -170,9 +170,8 @@ def open_avatar_motion(request: Posed, avatar: Avatar, say: Say) -> Motion:
     if options.stay_trained is not None and trained is None:
         what = "is no run with a FLAME capture, whose motion would be the range"
         raise StgaError(f"--stay-trained: {source} {what}")
-    motion = open_motion(
-        request.motion, flame, avatar.neutral, avatar.faces, options, trained, request.fps
-    )
+    head = avatar.neutral, avatar.faces
+    motion = open_motion(request.motion, flame, head, options, trained, request.fps)
     for line in findings(motion):
         say(line)
     return motion

@@ -194,6 +194,7 @@ def test_what_is_no_motion(tmp_path, capsys, out):
     """Catches "holds FLAME parameters already" for a BVH and for a file that does not exist."""
     (tmp_path / "take.bvh").write_text("HIERARCHY\nROOT Hips\n{\n}\nMOTION\n")
     (tmp_path / "face.mp4").touch()
+    head = np.zeros((4, 3)), np.zeros((4, 3), int)
     expected = ".csv, .tsv, .json, .txt, .npz, the folder of a take or of a capture"
     for name, sentence in (
         ("take.bvh", f"take.bvh: is no motion; expected {expected}"),
@@ -205,9 +206,9 @@ def test_what_is_no_motion(tmp_path, capsys, out):
         assert sentence in capsys.readouterr().err
         sentence = sentence.replace("cannot be read", "does not exist")
         with pytest.raises(StgaError, match=re.escape(sentence)):
-            open_motion(tmp_path / name, None, np.zeros((4, 3)), np.zeros((4, 3), int))
+            open_motion(tmp_path / name, None, head)
     with pytest.raises(StgaError, match="stga drive makes a motion of a video"):
-        open_motion(tmp_path / "face.mp4", None, np.zeros((4, 3)), np.zeros((4, 3), int))
+        open_motion(tmp_path / "face.mp4", None, head)
 
 
 def test_header_of_live_link_face():

@@ -18,7 +18,7 @@ from mathutils import Matrix, Vector
 from ...capture.model import Capture
 from ...errors import StgaError
 from ...flame.forward import FlameFrame, joint_positions, shaped_vertices
-from ...flame.model import JOINTS
+from ...flame.model import JOINTS, FlameModel
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG, FlameSequence, joint_angles
 from .. import arrays, tags
 from ..arrays import Z_UP_TO_Y_UP, add_driver, flat_floats, key_points
@@ -142,16 +142,7 @@ def add_rig(
     deformed = [keyframes.deform_bone(name) if moves else name for name, moves in moved]
     _remove_bone_groups(head, _rigs(head))
     rig = _place_armature(head, joint_positions(model, basis), model.parents, deformed)
-    for name, column in zip(deformed, model.weights.T, strict=True):
-        group = head.vertex_groups.new(name=name)
-        for vertex in np.flatnonzero(column).tolist():
-            group.add([vertex], column[vertex], "REPLACE")
-    modifiers = (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig)
-    modifier = next(modifiers, None) or head.modifiers.new(rig.name, "ARMATURE")
-    modifier.object = rig
-    modifier.use_vertex_groups = True
-    modifier.use_bone_envelopes = False
-    modifier.use_deform_preserve_volume = False
+    _skin(head, rig, deformed, model.weights)
     _draw_at_skin(rig, basis, model.weights, joint_positions(model, basis))
     head.pop(keyframes.ARKIT_MAP, None)  # of shape keys that an earlier import had
     if model.expression_names:
@@ -159,19 +150,7 @@ def add_rig(
     for name, component in sliders.items():
         _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
     corrected = np.array(correctives == "all") | (joint_angles(frames) > MIN_JOINT_ANGLE_DEG)
-    # Nine per joint, each driven by one entry of the joint's rotation minus identity.
-    for feature in range(model.posedirs.shape[2]):
-        joint = 1 + feature // 9
-        row = feature % 9 // 3
-        column = feature % 3
-        if not corrected[joint] or not model.posedirs[:, :, feature].any():
-            continue
-        name = f"pose_{JOINTS[joint]}_{row}{column}"
-        path = rotation_path(JOINTS[joint])
-        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
-        expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
-        rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
-        add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
+    _add_correctives(head, rig, model, basis, corrected)
     keyframes.key_motion(head, rig, np.array(sequence.timesteps), frames, warn=warn)
     if has_offsets:
         warn(
@@ -187,6 +166,39 @@ def add_rig(
     for joint in np.flatnonzero(displaced).tolist():
         _drive_joint(head, rig, JOINTS[joint], list(sliders), directions[joint])
     return rig
+
+
+def _skin(head: Any, rig: Any, bones: Sequence[str], weights: np.ndarray) -> None:
+    """Let the head's mesh follow the bones by the weights (V, 5)."""
+    for name, column in zip(bones, weights.T, strict=True):
+        group = head.vertex_groups.new(name=name)
+        for vertex in np.flatnonzero(column).tolist():
+            group.add([vertex], column[vertex], "REPLACE")
+    modifiers = (old for old in head.modifiers if old.type == "ARMATURE" and old.object == rig)
+    modifier = next(modifiers, None) or head.modifiers.new(rig.name, "ARMATURE")
+    modifier.object = rig
+    modifier.use_vertex_groups = True
+    modifier.use_bone_envelopes = False
+    modifier.use_deform_preserve_volume = False
+
+
+def _add_correctives(
+    head: Any, rig: Any, model: FlameModel, basis: np.ndarray, corrected: np.ndarray
+) -> None:
+    """Shape keys of the `corrected` joints (5,), nine per joint, each driven by one entry of the
+    joint's rotation minus identity."""
+    for feature in range(model.posedirs.shape[2]):
+        joint = 1 + feature // 9
+        row = feature % 9 // 3
+        column = feature % 3
+        if not corrected[joint] or not model.posedirs[:, :, feature].any():
+            continue
+        name = f"pose_{JOINTS[joint]}_{row}{column}"
+        path = rotation_path(JOINTS[joint])
+        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
+        expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
+        rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
+        add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
 
 
 def rig_of(head: Any) -> Any:

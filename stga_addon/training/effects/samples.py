@@ -10,6 +10,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, map_coordinates, unif
 from ...avatar.embedding import face_frames
 from ...avatar.offsets import SIGNALS
 from ...avatar.strain import strain_basis, trained_range
+from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_view
 from ...capture.model import Capture, View, evenly_spread
 
@@ -125,22 +126,10 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     mesh = np.asarray(capture.mesh(view.timestep))
     corners, depth = camera.project(mesh)
     depths = depth[capture.faces].mean(1)
-    (p0, p1, p2) = mesh[capture.faces].swapaxes(0, 1)
-    # cosine between each triangle's normal and its direction to the camera
-    normal = np.cross(p1 - p0, p2 - p0)
-    to_camera = camera.position - (p0 + p1 + p2) / 3
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
-    towards = np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30)
-    # (H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
-    # are drawn whole, from far to near
-    picture = Image.new("I", (camera.width, camera.height), -1)
-    drawn = np.flatnonzero((towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1))
-    drawn = drawn[np.argsort(-depths[drawn], kind="stable")]
-    polygons = (corners[capture.faces[drawn]].reshape(-1, 6) - 0.5).tolist()
-    draw = ImageDraw.Draw(picture)
-    for face, polygon in zip(drawn.tolist(), polygons, strict=True):
-        draw.polygon(polygon, fill=face)
-    nearest = np.asarray(picture)
+    towards = _facing(mesh, capture.faces, camera)
+    drawn = (towards > 0) & (depth[capture.faces] > MIN_NEAR_DEPTH_M).all(1)
+    far_first = np.flatnonzero(drawn)[np.argsort(-depths[drawn], kind="stable")]
+    nearest = _nearest(corners[capture.faces], far_first, camera)
     triangles = corners[capture.faces[faces]]
     center = triangles.mean(1)
     x, y = np.round(center - 0.5).astype(int).T
@@ -176,10 +165,7 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     if mask is None:
         names = ("foreground", "uncovered", "mesh", "outside", "background_spread")
         return {**row, **dict.fromkeys(names, np.array(np.nan))}
-    foreground = mask > 127
-    outside = covered & ~binary_dilation(foreground, np.ones((3, 3)))
-    uncovered = foreground & ~near
-    parts = {"foreground": foreground, "uncovered": uncovered, "mesh": covered, "outside": outside}
+    parts = {**_areas(mask > 127, covered, near), "mesh": covered}
     row |= {name: np.array(area * part.sum()) for name, part in parts.items()}
     beside = binary_erosion(mask == 0, iterations=MASK_EDGE_PIXELS, border_value=1)
     clear = image[beside].astype(np.float64)
@@ -188,3 +174,33 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
         row["background"] = clear.mean(0)
         spread = np.sqrt(((clear - row["background"]) ** 2).mean())
     return {**row, "background_spread": np.array(spread)}
+
+
+def _facing(mesh: np.ndarray, triangles: np.ndarray, camera: Camera) -> np.ndarray:
+    """(F,) cosine between each triangle's normal and its direction to the camera."""
+    (p0, p1, p2) = mesh[triangles].swapaxes(0, 1)
+    normal = np.cross(p1 - p0, p2 - p0)
+    to_camera = camera.position - (p0 + p1 + p2) / 3
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
+    return np.asarray(np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30))
+
+
+def _nearest(corners: np.ndarray, far_first: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
+    of corners (F, 3, 2) are drawn whole, from far to near."""
+    picture = Image.new("I", (camera.width, camera.height), -1)
+    polygons = (corners[far_first].reshape(-1, 6) - 0.5).tolist()
+    draw = ImageDraw.Draw(picture)
+    for face, polygon in zip(far_first.tolist(), polygons, strict=True):
+        draw.polygon(polygon, fill=face)
+    return np.asarray(picture)
+
+
+def _areas(foreground: np.ndarray, covered: np.ndarray, near: np.ndarray) -> dict[str, np.ndarray]:
+    """(H, W) the mask's foreground, what of it is not `near` the mesh, within the tracking's error,
+    and where the mesh, which is `covered`, lies outside of it."""
+    return {
+        "foreground": foreground,
+        "uncovered": foreground & ~near,
+        "outside": covered & ~binary_dilation(foreground, np.ones((3, 3))),
+    }

@@ -175,39 +175,41 @@ def test_environments_stand_upright_and_turn(up, browser, tmp_path):
     np.testing.assert_allclose(turned_world, rotated(world, quarter), atol=1e-9)
 
 
+def choose(browser, kind):
+    """Choose a light in the page's section; the lighting that the page then has."""
+    return browser.evaluate(f"""{{
+      const list = document.querySelector('#light select');
+      list.value = '{kind}';
+      list.dispatchEvent(new Event('change'));
+      document.querySelector('stga-avatar').lighting;
+    }}""")
+
+
+def side_of_light(browser):
+    """Brightness of the right half of the picture over the left."""
+    levels = picture(browser, 0)
+    covered = levels.min(2) < 250
+    half = covered.shape[1] // 2
+    shown = levels.mean(2)
+    left, right = (shown[:, k][covered[:, k]].mean() for k in np.s_[:half, half:])
+    return float(right / left)
+
+
+def mouse(browser, kind, x, y, **keys):
+    at = {"type": f"mouse{kind}", "x": x, "y": y, "button": "left", "clickCount": 1}
+    browser.send("Input.dispatchMouseEvent", **at, **keys)
+
+
 def test_light_controls(browser, tmp_path):
     """Catches a control of the section Light that does nothing, and a light that is dragged the
     wrong way."""
     head = lit_head()
     show(browser, tmp_path, head.data())
     assert not browser.evaluate("document.getElementById('light').hidden")
-
-    def choose(kind):
-        return browser.evaluate(f"""{{
-          const list = document.querySelector('#light select');
-          list.value = '{kind}';
-          list.dispatchEvent(new Event('change'));
-          document.querySelector('stga-avatar').lighting;
-        }}""")
-
-    assert choose("studio") == {"environment": "studio", "turn": 0, "exposure": 0}
-    dragged = choose("dragged")
+    assert choose(browser, "studio") == {"environment": "studio", "turn": 0, "exposure": 0}
+    dragged = choose(browser, "dragged")
     assert set(dragged) == {"even", "sun", "exposure"}
     assert browser.evaluate("document.querySelector('#light-dragged').hidden") is False
-
-    def side_of_light():
-        """Brightness of the right half of the picture over the left."""
-        levels = picture(browser, 0)
-        covered = levels.min(2) < 250
-        half = covered.shape[1] // 2
-        shown = levels.mean(2)
-        left, right = (shown[:, k][covered[:, k]].mean() for k in np.s_[:half, half:])
-        return float(right / left)
-
-    def mouse(kind, x, y, **keys):
-        at = {"type": f"mouse{kind}", "x": x, "y": y, "button": "left", "clickCount": 1}
-        browser.send("Input.dispatchMouseEvent", **at, **keys)
-
     left, top, width = browser.evaluate("""(() => {
       document.getElementById('panel').hidden = false;
       const pad = document.getElementById('light-pad');
@@ -218,15 +220,15 @@ def test_light_controls(browser, tmp_path):
     shares = []
     for x in (0.15, 0.85):
         for kind in ("Pressed", "Released"):
-            mouse(kind, left + x * width, top + 0.5 * width)
-        shares.append(side_of_light())
+            mouse(browser, kind, left + x * width, top + 0.5 * width)
+        shares.append(side_of_light(browser))
     assert shares[1] > 1.2 * shares[0]
     browser.evaluate("document.getElementById('panel').hidden = true")
     camera = "document.querySelector('stga-avatar').camera.matrix.join()"
     before = browser.evaluate(camera)
     for kind, x in (("Pressed", 200), ("Moved", 100), ("Released", 100)):
-        mouse(kind, x, 150, buttons=1, modifiers=1)  # Alt
-    assert side_of_light() < shares[1]
+        mouse(browser, kind, x, 150, buttons=1, modifiers=1)  # Alt
+    assert side_of_light(browser) < shares[1]
     assert browser.evaluate(camera) == before
     place = "document.getElementById('light-pad').style.getPropertyValue('--x')"
     assert browser.evaluate(place) != "85%"
@@ -236,5 +238,5 @@ def test_light_controls(browser, tmp_path):
     ):
         with pytest.raises(AssertionError, match=problem):
             set_lighting(browser, lighting)
-    assert choose("recorded") is None
+    assert choose(browser, "recorded") is None
     assert browser.errors == []
