@@ -13,7 +13,7 @@ from itertools import count
 from pathlib import Path
 from subprocess import Popen
 from time import sleep
-from typing import Any
+from typing import Any, Protocol
 
 import bpy
 import numpy as np
@@ -70,14 +70,24 @@ curves: dict[Path, Curve | None] = {}
 """Run or capture folder -> its curve as last read, or the picture of a tracking."""
 _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
-_watched: list[Any] = []
-"""What has a timer of its own: `tick` returns the seconds until the next call, or None; `close` is
-called where file or extension is gone."""
 
 
-def watch(thing: Any) -> None:
-    """Call `thing.tick` from a timer until it returns None, the file is closed, or the extension
-    ends; then, or after an error, `thing.close`."""
+class Watched(Protocol):
+    """What has a timer of its own."""
+
+    def tick(self) -> float | None:
+        """Do a little; seconds until the next call, None: that was the last."""
+
+    def close(self) -> None:
+        """End: file or extension is gone, or `tick` has raised."""
+
+
+_watched: list[Watched] = []
+
+
+def watch(thing: Watched) -> None:
+    """Call its `tick` from a timer until that returns None, the file is closed, or the extension
+    ends."""
 
     def tick() -> float | None:
         interval = None
@@ -96,7 +106,7 @@ def watch(thing: Any) -> None:
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
-def unwatch(thing: Any) -> None:
+def unwatch(thing: Watched) -> None:
     """Call it no more; without an effect where it is not called."""
     with suppress(ValueError):
         _watched.remove(thing)
