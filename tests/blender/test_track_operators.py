@@ -117,7 +117,7 @@ def test_mistakes_are_one_sentence(extension, take, tmp_path):
     """Catches a traceback, a panel that waits, and another tracker's capture overwritten."""
     for more, expected in (
         ({"model": "/nowhere/head.npz"}, "/nowhere/head.npz: cannot be read"),
-        ({"footage": "/nowhere"}, "/nowhere: is neither a folder nor a video"),
+        ({"footage": "/nowhere"}, "/nowhere: does not exist"),
     ):
         with pytest.raises(RuntimeError, match=expected):
             track(take, tmp_path / "tracked", **more)

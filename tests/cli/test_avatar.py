@@ -95,7 +95,7 @@ def test_a_wrong_folder_is_left_as_it_is(take, tmp_path, capsys):
     """Catches a folder that remembers a mistake, and somebody's run taken for a part of it."""
     files = "--model", take / "head.npz", "--out", tmp_path / "out"
     assert stga("avatar", tmp_path / "nowhere", *files) == 2
-    assert "nowhere: is neither a folder nor a video" in capsys.readouterr().err
+    assert "nowhere: does not exist" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     (tmp_path / "out").mkdir()
     assert stga("avatar", tmp_path / "nowhere", *files) == 2
