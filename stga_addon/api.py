@@ -1,7 +1,7 @@
 """The Python interface: what other programs import, kept from version to version.
 
 Other modules may move. Importing this one needs numpy alone; rendering needs numba, training what
-`pip install '.[train]'` brings.
+the extra `train` of the package brings.
 
     >>> from pathlib import Path
     >>> from PIL import Image
