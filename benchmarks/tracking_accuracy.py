@@ -32,6 +32,7 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import read_head_model
 from stga_addon.tracking.landmarks import read_places
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.seen_surface import facing, in_sight
 from stga_addon.tracking.track import track
 
@@ -91,7 +92,7 @@ def measure(options: argparse.Namespace, folder: Path) -> None:
     true = open_capture(options.capture, options.flame)
     file = head_file(options.model, folder)
     begin = perf_counter()
-    result = track(footage, file, folder / "out", options.landmarks, mattes=False)
+    result = track(footage, file, folder / "out", TrackingOptions(options.landmarks, mattes=False))
     seconds = perf_counter() - begin
     found = open_capture(folder / "out", file)
     places, used = read_places(

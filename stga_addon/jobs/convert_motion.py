@@ -145,7 +145,7 @@ def _tracked_by_avatar(
     somebody else."""
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
-    from ..tracking.track import is_of_footage
+    from ..tracking.opened import is_of_footage
 
     count = len(open_footage(request.source).timesteps)
     flame = read_run(avatar).flame

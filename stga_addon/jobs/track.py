@@ -18,6 +18,7 @@ from ..options import option, usable_path
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
+from ..tracking.stages import Stage
 from ..training.run.folder import AVATAR, has_run
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
@@ -164,24 +165,6 @@ class MakeAvatar:
             raise StgaError(f"{self.out}: {problem}")
 
 
-STAGES = {
-    "Opening the footage": (0.0, 0.0),
-    "Head model": (0.0, 0.01),
-    "Landmarks": (0.01, 0.06),
-    "Focal length": (0.06, 0.07),
-    "Fit": (0.07, 0.12),
-    "Dense tracking": (0.12, 0.3),
-    "Surface": (0.3, 0.34),
-    "Refinement": (0.34, 0.51),
-    "Mattes": (0.51, 0.64),
-    "Torso": (0.64, 0.97),
-    "Contact sheet": (0.97, 0.985),
-    "Images": (0.985, 0.99),
-    "Heads": (0.99, 1.0),
-}
-"""Stage of `tracking.track` -> the share of the progress that it begins and ends with: about its
-share of the time on two processors where one camera recorded a video of 1080p."""
-AVATAR_STAGE = "Avatar"
 WRITER = "tracking is writing this capture"  # Who holds its lock
 MAX_MISFIT = 0.5
 """Median share of the head's pixels, beyond which the avatar is another person's."""
@@ -208,13 +191,14 @@ def _track_held(request: Track, report: Report, say: Say) -> Written:
     from ..tracking.correct import report_errors
     from ..tracking.footage.open import open_footage
     from ..tracking.footage.sequences import FrameRange
+    from ..tracking.opened import TrackingOptions
     from ..tracking.track import end_tracking
     from ..tracking.track import track as track_footage
     from ..training.run.recording import avatar_person, track_recording
 
     steps = _Steps(report, 1.0 if request.avatar is None else TRACKING_SHARE)
     out = request.out
-    steps.report("Opening the footage", 0, 1)
+    steps.report(Stage.OPENING, 0, 1)
     offset = dict(request.offset or {})
     frames = FrameRange(request.start, request.stop, request.step, offset, request.sync)
     given = None if request.mattes in MATTES else Path(request.mattes)
@@ -223,18 +207,10 @@ def _track_held(request: Track, report: Report, say: Say) -> Written:
     model = request.model
     if request.avatar is not None:
         person, model = avatar_person(request.avatar)
-    found = track_footage(
-        footage,
-        model,
-        out,
-        request.landmarks,
-        request.meshes,
-        request.world,
-        request.mattes == "auto",
-        steps.report,
-        steps.show,
-        person,
+    options = TrackingOptions(
+        request.landmarks, request.meshes, request.world, request.mattes == "auto", person
     )
+    found = track_footage(footage, model, out, options, steps.report, steps.show)
     lines = [f"warning: {warning}" for warning in found.warnings]
     pixels = found.median_px
     if found.focal_px is not None:
@@ -247,7 +223,7 @@ def _track_held(request: Track, report: Report, say: Say) -> Written:
                 request.avatar,
                 out,
                 helpers,
-                partial(steps.report, AVATAR_STAGE),
+                partial(steps.report, Stage.AVATAR),
                 footage.keeps(request.world),
             )
         pixels = report_errors(out, model)
@@ -281,16 +257,14 @@ class _Steps:
         self._now = Progress()
         self._quality = dict[str, float]()
 
-    def report(self, stage: str, done: int, total: int) -> None:
+    def report(self, stage: Stage, done: int, total: int) -> None:
         """Raises Cancelled where the report says to stop."""
-        begin, end = (self._share * share for share in STAGES.get(stage, (0.0, 0.9)))
-        if stage == AVATAR_STAGE:
-            begin = self._share
-            end = 1.0
+        begin = self._share * stage.begin
+        end = self._share * stage.end
         share = begin + (end - begin) * done / max(total, 1)
         figures = {"left_s": self._time_left.after(share), **self._quality}
         detail = f"{done} of {total}" if total > 1 else ""
-        self._now = Progress(share, stage, detail, lambda: figures)
+        self._now = Progress(share, stage.title, detail, lambda: figures)
         if self._report(self._now):
             raise Cancelled
 

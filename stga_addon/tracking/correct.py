@@ -18,10 +18,11 @@ from ..flame.sequence import MAX_PARAMETER, FlameSequence, with_identity
 from .folder import LANDMARKS_FOLDER, PLACES_FILE, REPORT_FILE, SHEET_FILE, rounded
 from .footage.model import Footage
 from .footage.open import open_footage
-from .landmarks import CameraLandmarks, Report, check_count, read_landmarks, read_places
-from .pictures import write_contact_sheet
+from .landmarks import CameraLandmarks, check_count, read_landmarks, read_places
+from .pictures import PosedHead, write_contact_sheet
 from .posed_points import PosedPoints, SurfacePoints
 from .solve import LANDMARK_SIGMA_M, acceleration_precision
+from .stages import ReportStage, Stage, unreported
 from .write_capture import moving_arrays
 
 SOLVED_FILE = "tracking_solved.npz"
@@ -34,7 +35,7 @@ def correct_capture(
     model: Path,
     keys: Mapping[int, np.ndarray],
     span: int = DEFAULT_SPAN,
-    report: Report = lambda stage, done, total: None,
+    report: ReportStage = unreported,
 ) -> None:
     """Solve a tracked FLAME capture again around timesteps whose parameters (E + 18,) are given:
     `keys`.
@@ -58,15 +59,15 @@ def correct_capture(
     rows = {timesteps.index(t): values.astype(np.float64) for t, values in keys.items()}
     trust = _trust(out / REPORT_FILE, read_json(out / REPORT_FILE), timesteps)
     places, used, _, _ = _landmarks(out, capture)
-    report("Solve", 0, 1)
+    report(Stage.CORRECTION, 0, 1)
     person = with_identity(capture.flame).model
     heads = corrected(person, places[used], solved, trust, rows, span)
     write_npz(out / SOLVED_FILE, {"timesteps": np.array(timesteps), "parameters": solved})
     for number, (timestep, values) in enumerate(zip(timesteps, heads, strict=True)):
         path = out / PARAMETERS / f"{timestep:05d}.npz"
         write_npz(path, {**read_npz(path), **moving_arrays(values)})  # identity and offsets stay
-        report("Heads", number + 1, len(timesteps))
-    report("Contact sheet", 0, 1)
+        report(Stage.HEADS, number + 1, len(timesteps))
+    report(Stage.CONTACT_SHEET, 0, 1)
     report_errors(out, model)
 
 
@@ -193,8 +194,8 @@ def report_errors(out: Path, model: Path | None) -> float:
     report["reprojection_px"] = rounded(errors)
     write_json(out / REPORT_FILE, report)
     misfit = _misfit(report)
-    sheet = out / SHEET_FILE
-    write_contact_sheet(sheet, footage, cameras, capture.mesh, capture.faces, errors, misfit)
+    posed = PosedHead(cameras, capture.mesh, capture.faces)
+    write_contact_sheet(out / SHEET_FILE, footage, posed, errors, misfit)
     return median
 
 

@@ -25,9 +25,9 @@ from .fit import (
     excerpt,
     landmarks_in_capture,
 )
-from .landmarks import Report
 from .posed_points import split
 from .solve import Observation, acceleration_precision, normal_equations, prior_terms, smoothed
+from .stages import ReportStage, Stage, unreported
 
 MIN_TIMESTEPS = 6  # Below it, an averaged texture is no evidence of how timesteps differ
 SETTLED_WEIGHT = 0.1  # Least weight of a timestep in the texture of a settled take
@@ -123,7 +123,7 @@ def fit_dense(
     take: RecordedTake,
     helpers: Helpers,
     settled: bool = False,
-    report: Report = lambda stage, done, total: None,
+    report: ReportStage = unreported,
 ) -> DenseFit | None:
     """Expression and pose of every timestep from the images; None where the take is too short for
     it.
@@ -146,7 +146,7 @@ def fit_dense(
         work: Callable[..., Any], parts: Sequence[tuple], before: int, keep: bool = False
     ) -> list:
         every = [(*excerpt(fit, take, part), *arguments) for part, *arguments in parts]
-        stage = "Refinement" if settled else "Dense tracking"
+        stage = Stage.REFINEMENT if settled else Stage.DENSE
         return helpers.map(work, every, lambda steps: report(stage, before + steps, total), keep)
 
     weights = head.rest([fit.parameters[t] for t in chosen])

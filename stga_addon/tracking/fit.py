@@ -162,20 +162,6 @@ class HeadFit:
     ordered: bool = True
 
 
-@dataclass(frozen=True)
-class KnownPerson:
-    """Whom an avatar shows.
-
-    fit     the head, without a take's parameters
-    draw    the avatar on a mesh (V, 3), as a camera sees it: (H, W, 3) uint8
-    camera  that recorded the person; None of several
-    """
-
-    fit: HeadFit
-    draw: Callable[[np.ndarray, Camera], np.ndarray]
-    camera: Camera | None
-
-
 def posed_mesh(
     fit: HeadFit, parameters: np.ndarray, offset: np.ndarray | None = None
 ) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Landmarks of every frame: detected, or read from a folder of files."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from .folder import PLACES_FILE
 from .footage.model import Footage, FootageCamera
 from .head_model import floats
 from .posed_points import SurfacePoints
+from .stages import ReportStage, Stage
 
 MIN_BARYCENTRIC = -1e-3
 MAX_SUM_ERROR = 1e-3
@@ -30,10 +31,6 @@ MIN_PART_TIMESTEPS = 50
 """Of a camera's parts, which are worked on at once, and as many as there may be helpers: each
 decodes a video from the key frame before it, or from the beginning."""
 MIN_OVERLAP = 0.3  # Two faces whose boxes share this much of their area are one, found twice
-
-Report = Callable[[str, int, int], None]
-"""Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not
-detected again."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ def landmark_file(folder: Path, camera: str) -> Path:
 
 
 def detect_landmarks(
-    footage: Footage, detector: FaceNetworks, folder: Path, helpers: Helpers, report: Report
+    footage: Footage, detector: FaceNetworks, folder: Path, helpers: Helpers, report: ReportStage
 ) -> dict[str, CameraLandmarks]:
     """Landmarks by camera; each camera's are written to `folder`, and read from there where they
     are already.
@@ -71,7 +68,7 @@ def detect_landmarks(
     done = 0
 
     def count(steps: int) -> None:
-        report("Landmarks", done + steps, total)
+        report(Stage.LANDMARKS, done + steps, total)
 
     for camera in footage.cameras:
         path = landmark_file(folder, camera.name)

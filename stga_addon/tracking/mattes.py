@@ -22,7 +22,7 @@ from ..worker.helpers import Helpers, Step
 from .face_networks import PersonNetwork
 from .folder import MATTES_FILE, mask_name
 from .footage.model import Footage, FootageCamera
-from .landmarks import Report
+from .stages import ReportStage, Stage
 
 PART_TIMESTEPS = 24  # At most, of the parts of a camera that are worked on at once
 MIN_HEAD_PROBABILITY = 0.5
@@ -63,7 +63,7 @@ def with_mattes(
     out: Path,
     source: dict[str, Any],
     helpers: Helpers,
-    report: Report,
+    report: ReportStage,
 ) -> tuple[Footage, tuple[str, ...]]:
     """The footage with a mask for every frame, and warnings.
 
@@ -80,7 +80,7 @@ def with_mattes(
     cameras = []
 
     def count(steps: int) -> None:
-        report("Mattes", done + steps, total)
+        report(Stage.MATTES, done + steps, total)
 
     for number, camera in enumerate(footage.cameras):
         files = {t: out / mask_name(t, number) for t in camera.timesteps}

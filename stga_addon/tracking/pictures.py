@@ -3,7 +3,7 @@ a tracked take, with errors of all views and the mesh drawn over the worst."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +49,20 @@ COLOR_SCALE_END = 3.0  # In medians of all errors
 
 Errors = Mapping[str, Mapping[int, float]]
 """Camera -> timestep -> reprojection error in pixels; without an entry where no face was found."""
-Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
-"""Called with what draws a picture (SIZE, SIZE, 3) uint8 for those who watch, None: there is
-nothing to see; and with figures of how well the head fits (`format.describe_figures`)."""
+
+
+@dataclass(frozen=True)
+class PosedHead:
+    """The head of a take in the world of its cameras.
+
+    cameras  by name
+    mesh     timestep -> vertices (V, 3)
+    faces    (F, 3)
+    """
+
+    cameras: Mapping[str, Camera]
+    mesh: Callable[[int], np.ndarray]
+    faces: np.ndarray
 
 
 def picture_of_first_frame(
@@ -107,16 +118,13 @@ def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
 def write_contact_sheet(
     path: Path,
     footage: Footage,
-    cameras: Mapping[str, Camera],
-    mesh: Callable[[int], np.ndarray],
-    faces: np.ndarray,
+    head: PosedHead,
     errors: Errors,
     misfit: Errors | None = None,
 ) -> None:
     """Write a PNG: a chart of the errors, cameras down and timesteps across, and the worst views
     with the mesh. What lies outside a view's mask is green.
 
-    cameras: name -> camera in the mesh's world. mesh: timestep -> (V, 3) vertices. faces (F, 3).
     misfit: region of the face -> timestep -> share of the images that is not explained; it is
     charted below, and counts as much as the reprojection error in which views are the worst. Raises
     StgaError where the file cannot be written or a frame cannot be read.
@@ -151,7 +159,7 @@ def write_contact_sheet(
         caption = f"{name}, timestep {t}: {every[name, t]:.1f} px"
         caption += f", {unexplained[t]:.0%} unexplained" if t in unexplained else ""
         row, column = divmod(number, COLUMNS)
-        tile = _tile(image, cameras[name], mesh(t), faces, caption)
+        tile = _tile(image, head.cameras[name], head.mesh(t), head.faces, caption)
         sheet.paste(tile, (MARGIN + column * (width + GAP), top + row * (height + GAP)))
     with replacing(path) as partial:
         sheet.save(partial, format="PNG")

@@ -54,6 +54,11 @@ def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
     return np.asarray(vectors / np.maximum(length, least))
 
 
+def face_size(pixels: np.ndarray) -> float:
+    """Diagonal of the box around landmarks (N, 2)."""
+    return float(np.linalg.norm(np.ptp(pixels, axis=0)))
+
+
 class PosedPoints:
     """The model's arrays at surface points; parameters are K coefficients and P = 18 numbers of
     pose and translation.

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +63,16 @@ class SurfaceSearch:
     points: SurfacePoints
     near: np.ndarray
     sweep: Sweep
+
+
+class PosedSurface(NamedTuple):
+    """A mesh at a timestep: vertices (V, 3) meters and faces (F, 3); N points on it, and their unit
+    normals, (N, 3)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
 
 
 def gray_view(
@@ -220,10 +231,11 @@ def seen_surface(
     `visible` is filled with what is in sight from where, and read for directions that are in it
     already.
     """
-    vertices, at, normals = _posed(fit, timestep, sought.points)
+    surface = _posed(fit, timestep, sought.points)
+    at = surface.points
+    normals = surface.normals
     near = sought.near
     sweep = sought.sweep
-    faces = fit.head.model.faces
     turn = head_rotation(fit.parameters[timestep])
     cosines = []
     views = []
@@ -232,15 +244,15 @@ def seen_surface(
         views.append(gray_view(camera, image, at.mean(0), sweep.spacing))
         key = rounded_direction((camera.position - at.mean(0)) @ turn, DIRECTIONS)
         if key not in visible:
-            visible[key] = in_sight(camera, vertices, faces, at)
+            visible[key] = in_sight(camera, surface.vertices, surface.faces, at)
         cosines.append(facing(camera, at, normals) * visible[key])
     offset, correlation = surface_offsets(views, np.stack(cosines), at, normals, sweep)
     weight = POINT_SHARE * correlation
     moved = weight * offset
+    close = surface._replace(points=at[near], normals=normals[near])
     for recording, mask in masks:
         camera = fit.to_capture.camera(recording)
-        places = vertices, faces, at[near], normals[near]
-        offset, known = outline_offsets(camera, mask, *places, sweep.reach)
+        offset, known = outline_offsets(camera, mask, close, sweep.reach)
         weight[near] += POINT_SHARE * known
         moved[near] += POINT_SHARE * offset
     mean = moved / np.maximum(weight, 1e-9)
@@ -252,27 +264,23 @@ def rounded_direction(direction: np.ndarray, steps: int) -> tuple[int, ...]:
     return tuple(np.round(steps * direction / np.linalg.norm(direction)).astype(int).tolist())
 
 
-def _posed(
-    fit: HeadFit, timestep: int, points: SurfacePoints
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3) at a timestep; of the points positions and unit normals (N, 3)."""
+def _posed(fit: HeadFit, timestep: int, points: SurfacePoints) -> PosedSurface:
     vertices = posed_mesh(fit, fit.parameters[timestep])
     faces = fit.head.model.faces
     normals = unit(points.on(vertex_normals(vertices, faces), faces))
-    return vertices, points.on(vertices, faces), normals
+    return PosedSurface(vertices, faces, points.on(vertices, faces), normals)
 
 
 def outlines_agree(fit: HeadFit, take: RecordedTake, sought: SurfaceSearch) -> bool:
     """Whether masks, if any, end where the surface in the images does."""
     distances = [np.zeros(0)]
-    faces = fit.head.model.faces
     chosen = sought.points[sought.near]
     reach = sought.sweep.reach
     for timestep in fit.parameters:
-        vertices, at, normals = _posed(fit, timestep, chosen)
+        surface = _posed(fit, timestep, chosen)
         for recording, mask in take.masks(timestep):
             camera = fit.to_capture.camera(recording)
-            offset, known = outline_offsets(camera, mask, vertices, faces, at, normals, reach)
+            offset, known = outline_offsets(camera, mask, surface, reach)
             distances.append(np.abs(offset[known]))
     every = np.concatenate(distances)
     return len(every) >= MIN_OUTLINE_POINTS and float(np.median(every)) < MAX_OUTLINE_DISTANCE_M
@@ -290,24 +298,21 @@ def near_landmarks(head: HeadModel, points: SurfacePoints, take: RecordedTake) -
 
 
 def outline_offsets(
-    camera: Camera,
-    mask: np.ndarray,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    reach: float,
+    camera: Camera, mask: np.ndarray, surface: PosedSurface, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Meters (N,) by which points would have to move along their normals for the mesh to fill the
     mask; and (N,) bool for which points this is known: those near the outline of the mesh, with one
     edge of the mask near them.
 
-    mask (H, W) uint8, 255 inside; points on the mesh and unit normals (N, 3); reach: the largest
-    move, in meters. Both outlines are crossed along the projected normal, so that a point need not
-    lie on the outline itself.
+    mask (H, W) uint8, 255 inside; reach: the largest move, in meters. Both outlines are crossed
+    along the projected normal, so that a point need not lie on the outline itself.
     """
     from scipy.spatial import cKDTree
 
+    points = surface.points
+    normals = surface.normals
+    vertices = surface.vertices
+    faces = surface.faces
     found = np.zeros(len(points))
     known = np.zeros(len(points), bool)
     rows = np.flatnonzero(np.abs(facing(camera, points, normals)) < MAX_COSINE)

@@ -15,7 +15,6 @@ from ..worker.helpers import Helpers, Step
 from . import fit as head_fit
 from .fit import HeadFit, RecordedTake, posed_mesh
 from .head_model import HeadModel
-from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split
 from .seen_surface import (
     SeenSurface,
@@ -28,6 +27,7 @@ from .seen_surface import (
     surface_points,
 )
 from .solve import LANDMARK_SIGMA_M, Observation, person, solve_identity, solve_take
+from .stages import ReportStage, Stage, unreported
 
 IDENTITY_SWEEPS = (
     Sweep(0.010, 0.001, 0.0015),
@@ -76,7 +76,7 @@ def fit_surface(
     fit: HeadFit,
     take: RecordedTake,
     helpers: Helpers,
-    report: Report = lambda stage, done, total: None,
+    report: ReportStage = unreported,
     dense: bool = False,
 ) -> HeadFit:
     """The fit moved onto the surface that several cameras see; unchanged where no timestep has
@@ -101,35 +101,15 @@ def fit_surface(
         for t, own in take.landmarks.items()
     }
     take = replace(take, landmarks=visible)
-    early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
     points = surface_points(head, SURFACE_POINTS)
-    done = 0
-    near = near_landmarks(head, points, take)
-    by_skin, by_outline = (
-        [SurfaceSearch(points, near, sweep) for sweep in sweeps]
-        for sweeps in (IDENTITY_SWEEPS, OUTLINE_SWEEPS)
-    )
-
-    def search(work: Callable[..., list], parts: Sequence[tuple]) -> list:
-        nonlocal done
-        total = early + len(timesteps)
-        results = helpers.map(work, parts, lambda steps: report("Surface", done + steps, total))
-        found = [one for result in results for one in result]
-        done += len(found)
-        return found
-
+    early = (len(IDENTITY_SWEEPS) + len(OUTLINE_SWEEPS)) * len(chosen)
+    search = _Search(helpers, report, early + len(timesteps))
     start = replace(fit, parameters={t: fit.parameters[t] for t in chosen})
-    without = replace(take, masks=head_fit.no_pictures)
-    solved = _identity(head, start, without, by_skin, search)
+    solved = _solved_subject(head, start, take, points, search)
     if solved is None:
         return fit
-    if outlines_agree(solved[0], take, by_outline[0]):
-        start = replace(solved[0], static_offset=None)
-        solved = _identity(head, start, take, by_outline, search) or solved
-    else:
-        take = without
-    (found, seen) = solved
-    done = early
+    (take, found, seen) = solved
+    search.done = early
     if not dense:
         marks = take.landmarks
         observed = {t: head_fit.landmarks_in_capture(marks[t], take, found) for t in timesteps}
@@ -147,6 +127,47 @@ def fit_surface(
         on = points[rows[:: 1 + len(rows) // count]]
         sought.append(SurfaceSearch(on, near_landmarks(found.head, on, take), sweep))
     return _whole_take(found, fit, take, observed, sought, search)
+
+
+class _Search:
+    """Parts of a search for the surface, worked on at once by helping processes, and reported as
+    so many timesteps of `total`."""
+
+    def __init__(self, helpers: Helpers, report: ReportStage, total: int) -> None:
+        self.done = 0
+        self._helpers = helpers
+        self._report = report
+        self._total = total
+
+    def __call__(self, work: Callable[..., list], parts: Sequence[tuple]) -> list:
+        """The results of the parts' timesteps, in order."""
+
+        def count(steps: int) -> None:
+            self._report(Stage.SURFACE, self.done + steps, self._total)
+
+        found = [one for result in self._helpers.map(work, parts, count) for one in result]
+        self.done += len(found)
+        return found
+
+
+def _solved_subject(
+    head: HeadModel, start: HeadFit, take: RecordedTake, points: SurfacePoints, search: _Search
+) -> tuple[RecordedTake, HeadFit, dict[int, SeenSurface]] | None:
+    """Of `_identity`, by the skin, and by the masks' outlines where they are those of the skin; and
+    the take, without masks where they are not."""
+    near = near_landmarks(head, points, take)
+    by_skin, by_outline = (
+        [SurfaceSearch(points, near, sweep) for sweep in sweeps]
+        for sweeps in (IDENTITY_SWEEPS, OUTLINE_SWEEPS)
+    )
+    without = replace(take, masks=head_fit.no_pictures)
+    solved = _identity(head, start, without, by_skin, search)
+    if solved is None:
+        return None
+    if not outlines_agree(solved[0], take, by_outline[0]):
+        return without, *solved
+    again = replace(solved[0], static_offset=None)
+    return take, *(_identity(head, again, take, by_outline, search) or solved)
 
 
 def _seen_part(
@@ -170,7 +191,7 @@ def _identity(
     fit: HeadFit,
     take: RecordedTake,
     sought: Sequence[SurfaceSearch],
-    search: Callable[..., list[SeenSurface]],
+    search: _Search,
 ) -> tuple[HeadFit, dict[int, SeenSurface]] | None:
     """Identity, scale and offsets from the timesteps of the fit, in rounds of what is sought, and
     the surfaces that they were solved from; None where the images do not show enough of the
@@ -220,7 +241,7 @@ def _whole_take(
     take: RecordedTake,
     observed: Mapping[int, Observation],
     sought: Sequence[SurfaceSearch],
-    search: Callable[..., list],
+    search: _Search,
 ) -> HeadFit:
     """Expression and pose of every timestep, from landmarks and then from the surface beside them.
 

@@ -23,7 +23,7 @@ from .appearance import NOISE_LEVELS, flow_weights, point_weights, projection_de
 from .fit import HeadFit, posed_mesh
 from .folder import TorsoMotion, TorsoPoints
 from .footage.model import Footage
-from .landmarks import Report
+from .stages import ReportStage
 from .surface import with_offset
 from .torso_cloth import Bending, found_bending
 from .torso_take import NECK, Motion, PosedTorso, TorsoPose, TorsoTake, axis_angle, head_turn
@@ -81,7 +81,7 @@ def follow_torso(
     parameters: Mapping[int, np.ndarray],
     footage: Footage,
     helpers: Helpers,
-    report: Report,
+    report: ReportStage,
     bends: bool = True,
 ) -> FollowedTorso:
     """The torso's motion in a take of heads whose parameters (E + 18,) are given by timestep.

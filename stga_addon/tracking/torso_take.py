@@ -20,8 +20,8 @@ from . import appearance
 from .appearance import NOISE_LEVELS, PyramidView, inside, sampled, unexplained
 from .fit import HeadFit, posed_mesh
 from .footage.model import FootageCamera
-from .landmarks import Report
 from .posed_points import PosedPoints, SurfacePoints, head_rotation, split, unit
+from .stages import ReportStage, Stage
 
 ROOT = JOINTS.index("root")
 NECK = JOINTS.index("neck")
@@ -186,7 +186,7 @@ class TorsoTake:
 class BothWays:
     """Work along a take, from one timestep to both ends, by helping processes, each on a way."""
 
-    def __init__(self, helpers: Helpers, report: Report, total: int) -> None:
+    def __init__(self, helpers: Helpers, report: ReportStage, total: int) -> None:
         self._helpers = helpers
         self._report = report
         self._done = 0
@@ -202,7 +202,7 @@ class BothWays:
         done = self._done
 
         def count(number: int) -> None:
-            self._report("Torso", done + number, self._total)
+            self._report(Stage.TORSO, done + number, self._total)
 
         found = self._helpers.map(follow, every, count, keep=True)
         self._done += len(who) * (len(later) + len(earlier) - 2)

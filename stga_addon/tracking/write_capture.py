@@ -16,14 +16,14 @@ from ..flame.sequence import FRAME_FIELDS
 from .fit import posed_mesh
 from .folder import SPLIT_FILES, image_name, mask_name
 from .footage.model import Footage, FootageCamera
-from .landmarks import Report
+from .stages import ReportStage, Stage
 from .torso import FollowedTorso
 
 MIN_CAMERAS_TO_HOLD_OUT = 4
 
 
 def write_capture(
-    out: Path, footage: Footage, torso: FollowedTorso, meshes: bool, report: Report
+    out: Path, footage: Footage, torso: FollowedTorso, meshes: bool, report: ReportStage
 ) -> None:
     """Write images, masks, the tracked head of each timestep, and at last the transforms that make
     it a capture.
@@ -53,7 +53,7 @@ def write_capture(
             entry["mesh_path"] = f"meshes/{timestep:05d}.obj"
         seen = "val" if source.name == held_out else "train"
         splits[seen if timestep in fit.parameters else "test"].append(entry)
-        report("Images", number + 1, len(views))
+        report(Stage.IMAGES, number + 1, len(views))
     top: dict[str, Any] = {} if flame else {"canonical_mesh_path": "meshes/neutral.obj"}
     if footage.fps is not None:
         top["fps"] = footage.fps
@@ -70,7 +70,7 @@ def write_capture(
         if meshes or not flame:
             path = out / "meshes" / f"{timestep:05d}.obj"
             write_obj(path, torso.mesh(timestep), model.faces)
-        report("Heads", number + 1, len(parameters))
+        report(Stage.HEADS, number + 1, len(parameters))
     if meshes or not flame:
         write_obj(out / "meshes" / "neutral.obj", posed_mesh(fit, neutral), model.faces)
     if flame:

@@ -33,10 +33,10 @@ def made(take, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write_capture, "write_json", interrupt)
         # What takes the longest, and is thrown away here
-        patch.setattr("stga_addon.tracking.track.fit_dense", lambda *_, **__: None)
-        patch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
+        patch.setattr("stga_addon.tracking.seen.fit_dense", lambda *_, **__: None)
+        patch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
         follow = lambda fit, own, *_: FollowedTorso(fit, own)  # noqa: E731
-        patch.setattr("stga_addon.tracking.track.follow_torso", follow)
+        patch.setattr("stga_addon.tracking.seen.follow_torso", follow)
         assert make(take, out) == 130
     assert not (out / "run").exists()
     printed = StringIO()

@@ -28,7 +28,7 @@ from stga_addon.render.video import video_writer
 from stga_addon.tracking.folder import AVATAR_MISFIT, FOOTAGE_FILE, REPORT_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
-from stga_addon.tracking.track import footage_state
+from stga_addon.tracking.opened import footage_state
 from stga_addon.training.run.folder import AVATAR, Run, avatar_version, write_run
 from stga_addon.training.settings import TrainingSettings
 

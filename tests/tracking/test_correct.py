@@ -18,6 +18,7 @@ from stga_addon.tracking.correct import SOLVED_FILE, correct_capture, corrected
 from stga_addon.tracking.folder import LANDMARKS_FOLDER, REPORT_FILE
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 
@@ -91,7 +92,8 @@ def tracked(tmp_path_factory):
     """A tracked capture, its model and its parameters."""
     folder = tmp_path_factory.mktemp("tracked")
     record(folder, HEAD)
-    track(open_footage(folder / "footage"), folder / "head.npz", folder / "out", folder / "points")
+    footage = open_footage(folder / "footage")
+    track(footage, folder / "head.npz", folder / "out", TrackingOptions(folder / "points"))
     return folder / "out", folder / "head.npz", parameters_in(folder / "out", folder / "head.npz")
 
 

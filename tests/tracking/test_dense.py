@@ -23,6 +23,7 @@ from stga_addon.tracking.dense_head import REGIONS
 from stga_addon.tracking.fit import RecordedTake, fit_head
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.posed_points import PosedPoints
+from stga_addon.tracking.seen import by_images
 from stga_addon.tracking.solve import (
     Observation,
     acceleration_precision,
@@ -31,7 +32,6 @@ from stga_addon.tracking.solve import (
     smoothed,
     solve_take,
 )
-from stga_addon.tracking.track import by_images
 from stga_addon.worker.helpers import Helpers
 
 from .test_fit import in_cameras_world, places_on, seen, shown

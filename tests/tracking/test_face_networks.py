@@ -14,9 +14,11 @@ from stga_addon.flame.model import EYEBALL_WEIGHT
 from stga_addon.flame.teeth import flame_model
 from stga_addon.tracking.correspondence import calibrate, picture_cameras, shaded_image
 from stga_addon.tracking.face_networks import IRIS_CENTERS, SCORE_NAMES, FaceNetworks
-from stga_addon.tracking.fit import HeadFit, KnownPerson
+from stga_addon.tracking.fit import HeadFit
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
+from stga_addon.tracking.known_person import KnownPerson
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.track import track
 
@@ -160,7 +162,8 @@ def test_a_known_head_seen_from_above_is_not_tilted(tmp_path):
     tilts_deg = []
     for name, drawn in (("biased", draw_nothing), ("corrected", draw)):
         known = KnownPerson(fit, drawn, None)
-        track(footage, None, tmp_path / name, mattes=False, person=known)
+        options = TrackingOptions(mattes=False, person=known)
+        track(footage, None, tmp_path / name, options)
         capture = open_capture(tmp_path / name)
         own_deg = []
         for view in capture.views["train"]:

@@ -27,6 +27,7 @@ from stga_addon.tracking.fit import (
 )
 from stga_addon.tracking.head_model import HeadModel, linear_model
 from stga_addon.tracking.posed_points import PosedPoints, SurfacePoints, split
+from stga_addon.tracking.seen import interpolated
 from stga_addon.tracking.solve import (
     LID_SHAPES,
     WEIGHT_EXCESS_SIGMA,
@@ -39,7 +40,6 @@ from stga_addon.tracking.solve import (
     smoothed,
     solve_take,
 )
-from stga_addon.tracking.track import interpolated
 
 
 def places_on(head, count, seed=0):

@@ -12,11 +12,13 @@ from stga_addon.capture.camera import camera_from_gl
 from stga_addon.capture.mesh_geometry import Similarity
 from stga_addon.files import read_json, write_npz
 from stga_addon.flame.forward import FlameFrame, flame_forward
-from stga_addon.tracking.fit import HeadFit, KnownPerson, RecordedTake, TimestepLandmarks
+from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import solved_focal
 from stga_addon.tracking.footage.open import open_footage, usual_focal
 from stga_addon.tracking.footage.video import VideoFrames
+from stga_addon.tracking.known_person import KnownPerson
 from stga_addon.tracking.landmarks import write_places
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.track import track
 
 from .scenes import write_image, write_video
@@ -210,10 +212,10 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     footage = open_footage(tmp_path / "phone.mp4")
     (width, height) = SIZE
     likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
-    inputs = footage, tmp_path / "head.npz", tmp_path / "out", tmp_path / "points"
+    inputs = footage, tmp_path / "head.npz", tmp_path / "out"
     fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
     known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)
-    found = track(*inputs, mattes=False, person=known)
+    found = track(*inputs, TrackingOptions(tmp_path / "points", mattes=False, person=known))
     assert (found.focal, found.focal_px) == ("avatar", 250)
     assert any("focal length is a guess" in warning for warning in found.warnings)
 
@@ -234,7 +236,9 @@ def test_a_phones_video_is_decoded_once_and_its_lens_is_told(tmp_path, head, mon
     monkeypatch.setattr(VideoFrames, "_frame", decode_and_note)
     footage = open_footage(tmp_path / "phone.mp4")
     out = tmp_path / "out"
-    found = track(footage, tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
+    found = track(
+        footage, tmp_path / "head.npz", out, TrackingOptions(tmp_path / "points", mattes=False)
+    )
     assert decoded == list(range(COUNT))
     assert found.focal == "solved"
     assert found.focal_px == pytest.approx(1.6 * usual_focal(*SIZE), rel=0.1)

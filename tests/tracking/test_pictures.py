@@ -17,7 +17,13 @@ from stga_addon.tracking.fit import RecordedTake
 from stga_addon.tracking.footage.model import Footage, FootageCamera, ImageFrames
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import read_head_model
-from stga_addon.tracking.pictures import COLUMNS, MESH_OPACITY, PICTURE, write_contact_sheet
+from stga_addon.tracking.pictures import (
+    COLUMNS,
+    MESH_OPACITY,
+    PICTURE,
+    PosedHead,
+    write_contact_sheet,
+)
 
 from .head_video import write_head_video
 
@@ -56,7 +62,7 @@ def footage(folder, cameras, timesteps):
 
 def write(folder, take, errors, misfit=None):
     cameras = {camera.name: camera.camera for camera in take.cameras}
-    write_contact_sheet(folder / "sheet.png", take, cameras, ball, FACES, errors, misfit)
+    write_contact_sheet(folder / "sheet.png", take, PosedHead(cameras, ball, FACES), errors, misfit)
     return np.asarray(Image.open(folder / "sheet.png").convert("RGB")).astype(int)
 
 

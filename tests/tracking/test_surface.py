@@ -15,6 +15,7 @@ from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, fit_head
 from stga_addon.tracking.posed_points import SurfacePoints
 from stga_addon.tracking.seen_surface import (
+    PosedSurface,
     SurfaceSearch,
     Sweep,
     facing,
@@ -286,7 +287,8 @@ def ball_mask(camera, grid=8):
 
 def measured(radius, mask, reach=0.005):
     vertices, faces, directions = ball(radius)
-    return outline_offsets(CAMERA, mask, vertices, faces, radius * directions, directions, reach)
+    surface = PosedSurface(vertices, faces, radius * directions, directions)
+    return outline_offsets(CAMERA, mask, surface, reach)
 
 
 @pytest.mark.parametrize("offset", [-0.003, 0.0, 0.002])

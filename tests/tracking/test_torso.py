@@ -37,6 +37,7 @@ from stga_addon.tracking.footage.model import Footage, FootageCamera
 from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import write_places
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
 from stga_addon.tracking.surface import with_offset
 from stga_addon.tracking.torso import _followed, follow_torso
@@ -384,7 +385,7 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
     """Catches a torso that is followed and then not written, or not reported to those who train on
     the capture; dense tracking that `track` does not run, and a report without it."""
     # What takes the longest, and changes neither
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
     fit, parameters, footage = lifted
     cameras = [own.camera for own in footage.cameras]
     numbers = {camera.position.tobytes(): number for number, camera in enumerate(cameras)}
@@ -404,7 +405,9 @@ def test_track_writes_the_torso_as_flames_neck(tmp_path, head, lifted, monkeypat
         write_npz(tmp_path / f"points/cam{number}.npz", arrays)
     footage = open_footage(tmp_path / "footage")
     out = tmp_path / "out"
-    result = track(footage, tmp_path / "head.npz", out, tmp_path / "points", mattes=False)
+    result = track(
+        footage, tmp_path / "head.npz", out, TrackingOptions(tmp_path / "points", mattes=False)
+    )
     found = read_torso_motion(out)
     assert found == result.torso
     assert found.shift_mm > 5

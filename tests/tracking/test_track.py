@@ -20,7 +20,7 @@ from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
 from stga_addon.flame.teeth import flame_model
 from stga_addon.jobs.perform import perform
-from stga_addon.jobs.track import STAGES, Track
+from stga_addon.jobs.track import Track
 from stga_addon.tracking.correspondence import nearest_points, shaded_image
 from stga_addon.tracking.fit import HeadFit, RecordedTake, TimestepLandmarks
 from stga_addon.tracking.focal_length import scale_warnings
@@ -29,7 +29,9 @@ from stga_addon.tracking.footage.open import open_footage
 from stga_addon.tracking.footage.sequences import FrameRange
 from stga_addon.tracking.head_model import HeadModel
 from stga_addon.tracking.landmarks import detect_landmarks, landmark_file, read_camera
+from stga_addon.tracking.opened import TrackingOptions
 from stga_addon.tracking.solve import person
+from stga_addon.tracking.stages import Stage
 from stga_addon.tracking.track import track
 from stga_addon.worker.helpers import Helpers
 
@@ -50,7 +52,7 @@ def take(tmp_path_factory, head):
 def recorded(tmp_path, take, monkeypatch):
     """A copy of the take that a test may change, and its meshes. Its blank images are not searched
     for the surface, which would take a third of the time."""
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
     folder, meshes = take
     return shutil.copytree(folder, tmp_path, dirs_exist_ok=True), meshes
 
@@ -76,7 +78,7 @@ def change(path, **values):
 
 def test_the_bundled_head_is_tracked_without_a_model(tmp_path, monkeypatch):
     """Catches a default that needs a file, and weights of another scale."""
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", lambda head, fit, *_, **__: fit)
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", lambda head, fit, *_, **__: fit)
     head = HeadModel(flame_model(None), "flame")
     meshes = record(tmp_path, head)
     footage, out, points = (str(tmp_path / name) for name in ("footage", "out", "points"))
@@ -107,7 +109,7 @@ def test_the_capture_opens_and_projects_where_the_landmarks_were(recorded, head)
     assert (folder / "out/contact_sheet.png").is_file()
     shares = [progress.share for progress in told]
     assert shares == sorted(shares)
-    assert {progress.stage for progress in told} <= {*STAGES, "Tracked"}
+    assert {progress.stage for progress in told} <= {*(stage.title for stage in Stage), "Tracked"}
     quality = {progress.stage: progress.figures().get("error_px") for progress in told}
     assert quality["Opening the footage"] is None
     assert 0 < quality["Heads"] < 0.5
@@ -158,7 +160,8 @@ def test_frame_rate_of_the_footage(recorded, fps):
     write_json(transforms, {**read_json(transforms), "fps": fps})
     footage = open_footage(folder / "footage", frames=FrameRange(0, None, 3))
     assert footage.fps == fps
-    track(footage, folder / "head.npz", folder / "out", folder / "points")
+    options = TrackingOptions(folder / "points")
+    track(footage, folder / "head.npz", folder / "out", options)
     capture = open_capture(folder / "out", folder / "head.npz")
     assert capture.timesteps == (0, 3)
     assert capture.fps == fps
@@ -369,9 +372,9 @@ class Remembering:
 
 def use_detector(monkeypatch, detector, places):
     """Let `track` use a detector whose landmarks lie at some places of the head model."""
-    monkeypatch.setattr("stga_addon.tracking.track.FaceNetworks", lambda: detector)
+    monkeypatch.setattr("stga_addon.tracking.recorded.FaceNetworks", lambda: detector)
     calibrated = places, np.ones(len(places), bool)
-    monkeypatch.setattr("stga_addon.tracking.track.calibrate", lambda *_: calibrated)
+    monkeypatch.setattr("stga_addon.tracking.recorded.calibrate", lambda *_: calibrated)
 
 
 def test_a_canceled_run_ends_as_an_unbroken_one(tmp_path, head, monkeypatch):
@@ -456,7 +459,7 @@ def test_two_trackings_of_one_capture(recorded, capsys, monkeypatch):
         codes.append(command(folder))
         return fit
 
-    monkeypatch.setattr("stga_addon.tracking.track.fit_surface", meanwhile)
+    monkeypatch.setattr("stga_addon.tracking.seen.fit_surface", meanwhile)
     assert command(folder) == 0
     assert codes == [2]
     own = f"out: another tracking is writing this capture (process {os.getpid()})"
@@ -502,10 +505,10 @@ def test_a_face_that_is_hardly_ever_found_is_no_capture(tmp_path, head, monkeypa
     use_detector(monkeypatch, Glimpsing(points, {3}), places)
     message = r"is found at 1 of 5 timesteps, expected 33% .* crop the video to head and shoulders"
     with pytest.raises(StgaError, match=message):
-        track(footage, model, tmp_path / "out", mattes=False)
+        track(footage, model, tmp_path / "out", TrackingOptions(mattes=False))
     assert not (tmp_path / "out").exists()
     use_detector(monkeypatch, Glimpsing(points, {0, 4}), places)
-    found = track(footage, model, tmp_path / "out", mattes=False)
+    found = track(footage, model, tmp_path / "out", TrackingOptions(mattes=False))
     assert any("no face at 3 of 5 timesteps" in warning for warning in found.warnings)
 
 

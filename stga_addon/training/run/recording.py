@@ -21,9 +21,10 @@ from ...flame.sequence import FlameSequence, torso_offset, torso_shapes, with_id
 from ...light.harmonics import basis, uniform
 from ...render.render import render_avatar, to_uint8
 from ...tracking import folder as tracking_folder
-from ...tracking.fit import HeadFit, KnownPerson
+from ...tracking.fit import HeadFit
 from ...tracking.folder import REPORT_FILE, SPLIT_FILES
 from ...tracking.head_model import HeadModel
+from ...tracking.known_person import KnownPerson
 from ...tracking.write_capture import moving_arrays
 from ...worker.helpers import Helpers, Step
 from ..optimize.avatar_tracking import (

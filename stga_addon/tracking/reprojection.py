@@ -1,0 +1,63 @@
+"""How far landmarks lie from those of the fitted head, and cameras that do not fit the others."""
+
+import numpy as np
+
+from ..errors import StgaError
+from .fit import HeadFit, RecordedTake
+from .footage.model import Footage
+from .posed_points import PosedPoints, face_size, split
+
+OUTLIER_FACTOR = 4.0
+MIN_OUTLIER_SHARE = 0.03
+"""A camera is at fault whose landmarks miss the fitted head by this many times those of the others,
+and by this share of the face's size."""
+MAX_USUAL_SHARE = 0.04
+"""Median over the cameras, beyond which they do not see one head: up to 0.016 on sound footage; the
+demo's gives 0.06 where no camera is in step with another, and 0.2 mirrored."""
+
+Errors = dict[str, dict[int, tuple[float, float]]]
+"""Camera -> timestep -> landmarks' median distance from the head's: pixels, face sizes."""
+
+
+def reprojection_errors(fit: HeadFit, take: RecordedTake, footage: Footage) -> Errors:
+    """How far the landmarks of all cameras lie from those of the fitted head."""
+    points = PosedPoints(fit.head.model, take.places)
+    errors: Errors = {camera.name: {} for camera in footage.cameras}
+    for timestep, parameters in fit.parameters.items():
+        head = points.positions(*split(parameters))
+        own = take.landmarks[timestep]
+        seen = zip(own.names, own.cameras, own.points, own.confidence, strict=True)
+        for name, camera, pixels, confidence in seen:
+            use = take.reliable & (confidence > 0)
+            away = fit.to_capture.camera(camera).project(head[use])[0] - pixels[use]
+            distance = float(np.median(np.linalg.norm(away, axis=1)))
+            errors[name][timestep] = distance, distance / max(face_size(pixels[use]), 1e-9)
+    return errors
+
+
+def median_px(errors: Errors) -> float:
+    """Median in pixels over all cameras and timesteps."""
+    return float(np.median([pixels for own in errors.values() for pixels, _ in own.values()]))
+
+
+def check_cameras(errors: Errors) -> None:
+    """Raise StgaError for a camera that does not fit what others see, or where none fits."""
+    seen = {name: [part for _, part in own.values()] for name, own in errors.items() if own}
+    share = {name: float(np.median(own)) for name, own in seen.items()}
+
+    def at_worst(name: str) -> str:
+        worst, (pixels, _) = max(errors[name].items(), key=lambda error: error[1][1])
+        return f"camera {name}: its landmarks are off by {pixels:.0f} pixels at timestep {worst}"
+
+    for name, value in share.items():
+        others = [share[other] for other in share if other != name] or [value]
+        if value > max(MIN_OUTLIER_SHARE, OUTLIER_FACTOR * float(np.median(others))):
+            raise StgaError(
+                f"{at_worst(name)}, far more than those of the other cameras; "
+                "check its calibration, synchronization and mirroring"
+            )
+    if len(share) > 1 and float(np.median(list(share.values()))) > MAX_USUAL_SHARE:
+        raise StgaError(
+            f"{at_worst(max(share, key=share.__getitem__))}, and those of the other cameras are "
+            "too; check the calibration, and whether all are synchronized and none mirrored"
+        )

@@ -1,0 +1,234 @@
+"""From landmarks to a head on its torso: fitted to the landmarks, then to what images show."""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ..capture.mesh_geometry import silhouette
+from ..capture.model import evenly_spread
+from ..flame.forward import parameters_at
+from ..worker.helpers import Helpers
+from . import fit as head_fit
+from .dense import DenseFit, fit_dense
+from .dense_head import REGIONS
+from .fit import HeadFit, Pictures, RecordedTake, posed_mesh
+from .focal_length import scale_warnings
+from .footage.model import Footage, FootageCamera
+from .head_model import HeadModel
+from .mattes import with_mattes
+from .opened import file_state
+from .pictures import picture_of_fit
+from .recorded import RecordedFootage
+from .reprojection import Errors, check_cameras, median_px, reprojection_errors
+from .stages import Crew, ReportStage, Stage, unreported
+from .surface import fit_surface
+from .torso import FollowedTorso, follow_torso
+
+LONG_TAKE = 50  # From which the fit is worth a helping process: threads slow its small matrices
+
+Misfits = dict[str, dict[int, float]]
+"""Region of the face -> timestep -> how badly images are explained (`Misfit`)."""
+
+
+@dataclass(frozen=True)
+class FittedHead:
+    """A head that footage shows, in the capture's world.
+
+    misfits  empty before it is fitted to images, and of takes too short for dense tracking
+    """
+
+    recorded: RecordedFootage
+    fit: HeadFit
+    misfits: Misfits
+
+    @property
+    def errors(self) -> Errors:
+        return reprojection_errors(self.fit, self.recorded.take, self.recorded.footage)
+
+    def show(self, crew: Crew, errors: Errors) -> None:
+        """Draw the head over the footage, with figures of how well it fits."""
+        quality = {"error_px": median_px(errors)}
+        shares = [share for own in self.misfits.values() for share in own.values()]
+        quality |= {"unexplained": float(np.mean(shares))} if shares else {}
+        crew.show(partial(picture_of_fit, self.fit, self.recorded.footage), quality)
+
+
+@dataclass(frozen=True)
+class SeenHead:
+    """All that a capture is written from.
+
+    footage   with its mattes
+    warnings  one sentence each
+    """
+
+    fitted: FittedHead
+    errors: Errors
+    footage: Footage
+    torso: FollowedTorso
+    warnings: tuple[str, ...]
+
+
+def fit_landmarks(recorded: RecordedFootage, crew: Crew) -> FittedHead:
+    """The head fitted to landmarks. Raises StgaError for cameras that do not see one head."""
+    head = recorded.opened.head
+    take = recorded.take
+
+    def count(rounds: int) -> None:
+        crew.report(Stage.FIT, rounds, head_fit.ROUNDS)
+
+    count(0)
+    fit: HeadFit = (
+        crew.helpers.map(head_fit.fit_head, [(head, take)], count)[0]
+        if len(take.landmarks) < LONG_TAKE
+        else crew.helpers.run(head_fit.fit_head, (head, take), count)
+    )
+    fitted = FittedHead(recorded, fit, {})
+    errors = fitted.errors
+    check_cameras(errors)
+    fitted.show(crew, errors)
+    return fitted
+
+
+def fit_skin(fitted: FittedHead, crew: Crew) -> FittedHead:
+    """The head of a person who is seen for the first time, fitted to images."""
+    fitted = _with_images(fitted)
+    recorded = fitted.recorded
+    fit, misfits = by_images(
+        recorded.opened.head, fitted.fit, recorded.take, crew.helpers, crew.report
+    )
+    return _in_world(replace(fitted, fit=fit, misfits=misfits))
+
+
+def fit_expressions(fitted: FittedHead, person: HeadFit, crew: Crew) -> FittedHead:
+    """The head of a known person, whose surface need not be sought, posed as images show it."""
+    fitted = _with_images(fitted)
+    dense = fit_dense(fitted.fit, fitted.recorded.take, crew.helpers, report=crew.report)
+    fit = fitted.fit if dense is None else dense.fit
+    fit = replace(fit, shape=person.shape, static_offset=person.static_offset)
+    return _in_world(replace(fitted, fit=fit, misfits=_misfits(dense)))
+
+
+def with_torso(fitted: FittedHead, crew: Crew, bends: bool) -> SeenHead:
+    """The head on its torso, whose cloth may bend, in footage with mattes."""
+    errors = fitted.errors
+    fitted.show(crew, errors)
+    recorded = fitted.recorded
+    opened = recorded.opened
+    footage = opened.footage
+    parameters = interpolated(fitted.fit.parameters, footage.timesteps)
+    warnings = _warnings(fitted) + scale_warnings(fitted.fit, recorded.take)
+    if opened.options.mattes:
+        plates = [camera.plate for camera in footage.cameras if camera.plate is not None]
+        source = {**opened.source, "plates": [list(map(str, plates)), file_state(plates)]}
+        pixels = partial(_head_pixels, fitted.fit, parameters)
+        helpers = crew.helpers
+        footage, unseen = with_mattes(footage, pixels, opened.out, source, helpers, crew.report)
+        warnings += unseen
+    torso = follow_torso(fitted.fit, parameters, footage, crew.helpers, crew.report, bends)
+    return SeenHead(fitted, errors, footage, torso, warnings)
+
+
+def by_images(
+    head: HeadModel,
+    fit: HeadFit,
+    take: RecordedTake,
+    helpers: Helpers,
+    report: ReportStage = unreported,
+) -> tuple[HeadFit, Misfits]:
+    """The fit moved onto what the images show, and how badly they are explained. `fit` is what
+    `fit_head` returns for `head`."""
+    dense = fit_dense(fit, take, helpers, report=report)
+    if dense is None:
+        return fit_surface(head, fit, take, helpers, report), {}
+    take = replace(take, landmarks=dense.landmarks)
+    fit = fit_surface(head, dense.fit, take, helpers, report, dense=True)
+    dense = fit_dense(fit, take, helpers, True, report)
+    assert dense is not None
+    return dense.fit, _misfits(dense)
+
+
+def interpolated(
+    parameters: Mapping[int, np.ndarray], timesteps: tuple[int, ...]
+) -> dict[int, np.ndarray]:
+    """Parameters of all timesteps: between the known ones, constant before and after."""
+    known = np.array(sorted(parameters))
+    values = np.stack([parameters[timestep] for timestep in known.tolist()])
+    found = parameters_at(np.array(timesteps), known, values)
+    return dict(zip(timesteps, found, strict=True))
+
+
+def _misfits(dense: DenseFit | None) -> Misfits:
+    if dense is None:
+        return {}
+    shares = {t: own.tolist() for t, own in dense.misfit.items()}
+    return {name: {t: own[n] for t, own in shares.items()} for n, name in enumerate(REGIONS)}
+
+
+def _with_images(fitted: FittedHead) -> FittedHead:
+    """With the pictures that work on images asks the take for."""
+    recorded = fitted.recorded
+    images, masks = (
+        partial(_pictures, recorded.footage, of) for of in (FootageCamera.image, FootageCamera.mask)
+    )
+    take = replace(recorded.take, images=images, masks=masks)
+    return replace(fitted, recorded=replace(recorded, take=take))
+
+
+def _in_world(fitted: FittedHead) -> FittedHead:
+    """The head in the world of its cameras, where that is kept."""
+    keeps = fitted.recorded.opened.keeps_world
+    return replace(fitted, fit=head_fit.in_cameras_world(fitted.fit)) if keeps else fitted
+
+
+def _pictures(
+    footage: Footage,
+    picture: Callable[[FootageCamera, int], np.ndarray | None],
+    timestep: int,
+    most: int | None = None,
+) -> Pictures:
+    """The cameras that recorded a timestep, at most so many of them, with their pictures."""
+    cameras = [camera for camera in footage.cameras if timestep in camera.timesteps]
+    cameras = cameras if most is None else evenly_spread(cameras, most)
+    with ThreadPoolExecutor() as pool:  # decoding of a camera's images needs no lock of Python's
+        pictures = list(pool.map(lambda camera: picture(camera, timestep), cameras))
+    pairs = zip(cameras, pictures, strict=True)
+    return [(camera.camera, own) for camera, own in pairs if own is not None]
+
+
+def _head_pixels(
+    fit: HeadFit, parameters: Mapping[int, np.ndarray], timestep: int, camera: FootageCamera
+) -> np.ndarray:
+    """The pixels of the tracked head in a camera's frame; see `mattes.HeadPixels`."""
+    mesh = posed_mesh(fit, parameters[timestep])
+    faces = fit.head.model.faces
+    return silhouette(mesh, faces, fit.to_capture.camera(camera.camera))
+
+
+def _warnings(fitted: FittedHead) -> tuple[str, ...]:
+    recorded = fitted.recorded
+    footage = recorded.footage
+    fit = fitted.fit
+    missing = [timestep for timestep in footage.timesteps if timestep not in fit.parameters]
+    listed = ", ".join(map(str, missing[:20])) + (", …" if len(missing) > 20 else "")
+    share = f"{len(missing)} of {len(footage.timesteps)} timesteps"
+    blind = recorded.blind_cameras
+    single = len(footage.cameras) == 1
+    scale = f"{fit.to_capture.scale:.4g}"
+    is_scaled = recorded.opened.keeps_world and not recorded.take.metric
+    own = {
+        f"no face at {share}, interpolated: {listed}": bool(missing),
+        f"no face in any frame of: {', '.join(blind)}": bool(blind),
+        "one camera: size and distance of the head, and its depth, are those of the average "
+        "head": single,
+        "the images do not show the skin's surface sharply enough: the head is fitted to "
+        "landmarks alone": not single and fit.static_offset is None,
+        "the cameras' world is kept but for its scale: in meters, the head would be more than "
+        f"{head_fit.MAX_HEAD_SCALE - 1:.0%} off people's; positions are multiplied by "
+        f"{scale}": is_scaled,
+        "the focal length is a guess, as the head turns too little to tell; "
+        "give it if it is known": footage.focal in ("usual", "avatar"),
+    }
+    return *footage.warnings, *(text for text, holds in own.items() if holds)

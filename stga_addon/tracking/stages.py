@@ -1,0 +1,66 @@
+"""Stages of a tracking, and how they are reported."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from ..worker.helpers import Helpers
+
+
+class Stage(Enum):
+    """What a tracking does, in order.
+
+    title       what it is called
+    begin, end  of the progress: about its share of the time on two processors where one camera
+                recorded a video of 1080p; what follows the capture begins at 1
+    """
+
+    OPENING = ("Opening the footage", 0.0, 0.0)
+    HEAD_MODEL = ("Head model", 0.0, 0.01)
+    LANDMARKS = ("Landmarks", 0.01, 0.06)
+    FOCAL_LENGTH = ("Focal length", 0.06, 0.07)
+    FIT = ("Fit", 0.07, 0.12)
+    DENSE = ("Dense tracking", 0.12, 0.3)
+    SURFACE = ("Surface", 0.3, 0.34)
+    REFINEMENT = ("Refinement", 0.34, 0.51)
+    MATTES = ("Mattes", 0.51, 0.64)
+    TORSO = ("Torso", 0.64, 0.97)
+    CONTACT_SHEET = ("Contact sheet", 0.97, 0.985)
+    IMAGES = ("Images", 0.985, 0.99)
+    HEADS = ("Heads", 0.99, 1.0)
+    AVATAR = ("Avatar", 1.0, 2.0)
+    """Of a known person, whose avatar is posed in the capture."""
+    CORRECTION = ("Solve", 0.0, 0.9)
+    """Of a capture, around heads that were posed by hand."""
+
+    def __init__(self, title: str, begin: float, end: float) -> None:
+        self.title = title
+        self.begin = begin
+        self.end = end
+
+
+ReportStage = Callable[[Stage, int, int], None]
+"""Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not
+detected again."""
+Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
+"""Called with what draws a picture (H, W, 3) uint8 for those who watch, None: there is nothing to
+see; and with figures of how well the head fits (`format.describe_figures`)."""
+
+
+def unreported(stage: Stage, done: int, total: int) -> None:
+    """The `ReportStage` that nobody reads."""
+
+
+def unseen(draw: Callable[[], np.ndarray | None], figures: Mapping[str, float]) -> None:
+    """The `Show` that nobody watches."""
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who works on the stages of a tracking, and who is told of it."""
+
+    helpers: Helpers
+    report: ReportStage = unreported
+    show: Show = unseen
