@@ -11,7 +11,7 @@ from ..stga_addon.driving import open_motion
 from ..stga_addon.driving.head_map import head_turns
 from ..stga_addon.driving.open_motion import MotionOptions, TrainedRange
 from ..stga_addon.driving.performance import EXCHANGEABLE, amplified
-from ..stga_addon.driving.read_performance import READERS, is_performance, read_performance
+from ..stga_addon.driving.performers import READ_SUFFIXES, is_performance, read_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
@@ -149,7 +149,7 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         default=True,
         options=ONCE,
     )
-    filter_glob: options.file_filter(".npz", *READERS)
+    filter_glob: options.file_filter(".npz", *READ_SUFFIXES)
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:

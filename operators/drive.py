@@ -20,6 +20,7 @@ from ..stga_addon.driving.live import sources
 from ..stga_addon.driving.live.sources import LOOPBACK, SOURCES
 from ..stga_addon.driving.open_motion import MotionOptions
 from ..stga_addon.driving.performance import FacePacket, Performance
+from ..stga_addon.driving.performers import RECORDED_SUFFIXES
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import naming
 from ..stga_addon.jobs.convert_motion import SHAPES_SUFFIX, ConvertMotion
@@ -27,7 +28,6 @@ from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import Identity, show_progress
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
-from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES, is_video
 from ..stga_addon.training.run.folder import has_run, read_run
 from . import common, monitor, options
 from .apply_motion import exchange_property, exchanged_pairs, own_range, stay_trained_property
@@ -457,7 +457,7 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
     avatar: options.field(
         ConvertMotion, "avatar", "Track with Avatar", subtype="DIR_PATH", options=ONCE
     )
-    filter_glob: options.file_filter(*VIDEO_SUFFIXES)
+    filter_glob: options.file_filter(*RECORDED_SUFFIXES)
 
     def invoke(self, context: Any, event: Any) -> set[str]:
         run = context.scene.stga.run_folder
@@ -468,8 +468,10 @@ class DriveVideo(Action, bpy.types.Operator, FileImport):
     def run(self, context: Any) -> None:
         video = file_path(self.filepath, "video")
         head = head_of(context)
-        if not is_video(video):
-            raise StgaError(f"{video}: is no video; expected {', '.join(VIDEO_SUFFIXES)}")
+        if video.suffix.lower() not in RECORDED_SUFFIXES:
+            raise StgaError(
+                f"{video}: is no recording of a face; expected {', '.join(RECORDED_SUFFIXES)}"
+            )
         folder, _ = takes_folder(context.scene)
         given = common.given_values(self, ConvertMotion, "avatar")
         suffix = SHAPES_SUFFIX

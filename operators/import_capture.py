@@ -12,6 +12,7 @@ import bpy
 from ..stga_addon.capture.meshes import MESH_SUFFIXES
 from ..stga_addon.capture.open import OWN_MODELS, open_capture
 from ..stga_addon.capture.transforms import DEFAULT_PRINCIPAL_POINT, transforms_files
+from ..stga_addon.driving.performers import READ_SUFFIXES
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.splat_files import READERS
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
@@ -256,4 +257,4 @@ VideoDrop = _handler("video", "Avatar from Video", "avatar_from_video", *VIDEO_S
 CaptureDrop = _handler("capture", "Head Capture", "import_capture", ".json")
 NpzDrop = _handler("npz", "Avatar or FLAME Motion", "open_npz", ".npz")
 PlyDrop = _handler("ply", "Gaussian Splats", "import_ply", *READERS)
-MotionDrop = _handler("performance", "Face Performance", "apply_motion", ".csv", ".json", ".txt")
+MotionDrop = _handler("performance", "Face Performance", "apply_motion", *READ_SUFFIXES)

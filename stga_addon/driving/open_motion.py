@@ -18,7 +18,6 @@ from ..flame.model import FlameModel
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
 from ..flame.teeth import flame_model
 from ..options import option
-from ..tracking.footage.sources import is_video
 from .head_map import head_map, person_of
 from .performance import (
     ARKIT_SHAPES,
@@ -32,14 +31,8 @@ from .performance import (
     resampled,
     smoothed,
 )
-from .read_performance import (
-    MAX_FPS,
-    MAX_ROWS,
-    MIN_FPS,
-    READERS,
-    is_performance,
-    read_performance,
-)
+from .performance_files import MAX_FPS, MAX_ROWS, MIN_FPS
+from .performers import READ_SUFFIXES, is_performance, performer_of, read_performance
 
 PART_FIELDS = {"face": "expr", "jaw": "jaw_pose", "eyes": "eyes_pose"}
 """Part of a face -> field of a frame that holds it."""
@@ -255,10 +248,11 @@ def check_motion(path: Path) -> None:
     """Raise StgaError where a path is neither a performance nor FLAME parameters by its name."""
     if not exists(path):
         raise StgaError(f"{path}: does not exist")
-    known = (*READERS, ".npz")
+    known = (*READ_SUFFIXES, ".npz")
     if is_file(path) and path.suffix.lower() not in known:
         expected = f"{', '.join(known)}, the folder of a take or of a capture"
-        advice = "; stga drive makes a motion of a video" if is_video(path) else ""
+        recorded = performer_of(path)
+        advice = f"; stga drive makes a motion of {recorded.kind}" if recorded else ""
         raise StgaError(f"{path}: is no motion; expected {expected}{advice}")
 
 

@@ -19,7 +19,7 @@ from ..driving.open_motion import (
     prepared_performance,
 )
 from ..driving.performance import Performance
-from ..driving.read_performance import is_performance, read_performance
+from ..driving.performers import performer_of, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..files import read_json, write_npz
@@ -37,7 +37,6 @@ from ..tracking.folder import (
     is_begun,
     is_written,
 )
-from ..tracking.footage.sources import is_video
 from ..training.run.folder import avatar_version, open_refined, read_run
 from ..worker.lock import hold_folder
 from .avatar_source import findings, motion_options_field
@@ -99,12 +98,8 @@ def convert_motion(request: ConvertMotion, report: Report, say: Say) -> Written:
         tracked = _tracked_by_avatar(request, request.avatar, report, say)
     if tracked is not None:
         performance = _performance_of_head(tracked)
-    elif is_video(request.source):
-        from ..driving.face_video import watched_performance
-
-        performance = watched_performance(request.source, report)
-    elif is_performance(request.source):
-        performance = read_performance(request.source)
+    elif performer_of(request.source) is not None:
+        performance = read_performance(request.source, report)
     else:
         check_motion(request.source)
         performance = _shapes_of_motion(request)

@@ -11,7 +11,7 @@ from mathutils import Euler
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of

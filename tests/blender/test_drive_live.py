@@ -15,7 +15,7 @@ from driving.live import wire
 from stga_addon.driving.head_map import head_map
 from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
 from stga_addon.driving.performance import ARKIT_SHAPES, Performance
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.flame.forward import flame_forward
 from stga_addon.flame.sequence import read_motion
 from stga_addon.scene.arrays import evaluated_vertices

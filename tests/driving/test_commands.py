@@ -18,7 +18,7 @@ from stga_addon.capture.camera import look_at
 from stga_addon.capture.open import open_capture
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import COLUMN, Performance
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.export.playback import DEFAULT_FPS
 from stga_addon.files import write_json
 from stga_addon.flame.forward import flame_forward, neutral_frame

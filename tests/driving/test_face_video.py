@@ -7,7 +7,7 @@ from stga_addon.cli.main import main
 from stga_addon.driving.face_video import CAMERA_FIELD_OF_VIEW_DEG
 from stga_addon.driving.head_map import head_turns
 from stga_addon.driving.performance import COLUMN
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.driving.shapes import face_shapes
 from stga_addon.flame.quaternions import from_axis_angle, to_matrices
 from stga_addon.render.video import video_writer

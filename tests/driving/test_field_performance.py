@@ -9,10 +9,10 @@ from command_line import stga
 
 from stga_addon.driving.open_motion import open_motion
 from stga_addon.driving.performance import ARKIT_SHAPES
-from stga_addon.driving.read_performance import is_performance, read_performance
+from stga_addon.driving.performers import is_performance, read_performance
 from stga_addon.errors import StgaError
 
-from .test_read_performance import HEADER, write_csv
+from .test_performance_files import HEADER, write_csv
 
 COUNT = 60
 WEIGHTS = np.random.default_rng(2).random((COUNT, 52)).round(4)

@@ -16,7 +16,7 @@ from stga_addon.driving.inverse import (
 )
 from stga_addon.driving.open_motion import MotionOptions, performed
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, Performance
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.driving.shapes import EYE_JOINTS, _Surface, effective_weights, face_points
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward

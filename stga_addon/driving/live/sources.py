@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ...errors import StgaError
-from .. import read_performance
+from .. import performance_files
 from ..clocks import DEFAULT_FPS
 from ..open_motion import MotionOptions, corrected
 from ..performance import FacePacket, Performance
-from ..read_performance import MAX_FPS, MAX_ROWS
+from ..performance_files import MAX_FPS, MAX_ROWS
 from .decoders import Received, decode_live_link_face, decode_vmc
 
 Decoded = tuple[FacePacket | None, Any]
@@ -58,8 +58,8 @@ SOURCES = {
     "facial_mocap": Source(
         "iFacialMocap",
         49983,
-        _single(read_performance.parse_packet),
-        read_performance.REQUEST,
+        _single(performance_files.parse_packet),
+        performance_files.REQUEST,
         "A request is sent to the phone, which answers until it is closed",
     ),
     "vmc": Source(

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from stga_addon.driving import read_performance
+from stga_addon.driving import performance_files
 from stga_addon.driving.head_map import head_turns
 from stga_addon.driving.live import decoders
 from stga_addon.driving.live.decoders import Received, decode_live_link_face, decode_vmc
@@ -60,10 +60,10 @@ def test_facial_mocap():
     """Catches percent, degrees or pitch misread, and the second version's separator."""
     weights = {name: round(value, 2) for name, value in wire.mixed(2).items()}
     for separator in "-&":
-        packet = read_performance.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
+        packet = performance_files.parse_packet(wire.facial_mocap(weights, (10, 20, 30), separator))
         assert as_dict(packet.weights) == pytest.approx(weights)
         assert packet.head == pytest.approx(np.radians([20, 10, 30]))
-    packet = read_performance.parse_packet(b"mouthSmile_L&-5|jawOpen&12|")
+    packet = performance_files.parse_packet(b"mouthSmile_L&-5|jawOpen&12|")
     assert packet.weights[COLUMN["mouthSmileLeft"]] == pytest.approx(-0.05)
 
 
@@ -162,7 +162,7 @@ def test_ten_thousand_malformed_packets():
     for _ in range(10_000):
         data = malformed(rng)
         vmc, known = decode_vmc(data, known) or (None, known)
-        for packet in decode_live_link_face(data), read_performance.parse_packet(data), vmc:
+        for packet in decode_live_link_face(data), performance_files.parse_packet(data), vmc:
             if packet is not None and packet.weights is not None:
                 assert np.isfinite(packet.weights).all()
                 assert packet.time is None or math.isfinite(packet.time)

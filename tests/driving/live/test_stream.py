@@ -17,7 +17,7 @@ from stga_addon.driving.live.sources import (
     row_of,
 )
 from stga_addon.driving.performance import COLUMN
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.errors import StgaError
 
 from . import wire

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stga_addon.driving.performance import ARKIT_SHAPES, COUNT, resampled
-from stga_addon.driving.read_performance import read_performance
+from stga_addon.driving.performers import read_performance
 from stga_addon.errors import StgaError
 from stga_addon.export.web.page import PLAYER
 

@@ -1,6 +1,6 @@
 // @ts-check
 // Performances in CSV: Live Link Face, Audio2Face, and any table with a column per shape. The
-// rules are those of STGA for Blender's read_performance.py.
+// rules are those of STGA for Blender's performance_files.py.
 
 /** @import { Performance } from './types.js' */
 

@@ -1,4 +1,4 @@
-"""Performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap, weights in JSON."""
+"""Files of performances: Live Link Face, Audio2Face, MediaPipe, iFacialMocap, weights in JSON."""
 
 import math
 import re
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import StgaError, shorten
-from ..files import matching, read_json, read_table, read_text
+from ..files import read_json, read_table, read_text
 from .clocks import DEFAULT_FPS, evened, seconds_of, seconds_of_numbers, time_column
 from .performance import COLUMN, COUNT, MAX_WEIGHT, FacePacket, Performance, arkit_name, columns_of
 
@@ -60,8 +60,6 @@ WHOLE_TURN = 2 * math.pi + 0.01
 WHOLE_TURN_DEG = 360.0
 """Of a head's angles: above the second, they are degrees."""
 MAX_PERCENT = 110.0  # Of weights, of which some are a little above the whole
-TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
-"""Endings of files that Live Link Face writes beside a take's own."""
 FRAME_KEYS = ("frames", "weightMat", "weights")
 RATE_KEYS = ("exportFps", "fps", "FPS", "frameRate", "frame_rate", "framerate", "FrameRate")
 NAME_KEYS = ("facsNames", "names", "blendShapeNames", "blendshapes")
@@ -70,40 +68,8 @@ NAMED = ("categoryName", "category_name", "name")
 SCORED = ("score", "value", "weight")
 
 
-def is_performance(path: Path) -> bool:
-    """Whether a path has a suffix of `READERS`, or is the folder of a Live Link Face take."""
-    if path.is_dir():
-        is_capture = (path / "flame_param").is_dir() or matching(path, "transforms*.json")
-        return not is_capture and bool(_take_files(path))
-    return path.suffix.lower() in READERS
-
-
-def read_performance(path: Path) -> Performance:
-    """Read a performance by its content.
-
-    CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and
-    LAM-Audio2Expression, of MediaPipe's blend shapes, or of any named weights per frame;
-    iFacialMocap's packets as lines of text. Columns are found by name. Raises StgaError naming the
-    file, the row, and the shapes that are missing.
-    """
-    if path.is_dir():
-        files = _take_files(path)
-        own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
-        if len(own) != 1:
-            names = ", ".join(path.name for path in own[:4]) or "none"
-            raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
-        path = own[0]
-    if path.suffix.lower() not in READERS:
-        problem = f"is no performance; expected {', '.join(READERS)} or the folder of a take"
-        raise StgaError(f"{path}: {problem}")
-    return READERS[path.suffix.lower()](path)
-
-
-def _take_files(folder: Path) -> list[Path]:
-    return [path for path in matching(folder, "*.[cC][sS][vV]") if path.is_file()]
-
-
-def _read_csv(path: Path) -> Performance:
+def csv_performance(path: Path) -> Performance:
+    """Of a table with a row a frame. Raises StgaError."""
     rows = [row for _, row in read_table(path, MAX_TEXT_BYTES)]
     if not rows:
         raise StgaError(f"{path}: is empty, expected a row of column names")
@@ -153,7 +119,8 @@ def _plain(name: str) -> str:
     return re.sub(r"[_\- ]", "", name.rsplit(".", 1)[-1]).lower()
 
 
-def _read_packets(path: Path) -> Performance:
+def packet_performance(path: Path) -> Performance:
+    """Of lines that are iFacialMocap's packets. Raises StgaError."""
     lines = read_text(path, MAX_TEXT_BYTES).splitlines()
     packets = [parse_packet(line.encode()) for line in lines]
     known = [packet for packet in packets if packet is not None]
@@ -167,7 +134,8 @@ def _read_packets(path: Path) -> Performance:
     return _performance(path, None, weights, head)
 
 
-def _read_json(path: Path) -> Performance:
+def json_performance(path: Path) -> Performance:
+    """Of frames of weights. Raises StgaError."""
     document = read_json(path)
     outer = document if isinstance(document, dict) else {}
     frames = next((outer[key] for key in FRAME_KEYS if isinstance(outer.get(key), list)), document)
@@ -217,7 +185,7 @@ def _json_times(
 
 
 def _json_weights(path: Path, number: int, frame: Any, names: list[Any] | None) -> dict[str, float]:
-    """Name -> weight of one frame in any of the forms that `read_performance` takes."""
+    """Name -> weight of one frame in any of the forms that are read."""
     where = f"{path}: frame {number + 1}"
     found = _first(frame, WEIGHT_KEYS, frame) if isinstance(frame, dict) else frame
     if isinstance(found, list) and found and all(isinstance(entry, dict) for entry in found):
@@ -296,7 +264,3 @@ def _performance(
     head = np.broadcast_to(head, (len(weights), 3))[first]
     warnings = tuple(f"{path}: {text}" for text in guesses)
     return Performance(times, weights[first], head, rate, warnings)
-
-
-READERS = {".csv": _read_csv, ".tsv": _read_csv, ".json": _read_json, ".txt": _read_packets}
-"""By the suffixes of performances."""

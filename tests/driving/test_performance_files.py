@@ -15,7 +15,7 @@ from stga_addon.driving.performance import (
     resampled,
     smoothed,
 )
-from stga_addon.driving.read_performance import is_performance, read_performance
+from stga_addon.driving.performers import is_performance, read_performance
 from stga_addon.errors import StgaError
 
 from .live import wire

@@ -1,0 +1,93 @@
+"""Who performs: files of performances, and recordings of faces that one is made of."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import StgaError
+from ..files import matching
+from ..progress import Report, ignore
+from ..tracking.footage.sources import VIDEO_SUFFIXES
+from .performance import Performance
+from .performance_files import csv_performance, json_performance, packet_performance
+
+TAKE_EXTRAS = ("_neutral", "_raw", "_cal")
+"""Endings of files that Live Link Face writes beside a take's own."""
+
+
+@dataclass(frozen=True)
+class Performer:
+    """How a performance is read.
+
+    kind      of file, in messages
+    read      (path, report); raises StgaError, and Cancelled where the report asks to stop
+    at_once   whether all that takes a motion reads it; else it takes long, and `stga drive` makes a
+              motion of it first
+    """
+
+    kind: str
+    read: Callable[[Path, Report], Performance]
+    at_once: bool
+
+
+def _at_once(kind: str, read: Callable[[Path], Performance]) -> Performer:
+    return Performer(kind, lambda path, report: read(path), True)
+
+
+def _watched(path: Path, report: Report) -> Performance:
+    from .face_video import watched_performance
+
+    return watched_performance(path, report)
+
+
+PERFORMERS: Mapping[str, Performer] = {
+    ".csv": _at_once("a table", csv_performance),
+    ".tsv": _at_once("a table", csv_performance),
+    ".json": _at_once("named weights", json_performance),
+    ".txt": _at_once("lines of iFacialMocap", packet_performance),
+    **dict.fromkeys(VIDEO_SUFFIXES, Performer("a video", _watched, False)),
+}
+"""By the suffixes of their files."""
+READ_SUFFIXES = tuple(suffix for suffix, performer in PERFORMERS.items() if performer.at_once)
+RECORDED_SUFFIXES = tuple(suffix for suffix in PERFORMERS if suffix not in READ_SUFFIXES)
+
+
+def performer_of(path: Path) -> Performer | None:
+    """By a file's suffix; None for what is no performance. The folder of a Live Link Face take is
+    read as its table."""
+    if path.is_dir():
+        is_capture = (path / "flame_param").is_dir() or matching(path, "transforms*.json")
+        return None if is_capture or not _tables(path) else PERFORMERS[".csv"]
+    return PERFORMERS.get(path.suffix.lower())
+
+
+def is_performance(path: Path) -> bool:
+    """Whether `read_performance` reads it at once."""
+    performer = performer_of(path)
+    return performer is not None and performer.at_once
+
+
+def read_performance(path: Path, report: Report = ignore) -> Performance:
+    """Read a performance by its suffix and content.
+
+    CSV of Live Link Face (or the take's folder) and of Audio2Face; JSON of Audio2Face and
+    LAM-Audio2Expression, of MediaPipe's blend shapes, or of any named weights per frame;
+    iFacialMocap's packets as lines of text; a video of a face. Columns are found by name. Raises
+    StgaError naming the file, the row, and the shapes that are missing.
+    """
+    if path.is_dir():
+        files = _tables(path)
+        own = [path for path in files if not path.stem.lower().endswith(TAKE_EXTRAS)] or files
+        if len(own) != 1:
+            names = ", ".join(path.name for path in own[:4]) or "none"
+            raise StgaError(f"{path}: a take's folder holds one CSV file, found {names}")
+        path = own[0]
+    performer = performer_of(path)
+    if performer is None:
+        problem = f"is no performance; expected {', '.join(READ_SUFFIXES)} or the folder of a take"
+        raise StgaError(f"{path}: {problem}")
+    return performer.read(path, report)
+
+
+def _tables(folder: Path) -> list[Path]:
+    return [path for path in matching(folder, "*.[cC][sS][vV]") if path.is_file()]
