@@ -32,7 +32,7 @@ from stga_addon.avatar.embedding import face_areas, face_frames
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.model import Capture, View
-from stga_addon.flame.teeth import flame_model
+from stga_addon.flame.parts import flame_model
 from stga_addon.raster.cpu.blend import blend_backward, blend_forward
 from stga_addon.raster.cpu.layout import PROJECTED
 from stga_addon.raster.cpu.project import project_backward, project_forward

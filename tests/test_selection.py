@@ -7,7 +7,7 @@ import pytest
 
 from stga_addon.capture.model import Capture
 from stga_addon.errors import StgaError
-from stga_addon.flame.model import KEY_MASKS
+from stga_addon.flame.parts import KEY_MASKS
 from stga_addon.schema import validate
 from stga_addon.selection import KEY_REGIONS, SelectionOptions, select_capture, select_faces
 

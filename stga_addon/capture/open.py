@@ -14,7 +14,8 @@ import numpy as np
 from ..errors import StgaError, shorten
 from ..files import is_file, is_folder, matching, naming, read_json, read_npy, read_npz
 from ..flame.forward import FlameFrame
-from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES, key_regions
+from ..flame.model import BUNDLED_HEAD, EXPRESSION_NAMES
+from ..flame.parts import flame_model, key_regions
 from ..flame.sequence import (
     FlameSequence,
     expression_mesh,
@@ -24,7 +25,6 @@ from ..flame.sequence import (
     read_motion,
     sequence_mesh,
 )
-from ..flame.teeth import flame_model
 from . import meshes
 from .distortion import distortion
 from .mesh_geometry import without_head_motion
@@ -335,7 +335,7 @@ def read_face_ids(path: Path, faces: int) -> np.ndarray:
 def _open_flame_capture(root: Path, transforms: Transforms, model_file: Path | None) -> Capture:
     """Capture of layout "flame": `flame_param_path` per frame, else `flame_param/%05d.npz` by
     timestep; shape and static offset come from the first. A model with FLAME's published 5023
-    vertices gets teeth, because VHAP and GaussianAvatars use them."""
+    vertices gets all parts, teeth as VHAP and GaussianAvatars have them."""
     model_file = _model_file(root, model_file)
     model = flame_model(model_file)
     frames = transforms.frames

@@ -15,8 +15,8 @@ from ..export.playback import playback_fps
 from ..files import is_file
 from ..flame.forward import FlameFrame
 from ..flame.model import FlameModel
+from ..flame.parts import flame_model
 from ..flame.sequence import FlameSequence, strengthened, transferred_motion
-from ..flame.teeth import flame_model
 from ..options import option
 from .head_map import head_map, person_of
 from .performance import (

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .model import FlameModel
+from .model import JOINTS, FlameModel
 from .quaternions import from_axis_angle, from_matrices, multiply, to_axis_angle, to_matrices
 
-POSE_SIZE = 15
+POSE_SIZE = 3 * len(JOINTS)
 TRANSLATION_SIZE = 3
-"""At the end of a frame's parameters, after the expression: five joints' axis-angles; a shift."""
+"""At the end of a frame's parameters, after the expression: the joints' axis-angles; a shift."""
 RIGID_SIZE = POSE_SIZE + TRANSLATION_SIZE
 MAX_UNWOUND_RAD = 1.5 * np.pi  # At a whole turn, an axis-angle's change may turn nothing
 SMALL_ANGLE = 1e-4  # Radians, below which a quotient by the squared angle is its limit
@@ -37,7 +37,7 @@ class FlameFrame:
     def pose(self) -> np.ndarray:
         """(5, 3) axis-angle of root, neck, jaw, left eye, right eye."""
         joints = [self.rotation, self.neck_pose, self.jaw_pose, self.eyes_pose]
-        return np.asarray(np.concatenate(joints).reshape(5, 3))
+        return np.asarray(np.concatenate(joints).reshape(len(JOINTS), 3))
 
     @property
     def parameters(self) -> np.ndarray:

@@ -27,13 +27,6 @@ EXPRESSION_NAMES = "expression_names"
 """Key of the names in model files, and in motions of the bundled head."""
 SHAPE_STEP_M = 1e-5
 """Of `shape_steps` (K, V, 3), whole numbers, which a file may have in place of shapedirs."""
-# Key region -> the vertex masks it is made of (STGA, selective training: eyes, mouth and nose).
-KEY_MASKS = {
-    "left_eye": ("left_eye_region", "left_eyeball"),
-    "right_eye": ("right_eye_region", "right_eyeball"),
-    "mouth": ("lips", "teeth"),
-    "nose": ("nose",),
-}
 EYEBALL_WEIGHT = 0.9
 """Skinning weight by an eye's joint, above which a vertex belongs to the eyeball."""
 MIN_TORSO_WEIGHT = 0.7
@@ -217,13 +210,3 @@ def torso_faces(model: FlameModel) -> np.ndarray:
     """(F,) bool: triangles at the end of the neck, which the root joint carries."""
     torso = model.weights[:, JOINTS.index("root")] > MIN_TORSO_WEIGHT
     return np.asarray(torso[model.faces].all(axis=1))
-
-
-def key_regions(model: FlameModel) -> dict[str, np.ndarray]:
-    """left_eye, right_eye, mouth, nose as (F,) bool; those without any mask are left out."""
-    regions = {}
-    for region, names in KEY_MASKS.items():
-        present = [model.masks[name] for name in names if name in model.masks]
-        if present:
-            regions[region] = faces_within(model.faces, np.concatenate(present))
-    return regions

@@ -23,8 +23,8 @@ from .forward import (
     shaped_vertices,
 )
 from .model import JOINTS, MIN_TORSO_WEIGHT, Arrays, FlameModel
+from .parts import ADDED_VERTICES
 from .quaternions import from_matrices, to_axis_angle
-from .teeth import TEETH_VERTICES
 
 Identity = tuple[np.ndarray, np.ndarray | None]  # Shape and static offset
 ZERO_POSES = {
@@ -146,7 +146,7 @@ def joint_angles(frames: Sequence[FlameFrame]) -> np.ndarray:
 def read_frame(path: Path, model: FlameModel) -> FlameFrame:
     """Read one timestep's `flame_param/*.npz` (VHAP and GaussianAvatars captures), with or without
     a leading 1. Neck, jaw, eyes and dynamic offset may be missing (zero); fewer expression
-    coefficients than the model has, and offsets without the teeth's vertices, are filled up with
+    coefficients than the model has, and offsets without the parts' vertices, are filled up with
     zeros. Raises StgaError naming the file and the field."""
     arrays = read_npz(path)
     for name in ("expr", "rotation", "translation"):
@@ -333,13 +333,13 @@ def _vector(path: Path, arrays: Arrays, name: str, size: int) -> np.ndarray:
 
 
 def _offset(path: Path, arrays: Arrays, name: str, vertices: int) -> np.ndarray | None:
-    """(V, 3) float64, None where absent or all zero; the teeth's rows are added or dropped."""
+    """(V, 3) float64, None where absent or all zero; the parts' rows are added or dropped."""
     if name not in arrays:
         return None
     array = _finite(path, name, arrays[name])
     rows = array.shape[-2] if array.ndim >= 2 else 0
-    accepted = (vertices, vertices - TEETH_VERTICES, vertices + TEETH_VERTICES)
-    if array.ndim not in (2, 3) or rows not in accepted or array.size != rows * 3:
+    accepted = [mine - theirs for mine in ADDED_VERTICES for theirs in ADDED_VERTICES]
+    if array.ndim not in (2, 3) or rows - vertices not in accepted or array.size != rows * 3:
         expected = f"({vertices}, 3) or (1, {vertices}, 3)"
         raise StgaError(f"{path}: {name} has shape {array.shape}, expected {expected}")
     offset = np.zeros((vertices, 3))

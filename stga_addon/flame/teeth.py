@@ -7,14 +7,11 @@ its first corner. Shape, size, place and rigging of the teeth are this project's
 from the mesh.
 """
 
-from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
-
 import numpy as np
 
 from ..errors import StgaError
-from .model import BUNDLED_HEAD, JOINTS, FlameModel, read_flame
+from .graft import Graft, grafted
+from .model import JOINTS, FlameModel
 
 TEMPLATE_VERTICES = 5023
 TEETH_VERTICES = 120
@@ -46,27 +43,6 @@ MAX_MOUTH_RINGS = 12
 MAX_LIP_DISTANCE_M = 0.002  # Between opposite vertices of closed lips
 
 
-def flame_model(path: Path | None) -> FlameModel:
-    """The FLAME model file, with teeth where it has FLAME's 5023 vertices; None: the bundled head.
-    Raises StgaError."""
-    path = path or BUNDLED_HEAD
-    try:
-        # its masks may lie beside it
-        state = path.stat()
-        masks = path.parent.stat()
-    except OSError:  # which reading it names
-        return read_flame(path)
-    return _remembered(path, state.st_mtime_ns, state.st_size, masks.st_mtime_ns)
-
-
-@lru_cache(maxsize=2)
-def _remembered(path: Path, *state: int) -> FlameModel:
-    """The model of a file whose times and size are `state`: every button that needs the head reads
-    it again, and some the bundled one besides."""
-    model = read_flame(path)
-    return with_teeth(model) if len(model.v_template) == TEMPLATE_VERTICES else model
-
-
 def with_teeth(model: FlameModel) -> FlameModel:
     """The model with upper and lower teeth: 5023 to 5143 vertices, 9976 to 10144 triangles. The
     upper row follows the neck joint, which turns the head, and the lower row the jaw; both follow
@@ -75,24 +51,13 @@ def with_teeth(model: FlameModel) -> FlameModel:
     rings, lips = _mouth(model)
     inside = np.concatenate(rings)
     teeth = _positions(model.v_template, rings, lips)
-    shapedirs = np.zeros((TEETH_VERTICES, *model.shapedirs.shape[1:]))
     identity = model.shapedirs[inside, :, : model.n_identity]
-    shapedirs[:, :, : model.n_identity] = _followed(model.v_template[inside], identity, teeth)
+    followed = _followed(model.v_template[inside], identity, teeth)
     weights = np.zeros((TEETH_VERTICES, len(JOINTS)))
     for row, name in enumerate(TEETH_ROWS):
         joint = JOINTS.index("neck" if name.startswith("U") else "jaw")
         weights[row * TEETH_PER_ROW : (row + 1) * TEETH_PER_ROW, joint] = 1
-    added = np.arange(TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
-    return replace(
-        model,
-        v_template=np.concatenate([model.v_template, teeth]),
-        shapedirs=np.concatenate([model.shapedirs, shapedirs]),
-        posedirs=np.pad(model.posedirs, ((0, TEETH_VERTICES), (0, 0), (0, 0))),
-        j_regressor=np.pad(model.j_regressor, ((0, 0), (0, TEETH_VERTICES))),
-        weights=np.concatenate([model.weights, weights]),
-        faces=np.concatenate([model.faces, teeth_faces(TEMPLATE_VERTICES)]),
-        masks={**model.masks, "teeth": added},
-    )
+    return grafted(model, Graft("teeth", teeth, teeth_faces(0), followed, weights))
 
 
 def lip_pairs(model: FlameModel) -> tuple[np.ndarray, np.ndarray]:

@@ -23,10 +23,10 @@ from ..driving.performers import performer_of, read_performance
 from ..errors import StgaError
 from ..export.playback import playback_fps
 from ..files import read_json, write_npz
-from ..flame.model import EXPRESSION_NAMES
+from ..flame.model import EXPRESSION_NAMES, JOINTS
+from ..flame.parts import flame_model
 from ..flame.quaternions import from_axis_angle, from_matrices, to_axis_angle, to_matrices
 from ..flame.sequence import FRAME_FIELDS, FlameSequence, retimed
-from ..flame.teeth import flame_model
 from ..options import like, option
 from ..progress import Progress, Report, Say, Written
 from ..tracking.folder import (
@@ -173,7 +173,9 @@ def _performance_of_head(tracked: Capture) -> Performance:
     fps = playback_fps(tracked, numbered=True)
     performance = captured_performance(sequence, str(tracked.root), fps)
     poses = np.stack([sequence.frame(timestep).pose for timestep in sequence.timesteps])
-    root, neck = (to_matrices(from_axis_angle(poses[:, joint])) for joint in (0, 1))
+    root, neck = (
+        to_matrices(from_axis_angle(poses[:, JOINTS.index(name)])) for name in ("root", "neck")
+    )
     turned = root @ neck
     turns = to_axis_angle(from_matrices(turned @ turned[0].T))
     return replace(performance, head=head_angles(turns))

@@ -11,7 +11,7 @@ from ..capture.camera import MAX_COORDINATE_M
 from ..errors import StgaError
 from ..files import converted, read_npz, write_npz
 from ..flame.model import JOINTS, POSE_FEATURES, FlameModel
-from ..flame.teeth import flame_model
+from ..flame.parts import flame_model
 from .glb import read_glb
 
 IDENTITY_PREFIX = "identity"

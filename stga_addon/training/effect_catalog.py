@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..errors import StgaError
+from ..flame.parts import PARTS
 from ..schema import setting
 
 
@@ -120,7 +121,10 @@ _EFFECTS = (
     Effect(
         WORLD, "Room behind", "slower", "seconds to a minute after training, and a file of its own"
     ),
-    Effect("teeth", "Teeth", "free", "splats on 168 triangles", "teeth"),
+    *(
+        Effect(name, part.label, "free", f"splats on {part.faces} triangles", name)
+        for name, part in PARTS.items()
+    ),
     Effect(
         "torso", "Shoulders", "free", "none: splats below the neck follow other triangles", "torso"
     ),

@@ -9,8 +9,8 @@ import pytest
 
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.model import JOINTS
+from stga_addon.flame.parts import flame_model as bundled_model
 from stga_addon.flame.sequence import FlameSequence, sequence_mesh
-from stga_addon.flame.teeth import flame_model as bundled_model
 from stga_addon.flame.teeth import with_teeth
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices

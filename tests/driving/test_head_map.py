@@ -21,8 +21,8 @@ from stga_addon.driving.shapes import EYE_JOINTS, _Surface, effective_weights, f
 from stga_addon.errors import StgaError
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.flame.model import JOINTS
+from stga_addon.flame.parts import flame_model
 from stga_addon.flame.sequence import FlameSequence
-from stga_addon.flame.teeth import flame_model
 
 from .heads import generated_flame, random_poses, with_expressions
 

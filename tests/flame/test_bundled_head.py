@@ -13,9 +13,10 @@ from stga_addon.driving.head_map import head_map
 from stga_addon.driving.inverse import arkit_weights
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
 from stga_addon.flame.forward import flame_forward, joint_positions, neutral_frame
-from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, key_regions, torso_faces
+from stga_addon.flame.model import BUNDLED_HEAD, JOINTS, SHAPE_STEP_M, torso_faces
+from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.flame.sequence import FlameSequence
-from stga_addon.flame.teeth import flame_model, lip_pairs
+from stga_addon.flame.teeth import lip_pairs
 from stga_addon.tracking.solve import LID_SHAPES
 
 from .small_head import small_head, write_flame

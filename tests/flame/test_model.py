@@ -15,7 +15,8 @@ from PIL import Image
 from stga_addon.capture.images import image_size
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npy
-from stga_addon.flame.model import key_regions, read_flame
+from stga_addon.flame.model import read_flame
+from stga_addon.flame.parts import key_regions
 from stga_addon.flame.unpickle import _RestrictedUnpickler, read_pickled_arrays
 
 from .conftest import random_arrays

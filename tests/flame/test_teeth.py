@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from stga_addon.errors import StgaError
-from stga_addon.flame.model import FlameModel, key_regions
+from stga_addon.flame.model import FlameModel
+from stga_addon.flame.parts import key_regions
 from stga_addon.flame.teeth import lip_pairs, teeth_faces, with_teeth
 
 from .mouths import covered_from_front, crossings, jaw_opened, open_edges, open_flame

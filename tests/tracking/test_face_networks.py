@@ -11,7 +11,7 @@ from stga_addon.capture.camera import Camera, look_at
 from stga_addon.capture.mesh_geometry import Similarity, similarity
 from stga_addon.capture.open import open_capture
 from stga_addon.flame.model import EYEBALL_WEIGHT
-from stga_addon.flame.teeth import flame_model
+from stga_addon.flame.parts import flame_model
 from stga_addon.tracking.correspondence import calibrate, picture_cameras, shaded_image
 from stga_addon.tracking.face_networks import IRIS_CENTERS, SCORE_NAMES, FaceNetworks
 from stga_addon.tracking.fit import HeadFit

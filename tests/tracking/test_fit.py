@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stga_addon.capture.camera import look_at
 from stga_addon.flame.forward import RIGID_SIZE, FlameFrame, by_change, flame_forward, frame_of
 from stga_addon.flame.model import FlameModel
-from stga_addon.flame.teeth import flame_model
+from stga_addon.flame.parts import flame_model
 from stga_addon.tracking import fit as head_fit
 from stga_addon.tracking.correspondence import nearest_points
 from stga_addon.tracking.fit import (

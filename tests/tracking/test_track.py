@@ -18,7 +18,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.playback import playback_fps
 from stga_addon.files import read_json, read_npz, write_json, write_npz
 from stga_addon.flame.forward import RIGID_SIZE, flame_forward
-from stga_addon.flame.teeth import flame_model
+from stga_addon.flame.parts import flame_model
 from stga_addon.jobs.perform import perform
 from stga_addon.jobs.track import Track
 from stga_addon.tracking.correspondence import nearest_points, shaded_image

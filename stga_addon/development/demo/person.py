@@ -11,7 +11,7 @@ from ...avatar.embedding import face_areas, face_frames
 from ...capture.mesh_geometry import vertex_normals
 from ...flame.forward import flame_forward, neutral_frame
 from ...flame.model import JOINTS, POSE_FEATURES, FlameModel
-from ...flame.teeth import flame_model
+from ...flame.parts import flame_model
 from ..arkit_shapes import METERS_PER_UNIT
 from ..bundled_head import (
     FACE,

@@ -13,8 +13,8 @@ from ...avatar.file import Avatar
 from ...avatar.splats import harmonics_text
 from ...errors import StgaError
 from ...files import replacing_together
+from ...flame.parts import FLAME_SIZES
 from ...flame.sequence import FlameSequence
-from ...flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS
 from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..playback import Playback
@@ -123,7 +123,7 @@ def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bo
         return BUNDLED_NOTICE
     if sequence is not None and not motion_only:
         return RIG_NOTICE
-    is_flame = len(avatar.neutral) in (TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
+    is_flame = len(avatar.neutral) in FLAME_SIZES
     return MESH_NOTICE if is_flame or sequence is not None else ""
 
 

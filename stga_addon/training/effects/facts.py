@@ -8,6 +8,8 @@ import numpy as np
 from ...avatar.lattice import splats_per_triangle
 from ...capture.model import Capture, cameras_at_once, evenly_spread
 from ...flame.forward import FlameFrame
+from ...flame.model import JOINTS
+from ...flame.parts import PARTS
 from ...flame.sequence import joint_angles
 from ...flame.teeth import lip_pairs
 from ...selection import select_capture
@@ -121,9 +123,9 @@ class CaptureFacts:
 
     @cached_property
     def sampled(self) -> Capture:
-        """The capture at these only; meshes of a head with teeth are kept, for its lips."""
+        """The capture at these only; meshes of a head with parts are kept, for its lips."""
         pose = self.capture.expression_mesh
-        pose = cache(pose) if self.has_teeth else pose
+        pose = cache(pose) if self.parts else pose
         return replace(self.capture, timesteps=self.sampled_timesteps, expression_mesh=pose)
 
     @cached_property
@@ -143,9 +145,9 @@ class CaptureFacts:
         sequence = self.capture.flame
         return [] if sequence is None else [sequence.frame(t) for t in self.sampled_timesteps]
 
-    def joint_angle(self, *joints: int) -> float:
-        """Largest angle in degrees by which one of these FLAME joints turns."""
-        return float(joint_angles(self.frames)[list(joints)].max())
+    def joint_angle(self, *joints: str) -> float:
+        """Largest angle in degrees by which one of these of `JOINTS` turns."""
+        return float(joint_angles(self.frames)[[JOINTS.index(name) for name in joints]].max())
 
     @cached_property
     def lip_gap_mm(self) -> float:
@@ -159,5 +161,7 @@ class CaptureFacts:
         return 1000 * (max(gaps) - gaps[0])
 
     @property
-    def has_teeth(self) -> bool:
-        return self.capture.flame is not None and "teeth" in self.capture.flame.model.masks
+    def parts(self) -> list[str]:
+        """Names of `PARTS` that the head has."""
+        flame = self.capture.flame
+        return [] if flame is None else [name for name in PARTS if name in flame.model.masks]

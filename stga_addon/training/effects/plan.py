@@ -11,6 +11,7 @@ from ...avatar.offsets import OFFSETS
 from ...capture.camera import Camera
 from ...capture.model import Capture
 from ...errors import StgaError
+from ...flame.parts import PARTS
 from ...flame.sequence import MIN_JOINT_ANGLE_DEG
 from ...tracking.folder import is_tracked, read_torso_motion
 from ..effect_catalog import EFFECTS, Effect, EffectDecision
@@ -56,7 +57,7 @@ MIN_PIXELS_PER_SPLAT = 0.5
 """90th percentile over triangles, below which further splats have no detail to show."""
 MIN_LIP_GAP_MM = 1.5
 MIN_JAW_ANGLE_DEG = 3.0
-"""Teeth are visible when the lips part, or the jaw opens, by more than this."""
+"""What is in the mouth is visible when the lips part, or the jaw opens, by more than this."""
 MAX_OUTSIDE_SHARE = 0.001
 """Share of the mesh outside of the masks above which the tracking is inaccurate."""
 
@@ -244,10 +245,11 @@ def world(facts: CaptureFacts) -> Verdict:
     return Verdict(False, "kept only where it is asked for; no export has it but its own file")
 
 
-def teeth(facts: CaptureFacts) -> Verdict | None:
-    if not facts.has_teeth:
+def in_mouth(facts: CaptureFacts, part: str) -> Verdict | None:
+    """On where lips or jaw open enough to show what is behind them."""
+    if part not in facts.parts:
         return None
-    jaw = facts.joint_angle(2)
+    jaw = facts.joint_angle("jaw")
     lips = facts.lip_gap_mm
     reason = f"the jaw opens by {jaw:.0f}°, the lips by {lips:.1f} mm"
     return Verdict(jaw > MIN_JAW_ANGLE_DEG or lips > MIN_LIP_GAP_MM, reason)
@@ -263,8 +265,8 @@ def torso(facts: CaptureFacts) -> Verdict | None:
     return Verdict(found.motion != "head", found.description)
 
 
-def turning(facts: CaptureFacts, joints: Sequence[int]) -> Verdict | None:
-    """On where one of these FLAME joints turns."""
+def turning(facts: CaptureFacts, joints: Sequence[str]) -> Verdict | None:
+    """On where one of these of `JOINTS` turns."""
     if not facts.frames:
         return None
     turn = facts.joint_angle(*joints)
@@ -316,11 +318,11 @@ RULES: dict[str, Rule] = {
     "strain-position": strain,
     "relight": relight,
     "world": world,
-    "teeth": teeth,
+    **{name: partial(in_mouth, part=name) for name in PARTS},
     "torso": torso,
-    "neck": partial(turning, joints=[1]),
-    "jaw": partial(turning, joints=[2]),
-    "eyes": partial(turning, joints=[3, 4]),
+    "neck": partial(turning, joints=["neck"]),
+    "jaw": partial(turning, joints=["jaw"]),
+    "eyes": partial(turning, joints=["left_eye", "right_eye"]),
     "dynamic-offsets": dynamic_offsets,
     "tracking": tracking,
 }
@@ -351,8 +353,8 @@ def plan_effects(
         if verdict is None:
             if choice == "on":
                 lacks = "it has no parameters of FLAME"
-                if effect.name == "teeth":
-                    lacks = "its mesh has no rows of teeth"
+                if effect.name in PARTS:
+                    lacks = f"its mesh has no {PARTS[effect.name].kind}"
                 raise StgaError(f"{flag}: {capture.root} has none: {lacks}")
             continue
         on = verdict.on if choice == "auto" else choice == "on"

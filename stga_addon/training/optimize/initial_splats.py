@@ -15,7 +15,8 @@ from ...capture.camera import Camera
 from ...capture.images import WHITE_LEVEL, read_image, read_mask, read_view
 from ...capture.mesh_geometry import MIN_DEPTH_M, connected_parts, rasterize, silhouette
 from ...capture.model import Capture, View, evenly_spread
-from ...flame.model import torso_faces
+from ...flame.model import faces_within, torso_faces
+from ...flame.parts import PARTS
 from ...flame.sequence import below_neck
 from ...tracking.folder import read_torso_points
 from ..settings import TrainingSettings
@@ -69,9 +70,10 @@ def initial_splats(capture: Capture, settings: TrainingSettings) -> Splats:
     views = capture.views["train"]
     order = settings.first_lattice_order(len(capture.faces))
     lattice = lattice_splats(capture.neutral, capture.faces, order, degree, convention=convention)
-    if not settings.teeth and capture.flame is not None:
-        teeth = capture.flame.model.masks.get("teeth", ())
-        lattice = lattice.rows(~np.isin(capture.faces, teeth).all(axis=1)[lattice.face])
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    for name in PARTS:
+        if name in masks and not getattr(settings, name):
+            lattice = lattice.rows(~faces_within(capture.faces, masks[name])[lattice.face])
     lattice.sh[:, 0] = (triangle_colors(capture, views)[lattice.face] - 0.5) / SH_C0
     parts = [lattice]
     first = [view for view in views if view.timestep == views[0].timestep]
