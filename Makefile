@@ -41,7 +41,7 @@ kernels: .venv/ready
 test-fast: .venv/ready
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not nightly"
 
-# What `make test` skips on a machine without a graphics driver, a browser, Node.js or SLURM
+# What `make test` skips on a machine without a graphics driver, a browser or Node.js
 test-tools: .venv/ready
 	$(BIN)/python -m pytest $(PARALLEL) -m "needs and not nightly"
 

@@ -67,12 +67,6 @@ def has_adapter() -> bool:
     return bool(adapters())
 
 
-def has_slurm() -> bool:
-    from batch.slurm_cluster import missing_programs
-
-    return not missing_programs()
-
-
 VALIDATION_LAYER = "vulkan/explicit_layer.d/VkLayer_khronos_validation.json"
 TOOLS: dict[str, tuple[Callable[[], object], str]] = {
     "adapter": (has_adapter, "no WebGPU adapter (Debian's software Vulkan: mesa-vulkan-drivers)"),
@@ -85,7 +79,6 @@ TOOLS: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "chromium": (find_browser, "no Chromium (Debian: chromium)"),
     "node": (lambda: shutil.which("node"), "no Node.js (Debian: nodejs)"),
-    "slurm": (has_slurm, "no SLURM (Debian: slurm-wlm, munge)"),
 }
 """What tests marked `needs` use beyond the README's requirements: whether it is there, and what is
 said where not."""

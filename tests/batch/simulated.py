@@ -1,6 +1,6 @@
 """An engine that does no work, one without workers, and batches of jobs that ask for none."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,9 @@ class SimulatedEngine(Engine):
 
     interval_s = 0.0
 
-    def __init__(self, outcome=finished, room=1 << 30, takes_all=False):
+    def __init__(self, outcome=finished, room=1 << 30):
         self.outcome = outcome
         self.room = room
-        self.takes_all = takes_all
         self.submitted: list[str] = []
         self.most = 0
         self.jobs: dict[str, Job] = {}
@@ -33,9 +32,9 @@ class SimulatedEngine(Engine):
     def has_room(self, job: Job) -> bool:
         return len(self.jobs) < self.room
 
-    def submit(self, jobs: Sequence[Job]) -> None:
-        self.submitted += [job.name for job in jobs]
-        self.jobs.update({job.name: job for job in jobs})
+    def submit(self, job: Job) -> None:
+        self.submitted.append(job.name)
+        self.jobs[job.name] = job
         self.most = max(self.most, len(self.jobs))
 
     def adopt(self, job: Job) -> None:

@@ -136,7 +136,9 @@ def test_ctrl_c_through_ray(tmp_path: Path) -> None:
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches a traceback where Ray is not installed."""
+    """Catches a traceback where Ray is not installed, and an address that is silently ignored."""
     monkeypatch.setattr(ray_engine, "find_spec", lambda name: None)
     with pytest.raises(StgaError, match="--engine ray: the package ray is not installed"):
         make_engine("ray")
+    with pytest.raises(StgaError, match=r"--address: .*expected --engine ray, got local"):
+        make_engine("local", "host:1")

@@ -41,25 +41,24 @@ def states(batch: Batch) -> dict[str, JobState]:
     return {name: entry.state for name, entry in batch.entries.items()}
 
 
-@pytest.mark.parametrize("takes_all", [False, True])
-def test_second_start_does_only_what_is_left(tmp_path: Path, takes_all: bool) -> None:
+def test_second_start_does_only_what_is_left(tmp_path: Path) -> None:
     """Catches work repeated, and work not done though its input or result has changed."""
     plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
-    engine = SimulatedEngine(room=2 if not takes_all else 99, takes_all=takes_all)
+    engine = SimulatedEngine(room=2)
     batch, _ = carry_out(plan, engine)
     assert set(states(batch).values()) == {JobState.FINISHED}
     assert engine.submitted.index("last") == len(plan.jobs) - 1
-    assert engine.most == (7 if takes_all else 2)
-    second = SimulatedEngine(takes_all=takes_all)
+    assert engine.most == 2
+    second = SimulatedEngine()
     batch, _ = carry_out(plan, second)
     assert second.submitted == []
     assert set(states(batch).values()) == {JobState.KEPT}
     (tmp_path / "runs/look-00001/job/status.json").unlink()
-    third = SimulatedEngine(takes_all=takes_all)
+    third = SimulatedEngine()
     carry_out(plan, third)
     assert third.submitted == ["look-00001", "again-00001", "last"]
     (tmp_path / "capture/new.png").touch()
-    fourth = SimulatedEngine(takes_all=takes_all)
+    fourth = SimulatedEngine()
     _, said = carry_out(plan, fourth)
     assert len(fourth.submitted) == len(plan.jobs)
     moved = tmp_path / "runs/replaced/look-00001"
@@ -112,22 +111,21 @@ def test_a_frame_that_is_gone_is_rendered_again(tmp_path: Path) -> None:
         assert engine.submitted == submitted
 
 
-@pytest.mark.parametrize("takes_all", [False, True])
-def test_a_failed_job_fails_alone(tmp_path: Path, takes_all: bool) -> None:
+def test_a_failed_job_fails_alone(tmp_path: Path) -> None:
     """Catches a failure that stops other jobs, or is passed on as if the next had failed itself."""
 
     def outcome(job: Job) -> tuple[WorkerState, str]:
-        failed = job.name == "look-00001" or (takes_all and job.name == "again-00001")
+        failed = job.name == "look-00001"
         return (WorkerState.FAILED, "capture: is empty") if failed else (WorkerState.FINISHED, "")
 
     plan = empty_jobs(tmp_path, 3, again=True, last=LAST)
-    batch, said = carry_out(plan, SimulatedEngine(outcome, takes_all=takes_all))
+    batch, said = carry_out(plan, SimulatedEngine(outcome))
     found = states(batch)
     assert found["look-00001"] == JobState.FAILED
     assert batch.entries["look-00001"].error == "capture: is empty"
     assert found["again-00001"] == JobState.BLOCKED
     assert batch.entries["again-00001"].error == "it comes after look-00001, which is not finished"
-    assert Counter(found.values())[JobState.FINISHED] == (5 if takes_all else 4)
+    assert Counter(found.values())[JobState.FINISHED] == 4
     assert "look-00001: failed: capture: is empty" in said
     engine = SimulatedEngine()
     batch, _ = carry_out(plan, engine)
@@ -153,8 +151,7 @@ def test_a_lost_worker_is_replaced(tmp_path: Path) -> None:
     assert tries == {"look-00000": 3, "look-00001": 1 + MAX_RETRIES, "look-00002": 1}
 
 
-@pytest.mark.parametrize("takes_all", [False, True])
-def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch, takes_all):
+def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch):
     """Catches times and forecasts that grow with a cluster's queue or a batch's pauses."""
     queue_s = 800.0
     work_s = 200.0
@@ -174,7 +171,7 @@ def test_waiting_in_a_queue_is_no_work(tmp_path, monkeypatch, takes_all):
             writer.finish(WorkerState.FINISHED)
             return Ended(inspect_worker(job.request_folder))
 
-    batch, _ = carry_out(empty_jobs(tmp_path, 1), Queued(takes_all=takes_all))
+    batch, _ = carry_out(empty_jobs(tmp_path, 1), Queued())
     (entry,) = batch.entries.values()
     record = read_record(entry.job)
     assert record is not None
@@ -253,20 +250,34 @@ def test_ctrl_c_leaves_the_rest(tmp_path: Path) -> None:
     assert second.submitted == ["look-00001", "look-00002", "look-00003"]
 
 
-@pytest.mark.parametrize("takes_all", [False, True])
-def test_files_of_others_stay(tmp_path: Path, takes_all: bool) -> None:
+def test_files_of_others_stay(tmp_path: Path) -> None:
     """Catches a batch that moves what no job wrote, or starts the jobs after it."""
     plan = empty_jobs(tmp_path, 2, again=True)
     own = tmp_path / "runs/look-00000/run.json"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    engine = SimulatedEngine(takes_all=takes_all)
+    engine = SimulatedEngine()
     batch, _ = carry_out(plan, engine)
     assert engine.submitted == ["look-00001", "again-00001"]
     assert states(batch)["again-00000"] == JobState.BLOCKED
     assert "holds files that no job of a batch wrote" in batch.entries["look-00000"].error
     assert states(batch)["again-00001"] == JobState.FINISHED
     assert own.read_text() == "mine"
+
+
+def test_a_job_that_an_engine_refuses_fails_alone(tmp_path: Path) -> None:
+    """Catches a batch that ends, or waits for ever, where a worker cannot be started."""
+
+    class Refusing(SimulatedEngine):
+        def submit(self, job: Job) -> None:
+            if job.name == "look-00000":
+                raise StgaError("python: cannot be run")
+            super().submit(job)
+
+    batch, _ = carry_out(empty_jobs(tmp_path, 2, again=True), Refusing())
+    assert batch.entries["look-00000"].error == "python: cannot be run"
+    assert states(batch)["again-00000"] == JobState.BLOCKED
+    assert states(batch)["again-00001"] == JobState.FINISHED
 
 
 def test_a_damaged_record_is_no_result(tmp_path: Path) -> None:
@@ -317,7 +328,7 @@ def test_a_killed_worker_is_told_from_a_mistake(tmp_path, monkeypatch, windows, 
     (job,) = empty_jobs(tmp_path, 1).jobs
     prepare(job, "digest", 0.0)
     engine = LocalEngine(1, 1.0, str(python))
-    engine.submit([job])
+    engine.submit(job)
     while not (ended := engine.ended()):
         time.sleep(0.01)
     assert ended[job.name].snapshot.state == WorkerState.LOST

@@ -5,7 +5,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 from ...errors import StgaError
 from ...worker.launch import start_worker
@@ -45,12 +45,10 @@ class LocalEngine(Engine):
             and sum(needs.gpu for needs in wanted) <= GPUS
         )
 
-    def submit(self, jobs: Sequence[Job]) -> None:
-        for job in jobs:
-            folder = job.request_folder
-            threads = job.resources.threads or None
-            arguments = worker_arguments(folder, threads, resume=True)
-            self._jobs[job.name] = job, start_worker(folder, self._python, arguments)
+    def submit(self, job: Job) -> None:
+        folder = job.request_folder
+        arguments = worker_arguments(folder, job.resources.threads or None, resume=True)
+        self._jobs[job.name] = job, start_worker(folder, self._python, arguments)
 
     def adopt(self, job: Job) -> None:
         self._jobs[job.name] = job, None
@@ -79,19 +77,12 @@ def _ray(address: str) -> Engine:
     return RayEngine(address)
 
 
-def _slurm(address: str) -> Engine:
-    from .slurm import SlurmEngine
-
-    return SlurmEngine()
-
-
 ENGINES: dict[str, tuple[str, Callable[[str], Engine]]] = {
     "local": (
         "this machine, as many jobs as its processors and memory allow",
         lambda _: LocalEngine(),
     ),
     "ray": ("a Ray cluster at --address, or one started here", _ray),
-    "slurm": ("a SLURM cluster, as arrays of sbatch", _slurm),
 }
 """Name -> what the command line says of it, and what makes it with --address."""
 

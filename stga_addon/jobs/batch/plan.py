@@ -129,12 +129,9 @@ class Ended:
 class Engine(ABC):
     """Carries out jobs.
 
-    takes_all    it is given all jobs at once, and minds what they come after itself; else each when
-                 it can start
     interval_s   seconds between two questions after what has ended
     """
 
-    takes_all = False
     interval_s = 0.1
 
     def has_room(self, job: Job) -> bool:
@@ -142,8 +139,8 @@ class Engine(ABC):
         return True
 
     @abstractmethod
-    def submit(self, jobs: Sequence[Job]) -> None:
-        """Carry out jobs, each after those it comes after. Raises StgaError if it cannot begin."""
+    def submit(self, job: Job) -> None:
+        """Carry out a job that can start. Raises StgaError if it cannot begin."""
 
     @abstractmethod
     def adopt(self, job: Job) -> None:

@@ -59,15 +59,16 @@ class RayEngine(Engine):
     def has_room(self, job: Job) -> bool:
         return len(self._jobs) < MAX_WAITING
 
-    def submit(self, jobs: Sequence[Job]) -> None:
-        for job in jobs:
-            needs = job.resources
-            memory = needs.memory_gb * 1e9
-            gpus = int(needs.gpu)
-            options = {"num_cpus": needs.threads or 1, "num_gpus": gpus, "memory": memory}
-            task = self._task.options(name=job.name, **options)
-            log = str(job.request_folder / LOG_FILE)
-            self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
+    def submit(self, job: Job) -> None:
+        needs = job.resources
+        task = self._task.options(
+            name=job.name,
+            num_cpus=needs.threads or 1,
+            num_gpus=int(needs.gpu),
+            memory=needs.memory_gb * 1e9,
+        )
+        log = str(job.request_folder / LOG_FILE)
+        self._jobs[task.remote(job_command(job), str(PACKAGES_FOLDER), log)] = job
 
     def adopt(self, job: Job) -> None:
         self._adopted[job.name] = job

@@ -1,7 +1,7 @@
 """Running a batch: which jobs are to be done, what each comes after, and what became of it."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib.util import find_spec
@@ -181,15 +181,14 @@ class BatchRun:
             state = JobState.CANCELLED if was_stopped else JobState.BLOCKED
             self._over(entry, state, f"it comes after {missing.job.name}, which is not finished")
             return False
-        return self._engine.takes_all or all(other.state.is_done for other in others)
+        return all(other.state.is_done for other in others)
 
     def _begin(self) -> bool:
         """Submit what can start; whether there was something."""
-        fitting: list[Entry] = []
+        begun = 0
         misses = 0
-        takes_all = self._engine.takes_all
-        for name, entry in self._entries.items():  # each after those that it comes after
-            if misses > MAX_MISSES or (len(fitting) >= MAX_BEGUN and not takes_all):
+        for name, entry in self._entries.items():
+            if misses > MAX_MISSES or begun >= MAX_BEGUN:
                 break
             if not self._is_free(entry):
                 continue
@@ -198,38 +197,23 @@ class BatchRun:
                 continue
             try:
                 moved = prepare(entry.job, entry.digest, entry.forecast_s)
+                if moved is not None:
+                    self._say(f"{name}: has changed; what it wrote before is in {moved}")
+                self._engine.submit(entry.job)
             except StgaError as error:
                 self._over(entry, JobState.FAILED, str(error))
                 continue
-            if moved is not None:
-                self._say(f"{name}: has changed; what it wrote before is in {moved}")
-            if not takes_all:
-                self._submit([entry])
-            fitting.append(entry)
-        if takes_all and fitting:
-            self._submit(fitting)
-        return bool(fitting)
-
-    def _submit(self, entries: Sequence[Entry]) -> None:
-        try:
-            self._engine.submit([entry.job for entry in entries])
-        except StgaError as error:
-            for entry in entries:
-                self._over(entry, JobState.FAILED, str(error))
-            return
-        for entry in entries:
             entry.state = JobState.RUNNING
             entry.status = WorkerStatus()
+            begun += 1
+        return begun > 0
 
     def _collect(self, retry: bool = True) -> bool:
         """Take note of what has ended; whether something has."""
         ended = self._engine.ended()
-        # a job's end before that of those after it
-        for name, entry in self._entries.items() if ended else ():
-            if name not in ended:
-                continue
-            end = ended[name]
-            state = ended[name].snapshot.state
+        for name, end in ended.items():
+            entry = self._entries[name]
+            state = end.snapshot.state
             entry.status = end.snapshot.status
             entry.machine = entry.machine or entry.status.machine
             record = read_record(entry.job)
@@ -240,12 +224,7 @@ class BatchRun:
                     write_record(entry.job, new)
                 except StgaError as error:
                     self._say(f"warning: {error}")
-            after = entry.job.after
-            missing = next((o for o in after if not self._entries[o].state.is_done), None)
-            if state != WorkerState.FINISHED and missing is not None:  # an engine that takes all
-                reason = f"it comes after {missing}, which is not finished"
-                self._over(entry, JobState.BLOCKED, reason)
-            elif retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
+            if retry and end.is_lost and state in _LOST and entry.retries < MAX_RETRIES:
                 entry.retries += 1
                 entry.state = JobState.WAITING
                 self._say(f"{name}: its worker was lost; it goes on from its last checkpoint")
@@ -272,7 +251,7 @@ class BatchRun:
         self._shown_s = time.monotonic()
 
 
-_LOST = (WorkerState.LOST, WorkerState.NONE, WorkerState.STARTING)
+_LOST = (WorkerState.LOST, WorkerState.NONE)  # killed, or gone before it began
 _OUTCOMES = {WorkerState.FINISHED: JobState.FINISHED, WorkerState.CANCELLED: JobState.CANCELLED}
 
 
