@@ -34,7 +34,7 @@ from .common import Action, AtEnd, Poll, file_path, need, package, polled, prefe
 from .options import ONCE
 
 POLL_INTERVAL_S = 0.3
-PREPARATION = "stga_addon.jobs.perform"
+PREPARATION = "stga_addon.jobs.compile_ahead"
 START_DELAY_S = 1.0
 """After the extension was enabled: neither enabling nor Blender's start waits for a process."""
 
@@ -64,7 +64,7 @@ def start(
         folder = perform.request_folder(subject)
     folder = folder or Path(tempfile.mkdtemp(prefix="stga_"))
     try:
-        perform.check_request(request)
+        job.check(request)
         perform.write_request(folder, request)
         arguments = perform.worker_arguments(folder)
         process = None if python is None else start_worker(folder, python, arguments)

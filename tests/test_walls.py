@@ -236,7 +236,7 @@ for name in sys.argv[1:]:
 """
 LOAD = """
 import sys
-from stga_addon.jobs.perform import load_ahead
+from stga_addon.jobs.compile_ahead import load_ahead
 load_ahead()
 assert "stga_addon.training.run.session" in sys.modules
 assert "torch" not in sys.modules

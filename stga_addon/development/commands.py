@@ -98,7 +98,7 @@ def train_benchmark(request: Benchmark, report: Report, say: Say) -> Written:
     return train_slice(request, report, say)
 
 
-JOBS[Benchmark] = Job(train_benchmark)
+JOBS[Benchmark] = Job(train_benchmark, output="out")
 COMMANDS["demo"] = Command(
     "Train an avatar on a capture of a generated person and show it in Blender.",
     run_demo_command,

@@ -6,7 +6,7 @@ import shlex
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -16,7 +16,14 @@ from ..files import naming, temporary_folder
 from ..options import like
 from ..progress import Cancelled, Progress, Report, Say, Written, counted
 from ..render.device import Composer
-from ..render.video import finished, is_video, recorded_images, sequence_writer, video_writer
+from ..render.video import (
+    check_output,
+    finished,
+    is_video,
+    recorded_images,
+    sequence_writer,
+    video_writer,
+)
 from ..schema import MAX_COUNT, setting
 from ..worker.launch import end_with_this_process
 from ..worker.training_python import BLENDER_VARIABLE, PYTHON_VARIABLE
@@ -47,6 +54,11 @@ class RenderRecording:
     fps: float = setting(above=0)
     background: tuple[float, float, float] | None = setting(None, 0, 1)
     device: str = like(Train, "device")
+
+
+def check_recording(request: RenderRecording) -> None:
+    """Raise StgaError where the output cannot be written."""
+    check_output(request.output)
 
 
 def render_recording(request: RenderRecording, report: Report, say: Say) -> Written:
@@ -94,6 +106,11 @@ class RenderBlend:
         """Frame -> its file."""
         frames = range(self.frames[0], self.frames[1] + 1)
         return {frame: self.output / f"{frame:0{FRAME_DIGITS}d}.png" for frame in frames}
+
+
+def pictures(request: RenderBlend) -> Collection[Path]:
+    """What it has rendered when it is finished."""
+    return request.pictures.values()
 
 
 def render_blend(request: RenderBlend, report: Report, say: Say) -> Written:

@@ -3,64 +3,33 @@
 request.json   the request; request.npz: its arrays
 result.json    what was found, where the request asks for something other than files; result.npz:
                its arrays
-besides the files of the worker's status (`worker.status`). `python -m` this module compiles ahead
-of a training, which Blender starts with a capture.
+besides the files of the worker's status (`worker.status`).
 """
 
 import os
-from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
-from pkgutil import walk_packages
 from typing import Any
 
 from ..errors import StgaError, telling_refusals
 from ..files import read_json, read_npz, write_json, write_npz
 from ..options import refuse_useless
-from ..progress import Cancelled, Progress, Report, Say, Written, ignore
-from ..raster.kernel_cache import OWN_KERNELS
-from ..render.video import check_output
+from ..progress import Cancelled, Progress, Report, Say, ignore
 from ..schema import Arrays, from_json, to_json, validate
-from ..tracking.folder import is_written
-from ..training.run.folder import has_run, read_run
-from ..worker.launch import PREPARING, cache_folder, prepare_status_folder
-from ..worker.lock import hold_folder
+from ..worker.launch import prepare_status_folder
 from ..worker.status import PICTURE, PREVIEW, remove_status_folder, status_writer
-from .blender import RenderRecording
-from .table import JOBS, Request, Result, request_hint
-from .track import MakeAvatar, SolveAgain, Track, check_inputs
-from .train import Extend, Refine, Resume, Train, refuse_run, resumed
+from .compile_ahead import begin_training
+from .table import JOBS, TRAINS, Request, Result, request_hint
 
 FORMAT = "stga-request"
 VERSION = 1
 REQUEST = "request.json"
 RESULT = "result.json"
 FILES = (REQUEST, "request.npz", RESULT, "result.npz", PREVIEW, PICTURE)
-LOADED_AHEAD = ("avatar", "capture", "flame", "raster.cpu", "training", "report")
-"""Rooms that a worker which trains loads before it begins."""
-TORCH_MODULES = ("raster.cpu.autograd",)  # Modules in them that import torch, which takes seconds
 
 
 def request_folder(subject: Path) -> Path:
     """The folder of a request inside that of its run or capture, so that they move together."""
     return subject / "job"
-
-
-def check_request(request: Request) -> None:
-    """Raise StgaError for what can be known to fail before a worker is started."""
-    match request:
-        case Train() | Refine() | Extend():
-            refuse_run(request.run)
-        case Resume():
-            read_run(request.run)
-        case Track() if is_written(request.out):
-            raise StgaError(f"{request.out}: already holds a capture; choose another folder")
-        case MakeAvatar():
-            check_inputs(request.track)
-        case SolveAgain() if not is_written(request.capture):
-            raise StgaError(f"{request.capture}: holds no tracked capture to solve again")
-        case RenderRecording():
-            check_output(request.output)
 
 
 def worker_arguments(folder: Path, threads: int | None = None, resume: bool = False) -> list[str]:
@@ -164,52 +133,12 @@ def perform_in_folder(
         writer.report(Progress(stage="Starting"))
         try:
             request = read_request(folder)
-            if isinstance(request, Train | Resume | Refine | Extend | MakeAvatar):
-                from ..raster.cpu.precompile import begin_compiling
-
-                begin_compiling()
-                load_ahead()
-            if resume and isinstance(request, Train | Refine | Extend) and has_run(request.run):
-                request = resumed(request)
-            # ended before it wrote its result
-            if resume and isinstance(request, Track) and is_written(request.out):
-                result: Result = Written(request.out)
-            else:
-                result = perform(request, report, say)
+            job = JOBS[type(request)]
+            if job.kind in TRAINS:
+                begin_training()
+            left: Any = job.left(request) if resume else request
+            result: Result = perform(left, report, say) if type(left) in JOBS else left
         except Cancelled:
             return None
         write_result(folder, result)
         return result
-
-
-def load_ahead() -> None:
-    """Load what a training needs later: an add-on's update may exchange the files meanwhile."""
-    for room in LOADED_AHEAD:
-        package = import_module(f"..{room}", __package__)
-        for module in walk_packages(getattr(package, "__path__", ()), f"{package.__name__}."):
-            if not module.name.endswith(TORCH_MODULES):
-                # a package that not every Python has, and that nothing here needs
-                with suppress(ImportError):
-                    import_module(module.name)
-
-
-def prepare() -> None:
-    """Compile Numba's kernels and the bytecode of an extension's packages for the first training on
-    this machine; no effect while another process does, or without room."""
-    os.environ[OWN_KERNELS] = "1"
-    with suppress(OSError, StgaError), hold_folder(cache_folder(), PREPARING, "preparation"):
-        from ..raster.cpu.precompile import rasterizer_helper
-
-        rasterizer_helper()
-        load_ahead()
-        from ..training.optimize.precompile import compile_for_cpu
-
-        compile_for_cpu()
-        # The first lists the machine's fonts; torch's bytecode is not written by `load_ahead`.
-        for library in ("matplotlib.font_manager", "torch"):
-            with suppress(ImportError):
-                import_module(library)
-
-
-if __name__ == "__main__":
-    prepare()

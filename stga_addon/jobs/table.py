@@ -1,19 +1,51 @@
 """The one table of jobs: each request, its work, and what Blender's sidebar shows of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Union
 
 from ..progress import Written
 from .analyze import Analyze, Analyzed, Select, TimePresets, analyze, select, time_each_preset
-from .blender import RenderBlend, RenderRecording, render_blend, render_recording
+from .blender import (
+    RenderBlend,
+    RenderRecording,
+    check_recording,
+    pictures,
+    render_blend,
+    render_recording,
+)
 from .convert_motion import ConvertMotion, convert_motion
 from .export import Export, export
 from .finished_run import Evaluate, Relight, evaluate, relight
 from .render import Render, render
-from .track import MakeAvatar, SolveAgain, Track, make_avatar, solve_again, track
-from .train import Extend, Refine, Resume, Selected, SelectForTake, Train, select_for_take, train
+from .track import (
+    MakeAvatar,
+    SolveAgain,
+    Track,
+    check_avatar,
+    make_avatar,
+    refuse_tracked,
+    require_tracked,
+    solve_again,
+    track,
+    untracked,
+)
+from .train import (
+    Extend,
+    Refine,
+    Resume,
+    Selected,
+    SelectForTake,
+    Train,
+    avatar_file,
+    refuse_run,
+    require_run,
+    resumed,
+    select_for_take,
+    train_and_finish,
+)
 
 Request = (
     Train
@@ -55,35 +87,60 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Job:
-    """The work of a request, and what Blender knows of it.
+    """The work of a request, and what Blender, workers and batches know of it.
 
-    kind     of those that Blender asks for; subject: the field that names what it is about
+    kind      of those that Blender asks for; subject: the field that names what it is about
+    check     raises StgaError for what is known to fail before a worker is started
+    left      request -> what is left of one that a worker began: a request, or its result
+    output    the field that names what it writes
+    files     request -> the files that it has written when it is finished, where `output` is none
     """
 
     work: Work
     kind: Kind | None = None
     subject: str = ""
+    check: Callable[[Any], object] = lambda request: None
+    left: Callable[[Any], Any] = lambda request: request
+    output: str = ""
+    files: Callable[[Any], Iterable[Path]] | None = None
+
+    def is_written(self, request: Any) -> bool:
+        """Whether what the request writes, beside its result, is there."""
+        if self.files is not None:
+            return all(path.exists() for path in self.files(request))
+        return not self.output or getattr(request, self.output).exists()
 
 
+_NEW_RUN = Job(
+    train_and_finish,
+    Kind.TRAINING,
+    "run",
+    check=refuse_run,
+    left=resumed,
+    output="run",
+    files=avatar_file,
+)
 JOBS: dict[type[Any], Job] = {
-    Train: Job(train, Kind.TRAINING, "run"),
-    Resume: Job(train, Kind.TRAINING, "run"),
-    Refine: Job(train, Kind.TRAINING, "run"),
-    Extend: Job(train, Kind.TRAINING, "run"),
+    Train: _NEW_RUN,
+    Refine: _NEW_RUN,
+    Extend: _NEW_RUN,
+    Resume: Job(train_and_finish, Kind.TRAINING, "run", check=require_run),
     SelectForTake: Job(select_for_take, Kind.SELECTION, "capture"),
-    Track: Job(track, Kind.TRACKING, "out"),
-    SolveAgain: Job(solve_again, Kind.TRACKING, "capture"),
-    MakeAvatar: Job(make_avatar, Kind.AVATAR, "out"),
+    Track: Job(track, Kind.TRACKING, "out", check=refuse_tracked, left=untracked, output="out"),
+    SolveAgain: Job(solve_again, Kind.TRACKING, "capture", check=require_tracked),
+    MakeAvatar: Job(make_avatar, Kind.AVATAR, "out", check=check_avatar),
     Analyze: Job(analyze, Kind.ANALYSIS, "capture"),
     TimePresets: Job(time_each_preset),
     Select: Job(select),
     Evaluate: Job(evaluate),
     Relight: Job(relight, Kind.LIGHT, "run"),
-    Render: Job(render),
-    RenderRecording: Job(render_recording, Kind.VIDEO, "output"),
-    RenderBlend: Job(render_blend),
-    Export: Job(export),
-    ConvertMotion: Job(convert_motion, Kind.PERFORMANCE, "output"),
+    Render: Job(render, output="output"),
+    RenderRecording: Job(
+        render_recording, Kind.VIDEO, "output", check=check_recording, output="output"
+    ),
+    RenderBlend: Job(render_blend, output="output", files=pictures),
+    Export: Job(export, output="output"),
+    ConvertMotion: Job(convert_motion, Kind.PERFORMANCE, "output", output="output"),
 }
 """Every request; `development.commands` adds its own in a checkout."""
 

@@ -19,10 +19,10 @@ from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
 from ..tracking.stages import Stage
-from ..training.run.folder import AVATAR, has_run
+from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
-from .train import Train, resumed, train
+from .train import Train, resumed, train_and_finish
 
 WORLDS = {
     "auto": "the cameras' own where they were exported from a Blender scene, else head",
@@ -180,6 +180,23 @@ FOCAL_SOURCES = {
 """Where a focal length is from (`Footage.focal`) -> what a person reads of it."""
 
 
+def refuse_tracked(request: Track) -> None:
+    """Raise StgaError where the folder holds a capture."""
+    if is_written(request.out):
+        raise StgaError(f"{request.out}: already holds a capture; choose another folder")
+
+
+def require_tracked(request: SolveAgain) -> None:
+    """Raise StgaError where there is no tracked capture to solve again."""
+    if not is_written(request.capture):
+        raise StgaError(f"{request.capture}: holds no tracked capture to solve again")
+
+
+def untracked(request: Track) -> Track | Written:
+    """The request, or its result where a worker wrote the capture, and ended before it said so."""
+    return Written(request.out) if is_written(request.out) else request
+
+
 def track(request: Track, report: Report, say: Say) -> Written:
     """Track the head into a capture; cancelled, the same request continues. Raises StgaError, also
     while another process writes the capture."""
@@ -298,7 +315,7 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
         _track(request.track, report_tracking, say)
     tracked = perf_counter()
     new = replace(request.train, flame=request.track.model if is_flame(capture) else None)
-    trained = train(resumed(new) if has_run(run) else new, report_training, say)
+    trained = train_and_finish(resumed(new), report_training, say)
     tracking = tracked - begin
     training = perf_counter() - tracked
     values = read_json(capture / REPORT_FILE)
@@ -336,6 +353,11 @@ def _track(request: Track, report: Report, say: Say) -> None:
             if new:
                 out.rmdir()
         raise
+
+
+def check_avatar(request: MakeAvatar) -> None:
+    """Raise StgaError as `check_inputs`."""
+    check_inputs(request.track)
 
 
 def check_inputs(track: Track) -> None:

@@ -75,8 +75,10 @@ class Resume:
     selection: Selection | None = None
 
 
-def resumed(request: "Train | Refine | Extend") -> Resume:
-    """What continues the run of a request that was interrupted."""
+def resumed(request: "Train | Refine | Extend") -> "Train | Resume | Refine | Extend":
+    """What continues the run of a request, where it has begun one; else the request."""
+    if not run_folder.has_run(request.run):
+        return request
     names: tuple[str, ...] = ("run", "flame", "device")
     if isinstance(request, Train):
         names = (*names, "capture", "principal_point", "selection")
@@ -186,8 +188,9 @@ class Prepared:
     capture: Capture
     selection: Selection | None = None
 
-    def train(self, report: Report) -> Path:
-        """The path of the avatar. Raises as `training.run.session.train`."""
+    def run_session(self, report: Report) -> Path:
+        """Begin or resume the run in its folder; the path of the avatar. Raises as
+        `training.run.session.train`."""
         from ..training.run.session import train
 
         folder = self.request.run
@@ -196,9 +199,9 @@ class Prepared:
         return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
 
 
-def train(request: Training, report: Report, say: Say) -> Written:
-    """Train the run that is asked for; its avatar and summary. Raises StgaError, KeyboardInterrupt
-    after Ctrl-C."""
+def train_and_finish(request: Training, report: Report, say: Say) -> Written:
+    """Train the run that is asked for, and add its summary, light and world. Raises StgaError,
+    KeyboardInterrupt after Ctrl-C."""
     from ..training.effects.plan import describe_effects
 
     prepared = prepare(request, report, say)
@@ -223,7 +226,7 @@ def train(request: Training, report: Report, say: Say) -> Written:
         # with the figures of the training
         return report(replace(latest, stage=progress.stage, preview=None))
 
-    avatar = prepared.train(report_training)
+    avatar = prepared.run_session(report_training)
     lines = report_run(folder)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
@@ -268,10 +271,20 @@ def _world_of(prepared: Prepared, report: Report) -> str:
     return f"world: {path} ({len(splats)} splats)"
 
 
-def refuse_run(folder: Path) -> None:
-    """Raise StgaError where the folder holds a run."""
-    if run_folder.has_run(folder):
-        raise StgaError(f"{folder}: already holds a run; resume it, or choose another folder")
+def refuse_run(request: Train | Refine | Extend) -> None:
+    """Raise StgaError where the folder of the new run holds one."""
+    if run_folder.has_run(request.run):
+        raise StgaError(f"{request.run}: already holds a run; resume it, or choose another folder")
+
+
+def require_run(request: Resume) -> None:
+    """Raise StgaError where there is no run to resume, or a damaged one."""
+    run_folder.read_run(request.run)
+
+
+def avatar_file(request: Train | Refine | Extend) -> tuple[Path]:
+    """What a finished run has."""
+    return (request.run / AVATAR,)
 
 
 def prepare(request: Training, report: Report, say: Say) -> Prepared:
@@ -284,7 +297,7 @@ def prepare(request: Training, report: Report, say: Say) -> Prepared:
         say(why)
         run = replace(opened.run, device=device)
         return Prepared(request, run, opened.capture, request.selection)
-    refuse_run(request.run)
+    refuse_run(request)
     if isinstance(request, Train):
         return _new_run(request, report, say)
     device, why = run_folder.device_of(run_folder.read_run(request.parent), request.device)

@@ -25,7 +25,7 @@ CHARTS = "matplotlib"
 """Folders in it: of Numba; of kernels that an edition brings, where this processor is faster with
 its own (`raster.cpu.bundled`); of Python (`PYTHONPYCACHEPREFIX`) and of matplotlib."""
 PREPARING = "preparing.lock"
-"""Held in it by the process that compiles ahead of a training (`jobs.perform`)."""
+"""Held in it by the process that compiles ahead of a training (`jobs.compile_ahead`)."""
 PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that holds `stga_addon`, for a worker's import path."""
 NICENESS = 5

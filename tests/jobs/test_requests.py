@@ -73,6 +73,10 @@ def painted() -> dict[int, np.ndarray]:
     return {0: np.zeros(320, bool), 1: np.arange(320) < 40, 3: np.arange(320) % 2 == 0}
 
 
+def check(request: Any) -> None:
+    JOBS[type(request)].check(request)
+
+
 def asked(request: Train | Resume | Refine) -> Path:
     """The folder of a request that is written into it."""
     folder = jobs.request_folder(request.run)
@@ -111,19 +115,19 @@ def test_refusals(tmp_path: Path, capture: Path) -> None:
     """Catches a run overwritten, or resumed where none is, only after a worker was started."""
     run = tmp_path / "run"
     with pytest.raises(StgaError, match=r"holds no run \(run\.json is missing\)"):
-        jobs.check_request(Resume(run))
+        check(Resume(run))
     assert not run.exists()
     write_run(run, Run(capture, None, "vhap", make_settings(iterations=5)))
     with pytest.raises(StgaError, match="already holds a run; resume it, or choose another folder"):
-        jobs.check_request(training(run, capture))
-    jobs.check_request(Resume(run))
+        check(training(run, capture))
+    check(Resume(run))
     folder = asked(Resume(run))
     with status_writer(folder), pytest.raises(StgaError, match="another worker is running"):
         write_request(folder, Resume(run))
     with pytest.raises(StgaError, match="holds no tracked capture to solve again"):
-        jobs.check_request(SolveAgain(tmp_path / "nothing", Path("m"), {}))
+        check(SolveAgain(tmp_path / "nothing", Path("m"), {}))
     with pytest.raises(StgaError, match="already holds a capture"):
-        jobs.check_request(Track(Path("f"), Path("m"), capture))
+        check(Track(Path("f"), Path("m"), capture))
 
 
 DAMAGES: dict[str, Any] = {"format": "stga-job", "version": 0, "kind": "Paint", "run": 5}

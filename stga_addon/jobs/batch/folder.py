@@ -24,8 +24,8 @@ from ...worker.launch import prepare_status_folder
 from ...worker.lock import hold_folder, is_locked
 from ...worker.status import LOCK_FILE, WorkerState, read_status
 from ..perform import has_request, write_request
-from ..table import request_hint
-from .plan import REPLACED, Job, Plan, input_paths, output_field
+from ..table import JOBS, request_hint
+from .plan import REPLACED, Job, Plan, input_paths
 
 
 def job_digests(plan: Plan) -> dict[str, str]:
@@ -36,8 +36,8 @@ def job_digests(plan: Plan) -> dict[str, str]:
     writes into an input, not at all. Raises StgaError where an input cannot be read.
     """
     folders = {job.name: job.folder for job in plan.jobs}
-    fields = ((job.request, output_field(type(job.request))) for job in plan.jobs)
-    outputs = (getattr(request, name) for request, name in fields if name is not None)
+    fields = ((job.request, JOBS[type(job.request)].output) for job in plan.jobs)
+    outputs = (getattr(request, name) for request, name in fields if name)
     written = {os.path.realpath(path) for path in (plan.out, *outputs) if isinstance(path, Path)}
     found: dict[str, str] = {}
     inputs: dict[Path, str] = {}

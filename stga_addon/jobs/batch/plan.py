@@ -15,19 +15,14 @@ from typing import Any, get_args
 from ...errors import StgaError, shorten
 from ...files import read_toml
 from ...schema import IS_PATH, complaint, from_json, setting, to_json, type_hints
-from ...training.run.folder import AVATAR
 from ...training.settings import TrainingSettings, make_settings
 from ...worker.status import WorkerSnapshot
 from ...worker.training_python import find_training_python
-from ..blender import RenderBlend
 from ..perform import request_folder, worker_arguments
 from ..table import JOBS, Request
 from ..track import MakeAvatar
-from ..train import Extend, Refine, Resume, Train
+from ..train import Resume
 
-TRAININGS = (Train, Refine, Extend)
-OUTPUT_FIELDS = ("out", "output")
-"""Names of the field that says where a request writes; of a training it is `run`."""
 MAX_THREADS = 1024
 
 
@@ -79,19 +74,7 @@ class Job:
     @property
     def is_written(self) -> bool:
         """Whether what the request writes, beside its result, is there."""
-        request = self.request
-        if isinstance(request, TRAININGS):
-            return (request.run / AVATAR).exists()
-        if isinstance(request, RenderBlend):
-            return all(picture.exists() for picture in request.pictures.values())
-        path = getattr(request, output_field(type(request)) or "", None)
-        return not isinstance(path, Path) or path.exists()
-
-
-def output_field(kind: type[Any]) -> str | None:
-    """The field that says where requests of a kind write; None where they have none."""
-    names = ("run",) if kind in TRAININGS else OUTPUT_FIELDS
-    return next((name for name in names if name in kind.__dataclass_fields__), None)
+        return JOBS[type(self.request)].is_written(self.request)
 
 
 def is_path(kind: type[Any], name: str, value: Any) -> bool:
@@ -112,7 +95,7 @@ def input_paths(request: Request) -> Mapping[str, tuple[Path, ...]]:
     found = dict[str, tuple[Path, ...]]()
     for name in kind.__dataclass_fields__:
         value = getattr(request, name)
-        if value is not None and name != output_field(kind) and is_path(kind, name, value):
+        if value is not None and name != JOBS[kind].output and is_path(kind, name, value):
             found[name] = tuple(map(Path, value if isinstance(value, tuple) else (value,)))
     return found
 
@@ -284,9 +267,9 @@ def _request(
     where: str, kind: type[Any], values: Mapping[str, Any], base: Path, folder: Path
 ) -> Request:
     """The request of a kind from the fields that are given; the others have their defaults."""
-    output = output_field(kind)
+    output = JOBS[kind].output
     _require_keys(where, values, list(kind.__dataclass_fields__))
-    values = dict(values) if output is None else {output: ".", **values}
+    values = {output: ".", **values} if output else dict(values)
     for name, value in values.items():
         if is_path(kind, name, value):
             values[name] = _resolved(folder if name == output else base, value)

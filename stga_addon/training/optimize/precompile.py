@@ -30,7 +30,7 @@ def precompile_kernels(device: str = "cpu") -> None:
 
     Each of the former runs once on two splats, with the argument types of real training. If the
     cache is empty, a second process compiles rendering at the same time (`raster.cpu.precompile`).
-    While a process compiles ahead (`jobs.perform`), this one waits for it, unless it has
+    While a process compiles ahead (`jobs.compile_ahead`), this one waits for it, unless it has
     kernels that are bundled (`raster.cpu.bundled`).
     """
     end = time.monotonic() + HELPER_TIMEOUT_S
