@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("stga_addon", "operators", "ui", "tests", "benchmarks")
+FOLDERS = ("stga_addon", "operators", "ui", "tests")
 FILES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
 MAX_FUNCTION_LINES = 60
 

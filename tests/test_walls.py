@@ -24,7 +24,7 @@ BLENDER = {"bpy", "bmesh", "gpu", "mathutils", "bl_ext"}
 BLENDERS = ("stga_addon/scene/", "stga_addon/development/demo/studio.py", "operators/", "ui/")
 """Where Blender's modules are imported."""
 HEAVY = {"torch", "numba", "wgpu"}
-TRAININGS = ("stga_addon/raster/", "stga_addon/training/")
+TRAININGS = ("stga_addon/raster/", "stga_addon/training/", "stga_addon/development/benchmark/")
 # A module may import from layers before its own; a package counts as its first name.
 LAYERS = (
     {"errors", "__version__"}, {"files", "format", "schema"}, {"options", "progress"}, {"worker"},

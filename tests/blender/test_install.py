@@ -43,7 +43,7 @@ def test_the_zip(zip_file, tmp_path):
     """Catches tests or docs in the zip, a module left out, another version or wheel, traces of
     this computer, and a zip of nothing."""
     names = set(zipfile.ZipFile(zip_file).namelist())
-    left_out = ("tests/", "docs/", "benchmarks/", "stga_addon/development/", ".")
+    left_out = ("tests/", "docs/", "stga_addon/development/", ".")
     assert not [name for name in names if name.startswith(left_out) or name.endswith(".pyc")]
     expected = "LICENSE README.md CHANGELOG.md THIRD_PARTY.md __init__.py blender_manifest.toml"
     assert {name for name in names if "/" not in name} == {*expected.split()}

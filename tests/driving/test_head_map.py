@@ -169,7 +169,7 @@ def test_combinations_against_a_free_fit(rich):
         free = least_squares(error, found.parameters(row[None])[0, : count + 3], max_nfev=6)
         missed.append(np.linalg.norm(posed(sequence, found, row) - wanted, axis=1).mean())
         best.append(np.linalg.norm(points(free.x) - wanted, axis=1).mean())
-    assert np.mean(missed) < 1.2 * np.mean(best)  # 1.16; of FLAME 1.06 (benchmarks/driving.py)
+    assert np.mean(missed) < 1.2 * np.mean(best)  # 1.16; of FLAME 1.06
 
 
 def test_there_and_back(rich, tmp_path):

@@ -1,7 +1,8 @@
 """What one training iteration costs, stage by stage, globally and on a part of the splats.
 
-    python benchmarks/iteration.py [--head ellipsoid] [--splats 60000] [--width 802] [--height 550]
-        [--repeats 30] [--device gpu] [--opensplat FOLDER] [--processor-time] [--out FILE.json]
+    python -m stga_addon.development.benchmark.iteration [--head ellipsoid] [--splats 60000]
+        [--width 802] [--height 550] [--repeats 30] [--device gpu] [--opensplat FOLDER]
+        [--processor-time]
 
 Splats of SH degree 3 on the bundled head (23,400 triangles, denser at eyes and mouth, as heads
 are), or on an evenly covered ellipsoid, for which a selection costs most. Prints the
@@ -14,10 +15,9 @@ that passes, that of the processor, of ours divided by its threads.
 """
 
 import argparse
-import json
 import statistics
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -28,42 +28,44 @@ from llvmlite.binding import get_host_cpu_name
 from numba.core import config
 from numba.core.codegen import get_host_cpu_features
 
-from stga_addon.avatar.embedding import face_areas, face_frames
-from stga_addon.avatar.splats import Splats
-from stga_addon.capture.camera import Camera
-from stga_addon.capture.model import Capture, View
-from stga_addon.flame.parts import flame_model
-from stga_addon.raster.cpu.blend import blend_backward, blend_forward
-from stga_addon.raster.cpu.layout import PROJECTED
-from stga_addon.raster.cpu.project import project_backward, project_forward
-from stga_addon.raster.cpu.rasterize import (
+from ...avatar.embedding import face_areas, face_frames
+from ...avatar.splats import Splats
+from ...capture.camera import Camera
+from ...capture.model import Capture, View
+from ...flame.parts import flame_model
+from ...raster.cpu.blend import blend_backward, blend_forward
+from ...raster.cpu.layout import PROJECTED, CameraFrames
+from ...raster.cpu.project import project_backward, project_forward
+from ...raster.cpu.rasterize import (
     BufferPool,
+    RenderOutput,
     frames_in_camera,
     render_backward,
     render_forward,
     sort_by_depth,
     tile_grid,
 )
-from stga_addon.raster.cpu.threads import parallel, pieces, threads
-from stga_addon.raster.cpu.tiles import (
+from ...raster.cpu.threads import parallel, pieces, threads
+from ...raster.cpu.tiles import (
     SORT_PARTS,
     arrange_tiles,
     count_pairs,
     fill_pairs,
     sum_tiles,
 )
-from stga_addon.render.device import choose_device
-from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
-from stga_addon.training.optimize.frames import FrameStore
-from stga_addon.training.optimize.state import Batch, new_state
-from stga_addon.training.optimize.trainer import make_backend
-from stga_addon.training.schedule import learning_rates
-from stga_addon.training.settings import make_settings
+from ...render.device import choose_device
+from ...training.optimize import adam
+from ...training.optimize.cpu_backend import image_gradient, whole_image
+from ...training.optimize.frames import FrameStore
+from ...training.optimize.state import Batch, TrainState, new_state
+from ...training.optimize.trainer import make_backend
+from ...training.schedule import learning_rates
+from ...training.settings import make_settings
 
 RATES = dict.fromkeys(learning_rates(make_settings(iterations=1).rates, 0), 1e-9)
 SSIM_WEIGHT = 0.2
 """Of the image loss."""
+LOSS_STAGE = "L1 + SSIM, both ways"
 LOSS_OPERATIONS = 3 * (14 * 11 + 28 + 12)
 """Additions, multiplications, multiply-adds and the like that the image loss needs of a pixel: in
 each channel 14 blurs of 11, SSIM with its derivatives, and the rest.
@@ -175,98 +177,174 @@ def arithmetic_rate(clock: Callable[[], float]) -> float:
     )
 
 
-def stages(
-    splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
-) -> dict[str, tuple[float, int]]:
-    """stage -> (median ms, bytes that it must move at least)."""
-    n = len(splats)
-    (width, height) = frames.size.tolist()
-    pixels = width * height
-    background = np.ones(3, np.float32)
-    tiles_x, tiles_y = tile_grid(width, height)
+Stage = tuple[Callable[[], object], int]
+"""What a stage does, and the bytes that it must move at least."""
+BACKGROUND = np.ones(3, np.float32)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """An image that was rendered, of which each stage can be repeated."""
+
+    state: TrainState
+    frames: CameraFrames
+    output: RenderOutput
+    buffers: BufferPool
+
+    @property
+    def pairs(self) -> int:
+        return len(self.output.lists.pair_splat)
+
+
+def rendered(splats: Splats, frames: CameraFrames) -> Rendered:
     state = new_state(splats)
     buffers = BufferPool()
-    parameters = state.parameters
-    gradients = state.gradients
-    face = state.face
-    r = render_forward(parameters, face, frames, 3, background, buffers=buffers)
-    lists = r.lists
-    columns = r.projection.columns
-    rect = r.projection.rect
-    rows = lists.visible
+    output = render_forward(state.parameters, state.face, frames, 3, BACKGROUND, buffers=buffers)
+    return Rendered(state, frames, output, buffers)
+
+
+def listing_stages(image: Rendered) -> dict[str, Stage]:
+    """The stages until every tile has its list of splats."""
+    state = image.state
+    frames = image.frames
+    output = image.output
+    lists = output.lists
+    n = len(state.face)
+    rect = output.projection.rect
+    tiles_x, tiles_y = tile_grid(*frames.size.tolist())
     everything = np.arange(n)
     everywhere = sum_tiles(np.ones((tiles_y, tiles_x), bool))
-    _, order, first_pair, *_ = sort_by_depth(r.projection, BufferPool())
-    count = len(lists.pair_splat)
+    _, order, first_pair, *_ = sort_by_depth(output.projection, BufferPool())
     counts = np.empty((SORT_PARTS, tiles_x * tiles_y), np.int32)
     count_pairs(rect, order, tiles_x, counts)
     places = counts.copy()
-    arrange_tiles(places, r.tile_blocks)
-    v_image = np.empty_like(r.image)
-    screen_gradient = np.empty(n, np.float32)
-    bands = whole_image(height, width)
-    zero = np.zeros_like(r.transmittance)
-    wanted = np.ones(n, bool)
-    pair_gradients = np.empty((count, PROJECTED), np.float32)
-    work = {
-        "project": (
-            lambda: project_forward(
-                everything, everywhere, parameters, face, frames, 3, False, False, r.projection
-            ),
-            n * (59 + 16) * 4,
+    arrange_tiles(places, output.tile_blocks)
+
+    def project() -> object:
+        return project_forward(
+            everything,
+            everywhere,
+            state.parameters,
+            state.face,
+            frames,
+            3,
+            False,
+            False,
+            output.projection,
+        )
+
+    def fill() -> object:
+        return fill_pairs(
+            rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat
+        )
+
+    return {
+        "project": (project, n * (59 + 16) * 4),
+        "sort by depth": (
+            lambda: sort_by_depth(output.projection, image.buffers),
+            n * 36 + len(lists.visible) * 44,
         ),
-        "sort by depth": (lambda: sort_by_depth(r.projection, buffers), n * 36 + len(rows) * 44),
         "count pairs": (lambda: count_pairs(rect, order, tiles_x, counts), n * 20),
-        "arrange tiles": (lambda: arrange_tiles(counts.copy(), r.tile_blocks), 2 * counts.nbytes),
-        "fill pairs": (
-            lambda: fill_pairs(
-                rect, order, tiles_x, places.copy(), first_pair, lists.splat_pairs, lists.pair_splat
-            ),
-            count * 8 + n * 24,
+        "arrange tiles": (
+            lambda: arrange_tiles(counts.copy(), output.tile_blocks),
+            2 * counts.nbytes,
         ),
-        "blend": (
-            lambda: blend_forward(
-                r.tiles, tiles_x, r.tile_blocks, lists, r.projection, background, r.blended
-            ),
-            count * 42 + pixels * 20,
-        ),
-        "L1 + SSIM, both ways": (
-            lambda: image_gradient(r.image, target, bands, SSIM_WEIGHT, v_image),
+        "fill pairs": (fill, image.pairs * 8 + n * 24),
+    }
+
+
+def pixel_stages(image: Rendered, target: np.ndarray, v_image: np.ndarray) -> dict[str, Stage]:
+    """Blending, and the image loss, which writes its gradient into `v_image`."""
+    output = image.output
+    width, height = image.frames.size.tolist()
+    tiles_x, _ = tile_grid(width, height)
+    pixels = width * height
+    bands = whole_image(height, width)
+
+    def blend() -> object:
+        return blend_forward(
+            output.tiles,
+            tiles_x,
+            output.tile_blocks,
+            output.lists,
+            output.projection,
+            BACKGROUND,
+            output.blended,
+        )
+
+    return {
+        "blend": (blend, image.pairs * 42 + pixels * 20),
+        LOSS_STAGE: (
+            lambda: image_gradient(output.image, target, bands, SSIM_WEIGHT, v_image),
             pixels * (12 + 3 + 12),
         ),
-        "blend backward": (
-            lambda: blend_backward(
-                r.tiles,
-                tiles_x,
-                lists,
-                r.blended,
-                wanted,
-                columns,
-                background,
-                v_image,
-                zero,
-                pair_gradients,
-            ),
-            count * (46 + 36) + pixels * 24,
-        ),
-        "project backward": (
-            lambda: project_backward(
-                rows,
-                parameters,
-                face,
-                frames,
-                3,
-                False,
-                False,
-                columns,
-                lists,
-                pair_gradients,
-                gradients,
-                screen_gradient,
-            ),
-            count * 36 + len(rows) * (59 * 2 + 16) * 4,
-        ),
+    }
+
+
+def gradient_stages(image: Rendered, v_image: np.ndarray) -> dict[str, Stage]:
+    """From the image's gradient to the splats' step."""
+    state = image.state
+    output = image.output
+    rows = output.lists.visible
+    columns = output.projection.columns
+    width, height = image.frames.size.tolist()
+    tiles_x, _ = tile_grid(width, height)
+    zero = np.zeros_like(output.transmittance)
+    wanted = np.ones(len(state.face), bool)
+    pair_gradients = np.empty((image.pairs, PROJECTED), np.float32)
+    screen_gradient = np.empty(len(state.face), np.float32)
+
+    def blend() -> object:
+        return blend_backward(
+            output.tiles,
+            tiles_x,
+            output.lists,
+            output.blended,
+            wanted,
+            columns,
+            BACKGROUND,
+            v_image,
+            zero,
+            pair_gradients,
+        )
+
+    def project() -> object:
+        return project_backward(
+            rows,
+            state.parameters,
+            state.face,
+            image.frames,
+            3,
+            False,
+            False,
+            columns,
+            output.lists,
+            pair_gradients,
+            state.gradients,
+            screen_gradient,
+        )
+
+    return {
+        "blend backward": (blend, image.pairs * (46 + 36) + width * height * 24),
+        "project backward": (project, image.pairs * 36 + len(rows) * (59 * 2 + 16) * 4),
         "Adam": (lambda: adam.step(state, rows, RATES), len(rows) * 59 * 4 * 9),
+    }
+
+
+def stages(
+    splats: Splats,
+    frames: CameraFrames,
+    target: np.ndarray,
+    repeats: int,
+    clock: Callable[[], float],
+) -> dict[str, tuple[float, int]]:
+    """stage -> (median ms, bytes that it must move at least)."""
+    image = rendered(splats, frames)
+    v_image = np.empty_like(image.output.image)
+    work = {
+        **listing_stages(image),
+        **pixel_stages(image, target, v_image),
+        **gradient_stages(image, v_image),
     }
     return {name: (median_ms(call, repeats, clock), moved) for name, (call, moved) in work.items()}
 
@@ -313,7 +391,6 @@ def main() -> None:
     parser.add_argument(
         "--processor-time", action="store_true", help="of the CPU, for a loaded machine"
     )
-    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     rng = np.random.default_rng(0)
     make_head = {"bundled": bundled_head, "ellipsoid": ellipsoid}[options.head]
@@ -325,10 +402,8 @@ def main() -> None:
     backend, batch = global_step(splats, mesh, faces, camera, target, device)
     clock = time_of_a_thread if options.processor_time else perf_counter
     frames = frames_in_camera(face_frames(mesh, faces, mesh), camera)
-    found = {}
     if device == "cpu":
-        found = cpu_table(splats, frames, target, options.repeats, clock)
-        print(f"{'sum of stages':<22}{sum(found.values()):8.2f}")
+        print_stages(splats, frames, target, options.repeats, clock)
     if options.opensplat:
         compare_opensplat(options.opensplat, splats, frames, target, options.repeats)
 
@@ -338,16 +413,10 @@ def main() -> None:
 
     whole = measure(batch)
     print(f"{'whole iteration':<22}{whole:8.2f}")
-    parts = {}
     for share in (0.05, 0.1, 0.2, 0.4):
-        parts[share] = measure(
-            replace(batch, selected=two_regions(splats, mesh, faces, share, options.head))
-        )
-        ratio = parts[share] / whole
-        print(f"local, {share:4.0%} selected   {parts[share]:8.2f}   {ratio:.2f} of a global one")
-    if options.out:
-        result = {"stages_ms": found, "global_ms": whole, "local_ms": parts}
-        options.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        selected = two_regions(splats, mesh, faces, share, options.head)
+        part = measure(replace(batch, selected=selected))
+        print(f"local, {share:4.0%} selected   {part:8.2f}   {part / whole:.2f} of a global one")
 
 
 def instruction_set() -> str:
@@ -359,10 +428,14 @@ def instruction_set() -> str:
     return f"{cpu or get_host_cpu_name()}: {' '.join(vectors)}"
 
 
-def cpu_table(
-    splats: Splats, frames, target: np.ndarray, repeats: int, clock: Callable[[], float]
-) -> dict[str, float]:
-    """Print the stages beside their floors; returns their times."""
+def print_stages(
+    splats: Splats,
+    frames: CameraFrames,
+    target: np.ndarray,
+    repeats: int,
+    clock: Callable[[], float],
+) -> None:
+    """Print the stages beside their floors, and their sum."""
     bandwidth = copy_bandwidth()
     print(f"{threads()} threads, copy {bandwidth / 1e9:.1f} GB/s, {instruction_set()}")
     found = stages(splats, frames, target, repeats, clock)
@@ -371,29 +444,28 @@ def cpu_table(
         floor = 1e3 * moved / bandwidth
         print(f"{name:<22}{ms:8.2f}{moved / 1e6:8.1f}{floor:10.2f}{ms / floor:7.1f}")
     rate = arithmetic_rate(clock)
-    ms = found["L1 + SSIM, both ways"][0]
+    ms = found[LOSS_STAGE][0]
     floor = 1e3 * target.shape[0] * target.shape[1] * LOSS_OPERATIONS / rate
     print(f"{rate / 1e9:.0f} billion multiply-adds a second:", end=" ")
     print(f"L1 + SSIM at least {floor:.2f} ms, ratio {ms / floor:.1f}")
-    return {name: ms for name, (ms, _) in found.items()}
+    print(f"{'sum of stages':<22}{sum(ms for ms, _ in found.values()):8.2f}")
 
 
 def compare_opensplat(
-    folder: Path, splats: Splats, frames, target: np.ndarray, repeats: int
+    folder: Path, splats: Splats, frames: CameraFrames, target: np.ndarray, repeats: int
 ) -> None:
     """Print the wall time of both rasterizers for an image, its loss and the splats' gradients."""
-    import opensplat  # needs a C++ compiler
+    from . import opensplat  # needs a C++ compiler
 
     state = new_state(splats)
     buffers = BufferPool()
-    background = np.ones(3, np.float32)
     face = state.face
     gradients = state.gradients
     rectangles = whole_image(*target.shape[:2])
     v_image = np.empty((3, *target.shape[:2]), "f4")
 
     def forward():
-        return render_forward(state.parameters, face, frames, 3, background, buffers=buffers)
+        return render_forward(state.parameters, face, frames, 3, BACKGROUND, buffers=buffers)
 
     def both_ways():
         output = forward()

@@ -1,7 +1,8 @@
 """Relighting against path-traced truth: one avatar trained under light A, shown under lights that
 it never saw.
 
-    python benchmarks/relight.py FOLDER [FOLDER …] [--train 150s] [--folder out/relight]
+    python -m stga_addon.development.benchmark.relight FOLDER [FOLDER …] [--train 150s]
+        [--folder out/relight]
 
 Each FOLDER holds `capture_A` (a capture under light A whose head never turns), `truth_A` …
 `truth_E` (captures of the same head and cameras with split "train": held-out views under each
@@ -22,19 +23,19 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from stga_addon.avatar.file import Avatar, read_avatar
-from stga_addon.capture.images import read_image, read_mask
-from stga_addon.capture.mesh_geometry import rasterize
-from stga_addon.capture.model import Capture, View
-from stga_addon.capture.open import open_capture
-from stga_addon.light.estimate import Known, estimate_light
-from stga_addon.light.harmonics import basis, even_directions, uniform
-from stga_addon.light.lamps import Lamps
-from stga_addon.light.relight import Relighter
-from stga_addon.light.values import Light, Lighting
-from stga_addon.render.render import render_avatar, render_colors
-from stga_addon.training.evaluate.lpips import load_network
-from stga_addon.training.evaluate.metrics import psnr
+from ...avatar.file import Avatar, read_avatar
+from ...capture.images import read_image, read_mask
+from ...capture.mesh_geometry import rasterize
+from ...capture.model import Capture, View
+from ...capture.open import open_capture
+from ...light.estimate import Known, estimate_light
+from ...light.harmonics import basis, even_directions, uniform
+from ...light.lamps import Lamps
+from ...light.relight import Relighter
+from ...light.values import Light, Lighting
+from ...render.render import render_avatar, render_colors
+from ...training.evaluate.lpips import load_network
+from ...training.evaluate.metrics import psnr
 
 LIGHTS = "ABCDE"
 BARS = {"B": (27.5, 0.036), "C": (29.0, 0.032), "D": (27.5, 0.052)}

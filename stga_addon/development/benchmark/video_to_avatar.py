@@ -1,6 +1,7 @@
 """Time from a person's video to an avatar, step by step.
 
-    python benchmarks/video_to_avatar.py VIDEO [--frames 300] [--seconds 300] [--out FOLDER]
+    python -m stga_addon.development.benchmark.video_to_avatar VIDEO [--frames 300]
+        [--seconds 300] [--out FOLDER]
 
 Carries out `stga avatar VIDEO` with its defaults and prints a row in Markdown for each step: what
 its progress is called, and seconds of wall time. Below, processor seconds, of helping processes
@@ -14,11 +15,11 @@ import tempfile
 from pathlib import Path
 from time import perf_counter
 
-from stga_addon.jobs.perform import perform
-from stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
-from stga_addon.jobs.train import Train
-from stga_addon.progress import Progress
-from stga_addon.training.settings import make_settings
+from ...jobs.perform import perform
+from ...jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track
+from ...jobs.train import Train
+from ...progress import Progress
+from ...training.settings import make_settings
 
 
 def main() -> None:

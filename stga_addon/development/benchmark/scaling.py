@@ -1,8 +1,9 @@
 """What one iteration's time grows with: splats, pixels, the selected share and threads.
 
-    python benchmarks/scaling.py [--repeats 15] [--out docs/pictures/scaling.png]
+    python -m stga_addon.development.benchmark.scaling [--repeats 15]
+        [--out docs/pictures/scaling.png]
 
-The bundled head of benchmarks/iteration.py, one thing changed at a time from 60,000 splats at
+The bundled head of `iteration`, one thing changed at a time from 60,000 splats at
 802×550, all in one process. More splats are smaller ones, as on a real head: their size falls with
 the square root of their number. Run it on an idle machine. Prints every figure, with the (splat,
 tile) pairs of the view, and draws them.
@@ -16,12 +17,12 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from iteration import bundled_head, front_camera, global_step, median_ms, two_regions
 
-from stga_addon.avatar.embedding import face_frames
-from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
-from stga_addon.raster.cpu.threads import set_threads, threads
+from ...avatar.embedding import face_frames
+from ...raster.cpu.layout import Parameters
+from ...raster.cpu.rasterize import frames_in_camera, render_forward
+from ...raster.cpu.threads import set_threads, threads
+from .iteration import bundled_head, front_camera, global_step, median_ms, two_regions
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -1,56 +1,50 @@
 """Compares ways to extend an avatar by a take, and to refine a region of it, at equal training
 time.
 
-    python benchmarks/extend.py CAPTURE [--flame FILE] [--base 1500] [--seconds 60] [--seeds 0 1 2]
-    [--refine mouth]
-                                [--arms extend all-in-turn anew refine] [--parent RUN] [--report
-                                FILE]
+    python -m stga_addon.development.benchmark.extend CAPTURE [--flame FILE] [--base 1500]
+        [--seconds 60] [--seeds 0 1 2] [--refine mouth] [--report FILE]
 
 The training timesteps are split into two takes, alternating by how much of the face moves. An
 avatar is trained on the first; each arm then continues it for the same time, but training anew on
 both takes has three times as long. With --refine, arms that train this region of the same avatar
-follow; --parent refines a finished run instead. PSNR of held-out views in dB: whole image and
-moving region of the old and the new take, and the region. Ends with a table of all seeds and the
-differences that matter. --clock cpu counts processor time, for a machine that others use: set
-NUMBA_NUM_THREADS=1 with it. Runs and figures stay in --folder; the training on the first take is
-not repeated.
+follow. PSNR of held-out views in dB: whole image and moving region of the old and the new take, and
+the region. Ends with a table of all seeds and the differences that matter. Runs and figures stay in
+--folder; the training on the first take is not repeated.
 """
 
 import argparse
 import json
 import os
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
-from effects import derive
 
-from stga_addon.capture.loader import ViewLoader
-from stga_addon.capture.model import View
-from stga_addon.capture.open import open_capture
-from stga_addon.jobs.train import Extend, Prepared, Refine, prepare
-from stga_addon.progress import ignore
-from stga_addon.selection import SelectionOptions, select_capture
-from stga_addon.training.effects.plan import add_effects, plan_effects
-from stga_addon.training.evaluate.metrics import evaluate, known_exposure
-from stga_addon.training.optimize.image_preparation import image_preparation
-from stga_addon.training.optimize.precompile import precompile_kernels
-from stga_addon.training.optimize.trainer import Strategy, Trainer
-from stga_addon.training.run.continuation import (
-    DENSITY_INTERVAL,
+from ...capture.loader import ViewLoader
+from ...capture.model import View
+from ...capture.open import open_capture
+from ...jobs.train import Extend, Prepared, Refine, prepare
+from ...progress import ignore
+from ...selection import SelectionOptions, select_capture
+from ...training.effects.plan import add_effects, plan_effects
+from ...training.evaluate.metrics import evaluate, known_exposure
+from ...training.optimize.image_preparation import image_preparation
+from ...training.optimize.precompile import precompile_kernels
+from ...training.optimize.trainer import Strategy, Trainer
+from ...training.run.continuation import (
     continued_evaluation_views,
     continued_order,
     starting_state,
 )
-from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.session import train
-from stga_addon.training.schedule import view_order
-from stga_addon.training.settings import TrainingSettings, make_settings
+from ...training.run.folder import Run, read_run
+from ...training.run.session import train
+from ...training.schedule import view_order
+from ...training.settings import TrainingSettings, make_settings
 
 EVALUATIONS = 6
 """Evaluations of an arm after the first."""
@@ -59,7 +53,6 @@ ANEW_BUDGET = 3
 Line = dict[str, Any]
 """A line of quality: arm, seconds, iterations and what `Quality.as_json` gives."""
 FIGURES = ("take_1", "moving_take_1", "take_2", "moving_take_2", "region")
-CLOCKS: dict[str, Callable[[], float]] = {"wall": time.perf_counter, "cpu": time.process_time}
 
 
 @dataclass(frozen=True)
@@ -85,31 +78,19 @@ def main() -> None:
     parser.add_argument(
         "--refine", metavar="REGION", help="compare refinements of this region, too"
     )
-    parser.add_argument(
-        "--parent",
-        type=Path,
-        metavar="RUN",
-        help="a finished run to refine, instead of extending one",
-    )
-    parser.add_argument("--arms", nargs="+", help="only these (names as in the table)")
-    parser.add_argument("--clock", choices=tuple(CLOCKS), default="wall")
     parser.add_argument("--folder", type=Path, default=Path("out/extend"))
     parser.add_argument(
         "--report", type=Path, help="also write the tables of all seeds into this file"
     )
     options = parser.parse_args()
-    if options.parent is not None and options.refine is None:
-        parser.error("--parent needs --refine")
     precompile_kernels()
     options.folder.mkdir(parents=True, exist_ok=True)
     runs: dict[str, dict[str, list[list[Line]]]] = {}
     for seed in options.seeds:
         for kind, prepared, arms in comparisons(options, seed):
             for name, arm in arms.items():
-                if not options.arms or name in options.arms:
-                    runs.setdefault(kind, {}).setdefault(name, []).append(
-                        compare(name, prepared, arm, options)
-                    )
+                of_seeds = runs.setdefault(kind, {}).setdefault(name, [])
+                of_seeds.append(compare(name, prepared, arm, options))
     report = "\n\n".join(
         "\n".join([*table(of_kind), "", *differences(of_kind)]) for of_kind in runs.values()
     )
@@ -123,30 +104,16 @@ def comparisons(
 ) -> Iterator[tuple[str, Prepared, dict[str, Arm]]]:
     """What is compared with one seed: "extend" and, where a region is given, "refine"; the arms of
     each."""
-    parent = options.parent
     unused = options.folder / "unused"
-    if parent is None:
-        old, new = split_takes(
-            options.capture, options.flame, options.folder / options.capture.name
-        )
-        parent = trained(old, options, seed)
-        extend = Extend(unused, parent, (new,), seconds=options.seconds, seed=seed, device="cpu")
-        prepared = prepare(extend, ignore, print)
-        settings, plan = add_effects(
-            prepared.capture, prepared.run.settings, prepared.run.effect_plan
-        )
-        prepared = replace(prepared, run=replace(prepared.run, settings=settings, effect_plan=plan))
-        yield "extend", prepared, extend_arms(prepared, seed)
+    old, new = split_takes(options.capture, options.flame, options.folder / options.capture.name)
+    parent = trained(old, options, seed)
+    given: dict[str, Any] = {"seconds": options.seconds, "seed": seed, "device": "cpu"}
+    prepared = prepare(Extend(unused, parent, (new,), **given), ignore, print)
+    settings, plan = add_effects(prepared.capture, prepared.run.settings, prepared.run.effect_plan)
+    prepared = replace(prepared, run=replace(prepared.run, settings=settings, effect_plan=plan))
+    yield "extend", prepared, extend_arms(prepared, seed)
     if options.refine:
-        refine = Refine(
-            options.folder / "unused",
-            parent,
-            options.refine,
-            seconds=options.seconds,
-            seed=seed,
-            device="cpu",
-        )
-        prepared = prepare(refine, ignore, print)
+        prepared = prepare(Refine(unused, parent, options.refine, **given), ignore, print)
         yield "refine", prepared, refine_arms(prepared, seed)
 
 
@@ -173,6 +140,21 @@ def split_takes(root: Path, flame: Path | None, folder: Path) -> tuple[Path, Pat
     )
 
 
+def derive(root: Path, folder: Path, keep: Callable[[str, dict[str, Any]], bool]) -> Path:
+    """A capture of those frames of another that `keep(split, frame)` chooses; its files are
+    links."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for item in root.resolve().iterdir():
+        if not item.name.startswith("transforms") and not (folder / item.name).exists():
+            (folder / item.name).symlink_to(item)
+    for split in ("train", "val", "test"):
+        path = root / f"transforms_{split}.json"
+        document = json.loads(path.read_text("utf-8")) if path.exists() else {"frames": []}
+        document["frames"] = [frame for frame in document["frames"] if keep(split, frame)]
+        (folder / path.name).write_text(json.dumps(document), "utf-8")
+    return folder
+
+
 def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:
     """The run of the first take."""
     folder: Path = options.folder / options.capture.name / f"base_{options.base}_{seed}"
@@ -192,25 +174,17 @@ def extend_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
     continuation = prepared.run.continuation
     capture = prepared.capture
     parent = read_run(continuation.parent).settings
-    before: dict[str, Any] = {"driven_offsets": parent.driven_offsets}
-    now: dict[str, Any] = {"driven_offsets": settings.driven_offsets}
     views = capture.views["train"]
     new = [view for view in views if continuation.includes(view.timestep)]
     old = [view for view in views if not continuation.includes(view.timestep)]
     first = Strategy(settings, prepared.selection)
     every = Strategy(replace(settings, strategy="global"), {})
-    arms = {
+    anew = replace(parent, driven_offsets=settings.driven_offsets)
+    return {
         "extend": Arm(settings, continued_order(continuation, capture, None, seed), first),
         "all-in-turn": Arm(settings, alternating(old, new, seed), every),
-        "all-replay": Arm(settings, continued_order(continuation, capture, None, seed), every),
-        "all-new-only": Arm(settings, view_order(new, 1, seed), every),
-        "anew": Arm(replace(parent, **now), view_order(views, 1, seed), every, anew=True),
+        "anew": Arm(anew, view_order(views, 1, seed), every, anew=True),
     }
-    if now != before:
-        arms["all-in-turn-plain"] = Arm(
-            replace(settings, **before), alternating(old, new, seed), every
-        )
-    return arms
 
 
 def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
@@ -227,15 +201,10 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         prepared.selection,
         starting_state(continuation, settings, len(capture.faces)),
     )
-    share = float(region[base.state.face].mean())
-    grown = replace(settings, growth=share, density_interval=DENSITY_INTERVAL)
     every = view_order(capture.views["train"], 1, seed)
     return {
         "refine": Arm(
             settings, continued_order(continuation, capture, region, seed), base.strategy
-        ),
-        "refine-grown": Arm(
-            grown, continued_order(continuation, capture, region, seed), base.strategy
         ),
         "all": Arm(settings, every, Strategy(replace(settings, strategy="global"), {})),
     }
@@ -254,7 +223,6 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
     """Train one arm; returns and prints its quality before, during and after."""
     assert prepared.run.continuation is not None
     capture = prepared.capture
-    clock = CLOCKS[options.clock]
     state = (
         None
         if arm.anew
@@ -293,15 +261,12 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
                 if spent >= budget:
                     break
                 due += options.seconds / EVALUATIONS
-            begin = clock()
+            begin = perf_counter()
             view, image, mask, mesh = next(loader)
             trainer.step(view, image, min(1.0, spent / budget), mask, mesh)
-            spent += clock() - begin
+            spent += perf_counter() - begin
     with (options.folder / f"{options.capture.name}.jsonl").open("a", encoding="utf-8") as out:
-        out.writelines(
-            json.dumps({**line, "seed": arm.settings.seed, "clock": options.clock}) + "\n"
-            for line in lines
-        )
+        out.writelines(json.dumps({**line, "seed": arm.settings.seed}) + "\n" for line in lines)
     return lines
 
 

@@ -1,7 +1,8 @@
 """Writes docs/results.md: tables of quality, each with the version and the command that measured
 it.
 
-    python benchmarks/results.py CAPTURE [--share 1] [--out docs/results.md] [--folder out/results]
+    python -m stga_addon.development.benchmark.results CAPTURE [--share 1] [--out docs/results.md]
+        [--folder out/results]
 
 CAPTURE: one with a tracked mesh and the splits val and test, as `studio_head`. Takes less than 25
 minutes on two otherwise idle cores. What was measured stays in --folder and is not measured again.
@@ -19,11 +20,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from stga_addon import __version__
+from ... import __version__
 
 HEADER = """# Results
 
-Written by `python benchmarks/results.py {capture}`, on {machine}.
+Written by `python -m stga_addon.development.benchmark.results {capture}`, on {machine}.
 RUN is a new folder. Compare figures within a table.
 
 PSNR in dB; LPIPS, lower is better; means over views. *val*: the camera held out of training, which
@@ -63,9 +64,9 @@ def sections(capture: str, share: float) -> dict[str, Section]:
         return f"{budget * share:g}"
 
     extend = (
-        f"python benchmarks/extend.py {capture} --base {round(1200 * share)}"
+        f"python -m stga_addon.development.benchmark.extend {capture} --base {round(1200 * share)}"
         f" --seconds {seconds(20)} --seeds 0 1 --refine mouth"
-        " --arms extend all-in-turn anew refine all --folder RUN --report RUN/report.txt"
+        " --folder RUN --report RUN/report.txt"
     )
     return {
         "default": Section(

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch.utils.cpp_extension import load_inline
 
-from stga_addon.raster.cpu import layout
-from stga_addon.raster.cpu.layout import BLUE, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
+from ...raster.cpu import layout
+from ...raster.cpu.layout import BLUE, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
 
 SOURCE = Path("rasterizer", "gsplat-cpu", "gsplat_cpu.cpp")
 BINDING = """

@@ -1,6 +1,6 @@
 """How well ARKit's shapes drive FLAME heads: distances, leaks of identity, and the way back.
 
-    python benchmarks/driving.py DATA [--poses 1000] [--components 50]
+    python -m stga_addon.development.benchmark.driving DATA [--poses 1000] [--components 50]
 
 DATA is the folder of `flame_open/flame2023_open_basis.npz`. FLAME's expressions are not published
 openly, so the heads have generated ones (tests/driving/heads.py). Prints, for three identities with
@@ -19,21 +19,21 @@ from time import perf_counter
 
 import numpy as np
 
-from stga_addon.flame.forward import RIGID_SIZE
+from ...flame.forward import RIGID_SIZE
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3] / "tests"))
 
 from driving.heads import generated_flame, random_poses
 
-from stga_addon.driving.head_map import HeadMap, head_map
-from stga_addon.driving.inverse import arkit_weights
-from stga_addon.driving.open_motion import exchanged_neutral, quiet_neutral
-from stga_addon.driving.performance import ARKIT_SHAPES, Performance
-from stga_addon.driving.shapes import effective_weights, face_shapes
-from stga_addon.flame.forward import FlameFrame
-from stga_addon.flame.model import JOINTS, FlameModel
-from stga_addon.flame.sequence import FlameSequence, with_identity
-from stga_addon.tracking.posed_points import PosedPoints
+from ...driving.head_map import HeadMap, head_map
+from ...driving.inverse import arkit_weights
+from ...driving.open_motion import exchanged_neutral, quiet_neutral
+from ...driving.performance import ARKIT_SHAPES, Performance
+from ...driving.shapes import effective_weights, face_shapes
+from ...flame.forward import FlameFrame
+from ...flame.model import JOINTS, FlameModel
+from ...flame.sequence import FlameSequence, with_identity
+from ...tracking.posed_points import PosedPoints
 
 IDENTITIES = 3
 FREE_STEPS = 3

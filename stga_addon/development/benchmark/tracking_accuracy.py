@@ -1,7 +1,7 @@
 """Accuracy of `stga track`: distances of the tracked head from a capture's own meshes.
 
-    python benchmarks/tracking_accuracy.py CAPTURE [--model HEAD] [--flame FILE] [--timesteps 8]
-        [--cameras 4]
+    python -m stga_addon.development.benchmark.tracking_accuracy CAPTURE [--model HEAD]
+        [--flame FILE] [--timesteps 8] [--cameras 4]
 
 CAPTURE gives images and cameras as the only input, and its meshes as the truth; --flame is the
 model that they were made with. HEAD is what is fitted: a FLAME model, a linear model, or an .npz of
@@ -22,19 +22,19 @@ from time import perf_counter
 
 import numpy as np
 
-from stga_addon.capture.mesh_geometry import similarity, vertex_normals
-from stga_addon.capture.open import open_capture
-from stga_addon.files import read_npz, write_npz
-from stga_addon.flame.teeth import TEETH_VERTICES
-from stga_addon.tracking.correspondence import nearest_points
-from stga_addon.tracking.folder import LANDMARKS_FOLDER, PLACES_FILE
-from stga_addon.tracking.footage.open import open_footage
-from stga_addon.tracking.footage.sequences import FrameRange
-from stga_addon.tracking.head_model import read_head_model
-from stga_addon.tracking.landmarks import read_places
-from stga_addon.tracking.opened import TrackingOptions
-from stga_addon.tracking.seen_surface import facing, in_sight
-from stga_addon.tracking.track import track
+from ...capture.mesh_geometry import similarity, vertex_normals
+from ...capture.open import open_capture
+from ...files import read_npz, write_npz
+from ...flame.teeth import TEETH_VERTICES
+from ...tracking.correspondence import nearest_points
+from ...tracking.folder import LANDMARKS_FOLDER, PLACES_FILE
+from ...tracking.footage.open import open_footage
+from ...tracking.footage.sequences import FrameRange
+from ...tracking.head_model import read_head_model
+from ...tracking.landmarks import read_places
+from ...tracking.opened import TrackingOptions
+from ...tracking.seen_surface import facing, in_sight
+from ...tracking.track import track
 
 SHAPES = {"brows": "brow", "lids": "eyeBlink", "lips": "mouth", "jaw": "jaw"}
 """Of ARKit's shapes, how the names of those begin that move a part of the face."""

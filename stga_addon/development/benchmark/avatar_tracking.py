@@ -1,6 +1,6 @@
 """Time that a finished avatar takes to track its person, by timestep and camera.
 
-    python benchmarks/avatar_tracking.py RUN [--timesteps 16]
+    python -m stga_addon.development.benchmark.avatar_tracking RUN [--timesteps 16]
 
 Tracks timesteps of the run's capture, from where landmarks and dense tracking left them: as
 training does, and as the two rounds of `stga track --avatar` do, of which the first begins in small
@@ -15,10 +15,10 @@ from time import perf_counter, process_time
 
 import numpy as np
 
-from stga_addon.avatar.file import read_avatar
-from stga_addon.capture.model import evenly_spread
-from stga_addon.training.optimize.avatar_tracking import OtherRecording, track_by_avatar
-from stga_addon.training.run.folder import AVATAR, open_run
+from ...avatar.file import read_avatar
+from ...capture.model import evenly_spread
+from ...training.optimize.avatar_tracking import OtherRecording, track_by_avatar
+from ...training.run.folder import AVATAR, open_run
 
 
 def main() -> None:
