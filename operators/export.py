@@ -285,9 +285,10 @@ def scene_playback(context: Any, head: Any, frames: range, motion_only: bool) ->
         found = scene_camera(context.evaluated_depsgraph_get())
         pose = to_head @ found.camera_to_world_gl
         pose[:3, :3] /= np.linalg.norm(pose[:3, :3], axis=0)
-        lens = (found.fl_x, found.fl_y, found.cx, found.cy)
+        size = (found.width, found.height)
+        focal = (found.fl_x, found.fl_y)
         name = bpy.path.display_name(context.scene.camera.name, has_ext=False)
-        views[name] = camera_from_gl(pose, found.width, found.height, *lens)
+        views[name] = camera_from_gl(pose, size, focal, (found.cx, found.cy))
     selection = training_selection(head)
     everything = np.ones(len(head.data.polygons), bool)
     return Playback(

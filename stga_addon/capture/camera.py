@@ -111,16 +111,14 @@ def most_central(directions: np.ndarray) -> int:
 
 def camera_from_gl(
     camera_to_world: np.ndarray,
-    width: int,
-    height: int,
-    fl_x: float,
-    fl_y: float,
-    cx: float,
-    cy: float,
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    center: tuple[float, float],
 ) -> Camera:
-    """Camera from an OpenGL camera-to-world matrix (4, 4); cx, cy as in `Camera`."""
+    """Camera from an OpenGL camera-to-world matrix (4, 4); size: width and height, focal: fl_x and
+    fl_y, center: cx and cy, as in `Camera`."""
     world_to_camera = GL_TO_CV @ np.linalg.inv(np.asarray(camera_to_world, np.float64))
-    return Camera(width, height, fl_x, fl_y, cx, cy, world_to_camera)
+    return Camera(*size, *focal, *center, world_to_camera)
 
 
 def look_at(

@@ -30,6 +30,17 @@ class LoadedView(NamedTuple):
         return sum(array.nbytes for array in self[1:] if isinstance(array, np.ndarray))
 
 
+class LoaderMemory(NamedTuple):
+    """Bounds on the views that are ready (at least one), and on decoded images that are kept for
+    later epochs; memory does not depend on the sequence's length."""
+
+    queue_bytes: int = 16 << 20
+    cache_bytes: int = 224 << 20
+
+
+DEFAULT_MEMORY = LoaderMemory()
+
+
 class ViewLoader:
     """Iterator over the `LoadedView` of each of `views`, read ahead by a thread.
 
@@ -40,8 +51,6 @@ class ViewLoader:
     prepare  (view, image, mask) -> image and mask to yield instead, applied once per image read;
              None: those read
     mesh     timestep -> mesh (V, 3) or None, read in the thread as well; None yields no meshes
-    queue_bytes, cache_bytes  bounds on the views that are ready (at least one) and on decoded
-             images that are kept for later epochs; memory does not depend on the sequence's length
     waited_s seconds that the consumer has waited so far
 
     Arrays are read-only and shared with the cache. An exception in the thread is raised where its
@@ -53,8 +62,7 @@ class ViewLoader:
         views: Iterable[View],
         scale: Callable[[int], float] = lambda position: 1.0,
         background: tuple[int, int, int] = WHITE,
-        queue_bytes: int = 16 << 20,
-        cache_bytes: int = 224 << 20,
+        memory: LoaderMemory = DEFAULT_MEMORY,
         prepare: Preparation | None = None,
         mesh: Callable[[int], np.ndarray | None] | None = None,
     ) -> None:
@@ -63,12 +71,12 @@ class ViewLoader:
         self._background = background
         self._prepare = prepare
         self._mesh = mesh
-        self._queue_bytes = queue_bytes
+        self._queue_bytes = memory.queue_bytes
         # The first views of one scale. They come in random order, each once per epoch: one evicted
         # to make room would be needed sooner than what replaces it, so nothing is evicted until
         # another scale is asked for.
         self._cache: dict[tuple[Path, Path | None, int, int, float], LoadedView] = {}
-        self._cache_bytes = cache_bytes
+        self._cache_bytes = memory.cache_bytes
         self._cached_bytes = 0
         self._cached_scale = 1.0
         self._ready: deque[LoadedView] = deque()

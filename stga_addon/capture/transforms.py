@@ -270,7 +270,7 @@ def _read_frames(path: Path, values: Any, principal_point: str, moved: bool = Fa
         known = matrix.tobytes(), *size, *focal, *written  # most frames share a camera
         if known not in cameras:
             rigid, is_scaled = _pose(record, matrix)
-            camera = camera_from_gl(rigid, *size, *focal, *written)
+            camera = camera_from_gl(rigid, size, focal, written)
             camera = with_principal_point(camera, written, principal_point)
             cameras[known] = camera, is_scaled
         camera, is_scaled = cameras[known]

@@ -22,6 +22,7 @@ from ..light.environment import read_lighting, turned
 from ..light.relight import Relighter
 from ..options import like, option
 from ..progress import Report, Say, Written, counted
+from ..raster.posed_splats import PosedSplats
 from ..render.device import Composer
 from ..render.video import sequence_writer, video_writer
 from ..schema import setting
@@ -261,11 +262,12 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         ):
             if given:
                 raise StgaError(f"{source}: holds splats in the world, whose {why}")
-        from ..render.render import render
+        from ..render.render import render_layers
 
         splats = read_splats(source, say)
+        layers = [PosedSplats(splats)]
         return _Subject(
-            lambda view, _: render(splats, view.camera, request.background, composer=composer),
+            lambda view, _: render_layers(layers, view.camera, request.background, composer),
             (),
             lambda: np.median(splats.xyz, axis=0),
             playback_fps(None, request.fps),
@@ -305,32 +307,40 @@ def _pictured(
     request: Render, avatar: Avatar, mesh: Callable[[View], np.ndarray], composer: Composer
 ) -> Callable[[View, float], np.ndarray]:
     """The picture of an avatar on the mesh of a view, as recorded or under the asked light."""
-    from ..render.render import render_avatar, render_colors
+    from ..render.render import posed_avatar, render_layers
 
-    background = request.background
-    behind = None
+    behind = list[PosedSplats]()
     if request.world:
         path = avatar_source.avatar_path(request.source).with_name(WORLD_FILE)
         if not path.is_file():
             shown = "--world shows what a training with --effect world=on has written"
             raise StgaError(f"{path}: is missing; {shown}")
-        behind = read_splats(path)
-    if request.light is None:
-        return lambda view, _: render_avatar(
-            avatar, mesh(view), view.camera, background, composer, behind
-        )
-    relighter = Relighter(avatar)
-    lighting = read_lighting(request.light)
+        behind = [PosedSplats(read_splats(path))]
+    colors = None if request.light is None else _lit_colors(request, request.light, avatar)
 
     def picture(view: View, share: float) -> np.ndarray:
         posed = mesh(view)
-        light = lighting
-        if request.light_turn:
-            light = turned(lighting, _middle(posed), request.light_turn * share)
-        colors = relighter.colors(posed, view.camera.position, light)
-        return render_colors(avatar, posed, view.camera, colors, background, composer, behind)
+        lit = None if colors is None else colors(posed, view, share)
+        layers = [posed_avatar(avatar, posed, lit), *behind]
+        return render_layers(layers, view.camera, request.background, composer)
 
     return picture
+
+
+def _lit_colors(
+    request: Render, source: Path, avatar: Avatar
+) -> Callable[[np.ndarray, View, float], np.ndarray]:
+    """Mesh, view and share of the pictures -> colors (N, 3) under the asked light."""
+    relighter = Relighter(avatar)
+    lighting = read_lighting(source)
+
+    def colors(mesh: np.ndarray, view: View, share: float) -> np.ndarray:
+        light = lighting
+        if request.light_turn:
+            light = turned(lighting, _middle(mesh), request.light_turn * share)
+        return relighter.colors(mesh, view.camera.position, light)
+
+    return colors
 
 
 def _middle(vertices: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
 """Splats placed in a scene, and the image made of them; importing this needs numpy only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..avatar.embedding import FaceFrames
+from ..avatar.embedding import WORLD, FaceFrames
 from ..avatar.splats import Splats
 
 
@@ -13,13 +13,14 @@ class PosedSplats:
     """One set of splats in a scene with others: a layer of `compose`.
 
     frames: those of the splats' triangles (`WORLD` for a world-space set), in the space that the
-    splats were trained in. to_world (4, 4): from that space to the scene; it may scale and shear.
+    splats were trained in. to_world (4, 4): from that space to the scene; it may scale and shear;
+    by default, they are one.
     antialiased as in `Avatar`.
     """
 
     splats: Splats
-    frames: FaceFrames
-    to_world: np.ndarray
+    frames: FaceFrames = WORLD
+    to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     antialiased: bool = False
 
 

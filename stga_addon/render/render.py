@@ -3,6 +3,7 @@
 `cpu.autograd.render_differentiable` renders torch tensors that require gradients.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +26,6 @@ def render(
     background: tuple[float, float, float] = WHITE,
     frames: FaceFrames = WORLD,
     antialiased: bool = False,
-    composer: Composer | None = None,
-    behind: Splats | None = None,
 ) -> np.ndarray:
     """Render N splats: (3, H, W) float32, display values (sRGB) in 0…1, rows from the top.
 
@@ -35,16 +34,8 @@ def render(
     in world meters with `WORLD`.
     camera: pose and intrinsics with OpenCV axes. background: sRGB in 0…1. antialiased: whether
     splats narrower than a pixel lose opacity (Mip-Splatting's 2D filter); an avatar says how it was
-    trained. composer: chooses the device; the CPU without one. behind: others in world space, such
-    as those of a run's world.
+    trained.
     """
-    if behind is not None or (composer is not None and composer.choose() != "cpu"):
-        layers = [PosedSplats(splats, frames, np.eye(4), antialiased)]
-        if behind is not None:
-            layers.append(PosedSplats(behind, WORLD, np.eye(4)))
-        composed = (composer or Composer("cpu")).compose(layers, camera)
-        rest = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
-        return np.clip(composed.rgb + rest, 0, 1)
     values = (np.ascontiguousarray(getattr(splats, name)) for name in Parameters._fields)
     parameters = Parameters(*values)
     output = render_forward(
@@ -63,28 +54,39 @@ def render_avatar(
     mesh: np.ndarray,
     camera: Camera,
     background: tuple[float, float, float] = WHITE,
-    composer: Composer | None = None,
-    behind: Splats | None = None,
 ) -> np.ndarray:
     """`render` of an avatar that follows a mesh (V, 3) in world meters."""
-    pose = avatar.frames(mesh), avatar.antialiased
-    return render(avatar.splats, camera, background, *pose, composer, behind)
+    return render(avatar.splats, camera, background, avatar.frames(mesh), avatar.antialiased)
 
 
-def render_colors(
-    avatar: Avatar,
-    mesh: np.ndarray,
+def render_layers(
+    layers: Sequence[PosedSplats],
     camera: Camera,
-    colors: np.ndarray,
     background: tuple[float, float, float] = WHITE,
     composer: Composer | None = None,
-    behind: Splats | None = None,
 ) -> np.ndarray:
-    """`render_avatar` with sRGB colors (N, 3), as `light.relight` finds them, not its own."""
-    sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
-    pose = replace(avatar.frames(mesh), color=NO_COLUMNS), avatar.antialiased
-    splats = replace(avatar.splats, sh=sh)
-    return render(splats, camera, background, *pose, composer, behind)
+    """`render` of several sets of splats together; composer: chooses the device, the CPU without
+    one. A set that is alone, in the world, is on the CPU exactly as `render` has it."""
+    composer = composer or Composer("cpu")
+    first = layers[0]
+    is_alone = len(layers) == 1 and np.array_equal(first.to_world, np.eye(4))
+    if is_alone and composer.choose() == "cpu":
+        return render(first.splats, camera, background, first.frames, first.antialiased)
+    composed = composer.compose(list(layers), camera)
+    rest = (1 - composed.alpha) * np.array(background, np.float32)[:, None, None]
+    return np.clip(composed.rgb + rest, 0, 1)
+
+
+def posed_avatar(avatar: Avatar, mesh: np.ndarray, colors: np.ndarray | None = None) -> PosedSplats:
+    """A layer: the avatar on a mesh (V, 3), with sRGB colors (N, 3), as `light.relight` finds them,
+    or its own."""
+    frames = avatar.frames(mesh)
+    splats = avatar.splats
+    if colors is not None:
+        frames = replace(frames, color=NO_COLUMNS)
+        sh = ((colors[:, None] - 0.5) / SH_C0).astype(np.float32)
+        splats = replace(splats, sh=sh)
+    return PosedSplats(splats, frames, antialiased=avatar.antialiased)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ def camera_of(pose: np.ndarray, projection: Any, width: int, height: int) -> Cam
     p = np.array(projection, np.float64)
     focal = p[0, 0] * width / 2, p[1, 1] * height / 2
     center = (1 - p[0, 2]) * width / 2, (1 + p[1, 2]) * height / 2
-    return camera_from_gl(pose, width, height, *focal, *center)
+    return camera_from_gl(pose, (width, height), focal, center)
 
 
 SENSOR_WIDTH_MM = 36.0  # with the horizontal fit only its ratio to the focal length matters
@@ -277,7 +277,7 @@ def turntable_cameras(subject: Any, depsgraph: Any, count: int, angle: float) ->
     # The cameras of the capture that it belongs to, for their positions.
     children = () if angle or subject.parent is None else subject.parent.children_recursive
     sensors = [
-        camera_from_gl(np.array(child.matrix_world, np.float64), 1, 1, 1, 1, 0, 0)
+        camera_from_gl(np.array(child.matrix_world, np.float64), (1, 1), (1, 1), (0, 0))
         for child in children
         if child.get(tags.KIND) == tags.CAMERA
     ]

@@ -39,7 +39,7 @@ def pose(seed: int) -> np.ndarray:
 
 
 def camera(seed: int = 0, width: int = 550, height: int = 802, fl_y: float = 2050.0) -> Camera:
-    return camera_from_gl(pose(seed), width, height, 2050.0, fl_y, cx=243.7, cy=431.9)
+    return camera_from_gl(pose(seed), (width, height), (2050.0, fl_y), (243.7, 431.9))
 
 
 def capture_of(root: Path, cameras: dict[int, list[Camera]]) -> Capture:

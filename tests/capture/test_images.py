@@ -38,7 +38,7 @@ ORIENTATIONS = {
 
 
 def view_of(image, width=WIDTH, height=HEIGHT, mask=None):
-    camera = camera_from_gl(np.eye(4), width, height, 60, 60, width / 2, height / 2)
+    camera = camera_from_gl(np.eye(4), (width, height), (60, 60), (width / 2, height / 2))
     return View(0, 0, camera, image.name, image, mask)
 
 

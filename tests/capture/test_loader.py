@@ -11,7 +11,7 @@ import pytest
 
 from stga_addon.capture import loader as module
 from stga_addon.capture.images import read_view
-from stga_addon.capture.loader import ViewLoader
+from stga_addon.capture.loader import LoaderMemory, ViewLoader
 from stga_addon.capture.model import View
 from stga_addon.capture.open import open_capture
 from stga_addon.errors import StgaError
@@ -55,7 +55,7 @@ def test_order_and_content(views):
     deadlock where a single view exceeds the queue, and a consumer that changes the cached image
     under the next visit's feet."""
     order = [views[i] for i in (3, 1, 1, 8, 0)]
-    with ViewLoader(order, queue_bytes=1) as loader:
+    with ViewLoader(order, memory=LoaderMemory(queue_bytes=1)) as loader:
         loaded = list(loader)
     assert [item.view for item in loaded] == order
     for view, image, mask, _ in loaded:
@@ -70,7 +70,7 @@ def test_order_and_content(views):
 def test_cache_is_bounded(views, decoded):
     """Catches a cache that outgrows its limit, or throws out what the next epoch asks for."""
     sequence = [views[i] for i in (0, 1, 0, 2, 2, 1)]
-    with ViewLoader(sequence, cache_bytes=2 * VIEW_BYTES) as loader:
+    with ViewLoader(sequence, memory=LoaderMemory(cache_bytes=2 * VIEW_BYTES)) as loader:
         list(loader)
     # There is room for 0 and 1; 2 is decoded whenever it comes, and drives nothing out.
     assert decoded == [views[i].name for i in (0, 1, 2, 2)]
@@ -80,7 +80,9 @@ def test_scales_by_position(views, decoded):
     """Catches a full-size image from the cache where a small one is due, a camera that does not
     match it, and a coarse-to-fine run whose small images fill the cache for good."""
     sizes = [0.5, 0.5, 1.0, 1.0, 0.25]
-    with ViewLoader([views[0]] * 5, scale=sizes.__getitem__, cache_bytes=VIEW_BYTES) as loader:
+    with ViewLoader(
+        [views[0]] * 5, scale=sizes.__getitem__, memory=LoaderMemory(cache_bytes=VIEW_BYTES)
+    ) as loader:
         loaded = list(loader)
     shapes = [image.shape[:2] for _, image, *_ in loaded]
     assert shapes == [(30, 20), (30, 20), (60, 40), (60, 40), (15, 10)]
@@ -112,7 +114,7 @@ def test_errors_come_where_their_view_would(views):
 
 def test_closes_from_any_state(views):
     """Catches a thread left behind: full queue, finished, unused, or closed twice."""
-    loader = ViewLoader(itertools.cycle(views), queue_bytes=VIEW_BYTES)
+    loader = ViewLoader(itertools.cycle(views), memory=LoaderMemory(queue_bytes=VIEW_BYTES))
     next(loader)
     loader.__exit__(RuntimeError, RuntimeError("stop"), None)
     loader.close()
@@ -134,8 +136,8 @@ def test_meshes_are_read_in_the_thread_and_bounded(views):
         return np.full((1000, 3), float(timestep))
 
     item_bytes = VIEW_BYTES + 24_000
-    limits = {"queue_bytes": 2 * item_bytes, "cache_bytes": 0}
-    with ViewLoader(itertools.cycle(views), **limits, mesh=mesh) as loader:
+    memory = LoaderMemory(queue_bytes=2 * item_bytes, cache_bytes=0)
+    with ViewLoader(itertools.cycle(views), memory=memory, mesh=mesh) as loader:
         first = next(loader)
         wait_until(lambda: len(read) == 4)
         time.sleep(0.1)

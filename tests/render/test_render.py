@@ -13,8 +13,9 @@ pytest.importorskip("numba")
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.ply import write_ply
+from stga_addon.raster.posed_splats import PosedSplats
 from stga_addon.render import render as render_module
-from stga_addon.render.render import render
+from stga_addon.render.render import render, render_layers
 
 
 def one_splat(color: tuple[float, float, float]) -> Splats:
@@ -94,6 +95,7 @@ def test_a_gpu_renders_the_same_picture() -> None:
     frames = replace(face_frames(posed, faces, neutral), color=color)
     expected = render(splats, camera, (0.2, 0.9, 0.4), frames, antialiased=True)
     composer = Composer(f"gpu:{gpu_device.device().name}")
-    got = render(splats, camera, (0.2, 0.9, 0.4), frames, True, composer)
+    layers = [PosedSplats(splats, frames, antialiased=True)]
+    got = render_layers(layers, camera, (0.2, 0.9, 0.4), composer)
     assert np.abs(got - np.float32([0.2, 0.9, 0.4])[:, None, None]).max() > 0.2
     np.testing.assert_allclose(got, expected, atol=1e-5)

@@ -151,7 +151,7 @@ def turning(head, focal, turn_deg, size=(1080, 1920), count=30):
     usual = usual_focal(*size)
     (width, height) = size
     camera, guessed = (
-        camera_from_gl(np.eye(4), *size, f, f, width / 2, height / 2) for f in (focal, usual)
+        camera_from_gl(np.eye(4), size, (f, f), (width / 2, height / 2)) for f in (focal, usual)
     )
     take = {}
     for timestep, share in enumerate(np.sin(np.linspace(0, 7, count))):
@@ -211,7 +211,7 @@ def test_a_lens_that_nothing_tells_is_that_of_the_avatars_camera(tmp_path, head)
     film(tmp_path, head, 3)
     footage = open_footage(tmp_path / "phone.mp4")
     (width, height) = SIZE
-    likely = camera_from_gl(np.eye(4), 2 * width, 2 * height, 500, 500, width, height)
+    likely = camera_from_gl(np.eye(4), (2 * width, 2 * height), (500, 500), (width, height))
     inputs = footage, tmp_path / "head.npz", tmp_path / "out"
     fit = HeadFit(head, np.zeros(0), {}, Similarity(1.0, np.eye(3), np.zeros(3)))
     known = KnownPerson(fit, lambda mesh, camera: np.zeros((1, 1, 3), np.uint8), likely)

@@ -472,12 +472,7 @@ def compare_opensplat(
         image_gradient(output.image, target, rectangles, SSIM_WEIGHT, v_image)
         render_backward(output, state.parameters, face, frames, v_image, gradients, buffers=buffers)
 
-    output = forward()
-    visible = output.lists.visible
-    image = output.image.copy()
-    theirs = opensplat.both_ways_ms(
-        folder, output.projection, visible, image, target, SSIM_WEIGHT, min(repeats, 9)
-    )
+    theirs = opensplat.both_ways_ms(folder, forward(), target, SSIM_WEIGHT, min(repeats, 9))
     for name, run, peer in (("forward", forward, theirs[0]), ("both ways", both_ways, theirs[1])):
         ours = median_ms(run, repeats, perf_counter)
         print(f"OpenSplat {name:<12}{peer:8.2f}   ours, with projection, {ours:.2f}:", end=" ")

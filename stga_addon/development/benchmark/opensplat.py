@@ -15,6 +15,7 @@ from torch.utils.cpp_extension import load_inline
 
 from ...raster.cpu import layout
 from ...raster.cpu.layout import BLUE, OPACITY, PRECISION_X, PRECISION_Y, RED, SHEAR
+from ...raster.cpu.rasterize import RenderOutput
 
 SOURCE = Path("rasterizer", "gsplat-cpu", "gsplat_cpu.cpp")
 BINDING = """
@@ -55,32 +56,25 @@ def build(folder: Path) -> Any:
 
 
 def both_ways_ms(
-    folder: Path,
-    projection: layout.Projection,
-    rows: np.ndarray,
-    image: np.ndarray,
-    target: np.ndarray,
-    ssim_weight: float,
-    repeats: int,
+    folder: Path, ours: RenderOutput, target: np.ndarray, ssim_weight: float, repeats: int
 ) -> tuple[float, float]:
     """Median milliseconds of wall time of its forward pass, and of forward pass, loss and backward
     pass together, over a white background.
 
-    rows (M,): the visible splats; image (3, H, W): ours; target (H, W, 3) uint8. Raises ValueError
-    where its image is another one.
+    target (H, W, 3) uint8. Raises ValueError where its image is another one than ours.
     """
     module = build(folder)
-    (_, height, width) = image.shape
+    (_, height, width) = ours.image.shape
     captured = torch.from_numpy(target.astype(np.float32) / 255)
     white = torch.ones(3)
-    splats = [torch.from_numpy(array) for array in _splats(projection, rows)]
+    splats = [torch.from_numpy(array) for array in _splats(ours.projection, ours.lists.visible)]
 
     def render(wanted: torch.Tensor) -> torch.Tensor:
         return module.both_ways(width, height, splats, white, wanted, ssim_weight)[0]
 
     theirs = render(captured).numpy().transpose(2, 0, 1)
     # it blends pixels behind an opaque one's stop differently
-    if (off := np.abs(theirs - image).mean()) > 2e-3:
+    if (off := np.abs(theirs - ours.image).mean()) > 2e-3:
         raise ValueError(f"{folder}: its image differs by {off:.4f} on average")
     found = []
     for wanted in (torch.empty(0), captured):

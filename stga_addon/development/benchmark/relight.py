@@ -33,7 +33,7 @@ from ...light.harmonics import basis, even_directions, uniform
 from ...light.lamps import Lamps
 from ...light.relight import Relighter
 from ...light.values import Light, Lighting
-from ...render.render import render_avatar, render_colors
+from ...render.render import posed_avatar, render_avatar, render_layers
 from ...training.evaluate.lpips import load_network
 from ...training.evaluate.metrics import psnr
 
@@ -134,7 +134,7 @@ class Bench:
                 yield view, render_avatar(self.avatar, mesh, view.camera)
             else:
                 colors = relighter.colors(mesh, view.camera.position, values)
-                yield view, render_colors(self.avatar, mesh, view.camera, colors)
+                yield view, render_layers([posed_avatar(self.avatar, mesh, colors)], view.camera)
 
     def score(
         self,

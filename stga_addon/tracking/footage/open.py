@@ -278,7 +278,7 @@ def _single_camera(sources: Sources, frames: FrameRange, focal: float | None) ->
         known = "usual"
     if focal < 1:
         raise StgaError(f"Focal length: expected at least 1 pixel, not {focal:g}")
-    camera = camera_from_gl(np.eye(4), width, height, focal, focal, width / 2, height / 2)
+    camera = camera_from_gl(np.eye(4), (width, height), (focal, focal), (width / 2, height / 2))
     name = names[0] or root.name
     shot = Shot(name, camera, Lens(), str(root))
     return replace(_rig(sources, {name: shot}, {name: sequence}, frames), focal=known)

@@ -23,7 +23,8 @@ from ...capture.mesh_geometry import MIN_DEPTH_M
 from ...capture.model import Capture, View, ViewExposure, evenly_spread
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
-from ...render.render import render_avatar
+from ...raster.posed_splats import PosedSplats
+from ...render.render import posed_avatar, render_avatar, render_layers
 from ...selection import SelectionOptions, select_capture
 from ..optimize.cpu_backend import mean_ssim
 from ..optimize.image_preparation import NO_CORRECTION, fit_lines, view_exposure, without_backdrop
@@ -281,7 +282,8 @@ def psnr_recorded(avatar: Avatar, world: Splats, capture: Capture, split: str) -
     found = []
     for view in capture.views[split]:
         mesh = np.asarray(capture.mesh(view.timestep))
-        image = render_avatar(avatar, mesh, view.camera, avatar.background, behind=world)
+        layers = [posed_avatar(avatar, mesh), PosedSplats(world)]
+        image = render_layers(layers, view.camera, avatar.background)
         exposure = known(view)
         exposed = with_exposure(image, NO_CORRECTION if exposure is None else exposure)
         found.append(psnr(exposed, read_image(view)))

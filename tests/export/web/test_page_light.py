@@ -16,7 +16,7 @@ from stga_addon.light.harmonics import rotated, uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import Bounce, transfer_of
 from stga_addon.light.values import Light, Lighting
-from stga_addon.render.render import render_colors, to_uint8
+from stga_addon.render.render import posed_avatar, render_layers, to_uint8
 
 from .conftest import Head, make_head, show
 from .test_page import difference, picture, snapshot
@@ -128,7 +128,8 @@ def test_colors_are_the_relighters(options, exact, browser, tmp_path):
         error = np.abs(found - colors[order]).max(1)
         assert np.quantile(error, 0.5) < (0.002 if exact else 0.006)
         assert np.quantile(error, 0.95) < (0.02 if exact else 0.03)
-        expected = to_uint8(render_colors(head.avatar, head.meshes[frame], head.camera, colors))
+        layers = [posed_avatar(head.avatar, head.meshes[frame], colors)]
+        expected = to_uint8(render_layers(layers, head.camera))
         assert difference(shown, expected) >= MIN_PSNR
     assert browser.errors == []
     assert browser.requests == [(tmp_path / "a.html").as_uri()]
