@@ -7,11 +7,12 @@ from capture import factory
 from command_line import stga
 
 from stga_addon.capture.open import open_capture
+from stga_addon.flame.parts import PARTS
 from stga_addon.training.effect_catalog import EFFECTS
 from stga_addon.training.effects import plan as planning
 from stga_addon.training.effects.plan import Verdict, add_effects, plan_effects
 from stga_addon.training.run.folder import read_run
-from stga_addon.training.settings import make_settings
+from stga_addon.training.settings import TrainingSettings, make_settings
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +28,14 @@ def trained(root, tmp_path_factory):
     choices = "--iterations 4 --effect strain-color=on --effect hull-points=off"
     assert stga("train", root, "--out", out, choices) == 0
     return out
+
+
+def test_parts_of_the_head_can_be_left_out():
+    """Catches a part that has no setting of its name, or that no rule decides about."""
+    settings = TrainingSettings()
+    assert [name for name in PARTS if getattr(settings, name, None) is None] == []
+    assert [name for name in PARTS if EFFECTS[name].switch != name] == []
+    assert set(planning.RULES) == set(EFFECTS)
 
 
 def test_the_run_keeps_its_plan(trained, root, monkeypatch, capsys):
