@@ -19,7 +19,8 @@ CAMERAS = range(5)
 """The last timestep is `test`, the last camera `val`."""
 PLACES = (0, 1, 3, 4, 2)
 """Of the cameras, side by side: `val` is in the middle."""
-LENS = {"w": 96, "h": 96, "cx": 48.0, "cy": 48.0, "fl_x": 380.0, "fl_y": 380.0}
+LENS_SIDE_PX = 96
+LENS = {"w": LENS_SIDE_PX, "h": LENS_SIDE_PX, "cx": 48.0, "cy": 48.0, "fl_x": 380.0, "fl_y": 380.0}
 NOISE = {"expr": 0.5, "rotation": 0.02, "jaw_pose": 0.04, "translation": 0.002}
 """What a tracker is off by where the error is 1: coefficients of some 2 mm, radians, meters."""
 
@@ -30,6 +31,8 @@ def write_head(root: Path, error: float = 1.0) -> tuple[Capture, dict[int, np.nd
     factory.write_splits(
         root, [_entry(timestep, camera) for timestep in TIMESTEPS for camera in CAMERAS]
     )
+    for path in (root / "fg_masks").iterdir():  # of the lens's size, as a capture opens with
+        Image.new("L", (LENS_SIDE_PX, LENS_SIDE_PX)).save(path)
     true = open_capture(root, model)
     _paint(true)
     meshes = {timestep: true.mesh(timestep) for timestep in TIMESTEPS}
