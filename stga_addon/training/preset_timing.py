@@ -16,7 +16,7 @@ from .effects.plan import plan_effects
 from .optimize.avatar_tracking import track_by_avatar, tracked_timesteps
 from .optimize.image_preparation import image_preparation
 from .optimize.precompile import precompile_kernels
-from .optimize.trainer import Trainer
+from .optimize.trainer import Trainer, density_control
 from .schedule import image_scales, view_order
 from .settings import PRESETS, TrainingSettings, make_settings
 
@@ -90,7 +90,8 @@ def seconds_per_iteration(
     turns = [share for share in turns if start <= share < end]
     left = deque(turns)
     split_s = list[float]()
-    trainer.settings = replace(settings, density_interval=0)
+    density = density_control(settings)
+    trainer.changes["density"] = replace(density, interval=0)
     scales = image_scales(settings, capture.views["train"])
     loaded = _loaded_views(capture, settings, scales)
     times: list[float] = []
@@ -98,11 +99,11 @@ def seconds_per_iteration(
         progress = min(1.0, sum(times[WARM_UP_ITERATIONS:]) / seconds)
         view, image, mask, mesh = next(loaded[scales[progress >= settings.coarse_share]])
         while left and left[0] <= progress:
-            trainer.settings = replace(settings, density_interval=1)
+            trainer.changes["density"] = replace(density, interval=1)
             begin = perf_counter()
             trainer.step(view, image, left.popleft(), mask, mesh)
             split_s.append(perf_counter() - begin)
-            trainer.settings = replace(settings, density_interval=0)
+            trainer.changes["density"] = replace(density, interval=0)
             trainer.step(view, image, progress, mask, mesh)  # not measured: it allocates memory
         begin = perf_counter()
         trainer.step(view, image, progress, mask, mesh)

@@ -17,7 +17,7 @@ from ..progress import Progress, Report, counted, ignore
 from .optimize.image_preparation import Correction, exposure_correction
 from .optimize.initial_splats import pixels_of
 from .optimize.state import new_state
-from .optimize.trainer import Trainer
+from .optimize.trainer import Start, Trainer
 from .settings import Rates, TrainingSettings
 
 MAX_PLATE_VIEWS = 24
@@ -166,7 +166,7 @@ def trained_on(plates: Sequence[CleanPlate], center: np.ndarray, report: Report 
     )
     frames = face_frames(mesh, faces, mesh)
     face = np.zeros(len(start), np.int32)
-    trainer = Trainer(capture, settings, {}, new_state(to_local(start, frames, face)))
+    trainer = Trainer(capture, settings, {}, Start(new_state(to_local(start, frames, face))))
     targets = [np.rint(255 * plate.image).astype(np.uint8) for plate in plates]
     for target in targets:
         # as in training: Numba would compile again for writable arrays

@@ -8,7 +8,7 @@ from training.toys import random_splats
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.optimizer import scale_limit
 from stga_addon.training.optimize import adam
-from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
+from stga_addon.training.optimize.image_loss import image_gradient, whole_image
 from stga_addon.training.optimize.state import new_state
 
 HEIGHT = 30

@@ -9,7 +9,7 @@ from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.raster.cpu.rasterize import frames_in_camera, render_backward, render_forward
-from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
+from stga_addon.training.optimize.image_loss import image_gradient, whole_image
 
 rng = np.random.default_rng(0)
 n = 300

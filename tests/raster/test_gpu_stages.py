@@ -27,7 +27,7 @@ from stga_addon.raster.gpu.layout import (
 )
 from stga_addon.raster.gpu.optimizer import image_loss, upload_target
 from stga_addon.raster.gpu.rasterize import counts_buffer, sort_keys
-from stga_addon.training.optimize.cpu_backend import image_gradient, whole_image
+from stga_addon.training.optimize.image_loss import image_gradient, whole_image
 
 pytestmark = pytest.mark.needs("adapter")
 

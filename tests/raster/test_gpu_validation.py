@@ -17,7 +17,7 @@ from render.test_compose import CAMERA, scene
 from stga_addon.capture.open import open_capture
 from stga_addon.raster.gpu import compose
 from training.test_gpu_backend import batch_of, disturbed, settings_of
-from stga_addon.training.optimize.trainer import make_backend
+from stga_addon.training.optimize.make_backend import make_backend
 from stga_addon.training.optimize.frames import FrameStore
 
 adapter, root = sys.argv[1:]

@@ -12,7 +12,9 @@ from stga_addon.capture.images import read_image, read_mask, read_view
 from stga_addon.capture.mesh_geometry import rasterize
 from stga_addon.capture.model import Capture
 from stga_addon.raster.cpu.image_loss import change_background
+from stga_addon.raster.cpu.rasterize import frames_in_camera
 from stga_addon.training.evaluate.metrics import read_evaluation_view
+from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.image_preparation import (
     image_preparation,
     over_color,
@@ -153,8 +155,9 @@ def transmittance_error(capture: Capture, random_background: bool) -> float:
     errors = []
     for view in capture.views["val"]:
         splats = trainer.state.parameters
-        frames = trainer.frames.of(view.timestep)
-        rendering = trainer._backend._forward(splats, frames, view, np.zeros(3, np.float32), 0)
+        seen = frames_in_camera(trainer.frames.of(view.timestep), view.camera)
+        options = RenderOptions(np.zeros(3, np.float32), 0)
+        rendering = trainer._backend._forward(splats, seen, options)
         mask = read_mask(view)
         assert mask is not None
         errors.append(np.mean((1 - rendering.transmittance - mask / 255) ** 2))

@@ -9,13 +9,15 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
-from stga_addon.training.optimize.post_step import MIN_OPACITY, control_density
+from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.density import DensityControl
 from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 
-from .toys import bits, random_state
+from .toys import Rows, bits, random_state
 
 FACES = 6
 COUNT = 40
+MIN_OPACITY = 0.02
 FAINT_LOGIT = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
 
 
@@ -31,7 +33,10 @@ def busy_state(listed: list[int]) -> TrainState:
 
 
 def control(state: TrainState, budget: int = 1000, share: float = 1.0, seed: int = 0) -> TrainState:
-    return control_density(state, budget, np.random.default_rng(seed), share)
+    rows = Rows(state)
+    density = DensityControl(1, (0.0, 1.0), split_share=share, growth=0.0, seed=seed)
+    density.apply(rows, Turn(0, 0.5, initial_count=len(state) + budget))
+    return rows.state
 
 
 def test_survivors_keep_everything_and_children_what_steadies_them():
@@ -124,7 +129,7 @@ def test_a_split_covers_about_what_its_parent_did(opacity):
     parent = cover(state)
     state.screen_gradient[0] = 1.0
     state.gradient_count[0] = 1.0
-    split = control_density(state, 10, np.random.default_rng(0), 1.0)
+    split = control(state, 10)
     assert len(split) == 2
     children = cover(split)
     assert 0.8 < children.sum() / parent.sum() < 1.1

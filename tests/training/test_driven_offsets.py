@@ -12,6 +12,7 @@ from stga_addon.capture.images import read_view
 from stga_addon.capture.model import Capture
 from stga_addon.render.render import render_avatar
 from stga_addon.training.optimize import adam
+from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import new_offset
 from stga_addon.training.optimize.trainer import Trainer
@@ -157,7 +158,7 @@ def test_tracking_follows_splats_that_move_and_grow(toy, monkeypatch):
     def loss(posed):
         trainer.frames.clear()
         trainer.frames.mesh(view.timestep, posed)
-        return backend.mesh_gradient([(view, target)], [1.0], black, 0)
+        return backend.mesh_gradient([(view, target)], [1.0], RenderOptions(black, 0))
 
     _, gradient = loss(mesh)
     for move in (*np.eye(3)[:, None], mesh - mesh.mean(0)):

@@ -14,12 +14,12 @@ from stga_addon.capture.model import Capture
 from stga_addon.errors import DeviceError, StgaError
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
+from stga_addon.training.optimize.backend import Batch, RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
 from stga_addon.training.optimize.initial_splats import initial_splats
 from stga_addon.training.optimize.state import (
-    Batch,
     OffsetState,
     TrainState,
     arrays_of,
@@ -101,8 +101,7 @@ def batch_of(capture, settings, timestep=1, **changes):
         "view": view,
         "target": read_image(view),
         "mask": None,
-        "background": np.ones(3, np.float32),
-        "sh_degree": 3,
+        "options": RenderOptions(np.ones(3, np.float32), 3),
         "selected": None,
         "rates": learning_rates(settings.rates, 0.0),
     }
@@ -121,7 +120,7 @@ def test_one_step_is_the_cpus(toy, part):
         mask = 255 * np.random.default_rng(1).integers(
             0, 2, read_image(view_of(toy, 1)).shape[:2], np.uint8
         )
-        changes |= {"mask": mask, "background": np.float32([0.13, 0.82, 0.43])}
+        changes |= {"mask": mask, "options": RenderOptions(np.float32([0.13, 0.82, 0.43]), 3)}
     batch = batch_of(toy, settings, **changes)
     cpu, gpu = pair(toy, settings)
     before = gpu.state.parameters.xyz
@@ -218,7 +217,7 @@ def test_everything_is_compiled_before_the_first_iteration(toy):
     for part in (None, toy.regions["mouth"]):
         gpu.step(batch_of(toy, settings, selected=part))
     gpu.step(batch_of(toy, settings, view=view, target=target))
-    gpu.render(view, np.ones(3, np.float32), 3)
+    gpu.render(view, RenderOptions(np.ones(3, np.float32), 3))
     assert set(device._kernels) == compiled
 
 
@@ -327,12 +326,13 @@ def test_renders_with_the_average(toy):
         offset.average *= 10
     cpu.state = gpu.state = state
     view = view_of(capture, 3)
-    image = gpu.render(view, np.ones(3, np.float32), 3)
-    np.testing.assert_allclose(image, cpu.render(view, np.ones(3, np.float32), 3), atol=1e-4)
+    options = RenderOptions(np.ones(3, np.float32), 3)
+    image = gpu.render(view, options)
+    np.testing.assert_allclose(image, cpu.render(view, options), atol=1e-4)
     for offset in state.driven_offsets.values():
         offset.average[:] = offset.value
     gpu.state = state
-    assert np.abs(gpu.render(view, np.ones(3, np.float32), 3) - image).max() > 0.05
+    assert np.abs(gpu.render(view, options) - image).max() > 0.05
     state = disturbed(capture, settings)
     state = keep_rows(state, np.random.default_rng(0).permutation(len(state))[: len(state) // 2])
     gpu.state = state

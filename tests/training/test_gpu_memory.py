@@ -12,10 +12,11 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.model import Capture
 from stga_addon.raster.gpu import rasterize
 from stga_addon.raster.gpu.device import Device
+from stga_addon.training.optimize.backend import Batch, RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.gpu_backend import GpuBackend
-from stga_addon.training.optimize.state import Batch, arrays_of, new_state
+from stga_addon.training.optimize.state import arrays_of, new_state
 from stga_addon.training.schedule import learning_rates
 
 from .test_trainer import view_of
@@ -50,7 +51,12 @@ def batch_of(capture: Capture, width: int, height: int) -> Batch:
     for array in (target, mask):
         array.setflags(write=False)
     return Batch(
-        view, target, mask, np.ones(3, np.float32), 3, None, learning_rates(SETTINGS.rates, 0.0)
+        view,
+        target,
+        mask,
+        RenderOptions(np.ones(3, np.float32), 3),
+        None,
+        learning_rates(SETTINGS.rates, 0.0),
     )
 
 

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from stga_addon.raster.cpu.optimizer import distance_limit, opacity_weight, scale_limit
-from stga_addon.training.optimize.post_step import reset_strays
+from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.strays import StrayReset
 
-from .toys import bits, random_splats, random_state
+from .toys import Rows, bits, random_splats, random_state
 
 FACES = 5
 WEIGHT = 0.7
@@ -97,7 +98,8 @@ def test_stray_resets(to):
     assert 5 < strays.sum() < 40
     assert np.array(far)[::4].any()
     before = bits(state)
-    assert reset_strays(state, limit, to) == strays.sum()
+    reset = StrayReset(1, limit, to)
+    reset.apply(Rows(state), Turn(0, 0.5, 60))
     after = bits(state)
     for name, old in before.items():
         if name in ("parameters/xyz", "first/xyz"):
@@ -113,4 +115,6 @@ def test_stray_resets(to):
             assert not after[name][strays].any()
         else:
             np.testing.assert_array_equal(after[name], old, err_msg=name)
-    assert reset_strays(state, limit, to) == 0
+    reset.apply(Rows(state), Turn(0, 0.5, 60))
+    for name, array in bits(state).items():
+        np.testing.assert_array_equal(array, after[name], err_msg=name)

@@ -7,7 +7,7 @@ from raster.reference import image_loss
 
 from stga_addon.raster.cpu.image_loss import LOSS_REACH_PX
 from stga_addon.raster.cpu.layout import TILE
-from stga_addon.training.optimize.cpu_backend import (
+from stga_addon.training.optimize.image_loss import (
     image_gradient,
     mean_ssim,
     tile_rectangles,

@@ -35,11 +35,10 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         """Its state is the number of its splats, of which a turn adds 500, up to 2,000."""
 
         state = 1000
-        settings = make_settings(iterations=1)
         once_s = 0.0
 
         def __init__(self, *_: Any, **__: Any) -> None:
-            pass
+            self.changes: dict[str, Any] = {}
 
         def prepare_turns(self) -> None:
             watch.now += self.once_s
@@ -48,7 +47,7 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
             assert not image.flags.writeable
             assert image.shape[:2] == mask.shape == (view.camera.height, view.camera.width)
             watch.now += 0.01 * image.shape[0] * image.shape[1] / 1000 * self.state / 1000
-            if self.settings.density_interval == 1:
+            if self.changes["density"].interval == 1:
                 watch.now += 0.5
                 self.state = min(2000, self.state + 500)
             else:
@@ -139,4 +138,5 @@ def test_one_phones_sides_are_found_before_they_are_timed(toy):
     settings = make_settings(iterations=1, hull_points=False, lattice=0)
     trainer = Trainer(replace(toy, views={"train": views}), settings, {})
     trainer.prepare_turns()
-    assert {"_outlines", "_sides"} <= vars(trainer).keys()
+    assert "outlines" in vars(trainer.changes["outlines"])
+    assert "sides" in vars(trainer.changes["unseen sides"])

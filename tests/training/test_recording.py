@@ -209,4 +209,4 @@ def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa
     settings = quick_settings("global", lattice=0)
     for capture, is_one in ((joined, True), (first, False)):
         assert depth_limits(CaptureFacts(capture, settings)).on == is_one
-        assert Trainer(capture, settings, {})._colors_unseen_sides == is_one
+        assert ("unseen sides" in Trainer(capture, settings, {}).changes) == is_one

@@ -13,6 +13,7 @@ from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.capture.images import read_image
 from stga_addon.capture.model import Capture, View
 from stga_addon.capture.open import open_capture
+from stga_addon.training.optimize.backend import RenderOptions
 from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import initial_splats, unseen_share
@@ -93,7 +94,8 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
     focus = toy.regions["mouth"][trainer.state.face]
     step = cpu_backend(trainer)
     frames = step._moved_frames(view.timestep)
-    rows, screen, loss = step._backward(frames, view, target, WHITE, degree, None)
+    options = RenderOptions(WHITE, degree)
+    rows, screen, loss = step._backward(frames, view, target, options, None)
     full = {name: array.copy() for name, array in trainer.state.gradients._asdict().items()}
     screen_gradient = screen.copy()
     wanted = rows[focus[rows]].copy()
@@ -102,7 +104,7 @@ def test_local_gradient_is_the_whole_images(toy, degree, camera):
         buffer.fill(np.nan if buffer.dtype.kind == "f" else 0)
     for array in trainer.state.gradients:
         array.fill(7.0)
-    rows, screen, loss = step._backward(frames, view, target, WHITE, degree, focus)
+    rows, screen, loss = step._backward(frames, view, target, options, focus)
     assert loss is None
     np.testing.assert_array_equal(np.sort(rows), np.sort(wanted))
     assert 20 < len(rows) < 0.5 * len(trainer.state)

@@ -1,6 +1,7 @@
 """States and settings small enough to check by hand."""
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.progress import Report
+from stga_addon.training.optimize.cpu_backend import CpuBackend
 from stga_addon.training.optimize.state import TrainState, arrays_of, new_state
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.settings import TrainingSettings, make_settings
@@ -61,6 +63,19 @@ def assert_same_state(folder: Path, expected: Path) -> None:
         )
     for name in ("iteration", "visit", "initial_count"):
         assert getattr(ours, name) == getattr(theirs, name)
+
+
+class Rows(CpuBackend):
+    """The rows of a state alone; columns are copies that cannot be written to, as a device's."""
+
+    def __init__(self, state: TrainState) -> None:
+        self.state = state
+
+    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        found = {name: array.copy() for name, array in super().columns(names).items()}
+        for array in found.values():
+            array.setflags(write=False)
+        return found
 
 
 def bits(state: TrainState) -> dict[str, np.ndarray]:

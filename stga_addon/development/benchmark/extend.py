@@ -35,7 +35,7 @@ from ...training.effects.plan import add_effects, plan_effects
 from ...training.evaluate.metrics import evaluate, known_exposure
 from ...training.optimize.image_preparation import image_preparation
 from ...training.optimize.precompile import precompile_kernels
-from ...training.optimize.trainer import Strategy, Trainer
+from ...training.optimize.trainer import Start, Strategy, Trainer
 from ...training.run.continuation import (
     continued_evaluation_views,
     continued_order,
@@ -199,7 +199,7 @@ def refine_arms(prepared: Prepared, seed: int) -> dict[str, Arm]:
         capture,
         settings,
         prepared.selection,
-        starting_state(continuation, settings, len(capture.faces)),
+        Start(starting_state(continuation, settings, len(capture.faces))),
     )
     every = view_order(capture.views["train"], 1, seed)
     return {
@@ -228,7 +228,7 @@ def compare(name: str, prepared: Prepared, arm: Arm, options: argparse.Namespace
         if arm.anew
         else starting_state(prepared.run.continuation, arm.settings, len(prepared.capture.faces))
     )
-    trainer = Trainer(capture, arm.settings, prepared.selection or {}, state)
+    trainer = Trainer(capture, arm.settings, prepared.selection or {}, Start(state))
     trainer.strategy = arm.strategy
     region = arm_region(prepared)
     evaluation_views = continued_evaluation_views(prepared.run, capture, region)

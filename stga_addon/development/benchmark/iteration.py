@@ -55,10 +55,11 @@ from ...raster.cpu.tiles import (
 )
 from ...render.device import choose_device
 from ...training.optimize import adam
-from ...training.optimize.cpu_backend import image_gradient, whole_image
+from ...training.optimize.backend import Batch, RenderOptions
 from ...training.optimize.frames import FrameStore
-from ...training.optimize.state import Batch, TrainState, new_state
-from ...training.optimize.trainer import make_backend
+from ...training.optimize.image_loss import image_gradient, whole_image
+from ...training.optimize.make_backend import make_backend
+from ...training.optimize.state import new_state
 from ...training.schedule import learning_rates
 from ...training.settings import make_settings
 
@@ -363,7 +364,7 @@ def global_step(
     capture = Capture(Path(), "", faces, mesh, {}, (0,), {}, *poses)
     given = make_settings(iterations=1), FrameStore(capture, "stga"), new_state(splats)
     view = View(0, 0, camera, "benchmark", Path())
-    batch = Batch(view, target, None, np.ones(3, np.float32), 3, None, RATES)
+    batch = Batch(view, target, None, RenderOptions(np.ones(3, np.float32), 3), None, RATES)
     return make_backend(device, *given), batch
 
 

@@ -26,7 +26,7 @@ from ...raster.cpu.rasterize import BufferPool, frames_in_camera, render_backwar
 from ...raster.posed_splats import PosedSplats
 from ...render.render import posed_avatar, render_avatar, render_layers
 from ...selection import SelectionOptions, select_capture
-from ..optimize.cpu_backend import mean_ssim
+from ..optimize.image_loss import mean_ssim
 from ..optimize.image_preparation import NO_CORRECTION, fit_lines, view_exposure, without_backdrop
 from . import lpips
 from .forecast import FITTED_HEADS

@@ -47,10 +47,11 @@ from ...tracking.posed_points import PosedPoints
 from ...tracking.seen_surface import facing, in_sight, surface_points
 from ..schedule import sh_degree
 from ..settings import TrainingSettings
+from .backend import RenderOptions
 from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .image_preparation import MAX_GAIN, image_preparation
-from .post_step import TOLERANCE_SHARE
+from .outlines import TOLERANCE_SHARE
 from .state import state_of_avatar
 
 RENDERINGS = 7
@@ -319,6 +320,8 @@ class _Tracker:
         self._points = surface_points(self._head, POINTS)
         self._posed_points = PosedPoints(person, self._points)
         self._values = np.zeros(0)  # parameters that are being tried
+        background = np.array(settings.background, np.float32)
+        self._options = RenderOptions(background, sh_degree(settings, 1.0))
         state = state_of_avatar(avatar)
         self._frames = FrameStore(
             capture, settings.convention, settings.follows_strain, self._mesh, avatar.strain_range
@@ -442,8 +445,7 @@ class _Tracker:
         margin = max(1, round(TOLERANCE_SHARE * len(image)))
         inside = silhouette(self._mesh(view.timestep), self._capture.faces, view.camera)
         inside = binary_erosion(inside, iterations=margin)
-        background = np.array(self._settings.background, np.float32)
-        drawn = to_uint8(self._backend.render(view, background, sh_degree(self._settings, 1.0)))
+        drawn = to_uint8(self._backend.render(view, self._options))
         shown = np.where(inside[..., None], image, drawn)
         shown.setflags(write=False)
         return shown
@@ -479,11 +481,9 @@ class _Tracker:
         """The images' loss in the points' units, and its gradient (E + 18,)."""
         self._values = values
         self._frames.clear()
-        background = np.array(self._settings.background, np.float32)
         shots = [(view, self._cut(view, image)) for view, image in shots]
         weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
-        degree = sh_degree(self._settings, 1.0)
-        total, by_vertex = self._backend.mesh_gradient(shots, weights, background, degree)
+        total, by_vertex = self._backend.mesh_gradient(shots, weights, self._options)
         offset = self._sequence.frame(timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
 

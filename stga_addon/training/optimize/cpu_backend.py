@@ -1,9 +1,7 @@
-"""Training backend on the CPU (Numba kernels), and its image loss (STGA, training)."""
+"""Training backend on the CPU (Numba kernels)."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
-from itertools import pairwise
 
 import numpy as np
 
@@ -11,69 +9,15 @@ from ...avatar.embedding import FaceFrames, frame_backward
 from ...avatar.offsets import OFFSETS, POSITION, SCALE, offset_of
 from ...capture.model import View
 from ...raster.cpu import optimizer, rasterize
-from ...raster.cpu.image_loss import LOSS_REACH_PX, add_up, change_background, image_loss
-from ...raster.cpu.layout import TILE, Parameters
+from ...raster.cpu.image_loss import LOSS_REACH_PX, change_background
+from ...raster.cpu.layout import CameraFrames, Parameters
 from ...raster.cpu.threads import threads
-from ...raster.cpu.tiles import box_groups
 from ..settings import TrainingSettings
 from . import adam
+from .backend import Batch, RenderOptions
 from .frames import FrameStore
-from .state import Batch, TrainState
-
-BAND_TILES = 4
-"""Most rows of tiles in a rectangle of a local iteration; each computes 20 rows of pixels more."""
-
-
-@cache
-def _bands(height: int, count: int) -> int:
-    """How many bands cost the busiest of `count` threads the fewest rows."""
-    fewest = -(-count // 2)
-    most = 2 * count
-    beyond = 2 * LOSS_REACH_PX
-    return min(
-        range(fewest, most + 1), key=lambda n: -(-3 * n // count) * (-(-height // n) + beyond)
-    )
-
-
-def whole_image(height: int, width: int, bands: int | None = None) -> np.ndarray:
-    """Rectangles (R, 4) of pixels x0, y0, x1, y1 that tile an image; each channel of one is one
-    thread's work. bands: how many, over the whole width, because pixels beyond left and right edges
-    cost more; by default, so many that the threads are done soonest."""
-    count = min(bands or _bands(height, threads()), height)
-    tops = [height * n // count for n in range(count + 1)]
-    return np.array([[0, y0, width, y1] for y0, y1 in pairwise(tops)], np.int64)
-
-
-def tile_rectangles(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Rectangles (R, 4) of pixels around each connected group of marked tiles (rows, columns) bool,
-    the largest first; those of more than BAND_TILES rows are cut, for the threads."""
-    return np.minimum(box_groups(tiles, BAND_TILES) * TILE, [width, height, width, height])
-
-
-def image_gradient(
-    image: np.ndarray,
-    target: np.ndarray,
-    rectangles: np.ndarray,
-    ssim_weight: float,
-    out: np.ndarray,
-) -> tuple[float, float]:
-    """Write the gradient of (1 − w)·L1 + w·(1 − SSIM) with respect to the image into `out`, within
-    the rectangles; of means over the whole image. Returns L1 and SSIM within the rectangles.
-
-    image, out (3, H, W) float32; target (H, W, 3) uint8.
-    """
-    sums = np.zeros((2, 3, sum(y1 - y0 for _, y0, _, y1 in rectangles.tolist())))
-    share = 1.0 / image.size
-    image_loss(image, target, rectangles, np.float32(ssim_weight), np.float32(share), out, sums)
-    l1, ssim = add_up(sums)
-    return l1 * share, ssim * share
-
-
-def mean_ssim(image: np.ndarray, target: np.ndarray) -> float:
-    """Mean SSIM of image (3, H, W) float32 and target (H, W, 3) uint8."""
-    unused = np.empty_like(image)
-    _, height, width = image.shape
-    return image_gradient(image, target, whole_image(height, width), 1.0, unused)[1]
+from .image_loss import image_gradient, tile_rectangles, whole_image
+from .state import Halving, TrainState, arrays_of, assign_rows, keep_rows, with_halves
 
 
 class CpuBackend:
@@ -90,7 +34,6 @@ class CpuBackend:
         return len(self.state)
 
     def step(self, batch: Batch) -> float | None:
-        """Forward, backward, optimizer; returns the image loss, None of a local iteration."""
         state = self.state
         settings = self._settings
         target = batch.target
@@ -101,17 +44,11 @@ class CpuBackend:
         if batch.mask is not None:
             over = self._buffers.get("target", target.shape, np.uint8)
             captured = 255 * np.array(settings.background, np.float32)
-            change_background(target, batch.mask, captured, 255 * batch.background, over)
+            change_background(target, batch.mask, captured, 255 * batch.options.background, over)
             target = over.view()
             target.setflags(write=False)  # like the loader's: Numba compiles for one type only
-        rows, screen, loss = self._backward(
-            self._moved_frames(batch.view.timestep),
-            batch.view,
-            target,
-            batch.background,
-            batch.sh_degree,
-            focus,
-        )
+        frames = self._moved_frames(batch.view.timestep)
+        rows, screen, loss = self._backward(frames, batch.view, target, batch.options, focus)
         options = adam.adam_options(settings, batch.view.camera)
         signals = self._frames.signals(batch.view.timestep)
         # before the limits' gradients are added
@@ -135,25 +72,40 @@ class CpuBackend:
             xyz = state.parameters.xyz
             weight = settings.distance_weight
             optimizer.distance_limit(rows, xyz, face, unbound, limit, weight, gradients.xyz)
-        adam.step(state, rows, batch.rates, options, batch.sh_degree)
+        adam.step(state, rows, batch.rates, options, batch.options.sh_degree)
         if batch.accumulate:
             optimizer.add_screen_gradients(
                 rows, screen, state.screen_gradient, state.gradient_count
             )
         return loss
 
-    def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """The view with the splats' exponential moving average: a new (3, H, W) float32 image."""
+    def render(self, view: View, options: RenderOptions) -> np.ndarray:
         frames = self._moved_frames(view.timestep, averaged=True)
-        return self._forward(self.state.average, frames, view, background, sh_degree).image.copy()
+        seen = rasterize.frames_in_camera(frames, view.camera)
+        return self._forward(self.state.average, seen, options).image.copy()
+
+    def coefficients(self) -> dict[str, np.ndarray]:
+        return {name: offset.value for name, offset in self.state.driven_offsets.items()}
+
+    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        arrays = arrays_of(self.state)
+        return {name: arrays[name] for name in names}
+
+    def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
+        assign_rows(self.state, rows, values)
+
+    def keep(self, rows: np.ndarray) -> None:
+        self.state = keep_rows(self.state, rows)
+
+    def append_halves(self, halving: Halving) -> None:
+        self.state = with_halves(self.state, halving)
 
     def _backward(
         self,
         frames: FaceFrames,
         view: View,
         target: np.ndarray,
-        background: np.ndarray,
-        sh_degree: int,
+        options: RenderOptions,
         focus: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray, float | None]:
         """Fill the trained rows' gradients; returns these rows, screen gradients (N,) and loss."""
@@ -161,7 +113,8 @@ class CpuBackend:
         height = view.camera.height
         width = view.camera.width
         state = self.state
-        rendering = self._forward(state.parameters, frames, view, background, sh_degree, focus)
+        seen = rasterize.frames_in_camera(frames, view.camera)
+        rendering = self._forward(state.parameters, seen, options, focus)
         if focus is None:
             key = height, width, threads()
             rectangles = self._buffers.kept("rectangles", key, lambda *key: whole_image(*key[:2]))
@@ -173,7 +126,7 @@ class CpuBackend:
             rendering,
             state.parameters,
             state.face,
-            self._frames_in_camera,
+            seen,
             v_image,
             state.gradients,
             buffers=self._buffers,
@@ -190,19 +143,16 @@ class CpuBackend:
     def _forward(
         self,
         splats: Parameters,
-        frames: FaceFrames,
-        view: View,
-        background: np.ndarray,
-        sh_degree: int,
+        seen: CameraFrames,
+        options: RenderOptions,
         focus: np.ndarray | None = None,
     ) -> rasterize.RenderOutput:
-        self._frames_in_camera = rasterize.frames_in_camera(frames, view.camera)
         return rasterize.render_forward(
             splats,
             self.state.face,
-            self._frames_in_camera,
-            sh_degree,
-            background,
+            seen,
+            options.sh_degree,
+            options.background,
             focus,
             LOSS_REACH_PX,
             antialiased=self._settings.antialiased,
@@ -213,8 +163,7 @@ class CpuBackend:
         self,
         shots: Sequence[tuple[View, np.ndarray]],
         weights: Sequence[float],
-        background: np.ndarray,
-        sh_degree: int,
+        options: RenderOptions,
     ) -> tuple[float, np.ndarray]:
         """The weighted sum of the image losses of a timestep's views and images, and its gradient
         (V, 3) with respect to the timestep's mesh; nothing is stepped."""
@@ -240,7 +189,7 @@ class CpuBackend:
         total = 0.0
         by_frame = np.zeros((len(frames.scale), 7))
         for (view, image), weight in zip(shots, weights, strict=True):
-            rows, _, loss = self._backward(moved, view, image, background, sh_degree, None)
+            rows, _, loss = self._backward(moved, view, image, options, None)
             assert loss is not None
             total += weight * loss
             by_frame += weight * frame_gradient(splats, face, state.gradients, rows, scaled)

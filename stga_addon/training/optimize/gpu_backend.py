@@ -1,9 +1,8 @@
 """Training backend on a GPU, by WebGPU kernels."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,17 @@ from ...raster.gpu.layout import COUNTS, NEEDED, OVERFLOWED, splat_rows, split_r
 from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, upload_target
 from ..settings import TrainingSettings
 from .adam import adam_options
+from .backend import Batch, RenderOptions
 from .frames import FrameStore
-from .state import Batch, OffsetState, TrainState
+from .state import (
+    Halving,
+    OffsetState,
+    TrainState,
+    arrays_of,
+    assign_rows,
+    keep_rows,
+    with_halves,
+)
 
 QUEUED_ITERATIONS = 2
 """Iterations that the device may be behind; losses are returned as many iterations late."""
@@ -42,6 +50,8 @@ class GpuBackend:
     How many (tile, splat) pairs there are only the device knows. Where they exceed the buffers, it
     changes nothing from there on; the host learns it when it reads that iteration's loss, makes
     room, and queues what was left out again.
+
+    Between steps, rows are edited in a copy in host memory, which the next step or picture uploads.
     """
 
     def __init__(
@@ -58,6 +68,8 @@ class GpuBackend:
         self._triangles = len(capture.faces)
         distance_limits = settings.distance_limit * frames.units
         self._limits = np.column_stack([*frames.scale_limits(settings), distance_limits])
+        self._edited: TrainState | None = None
+        self._is_changed = False
         self._pending: deque[_Queued] = deque()
         self._readbacks = [Readback(device, COUNTS + 1) for _ in range(QUEUED_ITERATIONS)]
         self._rasterizer.make_room(0)
@@ -65,12 +77,12 @@ class GpuBackend:
         self.state = state
 
     def __len__(self) -> int:
-        return self._splats.count
+        return self._splats.count if self._edited is None else len(self._edited)
 
     @property
     def state(self) -> TrainState:
-        """A copy in host memory, after all queued iterations."""
         self._finish_all()
+        self._upload_edited()
         count = len(self)
         stride = self._splats.stride
         coefficients = self._splats.coefficients
@@ -109,6 +121,8 @@ class GpuBackend:
     @state.setter
     def state(self, state: TrainState) -> None:
         self._finish_all()
+        self._edited = None
+        self._is_changed = False
         upload = self.device.upload
         rows = {name: upload(name, splat_rows(getattr(state, name))) for name in TABLES}
         self._gradients = rows.pop("gradients")
@@ -129,8 +143,43 @@ class GpuBackend:
             parts = [upload(f"{name} {part}", each) for part, each in vars(offset).items()]
             self._offsets[name] = OffsetTables._make([*parts, splats_of])
 
+    def _host_state(self) -> TrainState:
+        """The copy that is edited: the latest state, which is read once between two steps."""
+        if self._edited is None:
+            self._edited = self.state
+        return self._edited
+
+    def _change(self, state: TrainState) -> None:
+        self._edited = state
+        self._is_changed = True
+
+    def _upload_edited(self) -> None:
+        if self._edited is not None and self._is_changed:
+            self.state = self._edited
+        self._edited = None
+
+    def coefficients(self) -> dict[str, np.ndarray]:
+        offsets = self._host_state().driven_offsets.items()
+        return {name: offset.value for name, offset in offsets}
+
+    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        arrays = arrays_of(self._host_state())
+        return {name: arrays[name] for name in names}
+
+    def assign(self, rows: np.ndarray, values: Mapping[str, np.ndarray | float]) -> None:
+        state = self._host_state()
+        assign_rows(state, rows, values)
+        self._change(state)
+
+    def keep(self, rows: np.ndarray) -> None:
+        self._change(keep_rows(self._host_state(), rows))
+
+    def append_halves(self, halving: Halving) -> None:
+        self._change(with_halves(self._host_state(), halving))
+
     def step(self, batch: Batch) -> float | None:
         """Queue one step; returns the loss of the iteration before the last, if global."""
+        self._upload_edited()
         loss = None
         if len(self._pending) == QUEUED_ITERATIONS:
             self._finish(0)
@@ -141,14 +190,12 @@ class GpuBackend:
         self._enqueue(queued)
         return loss
 
-    def render(self, view: View, background: np.ndarray, sh_degree: int) -> np.ndarray:
-        """With the splats' moving average after all iterations: a new (3, H, W) float32 image."""
+    def render(self, view: View, options: RenderOptions) -> np.ndarray:
         self._finish_all()
-        average = replace(self._splats, rows=self._tables.average)
-        moved = {name: tables.average for name, tables in self._offsets.items()}
+        self._upload_edited()
         while True:
             with self.device.record() as work:
-                rendering = self._render(work, average, moved, view, background, sh_degree)
+                rendering = self._render(work, view, options, averaged=True)
             if self._rasterizer.pairs_fit():
                 shape = 3, view.camera.height, view.camera.width
                 return self.device.read(rendering["image"], shape)
@@ -180,7 +227,7 @@ class GpuBackend:
         batch = queued.batch
         settings = self._settings
         whole = queued.batch.selected is None
-        change = 255 * batch.background - 255 * np.array(settings.background, np.float32)
+        change = 255 * batch.options.background - 255 * np.array(settings.background, np.float32)
         upload_target(self.device, batch.target, settings.ssim_weight, batch.mask, change)
         opacity_weight = settings.unseen_opacity_weight / max(len(self), 1)
         optimizer.upload_step(
@@ -194,10 +241,7 @@ class GpuBackend:
         with self.device.record() as work:
             splats = self._splats
             camera = batch.view.camera
-            moved = {name: tables.coefficients for name, tables in self._offsets.items()}
-            rendering = self._render(
-                work, splats, moved, batch.view, batch.background, batch.sh_degree, batch.selected
-            )
+            rendering = self._render(work, batch.view, batch.options, batch.selected)
             v_image, loss = image_loss(
                 work,
                 camera.width,
@@ -222,29 +266,32 @@ class GpuBackend:
     def _render(
         self,
         work: Recording,
-        splats: rasterize.SplatTable,
-        offsets: Mapping[str, Any],
         view: View,
-        background: np.ndarray,
-        sh_degree: int,
+        options: RenderOptions,
         selected: np.ndarray | None = None,
+        averaged: bool = False,
     ) -> rasterize.Tables:
-        """Record a view of the splats, moved by driven offsets with these coefficients (F, 3, 3) on
-        the device.
+        """Record a view of the splats, moved by the driven offsets; averaged: of the moving average
+        of both.
 
         Only the tiles around the splats on the selected triangles, if any are given.
         """
+        splats = self._splats
+        moved = {name: tables.coefficients for name, tables in self._offsets.items()}
+        if averaged:
+            splats = replace(splats, rows=self._tables.average)
+            moved = {name: tables.average for name, tables in self._offsets.items()}
         self._embedding.upload(self._frames.mesh(view.timestep), view.camera)
-        options = rasterize.ViewOptions(
+        given = rasterize.ViewOptions(
             view.camera,
-            sh_degree,
-            background,
+            options.sh_degree,
+            options.background,
             antialiased=self._settings.antialiased,
             focused=selected is not None,
             reach=LOSS_REACH_PX,
         )
-        uniform = self._rasterizer.upload_view(splats, options)
+        uniform = self._rasterizer.upload_view(splats, given)
         marked = None if selected is None else self.device.upload("selected", selected)
         focus = None if marked is None else rasterize.mark_focus(work, splats, uniform, marked)
-        frames = self._embedding.compose(work, offsets)
-        return self._rasterizer.forward(work, splats, frames, options, uniform, focus)
+        frames = self._embedding.compose(work, moved)
+        return self._rasterizer.forward(work, splats, frames, given, uniform, focus)

@@ -16,7 +16,7 @@ from ...raster.cpu.rasterize import frames_in_camera, render_backward, render_fo
 from ...render.device import adapter_name
 from ...worker.launch import is_preparing
 from . import adam
-from .cpu_backend import image_gradient, whole_image
+from .image_loss import image_gradient, whole_image
 from .state import TrainState, new_state, with_offsets
 
 HELPER_TIMEOUT_S = 120.0

@@ -4,38 +4,16 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...avatar.file import Avatar
-from ...avatar.splats import Splats
+from ...avatar.splats import Splats, joined
 from ...avatar.strain import STRAIN_COMPONENTS
-from ...capture.model import View
+from ...flame.quaternions import to_matrices
 from ...raster.cpu.layout import Parameters
 from ...raster.cpu.optimizer import AdamTables
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Input of one iteration: one view.
-
-    target      (H, W, 3) uint8 over the settings' background
-    mask        (H, W) uint8 coverage if the target's background is to be replaced by `background`
-    background  (3,) float32 behind the splats
-    selected    (F,) bool triangles whose splats are trained; None trains all
-    rates       learning rate by parameter name, and "sh_rest"
-    accumulate  whether screen gradients are summed for density control
-    """
-
-    view: View
-    target: np.ndarray
-    mask: np.ndarray | None
-    background: np.ndarray
-    sh_degree: int
-    selected: np.ndarray | None
-    rates: Mapping[str, float]
-    accumulate: bool = True
 
 
 @dataclass
@@ -160,11 +138,87 @@ def join(state: TrainState, other: TrainState) -> TrainState:
     return replace(state_of(rows), driven_offsets=state.driven_offsets)
 
 
+class Halving(NamedTuple):
+    """Splats that are split in two along their longest axis.
+
+    rows         (M,) of the splats
+    distance     (M, 1) float64 of either half's center from the parent's, in its standard deviation
+                 along that axis
+    narrowing    by which the halves are narrower along it
+    min_opacity  of a half, 0…1
+    """
+
+    rows: np.ndarray
+    distance: np.ndarray
+    narrowing: float
+    min_opacity: float
+
+
+def with_halves(state: TrainState, halving: Halving) -> TrainState:
+    """The state with halves of splats as the last rows: first all on one side, then all on the
+    other. Their parents are still there.
+
+    Halves inherit triangle, binding and unseen share, lie within the parent's Gaussian in local
+    units, and keep Adam's second moment and step count, without which their first steps would all
+    be as long as the rate.
+    """
+    kept = keep_rows(state, halving.rows)
+    parents = kept.splats()
+    pairs = join(kept, kept)
+    n = np.arange(len(parents))
+    longest = np.argmax(parents.log_scale, axis=1)
+    length = np.exp(parents.log_scale[n, longest])[:, None]
+    offset = to_matrices(parents.rotation)[n, :, longest] * length
+    parents.log_scale[n, longest] -= np.log(halving.narrowing)
+    # of two Gaussians beside each other, so much narrower, that cover as much as one
+    alike = halving.narrowing / 2 * opacity_of(parents.opacity)
+    opacity = np.maximum(alike, halving.min_opacity)
+    parents.opacity[:] = np.log(opacity / (1 - opacity))
+    away = offset * halving.distance
+    sides = [(parents.xyz + side * away).astype(np.float32) for side in (-1, 1)]
+    halves = new_state(joined([replace(parents, xyz=xyz) for xyz in sides]), pairs.unseen_share)
+    halves.second = pairs.second
+    halves.steps = pairs.steps
+    return join(state, halves)
+
+
+def opacity_of(logit: np.ndarray) -> np.ndarray:
+    """(N,) float64 opacity 0…1 of logits (N,)."""
+    return np.asarray(1 / (1 + np.exp(-logit.astype(np.float64))))
+
+
+PRUNED_BY = ("face", "unbound", "parameters/opacity")
+"""Columns that `prunable` needs."""
+
+
+def prunable(columns: Mapping[str, np.ndarray], unwanted: np.ndarray) -> np.ndarray:
+    """(N,) bool: the unwanted splats (N,) bool; a triangle that would lose all bound ones keeps the
+    most opaque."""
+    face = columns["face"]
+    opacity = columns["parameters/opacity"]
+    bound = np.flatnonzero(~columns["unbound"])
+    order = bound[np.lexsort((-opacity[bound], unwanted[bound], face[bound]))]
+    first = np.ones(len(order), bool)
+    first[1:] = face[order][1:] != face[order][:-1]
+    prunable = unwanted.copy()
+    prunable[order[first]] = False
+    return prunable
+
+
 def with_offsets(state: TrainState, offsets: Collection[str], triangles: int) -> TrainState:
     """The state with these driven offsets of so many triangles, too; those that it lacked begin by
     zero."""
     zeros = {name: new_offset(np.zeros((triangles, STRAIN_COMPONENTS, 3))) for name in offsets}
     return replace(state, driven_offsets={**zeros, **state.driven_offsets})
+
+
+def assign_rows(
+    state: TrainState, rows: np.ndarray, values: Mapping[str, np.ndarray | float]
+) -> None:
+    """Write to rows of the arrays of `arrays_of`, in place."""
+    arrays = arrays_of(state)
+    for name, value in values.items():
+        arrays[name][rows] = value
 
 
 def arrays_of(state: TrainState) -> dict[str, np.ndarray]:

@@ -1,37 +1,44 @@
 """One training step: a view in, updated splats out."""
 
 from collections.abc import Mapping
-from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
 from ...avatar.file import Avatar
 from ...avatar.lattice import splats_per_triangle
-from ...avatar.offsets import OFFSETS
 from ...capture.model import Capture, View, cameras_at_once
-from ...errors import StgaError
-from ...render.device import adapter_name
 from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
 from ..settings import CONTINUATIONS, TrainingSettings
-from . import post_step
 from .avatar_tracking import RefinedTracking
-from .cpu_backend import CpuBackend
+from .backend import Batch, RenderOptions
+from .change import Change, Turn, is_turn_of
+from .density import DensityControl
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
-from .state import Batch, TrainState, new_state, with_offsets
+from .make_backend import make_backend
+from .outlines import OutlinePruning
+from .state import TrainState, new_state, with_offsets
+from .strays import StrayReset
+from .unseen_sides import UnseenSideColors
 
-if TYPE_CHECKING:  # needs wgpu, which training on the CPU does without
-    from .gpu_backend import GpuBackend
-
-MAX_REGION_SPLIT_SHARE = 0.1
-"""Largest share of a region's splats that is split at a time: a refinement has few rounds."""
-OUTLINE_INTERVAL = 200
-SIDE_INTERVAL = 100
-"""Iterations between turns of pruning outside of the masks, and of coloring unseen sides."""
 EXTEND_LOCAL_SHARE = 0.5
 """Of an extension's budget, in which what the new takes need is trained, before all splats."""
+
+
+class Start(NamedTuple):
+    """What a training begins with.
+
+    state         None: new splats
+    strain_range  (F, 2, 6): within which deformation is followed; None: TRAINED_RANGE
+    """
+
+    state: TrainState | None = None
+    strain_range: np.ndarray | None = None
+
+
+NEW = Start()
 
 
 class Strategy:
@@ -83,6 +90,7 @@ class Trainer:
     visit          visits of frames so far, minus one: consecutive views of one timestep are one
                    visit
     initial_count  splats of the whole lattice and hull points, which density control counts from
+    changes        by name, what may change the splats after a step, in this order
     """
 
     def __init__(
@@ -90,40 +98,39 @@ class Trainer:
         capture: Capture,
         settings: TrainingSettings,
         selection: Mapping[int, np.ndarray],
-        state: TrainState | None = None,
+        start: Start = NEW,
         device: str = "cpu",
-        strain_range: np.ndarray | None = None,
     ) -> None:
         """selection: timestep -> (F,) bool triangles, for the selective strategy; device: one of
-        `choose_device`.
-
-        strain_range (F, 2, 6): within which deformation is followed; None: TRAINED_RANGE.
-        """
+        `choose_device`."""
         self.capture = capture
         self.settings = settings
         self.strategy = Strategy(settings, selection)
         self.tracking = RefinedTracking(capture, settings.convention) if settings.tracking else None
         moved = {} if self.tracking is None else {"moved_mesh": self.tracking.mesh}
+        limits = start.strain_range
         self.frames = FrameStore(
-            capture, settings.convention, settings.follows_strain, limits=strain_range, **moved
+            capture, settings.convention, settings.follows_strain, limits=limits, **moved
         )
         self.iteration = 0
         self.visit = -1
         self.last_timestep: int | None = None
         self._background = np.array(settings.background, np.float32)
-        begins = state is None
-        if state is None:
-            splats = initial_splats(capture, settings)
-            state = new_state(splats, unseen_share(capture, settings.convention, splats))
-            state = with_offsets(state, settings.driven_offsets, len(capture.faces))
+        state = _placed_splats(capture, settings) if start.state is None else start.state
         self._backend = make_backend(device, settings, self.frames, state)
-        self._has_one_camera = cameras_at_once(capture.views["train"]) == 1
-        self.initial_count = len(self)
-        if begins:
-            orders = settings.lattice_order, settings.first_lattice_order
-            whole, first = (splats_per_triangle(order(len(capture.faces))) for order in orders)
-            bound = int((~self.state.unbound).sum())
-            self.initial_count += bound * whole // first - bound
+        self.initial_count = len(state)
+        if start.state is None:
+            self.initial_count = _whole_count(state, settings, len(capture.faces))
+        limit = settings.stray_limit * self.frames.units
+        strays = StrayReset(settings.stray_reset_interval, limit, settings.stray_reset_share)
+        self.changes: dict[str, Change] = {
+            "strays": strays,
+            "density": density_control(settings),
+        }
+        if settings.random_background:  # alpha is learned from masks
+            self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
+        if cameras_at_once(capture.views["train"]) == 1 and self.strategy.region is None:
+            self.changes["unseen sides"] = UnseenSideColors(capture)
 
     def __len__(self) -> int:
         """How many splats there are."""
@@ -170,8 +177,7 @@ class Trainer:
             view,
             target,
             mask,
-            background,
-            sh_degree(settings, progress),
+            RenderOptions(background, sh_degree(settings, progress)),
             selected,
             learning_rates(settings.rates, progress),
             accumulate=selected is None or self.strategy.region is not None,
@@ -183,7 +189,8 @@ class Trainer:
 
     def render(self, view: View, progress: float = 1.0) -> np.ndarray:
         """With the splats' moving average: a new (3, H, W) float32 image over the background."""
-        return self._backend.render(view, self._background, sh_degree(self.settings, progress))
+        options = RenderOptions(self._background, sh_degree(self.settings, progress))
+        return self._backend.render(view, options)
 
     def avatar(self, principal_point: str, strain_range: np.ndarray | None) -> Avatar:
         """The avatar of now, made of moving averages; the arguments become its fields."""
@@ -206,78 +213,37 @@ class Trainer:
 
     def prepare_turns(self) -> None:
         """Find out now what the first turns of changes to the splats would find out once."""
-        if self._prunes_outside:
-            self._outlines  # noqa: B018
-        if self._colors_unseen_sides:
-            self._sides  # noqa: B018
-
-    @property
-    def _prunes_outside(self) -> bool:
-        """Where alpha is learned from masks."""
-        return self.settings.random_background
-
-    @property
-    def _colors_unseen_sides(self) -> bool:
-        return self._has_one_camera and self.strategy.region is None
-
-    @cached_property
-    def _outlines(self) -> list[post_step.Outline]:
-        return post_step.read_outlines(self.capture, self.settings.seed)
-
-    @cached_property
-    def _sides(self) -> post_step.UnseenSides:
-        return post_step.unseen_sides(self.capture)
+        for change in self.changes.values():
+            change.prepare()
 
     def _post_step(self, progress: float) -> None:
         """Change the splats after an optimizer step, where it is the turn of one of the changes."""
-        settings = self.settings
-        region = self.strategy.region
-        count = self.iteration
-
-        def is_turn(interval: int) -> bool:
-            return interval > 0 and count % interval == 0
-
-        moves_strays = is_turn(settings.stray_reset_interval)
-        start, end = settings.density_span
-        splits = start <= progress < end and is_turn(settings.density_interval)
-        prunes = self._prunes_outside and is_turn(OUTLINE_INTERVAL)
-        colors = self._colors_unseen_sides and is_turn(SIDE_INTERVAL)
-        if not (moves_strays or splits or prunes or colors):
-            return
-        state = self.state
-        if moves_strays:
-            limit = settings.stray_limit * self.frames.units
-            if region is not None:
-                limit = np.where(region, limit, np.inf).astype(limit.dtype)
-            post_step.reset_strays(state, limit, settings.stray_reset_share)
-        if splits:
-            budget = round(self.initial_count * (1 + settings.growth)) - len(state)
-            share = settings.split_share if region is None else MAX_REGION_SPLIT_SHARE
-            rng = np.random.default_rng([settings.seed, count])
-            state = post_step.control_density(state, budget, rng, share, region)
-        if prunes:
-            coefficients = {name: offset.value for name, offset in state.driven_offsets.items()}
-            frames = partial(self.frames.moved, coefficients=coefficients)
-            state = post_step.prune_outside(state, frames, self._outlines, region)
-        if colors:
-            state = self._sides.restore(state)
-        self.state = state
+        turn = Turn(self.iteration, progress, self.initial_count, self.strategy.region)
+        for change in self.changes.values():
+            if is_turn_of(change, turn):
+                change.apply(self._backend, turn)
 
 
-def make_backend(
-    device: str, settings: TrainingSettings, frames: FrameStore, state: TrainState
-) -> "CpuBackend | GpuBackend":
-    """Of a device of `choose_device`. Raises StgaError if it does not support the settings."""
-    if device == "cpu":
-        return CpuBackend(settings, frames, state)
-    if settings.tracking:
-        text = f"FLAME parameters are refined on the CPU only, not on {device}"
-        raise StgaError(f"--effect tracking=on: {text}")
-    from ...raster.gpu.device import Device
-    from ...raster.gpu.frames import SIGNALS
-    from .gpu_backend import GpuBackend
+def density_control(settings: TrainingSettings) -> DensityControl:
+    return DensityControl(
+        settings.density_interval,
+        settings.density_span,
+        settings.split_share,
+        settings.growth,
+        settings.seed,
+    )
 
-    for name in state.driven_offsets:
-        if OFFSETS[name].signal not in SIGNALS:
-            raise StgaError(f"driven offset {name}: is trained on the CPU only, not on {device}")
-    return GpuBackend(Device(adapter_name(device)), settings, frames, state)
+
+def _placed_splats(capture: Capture, settings: TrainingSettings) -> TrainState:
+    """The splats that a training begins with."""
+    splats = initial_splats(capture, settings)
+    state = new_state(splats, unseen_share(capture, settings.convention, splats))
+    return with_offsets(state, settings.driven_offsets, len(capture.faces))
+
+
+def _whole_count(state: TrainState, settings: TrainingSettings, triangles: int) -> int:
+    """How many splats there would be, had the lattice begun with all of its points."""
+    orders = settings.lattice_order, settings.first_lattice_order
+    whole, first = (splats_per_triangle(order(triangles)) for order in orders)
+    bound = int((~state.unbound).sum())
+    return len(state) + bound * whole // first - bound

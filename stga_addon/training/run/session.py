@@ -41,7 +41,7 @@ from ..optimize.avatar_tracking import (
 from ..optimize.image_preparation import image_preparation
 from ..optimize.precompile import precompile_kernels
 from ..optimize.state import TrainState
-from ..optimize.trainer import Trainer
+from ..optimize.trainer import Start, Trainer
 from ..schedule import image_scales, view_order
 from . import checkpoint as checkpoints
 from . import folder as folders
@@ -634,7 +634,7 @@ def _session(
     if settings.follows_strain:
         report(Progress(stage="Measuring strain"))
     strain_range = checkpoints.strain_range_of(folder, capture, run)
-    trainer = Trainer(capture, settings, selection, state, run.device, strain_range)
+    trainer = Trainer(capture, settings, selection, Start(state, strain_range), run.device)
     if run.continuation is not None:
         views = continued_evaluation_views(run, capture, trainer.strategy.refined_region)
     else:

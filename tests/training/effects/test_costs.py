@@ -14,7 +14,8 @@ from stga_addon.capture.model import View
 from stga_addon.flame.teeth import TEETH_FACES, teeth_faces
 from stga_addon.raster.cpu.rasterize import Parameters
 from stga_addon.training.effects.plan import plan_effects
-from stga_addon.training.optimize import cpu_backend, frames, initial_splats, post_step, trainer
+from stga_addon.training.optimize import cpu_backend, frames, initial_splats, trainer
+from stga_addon.training.optimize.density import DensityControl
 from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint
@@ -27,7 +28,7 @@ from .scenes import unlike_cameras
 CALLS = {
     "background": (cpu_backend, "change_background"),
     "hull-points": (initial_splats, "hull_points"),
-    "density": (post_step, "control_density"),
+    "density": (DensityControl, "apply"),
     "selection": (session, "select_capture"),
     "strain-color": (frames, "strain_basis"),
 }

@@ -1,4 +1,4 @@
-"""Needles beside the outline, and colors of sides that no view shows."""
+"""Needles beside the outline."""
 
 from dataclasses import replace
 
@@ -12,18 +12,12 @@ from scipy.spatial.transform import Rotation
 from stga_addon.avatar.embedding import FaceFrames, face_frames, to_local
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
-from stga_addon.training.optimize.post_step import (
-    Outline,
-    prune_outside,
-    read_outlines,
-    unseen_sides,
-)
+from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.outlines import Outline, OutlinePruning, read_outlines
 from stga_addon.training.optimize.trainer import Trainer
 
-from .heads import PLACES, write_head
-from .toys import bits, quick_settings, random_state
+from .toys import Rows, bits, quick_settings, random_state
 
 UPRIGHT_NEEDLE_M = np.array([0.0005, 0.03, 0.0005])
 
@@ -156,97 +150,10 @@ def test_what_is_pruned(region):
     assert pruned[bald].sum() == len(bald) - 1
     assert 60 < pruned.sum() < 240
     before = bits(state)
-    after = bits(prune_outside(state, frames.__getitem__, outlines, region))
+    pruning = OutlinePruning(None, 0, lambda timestep, coefficients: frames[timestep])
+    pruning.outlines = outlines
+    rows = Rows(state)
+    pruning.apply(rows, Turn(0, 0.5, 300, region))
+    after = bits(rows.state)
     for name, old in before.items():
         np.testing.assert_array_equal(after[name], old[~pruned], err_msg=name)
-
-
-CAMERA = 3
-"""Sees the ball's +x side and front, from 40° beside the middle."""
-
-
-@pytest.fixture(scope="module")
-def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    capture, _ = write_head(tmp_path_factory.mktemp("side"), error=0.0)
-    own = [view for view in capture.views["train"] if view.camera_index == CAMERA]
-    views = [view for view in own if view.timestep == 0]
-    return replace(capture, views={"train": views})
-
-
-def test_what_is_hidden_and_what_it_looks_like(from_one_side):
-    """Catches another side, normal or mirror plane, and a far side that takes any color."""
-    capture = from_one_side
-    sides = unseen_sides(from_one_side)
-    neutral, posed = (
-        mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))
-    )
-    direction, turned = (
-        own / np.linalg.norm(own, axis=1, keepdims=True) for own in (neutral, posed)
-    )
-    cosine = turned @ factory.pose(PLACES[CAMERA])[:3, 2]
-    assert sides.triangles[cosine < -0.3].mean() > 0.95
-    assert sides.triangles[cosine > 0.1].mean() < 0.05  # the expression makes dents
-    mirrored = direction * [-1, 1, 1]
-    partner = (mirrored @ direction.T).argmax(1)
-    copied = sides.triangles & (cosine[partner] > 0.7)
-    assert copied.sum() > 20
-    np.testing.assert_array_equal(sides.color[copied], sides.color[partner[copied]])
-    trainer = Trainer(
-        capture, quick_settings("global", iterations=200, lattice=1, sh_degree=1, sh_steps=()), {}
-    )
-    view = capture.views["train"][0]
-    image = read_image(view)
-    for n in range(200):
-        trainer.step(view, image, n / 200)
-    sides = unseen_sides(capture)
-    splats = trainer.state.splats()
-    far = sides.triangles[splats.face]
-    expected = (sides.color[splats.face[far]] - 0.5) / 0.28209479177387814
-    np.testing.assert_allclose(splats.sh[far, 0], expected, atol=1e-6)
-    assert (splats.sh[far, 1:] == 0).all()
-    near = splats.sh[~far, 0] - (sides.color[splats.face[~far]] - 0.5) / 0.28209479177387814
-    assert np.abs(near).max() > 0.01
-
-
-def test_a_side_that_one_view_shows_is_not_unseen(from_one_side):
-    """Catches sides that are judged by one view, where another shows them."""
-    capture = from_one_side
-    (view, *_) = capture.views["train"]
-    away = np.diag([-1.0, 1.0, -1.0, 1.0])  # by half a turn around the head
-    center = np.eye(4)
-    center[:3, 3] = capture.mesh(view.timestep).mean(0)
-    moved = view.camera.world_to_camera @ center @ away @ np.linalg.inv(center)
-    turned = replace(view, camera=replace(view.camera, world_to_camera=moved))
-    alone, beside = (
-        unseen_sides(replace(capture, views={"train": views})).triangles
-        for views in ((view,), (turned,))
-    )
-    both = unseen_sides(replace(capture, views={"train": (view, turned)})).triangles
-    assert (alone & ~beside).sum() > 20
-    assert (beside & ~alone).sum() > 20
-    np.testing.assert_array_equal(both, alone & beside)
-
-
-def test_restored_colors_are_those_of_the_avatar(from_one_side):
-    """Catches a side whose color is given to the splats that train, but not to their moving
-    average, which the avatar is made of, or that the optimizer's moments take away again."""
-    capture = from_one_side
-    trainer = Trainer(capture, quick_settings("global", lattice=1, sh_degree=1, sh_steps=()), {})
-    state = trainer.state
-    sides = unseen_sides(capture)
-    rng = np.random.default_rng(0)
-    for part in (state.parameters, state.average, state.first, state.second):
-        part.sh[:] = rng.random(part.sh.shape)
-    state.unbound[::7] = True
-    before = {name: getattr(state, name).sh.copy() for name in ("average", "first", "second")}
-    sides.restore(state)
-    far = sides.triangles[state.face] & ~state.unbound
-    assert 0 < far.sum() < len(far)
-    expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
-    for part in (state.parameters, state.average):
-        np.testing.assert_allclose(part.sh[far, 0], expected, atol=1e-6)
-        assert (part.sh[far, 1:] == 0).all()
-    for name, old in before.items():
-        np.testing.assert_array_equal(getattr(state, name).sh[~far], old[~far])
-    assert (state.first.sh[far] == 0).all()
-    assert (state.second.sh[far] == 0).all()

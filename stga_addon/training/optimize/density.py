@@ -1,0 +1,79 @@
+"""Density control: splats are added where images call for detail, and faint ones pruned."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .backend import Backend
+from .change import Turn
+from .state import PRUNED_BY, Halving, opacity_of, prunable
+
+
+@dataclass(frozen=True)
+class DensityControl:
+    """Splits the splats with the largest mean screen gradient and prunes those of low opacity.
+
+    The first five are those of `TrainingSettings`, whose defaults measured best at equal time
+    (docs/method.md). A triangle with bound splats keeps one.
+
+    interval       iterations between turns, 0: never; default 100, as in 3D Gaussian Splatting
+                   (Kerbl et al. 2023), 200 with the paper's settings
+    span           shares of the budget from and before which it works; default (0.1, 0.6)
+    split_share    largest share of the splats that is split at a turn; default 0.2, ours
+    growth         most splats that are added, as a share of the whole lattice and the hull points;
+                   default 0.25, ours
+    seed           of the halves' distances
+    region_share   `split_share` where a region is trained, as in a refinement, which has few turns
+    min_opacity    0…1, below which splats are pruned; ours, by docs/experiments.md, 0.005 in 3D
+                   Gaussian Splatting. A half has twice as much at least
+    narrowing      by which halves are narrower than their parent along its longest axis; 1.6 in 3D
+                   Gaussian Splatting, along all
+    distance       of a half's center from its parent's, in the parent's standard deviation along
+                   that axis; ours
+    jitter         standard deviation of that distance, as a share of it; ours
+    """
+
+    interval: int
+    span: tuple[float, float]
+    split_share: float
+    growth: float
+    seed: int
+    region_share: float = 0.1
+    min_opacity: float = 0.02
+    narrowing: float = 1.6
+    distance: float = 0.5
+    jitter: float = 0.1
+
+    def prepare(self) -> None:
+        """Nothing is found out once."""
+
+    def apply(self, backend: Backend, turn: Turn) -> None:
+        start, end = self.span
+        if not start <= turn.progress < end:
+            return
+        columns = backend.columns(("screen_gradient", "gradient_count", *PRUNED_BY))
+        face = columns["face"]
+        within = np.ones(len(face), bool) if turn.region is None else turn.region[face]
+        split = self._split(columns, within, turn)
+        faint = opacity_of(columns["parameters/opacity"]) < self.min_opacity
+        keep = ~prunable(columns, faint & within)
+        keep[split] = False
+        rng = np.random.default_rng([self.seed, turn.iteration])
+        distance = self.distance * (1 + self.jitter * rng.standard_normal((len(split), 1)))
+        backend.append_halves(Halving(split, distance, self.narrowing, 2 * self.min_opacity))
+        backend.keep(np.concatenate([keep, np.ones(2 * len(split), bool)]))
+        every = np.ones(len(backend), bool)
+        backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
+
+    def _split(
+        self, columns: Mapping[str, np.ndarray], within: np.ndarray, turn: Turn
+    ) -> np.ndarray:
+        """Rows of the largest mean gradients among those within (N,) bool, the largest first."""
+        mean = columns["screen_gradient"] / np.maximum(columns["gradient_count"], 1)
+        mean[~within] = 0.0
+        share = self.split_share if turn.region is None else self.region_share
+        room = round(turn.initial_count * (1 + self.growth)) - len(mean)
+        count = max(0, min(room, int(share * within.sum())))
+        rows = np.argsort(-mean, kind="stable")[:count]
+        return np.asarray(rows[mean[rows] > 0])

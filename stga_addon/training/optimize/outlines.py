@@ -1,0 +1,115 @@
+"""Pruning of splats outside of the masks: a needle beside the hair, which a few images call for and
+many others push back, would survive the training."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from ...avatar.embedding import FaceFrames, points_to_world
+from ...capture.camera import Camera
+from ...capture.images import area_mean, read_mask
+from ...capture.model import Capture
+from .backend import Backend
+from .change import Turn
+from .initial_splats import pixels_of
+from .state import PRUNED_BY, prunable
+
+MAX_OUTLINES = 16
+MAX_OUTLINE_HEIGHT_PX = 400
+"""Views whose masks are read; higher masks are shrunk to this."""
+TOLERANCE_SHARE = 0.01
+"""Error of masks and tracking, as a share of the image height."""
+MAX_OUTSIDE_SHARE = 0.5
+"""Share of the outlines in whose image a point lies, that it may lie outside of."""
+Coefficients = dict[str, np.ndarray]
+"""Driven offset -> (F, 3, 3) float32."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What a mask leaves clear, with a margin, (H, W) bool; camera: of that size."""
+
+    timestep: int
+    camera: Camera
+    clear: np.ndarray
+
+
+def read_outlines(capture: Capture, seed: int) -> list[Outline]:
+    """Of MAX_OUTLINES training views drawn by `seed`, those with a mask. Raises StgaError."""
+    views = capture.views["train"]
+    outlines = []
+    for n in np.random.default_rng(seed).permutation(len(views))[:MAX_OUTLINES]:
+        view = views[n]
+        mask = read_mask(views[n])
+        if mask is None:
+            continue
+        camera = view.camera.scaled(min(1.0, MAX_OUTLINE_HEIGHT_PX / view.camera.height))
+        margin = max(1, round(TOLERANCE_SHARE * camera.height))
+        covered = area_mean(mask, camera.height, camera.width) > 127
+        outlines.append(
+            Outline(view.timestep, camera, ~binary_dilation(covered, iterations=margin))
+        )
+    return outlines
+
+
+class OutlinePruning:
+    """Prunes splats whose center lies outside of most of the outlines in whose image it lies. Every
+    triangle with bound splats keeps one.
+
+    frames  timestep, coefficients of driven offsets -> the frames of the triangles
+    """
+
+    interval = 200
+
+    def __init__(
+        self, capture: Capture, seed: int, frames: Callable[[int, Coefficients], FaceFrames]
+    ) -> None:
+        self._capture = capture
+        self._seed = seed
+        self._frames = frames
+
+    @cached_property
+    def outlines(self) -> list[Outline]:
+        return read_outlines(self._capture, self._seed)
+
+    def prepare(self) -> None:
+        self.outlines  # noqa: B018
+
+    def apply(self, backend: Backend, turn: Turn) -> None:
+        coefficients = backend.coefficients()
+        columns = backend.columns(("parameters/xyz", *PRUNED_BY))
+        face = columns["face"]
+        stray = is_outside(
+            columns["parameters/xyz"],
+            face,
+            lambda timestep: self._frames(timestep, coefficients),
+            self.outlines,
+        )
+        if turn.region is not None:
+            stray &= turn.region[face]
+        unwanted = prunable(columns, stray)
+        if unwanted.any():
+            backend.keep(~unwanted)
+
+
+def is_outside(
+    xyz: np.ndarray,
+    face: np.ndarray,
+    frames: Callable[[int], FaceFrames],
+    outlines: Sequence[Outline],
+) -> np.ndarray:
+    """(N,) bool: whether points (N, 3), local to triangles (N,), lie outside of most of the
+    outlines in whose image they lie; frames: of a timestep's triangles."""
+    seen, outside = np.zeros((2, len(face)), np.int32)
+    rows = np.arange(len(face))
+    for n, outline in enumerate(outlines):
+        left = len(outlines) - n  # without those that all of these could not make a stray
+        rows = rows[outside[rows] + left > MAX_OUTSIDE_SHARE * (seen[rows] + left)]
+        points = points_to_world(xyz[rows], frames(outline.timestep), face[rows])
+        x, y, shown = pixels_of(points, outline.camera)
+        seen[rows] += shown
+        outside[rows] += shown & outline.clear[y, x]
+    return np.asarray(outside > MAX_OUTSIDE_SHARE * seen)

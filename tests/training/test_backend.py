@@ -1,0 +1,73 @@
+"""The seam between the trainer and what holds the splats."""
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stga_addon.capture.images import read_image, read_mask
+from stga_addon.capture.model import Capture
+from stga_addon.training.optimize import make_backend, trainer
+from stga_addon.training.optimize.backend import Backend
+from stga_addon.training.optimize.trainer import Trainer
+
+from .toys import bits, quick_settings
+
+METHODS = {name for name in vars(Backend) if name == "__len__" or not name.startswith("_")}
+
+
+class Far:
+    """A backend whose splats are elsewhere: what the seam has no method for is not there, columns
+    are copies, and reading everything is forbidden."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in METHODS - {"state"}:
+            raise AssertionError(f"{name} is asked for")
+        return getattr(self.real, name)
+
+    def __len__(self) -> int:
+        return len(self.real)
+
+    def columns(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        found = {name: array.copy() for name, array in self.real.columns(names).items()}
+        for array in found.values():
+            array.setflags(write=False)
+        return found
+
+
+def trained(capture: Capture) -> Trainer:
+    """Trained until every change of the splats had its turn."""
+    changes = {"density_interval": 3, "density_span": (0.0, 1.0), "stray_reset_interval": 2}
+    settings = quick_settings("global", lattice=1, stray_limit=0.05, growth=0.6, **changes)
+    made = Trainer(capture, settings, {})
+    assert set(made.changes) == {"strays", "density", "outlines", "unseen sides"}
+    made.iteration = 194
+    for view in capture.views["train"] * 2:
+        made.step(view, read_image(view), 0.5, read_mask(view))
+    assert made.iteration >= 200
+    return made
+
+
+def test_a_training_needs_no_more_than_the_seam(toy, monkeypatch):
+    """Catches a change of the splats that copies all of them to the host, writes to a column in
+    place, or reaches past the seam, and so does nothing where splats are on a device."""
+    first = toy.views["train"][0].camera_index
+    views = tuple(view for view in toy.views["train"] if view.camera_index == first)
+    capture = replace(toy, views={"train": views})
+    near = trained(capture)
+
+    def far(*given: Any) -> Far:
+        return Far(make_backend.make_backend(*given))
+
+    monkeypatch.setattr(trainer, "make_backend", far)
+    other = trained(capture)
+    assert len(other) > 320
+    for name, array in bits(other._backend.real.state).items():
+        np.testing.assert_array_equal(array, bits(near.state)[name], err_msg=name)
+    with pytest.raises(AssertionError, match="state is asked for"):
+        _ = other.state
