@@ -66,14 +66,18 @@ class DensityControl:
         every = np.ones(len(backend), bool)
         backend.assign(every, {"screen_gradient": 0.0, "gradient_count": 0.0})
 
+    def score(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(N,) how much detail is missing at each splat: its mean screen gradient."""
+        gradient = columns["screen_gradient"] / np.maximum(columns["gradient_count"], 1)
+        return np.asarray(gradient)
+
     def _split(
         self, columns: Mapping[str, np.ndarray], within: np.ndarray, turn: Turn
     ) -> np.ndarray:
-        """Rows of the largest mean gradients among those within (N,) bool, the largest first."""
-        mean = columns["screen_gradient"] / np.maximum(columns["gradient_count"], 1)
-        mean[~within] = 0.0
+        """Rows of the highest scores among those within (N,) bool, the highest first."""
+        score = np.where(within, self.score(columns), 0)
         share = self.split_share if turn.region is None else self.region_share
-        room = round(turn.initial_count * (1 + self.growth)) - len(mean)
+        room = round(turn.initial_count * (1 + self.growth)) - len(score)
         count = max(0, min(room, int(share * within.sum())))
-        rows = np.argsort(-mean, kind="stable")[:count]
-        return np.asarray(rows[mean[rows] > 0])
+        rows = np.argsort(-score, kind="stable")[:count]
+        return np.asarray(rows[score[rows] > 0])
