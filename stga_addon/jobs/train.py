@@ -188,15 +188,14 @@ class Prepared:
     capture: Capture
     selection: Selection | None = None
 
-    def run_session(self, report: Report) -> Path:
-        """Begin or resume the run in its folder; the path of the avatar. Raises as
-        `training.run.session.train`."""
-        from ..training.run.session import train
+    def train_as_asked(self, report: Report) -> Path:
+        """Train on the device of the request, or the one chosen for it; the path of the avatar.
+        Raises as `training.run.session.train_run`."""
+        from ..training.run.session import train_run, train_run_or_fall_back
 
-        folder = self.request.run
+        train = train_run_or_fall_back if self.request.device == "auto" else train_run
         resumes = isinstance(self.request, Resume)
-        falls_back = self.request.device == "auto"
-        return train(self.capture, folder, self.run, self.selection, resumes, report, falls_back)
+        return train(self.capture, self.request.run, self.run, self.selection, resumes, report)
 
 
 def train_and_finish(request: Training, report: Report, say: Say) -> Written:
@@ -226,7 +225,7 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
         # with the figures of the training
         return report(replace(latest, stage=progress.stage, preview=None))
 
-    avatar = prepared.run_session(report_training)
+    avatar = prepared.train_as_asked(report_training)
     lines = report_run(folder)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:

@@ -13,7 +13,7 @@ from ..capture.model import Capture, evenly_spread
 from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
-from .optimize.avatar_tracking import track_by_avatar, tracked_timesteps
+from .optimize.avatar_tracking import TrainedAvatar, track_by_avatar, tracked_timesteps
 from .optimize.image_preparation import image_preparation
 from .optimize.precompile import precompile_kernels
 from .optimize.trainer import Trainer, density_control
@@ -156,6 +156,7 @@ def _tracking_seconds(trainer: Trainer, settings: TrainingSettings) -> float:
         return False
 
     some = evenly_spread(sorted(trained), TRACKED_TIMESTEPS)
-    track_by_avatar(trainer.avatar("", None), settings, alone, some, None, note)
+    by = TrainedAvatar(trainer.avatar("", None), settings)
+    track_by_avatar(by, alone, some, None, note)
     laps.append(perf_counter())
     return sum(counts) * float(np.mean(np.diff(laps)[min(1, len(some) - 1) :]))

@@ -18,7 +18,7 @@ from stga_addon.report import CURVE, report_run, run_chart, summarize_run
 from stga_addon.training import preset_timing
 from stga_addon.training.evaluate.forecast import describe_forecast
 from stga_addon.training.run.folder import Run, read_run
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import TrainingSettings, make_settings
 
 
@@ -117,10 +117,10 @@ def test_report_of_a_finished_run(toy, tmp_path, monkeypatch):
     settings = make_settings(iterations=12, hull_points=False, lattice=0)
     run = Run(toy.root, None, "vhap", settings)
     why = f"{CURVE} was not drawn: "
-    train(toy, tmp_path / "run", run)
+    train_run(toy, tmp_path / "run", run)
     assert report_run(tmp_path / "run")[0].startswith("held-out views: ")
     assert (tmp_path / "run" / CURVE).stat().st_size > 1000
-    train(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
+    train_run(replace(toy, views={"train": toy.views["train"]}), tmp_path / "bare", run)
     nothing = "no held-out views (split 'val') were evaluated"
     assert report_run(tmp_path / "bare")[-1] == f"{why}{nothing}"
     (tmp_path / "run" / CURVE).unlink()

@@ -48,7 +48,7 @@ def train(run: Run, out: Path) -> None:
         return False
 
     resume = (out / "run.json").exists()
-    run_module.train(open_capture(run.capture), out, run, resume=resume, report=report)
+    run_module.train_run(open_capture(run.capture), out, run, resume=resume, report=report)
 
 
 def spawn(run: Run, out: Path) -> int:

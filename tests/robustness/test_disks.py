@@ -18,7 +18,7 @@ from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, locked
 from stga_addon.training.run.metrics_log import append_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 ITERATIONS = 24
 FULL_AT = 8  # the next step writes a checkpoint and no avatar
@@ -48,14 +48,14 @@ def test_no_room_for_a_checkpoint(root, tmp_path, monkeypatch):
         with pytest.raises(
             StgaError, match=r"checkpoint\.npz: cannot be written \(File too large\)"
         ):
-            train(capture, tmp_path, run, report=no_more)
+            train_run(capture, tmp_path, run, report=no_more)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert read_checkpoint(tmp_path).iteration == FULL_AT
     assert len(read_avatar(tmp_path / "avatar.npz").splats)
     assert not list(tmp_path.glob(".*"))
     assert not (tmp_path / "run.lock").exists()
-    train(capture, tmp_path, run, resume=True)
+    train_run(capture, tmp_path, run, resume=True)
     assert read_checkpoint(tmp_path).iteration == ITERATIONS
 
 

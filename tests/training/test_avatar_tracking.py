@@ -36,6 +36,7 @@ from stga_addon.training.optimize.avatar_tracking import (
     AvatarTracking,
     OtherRecording,
     RefinedTracking,
+    TrainedAvatar,
     track_by_avatar,
     tracked_timesteps,
 )
@@ -45,9 +46,8 @@ from stga_addon.training.run import session
 from stga_addon.training.run.checkpoint import read_checkpoint, write_checkpoint
 from stga_addon.training.run.folder import Run, read_run, with_refined_tracking
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import view_order
-from stga_addon.training.settings import TrainingSettings
 
 from .heads import TIMESTEPS, write_head
 from .test_run import without_times
@@ -70,7 +70,7 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture(scope="module")
-def person(right: Made) -> tuple[Avatar, TrainingSettings]:
+def person(right: Made) -> TrainedAvatar:
     """An avatar whose training saw the right meshes."""
     capture = right[0]
     settings = quick_settings("global", iterations=300, lattice=1, sh_degree=0, sh_steps=())
@@ -82,7 +82,8 @@ def person(right: Made) -> tuple[Avatar, TrainingSettings]:
         trainer.step(small, image, n / 300, mask)
     neutral = capture.neutral.astype(np.float32)
     splats = trainer.state.splats(averaged=True)
-    return Avatar(splats, settings.convention, neutral, capture.faces), settings
+    avatar = Avatar(splats, settings.convention, neutral, capture.faces)
+    return TrainedAvatar(avatar, settings)
 
 
 def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:
@@ -91,9 +92,7 @@ def millimeters(capture: Capture, true: dict[int, np.ndarray]) -> np.ndarray:
     return 1000 * np.linalg.norm(away, axis=-1).mean(1)
 
 
-def test_a_finished_avatar_finds_the_head(
-    person: tuple[Avatar, TrainingSettings], lost: Made
-) -> None:
+def test_a_finished_avatar_finds_the_head(person: TrainedAvatar, lost: Made) -> None:
     """Catches a gradient or a preconditioner with a wrong sign, axis or joint, steps that stop too
     early, and a drift of the last timestep, which is tracked right already."""
     capture, true = lost
@@ -104,7 +103,7 @@ def test_a_finished_avatar_finds_the_head(
         stages.append((done, total))
         return False
 
-    found = track_by_avatar(*person, capture, report=report)
+    found = track_by_avatar(person, capture, report=report)
     tracking.take(found, TIMESTEPS)
     before = millimeters(capture, true)
     after = millimeters(tracking.refined(capture), true)
@@ -113,13 +112,13 @@ def test_a_finished_avatar_finds_the_head(
     assert after[-1] < 0.8  # a third of a pixel
     assert stages == [(done, len(TIMESTEPS)) for done in range(len(TIMESTEPS))]
     with pytest.raises(Cancelled):
-        track_by_avatar(*person, capture, report=lambda done, total: done == 2)
+        track_by_avatar(person, capture, report=lambda done, total: done == 2)
     with pytest.raises(StgaError, match="another head"):
-        track_by_avatar(*person, replace(capture, faces=capture.faces[:-1]))
+        track_by_avatar(person, replace(capture, faces=capture.faces[:-1]))
 
 
 def test_a_timestep_begins_where_the_one_before_led(
-    person: tuple[Avatar, TrainingSettings], lost: Made, monkeypatch: pytest.MonkeyPatch
+    person: TrainedAvatar, lost: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Catches tracking that begins anew at each timestep, and so never arrives where all of a take
     is off alike; and a start that is worse than as tracked."""
@@ -127,11 +126,11 @@ def test_a_timestep_begins_where_the_one_before_led(
     starts = {}
     led = np.zeros(0)
 
-    def minimize(self, timestep, shots, tracked, start, *_):
-        starts[timestep] = start - tracked
+    def minimize(self, shots, tracked, start, *_):
+        starts[shots[0][0].timestep] = start - tracked
         return start + led, np.eye(len(start))
 
-    def loss(self, values, timestep, shots):
+    def loss(self, values, shots):
         return float(np.abs(values[-1] - wanted)), np.zeros(len(values))
 
     monkeypatch.setattr(avatar_tracking._Tracker, "_minimize", minimize)
@@ -141,13 +140,13 @@ def test_a_timestep_begins_where_the_one_before_led(
     led[-1] = 0.004
     for better in (True, False):
         wanted = tracked[1][-1] + (0.004 if better else 0.0)
-        track_by_avatar(*person, capture, TIMESTEPS[:2])
+        track_by_avatar(person, capture, TIMESTEPS[:2])
         assert not starts[TIMESTEPS[0]].any()
         np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
 
 
 def test_without_masks_the_mesh_that_is_tried_cuts(
-    person: tuple[Avatar, TrainingSettings], lost: Made, tmp_path: Path
+    person: TrainedAvatar, lost: Made, tmp_path: Path
 ) -> None:
     """Catches images cut by the very mesh whose place is sought, which say that it is right."""
     capture, true = lost
@@ -160,8 +159,8 @@ def test_without_masks_the_mesh_that_is_tried_cuts(
         views.append(replace(view, mask=None, image=path))
     bare = replace(capture, views={"train": tuple(views)})
     tracking = RefinedTracking(capture, "stga")
-    settings = replace(person[1], backdrop="mesh")
-    tracking.take(track_by_avatar(person[0], settings, bare, TIMESTEPS[:-1]), TIMESTEPS[:-1])
+    trained = person._replace(settings=replace(person.settings, backdrop="mesh"))
+    tracking.take(track_by_avatar(trained, bare, TIMESTEPS[:-1]), TIMESTEPS[:-1])
     before = millimeters(capture, true)
     after = millimeters(tracking.refined(capture), true)
     assert np.median(after[:-1] / before[:-1]) < 0.6
@@ -172,7 +171,7 @@ def test_time_is_kept_to(
     allowed_s: float,
     most: int,
     right: Made,
-    person: tuple[Avatar, TrainingSettings],
+    person: TrainedAvatar,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Catches a time that is judged by the first timestep, which costs a fifth of the others, and
@@ -192,13 +191,13 @@ def test_time_is_kept_to(
 
     monkeypatch.setattr(avatar_tracking, "_Tracker", Slow)
     monkeypatch.setattr(avatar_tracking, "perf_counter", lambda: clock[0])
-    found = track_by_avatar(*person, right[0], range(30), allowed_s)
+    found = track_by_avatar(person, right[0], range(30), allowed_s)
     assert found.timesteps[0] == 0
     assert 1 < len(found.timesteps) <= most + 1
     assert len(found.timesteps) >= min(most, 5)
     assert clock[0] <= allowed_s + 6.0
     assert found.information.size == 0
-    other = track_by_avatar(*person, right[0], range(30), recording=OtherRecording())
+    other = track_by_avatar(person, right[0], range(30), recording=OtherRecording())
     assert other.information.shape == (30, 23, 23)
 
 
@@ -352,7 +351,7 @@ def test_the_gradient_from_splats_to_parameters(lost: Made) -> None:
 def run_folder(lost: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An unbroken run."""
     out = tmp_path_factory.mktemp("tracked") / "run"
-    train(lost[0], out, make_run(lost[0]))
+    train_run(lost[0], out, make_run(lost[0]))
     return out
 
 
@@ -369,7 +368,7 @@ def test_what_it_brings(lost: Made, tmp_path: Path) -> None:
     capture, true = lost
     quality = {}
     for on in (True, False):
-        train(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
+        train_run(capture, tmp_path / str(on), make_run(capture, tracking=on, iterations=300))
         quality[on] = read_metrics(tmp_path / str(on))[-1]["psnr"]
     refined = with_refined_tracking(capture, tmp_path / "True")
     before = millimeters(capture, true)
@@ -392,7 +391,7 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
         monkeypatch.setattr(session, "LEFT_OUT_INTERVAL", 2)
 
     def astray(
-        avatar: Avatar, settings: TrainingSettings, shown: Capture, timesteps: list[int], *_: Any
+        trained: TrainedAvatar, shown: Capture, timesteps: list[int], *_: Any
     ) -> AvatarTracking:
         assert shown.flame is not None
         seen = (view for views in shown.views.values() for view in views)
@@ -403,7 +402,7 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
         return AvatarTracking(tuple(timesteps), values, none[:, 0], none, none[:, 0], np.eye(1))
 
     monkeypatch.setattr(session, "track_by_avatar", astray)
-    train(capture, tmp_path, make_run(capture))
+    train_run(capture, tmp_path, make_run(capture))
     tracked = TIMESTEPS[:-1] if held_out == "camera" else (0, 3)
     assert given == [(tracked, {0, 1, 2, 3})]  # and no timesteps of other splits afterwards
     checkpoint = read_checkpoint(tmp_path)
@@ -416,7 +415,9 @@ def test_tracking_is_undone_where_what_is_left_out_loses(
     (tmp_path / "tracking.json").write_text('{"in_order": false}')
     assert is_in_order(tmp_path) is False
     monkeypatch.setattr(session, "is_in_order", lambda root: False)
-    train(replace(capture, views={**capture.views, "val": ()}), tmp_path / "b", make_run(capture))
+    train_run(
+        replace(capture, views={**capture.views, "val": ()}), tmp_path / "b", make_run(capture)
+    )
     assert given[1][0] == TIMESTEPS[:-1]
     assert read_checkpoint(tmp_path / "b").rounds == 2
 
@@ -447,10 +448,10 @@ def test_stopped_and_resumed_is_the_unbroken_run(
     step on old meshes before they are tracked, unseen timesteps that stay untracked for ever, and
     evaluations or avatars that an unbroken run would not have."""
     capture, _ = lost
-    train(capture, tmp_path, make_run(capture), report=stops)
+    train_run(capture, tmp_path, make_run(capture), report=stops)
     assert read_checkpoint(tmp_path).rounds < 2
     assert not (tmp_path / "residuals.npz").exists()
-    train(capture, tmp_path, make_run(capture), resume=True)
+    train_run(capture, tmp_path, make_run(capture), resume=True)
     ours, theirs = (read_checkpoint(folder) for folder in (tmp_path, run_folder))
     assert ours.rounds == theirs.rounds == 2
     np.testing.assert_array_equal(ours.tracking, theirs.tracking)
@@ -483,7 +484,7 @@ def test_quality_is_measured_with_and_without_fitted_heads(
     for number in (10, 9):
         out = tmp_path / str(number)
         monkeypatch.setattr(evaluator, "kept_line", lambda lines, _, n=number: lines[:n][-1])
-        train(capture, out, make_run(capture, iterations=20, driven_offsets=()))
+        train_run(capture, out, make_run(capture, iterations=20, driven_offsets=()))
         *_, before, last = read_metrics(out)
         assert "psnr_fitted_heads" not in before
         assert {"ssim_fitted_heads", "detail_difference_fitted_heads"} <= last.keys()
@@ -509,7 +510,7 @@ def test_a_short_take_is_checked_or_called_unchecked(
     views = right[0].views["train"]
     shown = tuple(view for view in views if view.timestep in timesteps)
     capture = replace(right[0], views={"train": shown})
-    train(capture, tmp_path, make_run(capture, iterations=4, driven_offsets=()))
+    train_run(capture, tmp_path, make_run(capture, iterations=4, driven_offsets=()))
     (gain,) = [
         line["tracking_gain_db"] for line in read_metrics(tmp_path) if "tracking_gain_db" in line
     ]
@@ -521,12 +522,12 @@ def test_a_run_and_its_checkpoint_must_agree(lost: Made, run_folder: Path, tmp_p
     """Catches a run that goes on with tracked meshes after it was trained on refined ones."""
     run = shutil.copytree(run_folder, tmp_path / "run")
     with pytest.raises(StgaError, match="was begun with other settings"):
-        train(lost[0], run, make_run(lost[0], tracking=False), resume=True)
+        train_run(lost[0], run, make_run(lost[0], tracking=False), resume=True)
     checkpoint = read_checkpoint(run)
     checkpoint.tracking = None
     write_checkpoint(run, checkpoint)
     with pytest.raises(StgaError, match="its checkpoint's refined tracking does not fit"):
-        train(lost[0], run, make_run(lost[0]), resume=True)
+        train_run(lost[0], run, make_run(lost[0]), resume=True)
 
 
 @pytest.mark.parametrize(
@@ -648,7 +649,7 @@ def test_a_run_that_refines_nothing_leaves_nothing(
 ) -> None:
     """Catches a file of the run before, which the new avatar would be shown with."""
     shutil.copy(run_folder / "tracking.npz", tmp_path)
-    train(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
+    train_run(lost[0], tmp_path, make_run(lost[0], tracking=False, iterations=3))
     assert not (tmp_path / "tracking.npz").exists()
 
 

@@ -26,7 +26,7 @@ from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import START_SHARE
 from stga_addon.training.run.folder import Run, open_run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
@@ -58,7 +58,7 @@ def parent(takes: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     settings = quick_settings(
         "global", iterations=60, lattice=1, driven_offsets=("strain_color",), density_interval=0
     )
-    train(capture, out, Run(capture.root, None, "vhap", settings))
+    train_run(capture, out, Run(capture.root, None, "vhap", settings))
     return out
 
 
@@ -72,7 +72,7 @@ def prepare_extension(parent, takes, growth=0.0, iterations=1):
 def extend(parent, take, out, stop=None, growth=0.0):
     prepared = prepare_extension(parent, (take,), growth, iterations=ITERATIONS)
 
-    train(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
+    train_run(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 
@@ -143,7 +143,7 @@ def test_a_stopped_extension_is_continued_to_the_same_bits(
     before, after = (len(read_avatar(run / "avatar.npz").splats) for run in (parent, whole))
     assert (after > before) == bool(growth)
     opened = open_run(stopped)
-    train(opened.capture, stopped, opened.run, resume=True)
+    train_run(opened.capture, stopped, opened.run, resume=True)
     assert_same_state(stopped, whole)
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
@@ -152,11 +152,11 @@ def test_what_follows_strain_can_begin_with_a_further_take(takes, tmp_path):
     """Catches splats that cannot gain coefficients or train them, and an avatar that jumps."""
     capture = open_capture(takes[0])
     settings = quick_settings("global", iterations=20, lattice=1, density_interval=0)
-    train(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
+    train_run(capture, tmp_path / "run", Run(capture.root, None, "vhap", settings))
     prepared = prepare_extension(tmp_path / "run", (takes[1],), iterations=6)
     follows = {"driven_offsets": ("strain_position", "strain_color")}
     run = replace(prepared.run, settings=replace(prepared.run.settings, **follows))
-    train(prepared.capture, tmp_path / "new", run, prepared.selection)
+    train_run(prepared.capture, tmp_path / "new", run, prepared.selection)
     before, first = (read_metrics(tmp_path / name)[at] for name, at in (("run", -1), ("new", 0)))
     assert first["psnr_take_1"] == pytest.approx(before["psnr"], abs=0.01)
     avatar = read_avatar(tmp_path / "new" / "avatar.npz")

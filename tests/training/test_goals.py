@@ -20,7 +20,7 @@ from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 from .toys import quick_settings
 
@@ -67,7 +67,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 def test_evaluation_keeps_to_its_share_of_the_time(toy, tmp_path, clock):
     """Catches evaluations that eat the budget, are counted as training, or hardly ever come."""
-    train(toy, tmp_path, run_of(toy, iterations=None, seconds=400.0))
+    train_run(toy, tmp_path, run_of(toy, iterations=None, seconds=400.0))
     lines = read_metrics(tmp_path)
     assert read_checkpoint(tmp_path).elapsed_s == 400 == read_checkpoint(tmp_path).iteration
     assert [line["evaluation_s"] for line in lines] == [3.0] * len(lines)
@@ -80,7 +80,7 @@ def test_forecasts_are_noted_and_told(toy, tmp_path, clock):
     """Catches forecasts that cannot be checked afterwards, or that nobody sees."""
     told = []
     run = run_of(toy, iterations=200)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress)))
+    train_run(toy, tmp_path, run, report=lambda progress: bool(told.append(progress)))
     lines = read_metrics(tmp_path)
     foretold = [line["iteration"] for line in lines if "forecast" in line]
     assert foretold == [80, 100, 120, 140, 160, 180]
@@ -94,15 +94,15 @@ def test_a_reached_target_ends_the_run(toy, tmp_path, monkeypatch):
     values = iter([25.0, 29.0, 30.5, 30.5])
     monkeypatch.setattr(evaluator, "evaluate", scores(values))
     run = run_of(toy, target_psnr=30.0)
-    train(toy, tmp_path, run)
+    train_run(toy, tmp_path, run)
     assert read_checkpoint(tmp_path).iteration == 30
-    train(toy, tmp_path, run, resume=True)
+    train_run(toy, tmp_path, run, resume=True)
     assert read_checkpoint(tmp_path).iteration == 30
     assert next(values, None) is None
     blurred = Quality(30.5, 0.5, detail_difference=0.2)
     found = iter([Quality(25.0, 0.5, detail_difference=0.1), blurred, blurred])
     monkeypatch.setattr(evaluator, "evaluate", lambda *arguments, **named: next(found))
-    path = train(toy, tmp_path / "sharper", run)
+    path = train_run(toy, tmp_path / "sharper", run)
     end = read_checkpoint(tmp_path / "sharper")
     assert end.iteration == 20
     np.testing.assert_array_equal(read_avatar(path).splats.xyz, end.state.average.xyz)
@@ -115,7 +115,7 @@ def test_a_run_that_no_longer_improves(toy, tmp_path, monkeypatch, clock, stop):
     monkeypatch.setattr(evaluator, "evaluate", scores(falling))
     told = []
     run = run_of(toy, iterations=None, seconds=200.0, stop_when_flat=stop)
-    train(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
+    train_run(toy, tmp_path, run, report=lambda progress: bool(told.append(progress.detail)))
     assert (read_checkpoint(tmp_path).iteration < 200) == stop
     if not stop:
         assert any(
@@ -136,9 +136,9 @@ def test_images_grow_where_settings_say_so(toy, tmp_path, monkeypatch):
 
     monkeypatch.setattr(session.Trainer, "step", note)
     settings = {"iterations": 20, "scale": 0.5, "coarse_share": 0.25}
-    train(toy, tmp_path / "small", run_of(toy, **settings))
+    train_run(toy, tmp_path / "small", run_of(toy, **settings))
     assert seen == [(30, 20)] * 20  # half of so few pixels shows too little
     seen.clear()
     monkeypatch.setattr(schedule, "MIN_COARSE_SIDE_PX", 10)
-    train(toy, tmp_path / "large", run_of(toy, **settings))
+    train_run(toy, tmp_path / "large", run_of(toy, **settings))
     assert seen == [(15, 10)] * 5 + [(30, 20)] * 15

@@ -29,7 +29,7 @@ from stga_addon.training.optimize.state import (
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run, train_run_or_fall_back
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import TrainingSettings
 
@@ -226,7 +226,7 @@ def test_a_lost_gpu_is_followed_by_the_cpu(toy, tmp_path, monkeypatch, caplog):
     CPU unasked."""
     device = f"gpu:{gpu_device.device().name}"
     run = replace(make_run(toy, "selective", iterations=12), device=device)
-    train(toy, tmp_path, run, report=stop_at(5))
+    train_run(toy, tmp_path, run, report=stop_at(5))
     step = GpuBackend.step
     done = []
 
@@ -240,7 +240,7 @@ def test_a_lost_gpu_is_followed_by_the_cpu(toy, tmp_path, monkeypatch, caplog):
 
     monkeypatch.setattr(GpuBackend, "step", breaks)
     with pytest.raises(StgaError, match="Card 9000 was lost; try again, with --device cpu"):
-        train(toy, tmp_path, run, resume=True)
+        train_run(toy, tmp_path, run, resume=True)
     assert read_checkpoint(tmp_path).iteration == 5
     done.clear()
     stages = []
@@ -248,7 +248,7 @@ def test_a_lost_gpu_is_followed_by_the_cpu(toy, tmp_path, monkeypatch, caplog):
     def note(progress):
         return bool(stages.append(progress.stage))
 
-    train(toy, tmp_path, run, resume=True, report=note, falls_back=True)
+    train_run_or_fall_back(toy, tmp_path, run, resume=True, report=note)
     assert len(done) == 3
     assert "Continuing on the CPU" in stages
     assert "Card 9000 was lost; continuing on the CPU from the last checkpoint" in caplog.messages
@@ -349,10 +349,10 @@ def test_stopped_and_resumed_is_the_unbroken_run(toy, tmp_path):
     run = replace(make_run(squeezed(toy), "selective", iterations=14, **effects), device="gpu")
     broken = tmp_path / "broken"
     whole = tmp_path / "whole"
-    train(squeezed(toy), whole, run)
-    train(squeezed(toy), broken, run, report=stop_at(6))
+    train_run(squeezed(toy), whole, run)
+    train_run(squeezed(toy), broken, run, report=stop_at(6))
     assert read_checkpoint(broken).iteration == 6
-    train(squeezed(toy), broken, run, resume=True)
+    train_run(squeezed(toy), broken, run, resume=True)
     assert_same_state(broken, whole)
     ours, theirs = (following(read_checkpoint(folder).state) for folder in (broken, whole))
     assert theirs["strain_color/steps"].max() > 3

@@ -27,7 +27,7 @@ from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, device_of, open_run, read_run, write_run
 from stga_addon.training.run.identity import difference, identity_of
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 from .toys import assert_same_state, quick_settings, stop_at
 
@@ -47,7 +47,7 @@ def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run
 def begun(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the toy capture, stopped halfway."""
     out = tmp_path_factory.mktemp("begun") / "run"
-    train(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
+    train_run(toy, out, make_run(toy), report=stop_at(ITERATIONS // 2))
     return out
 
 
@@ -116,7 +116,7 @@ def test_changed_captures_are_refused(copy, toy, tmp_path, change, message):
     with pytest.raises(StgaError, match=both):
         open_run(copy, other)
     with pytest.raises(StgaError, match=message):
-        train(open_capture(other), copy, make_run(toy), resume=True)
+        train_run(open_capture(other), copy, make_run(toy), resume=True)
     # replaced in place
     factory.edit(copy / "run.json", lambda document: document.update(capture=str(other)))
     with pytest.raises(StgaError, match=rf"was trained on {other} .*, but it now has .*{message}"):
@@ -131,7 +131,7 @@ def test_moved_captures_and_refined_meshes_are_accepted(copy, toy, tmp_path):
         factory.write_mesh(other / f"meshes/{timestep:05d}.obj", vertices * 1.001, faces)
     opened = open_run(copy, other)
     assert opened.run.capture == opened.capture.root == other
-    train(opened.capture, copy, opened.run, resume=True)
+    train_run(opened.capture, copy, opened.run, resume=True)
     assert read_checkpoint(copy).iteration == ITERATIONS
     assert read_run(copy).capture == other
 
@@ -158,7 +158,7 @@ def test_runs_of_earlier_format_versions_are_resumed(toy, tmp_path, monkeypatch,
     with monkeypatch.context() as before:
         before.setattr(open_run_module, "identity_of", recorded)
         begun = make_run(toy, driven_offsets=FOLLOWS, **OLD)
-        train(toy, out, begun, report=stop_at(ITERATIONS // 2))
+        train_run(toy, out, begun, report=stop_at(ITERATIONS // 2))
 
     def as_then(document):
         document["version"] = version
@@ -169,11 +169,11 @@ def test_runs_of_earlier_format_versions_are_resumed(toy, tmp_path, monkeypatch,
     factory.edit(out / "run.json", as_then)
     opened = open_run(out)
     assert OLD.items() <= vars(opened.run.settings).items()
-    train(opened.capture, out, opened.run, resume=True)
+    train_run(opened.capture, out, opened.run, resume=True)
     assert read_checkpoint(out).iteration == ITERATIONS
     assert open_run(out).run == opened.run
     with pytest.raises(StgaError, match="begun with other settings"):
-        train(toy, out, make_run(toy, torso=True, driven_offsets=FOLLOWS, **OLD), resume=True)
+        train_run(toy, out, make_run(toy, torso=True, driven_offsets=FOLLOWS, **OLD), resume=True)
 
 
 def test_last_bits_of_another_machine_are_accepted(toy):
@@ -200,7 +200,7 @@ def test_another_flame_model_is_refused(toy, tmp_path):
     root, model = factory.write_flame_capture(tmp_path / "capture")
     capture = open_capture(root, model)
     out = tmp_path / "run"
-    train(capture, out, make_run(capture, model), report=stop_at(4))
+    train_run(capture, out, make_run(capture, model), report=stop_at(4))
     moved = shutil.copy(model, tmp_path / "moved.npz")
     assert open_run(out, flame=moved).run.flame == moved
     other = factory.write_flame_model(tmp_path / "other.npz", seed=1)
@@ -247,24 +247,24 @@ def test_a_checkpoint_left_from_another_run_is_not_taken(copy, toy):
         return False
 
     with pytest.raises(OSError, match="died"):
-        train(toy, copy, run, report=die)
+        train_run(toy, copy, run, report=die)
     assert not (copy / "checkpoint.npz").exists()
     reached = []
 
     def report(progress):
         return bool(reached.append(progress.figures().get("iteration", 0)))
 
-    train(toy, copy, run, resume=True, report=report)
+    train_run(toy, copy, run, resume=True, report=report)
     assert reached[:4] == [0, 0, 1, 2]
 
 
 @pytest.mark.parametrize("name", ["checkpoint.npz", "selection.npz"])
 def test_files_of_another_run_are_refused(copy, toy, tmp_path, name):
     """Catches a checkpoint or a selection that was copied beside the run.json of another run."""
-    train(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
+    train_run(toy, tmp_path / "other", make_run(toy, seed=5), report=stop_at(3))
     shutil.copy(tmp_path / "other" / name, copy / name)
     with pytest.raises(StgaError, match=rf"{name}: belongs to another run than run\.json"):
-        train(toy, copy, make_run(toy), resume=True)
+        train_run(toy, copy, make_run(toy), resume=True)
 
 
 def test_principal_point_comes_with_run_and_avatar(toy, tmp_path):
@@ -273,7 +273,7 @@ def test_principal_point_comes_with_run_and_avatar(toy, tmp_path):
     edit_frames(root, lambda frame: frame.update(cy=frame["cy"] + 7))
     capture = open_capture(root, principal_point="opencv")
     out = tmp_path / "run"
-    train(capture, out, replace(make_run(capture), principal_point="opencv"))
+    train_run(capture, out, replace(make_run(capture), principal_point="opencv"))
     assert read_avatar(out / "avatar.npz").principal_point == "opencv"
     cameras = root / "transforms_test.json"
 
@@ -321,12 +321,12 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
     out = tmp_path / "run"
     unbroken = tmp_path / "unbroken"
     with pytest.raises(KeyboardInterrupt):
-        train(toy, out, make_run(toy), report=interrupt)
+        train_run(toy, out, make_run(toy), report=interrupt)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert read_checkpoint(out).iteration == 5
     assert len(read_avatar(out / "avatar.npz").splats) == len(toy.faces)
-    train(toy, out, make_run(toy), resume=True)
-    train(toy, unbroken, make_run(toy))
+    train_run(toy, out, make_run(toy), resume=True)
+    train_run(toy, unbroken, make_run(toy))
     assert_same_state(out, unbroken)
 
     def interrupt_twice(progress):
@@ -336,7 +336,7 @@ def test_interrupt_saves_and_resumes_to_the_same_bits(toy, tmp_path):
         return False
 
     with pytest.raises(KeyboardInterrupt):
-        train(toy, tmp_path / "twice", make_run(toy), report=interrupt_twice)
+        train_run(toy, tmp_path / "twice", make_run(toy), report=interrupt_twice)
     assert not (tmp_path / "twice/checkpoint.npz").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -345,6 +345,6 @@ def test_a_prepared_run_begins_with_its_identity(toy, tmp_path):
     """Catches a run.json written ahead of the training that stays without identity."""
     write_run(tmp_path, make_run(toy))
     assert json.loads((tmp_path / "run.json").read_text())["identity"] is None
-    train(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))
+    train_run(toy, tmp_path, make_run(toy), resume=True, report=stop_at(2))
     stored = read_run(tmp_path)
     assert stored.identity == identity_of(toy, "vhap", stored.settings)

@@ -17,7 +17,7 @@ from stga_addon.training.optimize import frames
 from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.initial_splats import MAX_LATER_TIMESTEPS
 from stga_addon.training.run import session
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 from .test_run import make_run
 from .toys import assert_same_state
@@ -49,7 +49,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
     run = make_run(capture, "global", iterations=len(timesteps) - 1)
     # which read meshes after training
     monkeypatch.setattr(session, "triangle_residuals", no_residuals)
-    train(capture, tmp_path / "loaded", run)
+    train_run(capture, tmp_path / "loaded", run)
     assert {timestep for timestep, _ in read} == set(timesteps[:-1])  # the last one is a test view
     # Before training, splats are placed on the first mesh, and given colors there and on a few
     # later ones.
@@ -61,7 +61,7 @@ def test_no_mesh_is_read_on_the_training_thread(tmp_path, monkeypatch):
 
     read.clear()
     monkeypatch.setattr(session, "ViewLoader", without_meshes)
-    train(capture, tmp_path / "unloaded", run)
+    train_run(capture, tmp_path / "unloaded", run)
     assert len(read) == len(timesteps) - 1 + len(before)
     assert all(on_training_thread for _, on_training_thread in read)
     assert_same_state(tmp_path / "loaded", tmp_path / "unloaded")

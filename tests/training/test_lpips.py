@@ -21,7 +21,7 @@ from stga_addon.training.evaluate.lpips import read_network
 from stga_addon.training.evaluate.metrics import EvaluationView, evaluate
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 from .toys import quick_settings, stop_at
 
@@ -154,7 +154,7 @@ def test_another_file_is_refused(tmp_path, toy, monkeypatch):
         read_network(tmp_path)
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "none.ckpt"))
     with pytest.raises(StgaError, match=r"none\.ckpt"):
-        train(toy, tmp_path / "run", run_of(toy))
+        train_run(toy, tmp_path / "run", run_of(toy))
     assert not (tmp_path / "run").exists()
 
 
@@ -165,9 +165,9 @@ def run_of(capture: Capture) -> Run:
 def test_only_the_final_evaluation_measures_lpips(toy, tmp_path, weights_file, monkeypatch):
     """Catches slow evaluations, a cancel that waits for LPIPS, and a missing final figure."""
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(weights_file))
-    train(toy, tmp_path / "run", run_of(toy), report=stop_at(11))
+    train_run(toy, tmp_path / "run", run_of(toy), report=stop_at(11))
     assert not any("lpips" in line for line in read_metrics(tmp_path / "run"))
-    train(toy, tmp_path / "run", run_of(toy), resume=True)
+    train_run(toy, tmp_path / "run", run_of(toy), resume=True)
     *before, last = read_metrics(tmp_path / "run")
     assert not any("lpips" in line for line in before)
     assert last["lpips"] > 0

@@ -37,7 +37,7 @@ from stga_addon.training.evaluate.metrics import (
 from stga_addon.training.optimize.image_preparation import exposure_correction
 from stga_addon.training.run.folder import Run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import TrainingSettings
 
 from .toys import quick_settings
@@ -304,7 +304,7 @@ def test_transparent_images_lie_over_the_settings_background(toy, tmp_path):
     settings = replace(
         quick_settings("global", lattice=0, iterations=2), background=gray, random_background=False
     )
-    path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
+    path = train_run(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
     # behind the cameras: nothing but the background is rendered
     outside = np.ones(capture.neutral.shape) * 10
     avatar = read_avatar(path)

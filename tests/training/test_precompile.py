@@ -46,7 +46,7 @@ settings = make_settings(
     0.4, 0.6),
 )
 for root in roots:
-    run_module.train(open_capture(root), out / f"run of {root.name}", Run(root, None, "vhap",
+    run_module.train_run(open_capture(root), out / f"run of {root.name}", Run(root, None, "vhap",
     settings))
     assert len(read_metrics(out / f"run of {root.name}")) == 10
 after = counts()

@@ -112,8 +112,8 @@ def test_what_is_done_once_is_no_step(toy, shares, monkeypatch):
     asked: list[int] = []
 
     def track(*arguments: Any) -> None:
-        some = arguments[3]
-        note = arguments[5]
+        some = arguments[2]
+        note = arguments[4]
         for number in range(len(some)):
             note(number, len(some))
             preset_timing.perf_counter.now += 0.3 if number else 0.1

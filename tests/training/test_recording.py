@@ -171,7 +171,7 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
     shutil.copytree(root, tmp_path / "start")
 
     def counted(*arguments):
-        calls.append(len(arguments[3]))
+        calls.append(len(arguments[2]))
         return track_by_avatar(*arguments)
 
     monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", counted)

@@ -29,7 +29,7 @@ from stga_addon.training.run.continuation import (
 )
 from stga_addon.training.run.folder import Continuation, Run, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.schedule import learning_rates
 from stga_addon.training.settings import Rates, TrainingSettings
 
@@ -54,7 +54,7 @@ def finished(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
         hull_points=True,
     )
     without_held_out = replace(toy, views={"train": toy.views["train"]})
-    train(without_held_out, out, Run(toy.root, None, "vhap", settings))
+    train_run(without_held_out, out, Run(toy.root, None, "vhap", settings))
     return out
 
 
@@ -83,7 +83,7 @@ def prepare_refinement(parent, region, frames=None, **changes):
 def refine(parent: Path, out: Path, stop: int | None = None, **changes: Any) -> Path:
     prepared = prepare_refinement(parent, "mouth", **{"growth": 0.5, **changes})
 
-    train(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
+    train_run(prepared.capture, out, prepared.run, prepared.selection, report=stop_at(stop))
     return out
 
 
@@ -125,7 +125,7 @@ def test_a_stopped_refinement_is_continued_to_the_same_bits(parent, toy, tmp_pat
     whole = refine(parent, tmp_path / "whole", frames=(1, 3))
     stopped = refine(parent, tmp_path / "stopped", stop=7, frames=(1, 3))
     capture = replace(toy, views={"train": toy.views["train"]})
-    train(capture, stopped, read_run(stopped), resume=True)
+    train_run(capture, stopped, read_run(stopped), resume=True)
     assert_same_state(stopped, whole)
     assert (stopped / "avatar.npz").read_bytes() == (whole / "avatar.npz").read_bytes()
 
@@ -133,7 +133,7 @@ def test_a_stopped_refinement_is_continued_to_the_same_bits(parent, toy, tmp_pat
 def test_the_avatar_before_is_the_first_evaluation(parent, toy, tmp_path):
     """Catches a report without what came before, and a region that is not measured apart."""
     prepared = prepare_refinement(parent, "mouth", (1, 3))
-    train(toy, tmp_path / "refined", prepared.run, prepared.selection)
+    train_run(toy, tmp_path / "refined", prepared.run, prepared.selection)
     first, *_, last = read_metrics(tmp_path / "refined")
     assert (first["iteration"], last["iteration"]) == (0, ITERATIONS)
     assert {"psnr_region", "psnr_frames", "psnr_region_frames", "psnr_other_frames"} <= set(last)
@@ -161,7 +161,7 @@ def test_without_its_checkpoint_an_avatar_is_refined_as_well(parent, toy, tmp_pa
     prepared = prepare_refinement(parent, "mouth")
     (parent / "avatar.npz").write_bytes(b"")
     with pytest.raises(StgaError, match=r"avatar\.npz: has changed"):
-        train(prepared.capture, tmp_path / "again", prepared.run, prepared.selection)
+        train_run(prepared.capture, tmp_path / "again", prepared.run, prepared.selection)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
 from stga_addon.training.run.folder import Run, read_residuals, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import STRATEGIES
 
 from .toys import assert_same_state, quick_settings, stop_at
@@ -50,7 +50,7 @@ def without_times(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def unbroken(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run from start to end."""
     out = tmp_path_factory.mktemp("unbroken") / "run"
-    assert train(toy, out, make_run(toy)) == out / "avatar.npz"
+    assert train_run(toy, out, make_run(toy)) == out / "avatar.npz"
     return out
 
 
@@ -105,10 +105,10 @@ def continued(toy: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
             return False
 
         with pytest.raises(Crash):
-            train(toy, out, make_run(toy), report=crash)
+            train_run(toy, out, make_run(toy), report=crash)
     assert read_checkpoint(out).iteration == 8
     assert max(line["iteration"] for line in read_metrics(out)) > 8
-    train(toy, out, make_run(toy), resume=True)
+    train_run(toy, out, make_run(toy), resume=True)
     return out
 
 
@@ -135,11 +135,11 @@ def test_stopped_and_resumed_is_the_unbroken_run(
 ) -> None:
     """Catches a line of metrics, or an avatar, of the moment of a Ctrl-C that stays after resuming;
     15 is the iteration of an evaluation, 2 before the first."""
-    train(toy, tmp_path, make_run(toy), report=stop_at(iteration))
+    train_run(toy, tmp_path, make_run(toy), report=stop_at(iteration))
     stopped = read_metrics(tmp_path)
     assert stopped[-1]["iteration"] == iteration
     assert (tmp_path / "avatar.npz").exists()
-    train(toy, tmp_path, make_run(toy), resume=True)
+    train_run(toy, tmp_path, make_run(toy), resume=True)
     assert_same_state(tmp_path, unbroken)
     ours, theirs = (without_times(read_metrics(folder)) for folder in (tmp_path, unbroken))
     assert ours == theirs
@@ -153,13 +153,13 @@ def test_the_avatar_of_a_stop_is_not_that_of_the_resumed_run(
     which the unbroken run never evaluated."""
     before = iter([Quality(20, 0.5), Quality(21, 0.5), Quality(25, 0.5)])
     monkeypatch.setattr(evaluator, "evaluate", lambda *_: next(before))
-    train(toy, tmp_path, make_run(toy), report=stop_at(6))
+    train_run(toy, tmp_path, make_run(toy), report=stop_at(6))
     now = read_avatar(tmp_path / "avatar.npz").splats.xyz
     np.testing.assert_array_equal(now, read_checkpoint(tmp_path).state.average.xyz)
     monkeypatch.setattr(evaluator, "evaluate", lambda *_: Quality(19, 0.5))
-    train(toy, tmp_path, make_run(toy), resume=True)
+    train_run(toy, tmp_path, make_run(toy), resume=True)
     kept = read_avatar(tmp_path / "avatar.npz").splats.xyz
-    train(toy, tmp_path / "five", make_run(toy), report=stop_at(5))
+    train_run(toy, tmp_path / "five", make_run(toy), report=stop_at(5))
     five = read_checkpoint(tmp_path / "five").state.average.xyz
     np.testing.assert_array_equal(kept, five)
 
@@ -175,8 +175,8 @@ def test_residuals_that_could_not_be_measured(
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "triangle_residuals", fail)
         with pytest.raises(StgaError, match="image 7"):
-            train(toy, tmp_path, make_run(toy))
-    train(toy, tmp_path, make_run(toy), resume=True)
+            train_run(toy, tmp_path, make_run(toy))
+    train_run(toy, tmp_path, make_run(toy), resume=True)
     count = len(toy.faces)
     np.testing.assert_array_equal(read_residuals(tmp_path, count), read_residuals(unbroken, count))
     assert len(read_metrics(tmp_path)) == len(read_metrics(unbroken))
@@ -205,8 +205,8 @@ def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path)
         return False
 
     with pytest.raises(Crash):
-        train(toy, tmp_path, make_run(toy), painted, report=crash)
-    train(toy, tmp_path, make_run(toy), resume=True)
+        train_run(toy, tmp_path, make_run(toy), painted, report=crash)
+    train_run(toy, tmp_path, make_run(toy), resume=True)
     kept = read_selection(tmp_path, len(toy.faces))
     assert kept.keys() == painted.keys()
     assert all((kept[timestep] == painted[timestep]).all() for timestep in painted)
@@ -217,7 +217,7 @@ def test_resuming_a_finished_run_changes_nothing(
 ) -> None:
     """Catches steps beyond the budget and evaluations that pile up."""
     shutil.copytree(unbroken, tmp_path / "run")
-    train(toy, tmp_path / "run", make_run(toy), resume=True)
+    train_run(toy, tmp_path / "run", make_run(toy), resume=True)
     assert_same_state(tmp_path / "run", unbroken)
     ours = read_metrics(tmp_path / "run")
     theirs = read_metrics(unbroken)
@@ -235,15 +235,15 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
     def note(progress: Progress) -> bool:
         return bool(told.append(progress.stage))
 
-    train(toy, out, make_run(toy), resume=True, report=note)
+    train_run(toy, out, make_run(toy), resume=True, report=note)
     assert "Writing the missing avatar from the checkpoint" in told
     written = read_avatar(out / "avatar.npz").splats
     np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
     assert read_residuals(out, len(toy.faces)).shape == (len(toy.faces),)
     stopped = tmp_path / "stopped"
-    train(toy, stopped, make_run(toy), report=stop_at(11))
+    train_run(toy, stopped, make_run(toy), report=stop_at(11))
     (stopped / "avatar.npz").unlink()
-    train(toy, stopped, make_run(toy), resume=True)
+    train_run(toy, stopped, make_run(toy), resume=True)
     assert (stopped / "avatar.npz").exists()
 
 
@@ -261,10 +261,10 @@ def test_a_folder_that_is_moved_while_training(toy: Capture, tmp_path: Path, cha
         return False
 
     with pytest.raises(StgaError, match=rf"^{out}: was moved or deleted while its run trained; "):
-        train(toy, out, make_run(toy), report=move)
+        train_run(toy, out, make_run(toy), report=move)
     assert not out.exists() or not list(out.iterdir())
     assert (moved / "run.json").exists()
-    train(toy, moved, make_run(toy), resume=True)
+    train_run(toy, moved, make_run(toy), resume=True)
     assert read_checkpoint(moved).iteration == ITERATIONS
 
 
@@ -289,8 +289,8 @@ def test_the_best_avatar_is_kept(
 
     monkeypatch.setattr(evaluator, "evaluate", evaluate)
     monkeypatch.setattr(run_module, "write_avatar", write)
-    train(toy, tmp_path, make_run(toy), report=stop_at(11))
-    train(toy, tmp_path, make_run(toy), resume=True)
+    train_run(toy, tmp_path, make_run(toy), report=stop_at(11))
+    train_run(toy, tmp_path, make_run(toy), resume=True)
     assert len(written) == 3
     assert kept_line(read_metrics(tmp_path), make_run(toy).settings)["psnr"] == 31
     best = read_avatar(tmp_path / "avatar.npz").splats
@@ -301,7 +301,7 @@ def test_the_best_avatar_is_kept(
 def test_without_held_out_views_the_latest_avatar_is_kept(toy: Capture, tmp_path: Path) -> None:
     """Catches a run without avatar, or with its first one, where nothing can be measured."""
     bare = replace(toy, views={"train": toy.views["train"]})
-    train(bare, tmp_path, make_run(toy))
+    train_run(bare, tmp_path, make_run(toy))
     avatar = read_avatar(tmp_path / "avatar.npz")
     np.testing.assert_array_equal(avatar.splats.xyz, read_checkpoint(tmp_path).state.average.xyz)
     assert all("psnr" not in line for line in read_metrics(tmp_path))
@@ -316,14 +316,14 @@ def test_what_is_refused_changes_nothing(toy: Capture, unbroken: Path, tmp_path:
     ):
         before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
         with pytest.raises(StgaError, match=says):
-            train(toy, out, make_run(toy))
+            train_run(toy, out, make_run(toy))
         assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
     for views in ({}, {"train": (), "val": toy.views["val"]}):
         with pytest.raises(StgaError, match="has no training views"):
-            train(replace(toy, views=views), tmp_path / "run", make_run(toy))
+            train_run(replace(toy, views=views), tmp_path / "run", make_run(toy))
     bare = replace(toy, views={"train": toy.views["train"]})
     with pytest.raises(StgaError, match="has no held-out views"):
-        train(bare, tmp_path / "run", make_run(toy, target_psnr=30.0))
+        train_run(bare, tmp_path / "run", make_run(toy, target_psnr=30.0))
     assert not (tmp_path / "run").exists()
 
 
@@ -338,9 +338,9 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
         return progress.figures().get("iteration", 0) == 6
 
     run = make_run(toy, iterations=None, seconds=0.6)
-    train(toy, tmp_path, run, report=note)
+    train_run(toy, tmp_path, run, report=note)
     assert read_checkpoint(tmp_path).elapsed_s == pytest.approx(0.06)
-    train(toy, tmp_path, run, resume=True)
+    train_run(toy, tmp_path, run, resume=True)
     end = read_checkpoint(tmp_path)
     assert 0.6 <= end.elapsed_s < 0.615
     assert end.iteration == pytest.approx(60, abs=1)
@@ -356,7 +356,7 @@ def test_every_strategy_and_schedule_runs(
     settings = quick_settings(
         strategy, schedule=schedule, iterations=8, stray_reset_interval=3, density_interval=3
     )
-    train(toy, tmp_path, Run(toy.root, None, "vhap", settings))
+    train_run(toy, tmp_path, Run(toy.root, None, "vhap", settings))
     avatar = read_avatar(tmp_path / "avatar.npz")
     assert avatar.convention == ("gaussian_avatars" if strategy == "gaussian-avatars" else "stga")
     assert set(avatar.splats.face.tolist()) == set(range(len(toy.faces)))
@@ -377,7 +377,7 @@ def test_progress_tells_what_a_person_wants_to_know(toy: Capture, tmp_path: Path
             first.append(len(read_avatar(tmp_path / "first.npz").splats))
         return bool(told.append(progress))
 
-    train(toy, tmp_path, make_run(toy), report=report)
+    train_run(toy, tmp_path, make_run(toy), report=report)
     training = [found for found, p in zip(figures, told, strict=True) if p.stage == "Training"]
     assert [found["iteration"] for found in training] == list(range(1, ITERATIONS + 1))
     assert [p.share for p in told if p.stage == "Training"][-1] == 1.0

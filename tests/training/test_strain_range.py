@@ -23,7 +23,7 @@ from stga_addon.training.run.checkpoint import STRAIN_RANGE, trained_strain_rang
 from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.identity import identity_of
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import Rates
 
 from .toys import quick_settings, random_splats, stop_at
@@ -45,7 +45,7 @@ def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     """Catches a range of held-out expressions, one that clips, and one nobody needs."""
     capture = replace(toy, mesh=lambda timestep: deformed(toy, timestep))
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    found = read_avatar(train(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
+    found = read_avatar(train_run(capture, tmp_path / "on", Run(toy.root, None, "vhap", settings)))
     trained = strains(toy, {view.timestep for view in toy.views["train"]})
     limits = found.strain_range
     assert limits is not None
@@ -53,7 +53,7 @@ def test_a_run_writes_the_range_of_what_it_trained(toy, tmp_path):
     assert (trained.max(0) <= limits[:, 1]).all()
     assert (trained.max(0) * 1.21 + 1e-6 >= limits[:, 1])[trained.max(0) > 0].all()
     without = Run(toy.root, None, "vhap", replace(settings, driven_offsets=()))
-    assert read_avatar(train(capture, tmp_path / "off", without)).strain_range is None
+    assert read_avatar(train_run(capture, tmp_path / "off", without)).strain_range is None
 
 
 def test_a_continuation_keeps_what_its_parent_saw(toy, tmp_path):
@@ -109,19 +109,19 @@ def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run = Run(toy.root, None, "vhap", settings)
     out = tmp_path / "run"
-    path = train(toy, out, run, report=stop_at(2))
+    path = train_run(toy, out, run, report=stop_at(2))
     avatar = read_avatar(path)
     wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 6)).copy()
     write_avatar(path, replace(avatar, strain_range=wider if limited else None))
     before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
     earlier = r"avatar\.npz: colors follow strain as in an earlier version; train it anew"
     with pytest.raises(StgaError, match=earlier):
-        train(toy, out, run, resume=True)
+        train_run(toy, out, run, resume=True)
     assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
     write_avatar(path, avatar)
-    train(toy, out, run, resume=True)
+    train_run(toy, out, run, resume=True)
     write_avatar(path, replace(avatar, strain_range=wider))
-    train(toy, out, run, resume=True)
+    train_run(toy, out, run, resume=True)
 
 
 def test_the_range_covers_an_expression_of_few_timesteps(toy):
@@ -150,7 +150,7 @@ def test_evaluation_while_training_measures_the_avatar_that_is_written(toy, tmp_
     rates = Rates(strain_color=0.5)
     settings = quick_settings("global", driven_offsets=COLORS, rates=rates, **plain)
     capture = replace(toy, mesh=mesh, views={**toy.views, "train": weak})
-    path = train(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
+    path = train_run(capture, tmp_path / "run", Run(toy.root, None, "vhap", settings))
     best = kept_line(read_metrics(tmp_path / "run"), settings)
     found = evaluate_avatar(read_avatar(path), capture, "val").psnr
     assert found == pytest.approx(best["psnr"], abs=1e-3)
@@ -161,7 +161,7 @@ def test_another_runs_range_is_refused(toy, tmp_path):
     settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
     run = Run(toy.root, None, "vhap", settings)
     out = tmp_path / "run"
-    train(toy, out, run, report=stop_at(2))
+    train_run(toy, out, run, report=stop_at(2))
     limits = trained_range(len(toy.faces))
     digest = identity_of(toy, "vhap", settings).digest
     for (stored, identity), says in (
@@ -171,4 +171,4 @@ def test_another_runs_range_is_refused(toy, tmp_path):
         arrays = {"strain_range": stored, "identity": np.frombuffer(identity.encode(), np.uint8)}
         write_npz(out / STRAIN_RANGE, arrays)
         with pytest.raises(StgaError, match=rf"strain_range\.npz: {says}"):
-            train(toy, out, run, resume=True)
+            train_run(toy, out, run, resume=True)

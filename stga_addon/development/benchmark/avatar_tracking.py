@@ -17,7 +17,11 @@ import numpy as np
 
 from ...avatar.file import read_avatar
 from ...capture.model import evenly_spread
-from ...training.optimize.avatar_tracking import OtherRecording, track_by_avatar
+from ...training.optimize.avatar_tracking import (
+    OtherRecording,
+    TrainedAvatar,
+    track_by_avatar,
+)
 from ...training.run.folder import AVATAR, open_run
 
 
@@ -29,13 +33,12 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, default=16)
     options = parser.parse_args()
     opened = open_run(options.run)
-    avatar = read_avatar(options.run / AVATAR)
+    trained = TrainedAvatar(read_avatar(options.run / AVATAR), opened.run.settings)
     capture = opened.capture
-    settings = opened.run.settings
     chosen = evenly_spread(capture.timesteps, options.timesteps)
     views = [view for split in capture.views.values() for view in split]
     count = sum(view.timestep in chosen for view in views)
-    track_by_avatar(avatar, settings, capture, chosen[:1])  # compiles
+    track_by_avatar(trained, capture, chosen[:1])  # compiles
     size = f"{views[0].camera.width}x{views[0].camera.height}"
     print("| images | tracked | processor s | s | unexplained |\n| --- | --- | --- | --- | --- |")
     first = OtherRecording()
@@ -43,7 +46,7 @@ def main() -> None:
     for how, way in {"in training": None, "a recording": first, "again": again}.items():
         begin = perf_counter()
         busy = process_time()
-        found = track_by_avatar(avatar, settings, capture, chosen, recording=way)
+        found = track_by_avatar(trained, capture, chosen, recording=way)
         busy = (process_time() - busy) / count
         taken = (perf_counter() - begin) / count
         missed = "" if np.isnan(found.misfit).any() else f"{np.median(found.misfit):.0%}"

@@ -30,7 +30,7 @@ from ...training.effects.plan import plan_effects
 from ...training.evaluate.metrics import Quality, evaluate_avatar
 from ...training.run.folder import Run, with_refined_tracking
 from ...training.run.metrics_log import read_metrics
-from ...training.run.session import train
+from ...training.run.session import train_run
 from ...training.settings import make_settings
 from ..demo.run import side_by_side
 from .statistics import Spread, spread_of
@@ -72,7 +72,7 @@ def trained(
     )
     with tempfile.TemporaryDirectory() as folder:
         run = Run(capture.root, flame, "vhap", settings, plan)
-        avatar = read_avatar(train(capture, Path(folder), run))
+        avatar = read_avatar(train_run(capture, Path(folder), run))
         seconds = read_metrics(Path(folder))[-1]["seconds"]
         shown = with_refined_tracking(capture, Path(folder), fitted=False)
     splits = [split for split in ("val", "test") if shown.views.get(split)]

@@ -42,7 +42,7 @@ from ...training.run.continuation import (
     starting_state,
 )
 from ...training.run.folder import Run, read_run
-from ...training.run.session import train
+from ...training.run.session import train_run
 from ...training.schedule import view_order
 from ...training.settings import TrainingSettings, make_settings
 
@@ -162,7 +162,7 @@ def trained(take: Path, options: argparse.Namespace, seed: int) -> Path:
         capture = open_capture(take, options.flame)
         settings = make_settings(iterations=options.base, seed=seed, effects={"tracking": "off"})
         run = Run(capture.root, options.flame, "vhap", *plan_effects(capture, settings))
-        train(capture, folder, run, resume=(folder / "run.json").exists())
+        train_run(capture, folder, run, resume=(folder / "run.json").exists())
     return folder
 
 

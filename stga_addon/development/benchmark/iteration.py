@@ -59,7 +59,7 @@ from ...training.optimize.backend import Batch, RenderOptions
 from ...training.optimize.frames import FrameStore
 from ...training.optimize.image_loss import image_gradient, whole_image
 from ...training.optimize.make_backend import make_backend
-from ...training.optimize.state import new_state
+from ...training.optimize.state import TrainState, new_state
 from ...training.schedule import learning_rates
 from ...training.settings import make_settings
 

@@ -151,17 +151,34 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     b = triangles[:, 2] - triangles[:, 0]
     head = float(np.median(depth))
     pixels = area * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    covered = nearest >= 0
-    near = binary_dilation(covered, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
-    white = (image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0
-    row = {
+    return {
         "color": np.where(seen[:, None], np.stack(colors, -1), np.nan).astype(np.float32),
         "direction": direction / np.maximum(distance, 1e-12),
         "pixels": np.where(seen, pixels, np.nan),
         "pixel_width": np.array(head / view.camera.fl_x if head > 0 else np.nan),
-        "white": np.array(white),
-        "background": np.full(3, np.nan),
+        **_coverage(image, mask, nearest >= 0, area),
     }
+
+
+def _painted(camera: Camera, drawn: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """(H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
+    (D,) of corners (D, 3, 2) in pixels are drawn whole, from far to near."""
+    picture = Image.new("I", (camera.width, camera.height), -1)
+    polygons = (corners.reshape(-1, 6) - 0.5).tolist()
+    draw = ImageDraw.Draw(picture)
+    for face, polygon in zip(drawn.tolist(), polygons, strict=True):
+        draw.polygon(polygon, fill=face)
+    return np.asarray(picture)
+
+
+def _coverage(
+    image: np.ndarray, mask: np.ndarray | None, covered: np.ndarray, area: float
+) -> dict[str, np.ndarray]:
+    """What `Samples` holds of an image's mask and of its mesh, which covers pixels (H, W) bool;
+    area: pixels of the image at its own size in one of these."""
+    near = binary_dilation(covered, iterations=max(1, round(TRACKING_ERROR_SHARE * len(image))))
+    white = (image >= WHITE_LEVEL).all(axis=2)[~near].mean() if not near.all() else 1.0
+    row = {"white": np.array(white), "background": np.full(3, np.nan)}
     if mask is None:
         names = ("foreground", "uncovered", "mesh", "outside", "background_spread")
         return {**row, **dict.fromkeys(names, np.array(np.nan))}

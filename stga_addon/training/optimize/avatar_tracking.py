@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -195,6 +196,14 @@ class OtherRecording:
     is_again: bool = False
 
 
+class TrainedAvatar(NamedTuple):
+    """An avatar, and the settings that it was trained with, whose background and exposures the
+    images have that it is compared with."""
+
+    avatar: Avatar
+    settings: TrainingSettings
+
+
 def tracked_timesteps(
     settings: TrainingSettings, capture: Capture, timesteps: Sequence[int]
 ) -> list[int]:
@@ -210,8 +219,7 @@ def tracked_timesteps(
 
 
 def track_by_avatar(
-    avatar: Avatar,
-    settings: TrainingSettings,
+    trained: TrainedAvatar,
     capture: Capture,
     timesteps: Sequence[int] | None = None,
     seconds: float | None = None,
@@ -220,13 +228,12 @@ def track_by_avatar(
 ) -> AvatarTracking:
     """Refine the parameters of a tracked capture of the avatar's person, from where they are.
 
-    settings: with which the avatar was trained, whose background and exposures the images have.
     timesteps: None: all; as many of them, evenly spread, as `seconds` allow, but at least two.
     report: how many are done; returns whether to stop. recording: None: the avatar was trained on
     the capture; covariances are left out. Each timestep begins where the one before has led. Raises
     StgaError where the capture has no parameters or is of another head, and Cancelled.
     """
-    tracker = _Tracker(avatar, settings, capture, recording)
+    tracker = _Tracker(trained, capture, recording)
     left = list(capture.timesteps if timesteps is None else timesteps)
     begin = perf_counter()
     done = list[int]()
@@ -280,14 +287,22 @@ def read_small(
     return view, image if prepare is None else prepare(view, image, mask)[0]
 
 
+Shots = Sequence[tuple[View, np.ndarray]]
+"""Views of one timestep, and their images (H, W, 3) uint8."""
+
+
+class _Effort(NamedTuple):
+    """Renderings of each view at most; share of the loss by which a step has to lower it."""
+
+    renderings: int
+    least_gain: float
+
+
 class _Tracker:
     def __init__(
-        self,
-        avatar: Avatar,
-        settings: TrainingSettings,
-        capture: Capture,
-        recording: OtherRecording | None,
+        self, trained: TrainedAvatar, capture: Capture, recording: OtherRecording | None
     ) -> None:
+        avatar, settings = trained
         sequence = capture.flame
         if sequence is None:
             raise StgaError(f"{capture.root}: is not tracked with FLAME or the bundled head")
@@ -346,49 +361,42 @@ class _Tracker:
         faces = self._capture.faces
         self._shown = [rasterize(mesh, faces, _small(view.camera)) for view in views]
         shots = self._read(views, MAX_HEIGHT_PX)
-        renderings = RENDERINGS_AGAIN if self._is_again else RENDERINGS
-        least_gain = LEAST_GAIN
+        effort = _Effort(RENDERINGS_AGAIN if self._is_again else RENDERINGS, LEAST_GAIN)
         found = tracked
         first = None
         if self._change is not None and not self._is_again:
             starts = tracked, changed_by(tracked, self._change)
-            losses = [self._loss(start, timestep, shots) for start in starts]
+            losses = [self._loss(start, shots) for start in starts]
             best = min((0, 1), key=lambda number: losses[number][0])
             found = starts[best]
             first = losses[best]
         elif self._is_far:
-            renderings = PYRAMID_RENDERINGS
-            least_gain = 0.0
+            effort = _Effort(PYRAMID_RENDERINGS, 0.0)
             for height in PYRAMID_PX:
-                small = self._read(views, height)
-                found, _ = self._minimize(timestep, small, tracked, found, renderings, least_gain)
-        found, known = self._minimize(
-            timestep, shots, tracked, found, renderings, least_gain, first
-        )
+                found, _ = self._minimize(self._read(views, height), tracked, found, effort)
+        found, known = self._minimize(shots, tracked, found, effort, first)
         self._change = change_between(tracked, found)
         misfit = self._misfit(found, shots) if self._is_again else np.nan
         return found, known, misfit
 
     def _minimize(
         self,
-        timestep: int,
-        shots: Sequence[tuple[View, np.ndarray]],
+        shots: Shots,
         tracked: np.ndarray,
         start: np.ndarray,
-        renderings: int,
-        least_gain: float,
+        effort: _Effort,
         first: tuple[float, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """From `start` on, and their inverse covariance; first: the start's `_loss`, if known."""
         precision = self._precision()  # of the change from those that were tracked
-        known = self._gauss_newton(start, timestep, shots) + np.diag(precision)
+        known = self._gauss_newton(start, shots) + np.diag(precision)
         root = np.linalg.cholesky(known)
 
         def energy(
             whitened: np.ndarray, known: tuple[float, np.ndarray] | None = None
         ) -> tuple[float, np.ndarray]:
             values = start + solve_triangular(root, whitened, lower=True, trans=1)
-            loss, gradient = known or self._loss(values, timestep, shots)
+            loss, gradient = known or self._loss(values, shots)
             change = values - tracked
             excess = self._excess(values)
             gradient = gradient + precision * change + excess / solve.WEIGHT_EXCESS_SIGMA**2
@@ -403,12 +411,13 @@ class _Tracker:
             found, gradient = (before, slope) if not values.any() else energy(scale * values)
             return found, scale * gradient
 
-        options = {"maxfun": renderings, "maxiter": renderings, "ftol": least_gain}
+        most = effort.renderings
+        options = {"maxfun": most, "maxiter": most, "ftol": effort.least_gain}
         best = minimize(scaled, zero, jac=True, method="L-BFGS-B", options=options)
         change = solve_triangular(root, scale * best.x, lower=True, trans=1)
         return start + change, known
 
-    def _misfit(self, values: np.ndarray, shots: Sequence[tuple[View, np.ndarray]]) -> float:
+    def _misfit(self, values: np.ndarray, shots: Shots) -> float:
         self._values = values
         mesh = self._mesh(shots[0][0].timestep)
         missed = 0
@@ -421,7 +430,7 @@ class _Tracker:
             count = count + int(head.sum())
         return missed / max(count, 1)
 
-    def _read(self, views: Sequence[View], height: int) -> list[tuple[View, np.ndarray]]:
+    def _read(self, views: Sequence[View], height: int) -> Shots:
         shots = []
         for whole, shown in zip(views, self._shown, strict=True):
             view, image = read_small(whole, height, self._settings, self._prepare)
@@ -475,24 +484,20 @@ class _Tracker:
             found[:count] = values[:count] - np.clip(values[:count], 0, 1)
         return found
 
-    def _loss(
-        self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
-    ) -> tuple[float, np.ndarray]:
+    def _loss(self, values: np.ndarray, shots: Shots) -> tuple[float, np.ndarray]:
         """The images' loss in the points' units, and its gradient (E + 18,)."""
         self._values = values
         self._frames.clear()
         shots = [(view, self._cut(view, image)) for view, image in shots]
         weights = [POINT_SHARE * image.size / 3 / (NOISE_LEVELS / 255) for _, image in shots]
         total, by_vertex = self._backend.mesh_gradient(shots, weights, self._options)
-        offset = self._sequence.frame(timestep).dynamic_offset
+        offset = self._sequence.frame(shots[0][0].timestep).dynamic_offset
         return total, parameters_gradient(self._head.model, frame_of(values, offset), by_vertex)
 
-    def _gauss_newton(
-        self, values: np.ndarray, timestep: int, shots: Sequence[tuple[View, np.ndarray]]
-    ) -> np.ndarray:
+    def _gauss_newton(self, values: np.ndarray, shots: Shots) -> np.ndarray:
         """(E + 18, E + 18): how parameters change what images show at points of the surface."""
         self._values = values
-        mesh = self._mesh(timestep)
+        mesh = self._mesh(shots[0][0].timestep)
         faces = self._capture.faces
         at = self._points.on(mesh, faces)
         normals = self._points.on(vertex_normals(mesh, faces), faces)

@@ -30,6 +30,7 @@ from ...worker.helpers import Helpers, Step
 from ..optimize.avatar_tracking import (
     AvatarTracking,
     OtherRecording,
+    TrainedAvatar,
     normal_images,
     track_by_avatar,
 )
@@ -160,7 +161,7 @@ def _track_part(
 ) -> dict[str, np.ndarray]:
     avatar, settings, capture = _open(*source)
     exposure, shading = light
-    settings = replace(settings, exposure=exposure)
+    trained = TrainedAvatar(avatar, replace(settings, exposure=exposure))
 
     def report(done: int, total: int) -> bool:
         if done:
@@ -168,7 +169,7 @@ def _track_part(
         return False
 
     recording = OtherRecording(scales, shading, is_again=source[-1] > 0)
-    found = track_by_avatar(avatar, settings, capture, timesteps, None, report, recording)
+    found = track_by_avatar(trained, capture, timesteps, None, report, recording)
     step()
     names = ("parameters", "misfit", "shift", "scale", "information")
     return {name: getattr(found, name) for name in names}

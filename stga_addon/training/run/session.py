@@ -34,6 +34,7 @@ from ..optimize.avatar_tracking import (
     MAX_HEIGHT_PX,
     AvatarTracking,
     RefinedTracking,
+    TrainedAvatar,
     read_small,
     track_by_avatar,
     tracked_timesteps,
@@ -76,40 +77,41 @@ RESIDUAL_VIEWS = 24
 """Views in which the residuals of a finished run are measured."""
 
 
-def train(
+def train_run_or_fall_back(
     capture: Capture,
     out: Path,
     run: Run,
     selection: Selection | None = None,
     resume: bool = False,
     report: Report = ignore,
-    falls_back: bool = False,
+) -> Path:
+    """`train_run`; where a GPU fails, on the CPU from the last checkpoint on."""
+    try:
+        return train_run(capture, out, run, selection, resume, report)
+    except DeviceError as error:
+        _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
+    # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
+    report(Progress(stage="Continuing on the CPU"))
+    return train_run(capture, out, replace(run, device="cpu"), selection, True, report)
+
+
+def train_run(
+    capture: Capture,
+    out: Path,
+    run: Run,
+    selection: Selection | None = None,
+    resume: bool = False,
+    report: Report = ignore,
 ) -> Path:
     """Train a capture into the folder `out` and return the path of the avatar file.
 
     selection: instead of the rule's. With `resume`, continues from the folder's checkpoint to the
     parameters that an unbroken run would have reached (same seed, number of threads and device).
-    falls_back: where a GPU fails, continue from the last checkpoint on the CPU.
     Raises StgaError where the capture has nothing to train on, the folder is in use, is the
     capture's or holds another run or one that cannot be continued, or STGA_LPIPS names a file
-    without its weights. A first Ctrl-C raises KeyboardInterrupt when avatar and checkpoint are
-    saved, a second one at once.
+    without its weights; DeviceError where a GPU fails. A first Ctrl-C raises KeyboardInterrupt when
+    avatar and checkpoint are saved, a second one at once.
     """
-    try:
-        return _train(capture, out, run, selection, resume, report)
-    except DeviceError as error:
-        if not falls_back:
-            raise
-        _log.warning("%s; continuing on the CPU from the last checkpoint", error.cause)
-    # Outside the handler: the error's traceback would keep the failed loop and its buffers alive.
-    report(Progress(stage="Continuing on the CPU"))
-    return _train(capture, out, replace(run, device="cpu"), selection, True, report)
-
-
-def _train(
-    capture: Capture, out: Path, run: Run, selection: Selection | None, resume: bool, report: Report
-) -> Path:
-    """`train` on the device of the run."""
     lpips.load_network()  # read now, because it is needed only when everything is trained
     if not capture.views.get("train"):
         raise StgaError(f"{capture.root}: has no training views, so there is nothing to train on")
@@ -130,7 +132,7 @@ def _train(
             if has_begun and selection is None and (out / folders.SELECTION).exists():
                 selection = checkpoints.read_selection(out, len(capture.faces), run.digest)
             session = _begin(capture, out, run, selection, report)
-        session.work()
+        session.complete()
     return out / AVATAR
 
 
@@ -161,7 +163,7 @@ class _Session:
     tracking_gain: float | None = None
     interrupts: list[int] = field(default_factory=list)
 
-    def work(self) -> None:
+    def complete(self) -> None:
         """Train until the budget is spent, a goal is reached or the report asks to stop."""
         # meanwhile, the splats are shown as they begin
         self._tell("Compiling kernels")
@@ -174,7 +176,7 @@ class _Session:
         with interrupt_requests() as self.interrupts:
             if self.run.continuation is not None and not lines:
                 self._evaluate()  # the avatar before, which the others are compared with
-            self._train()
+            self._train_steps()
             if not self._is_trained():
                 self._stop()
             elif self._evaluate_finally():
@@ -184,7 +186,8 @@ class _Session:
         if self.interrupts:
             raise KeyboardInterrupt
 
-    def _train(self) -> None:
+    def _train_steps(self) -> None:
+        """Make steps, evaluations and checkpoints until training is finished or is to stop."""
         trainer = self.trainer
         tracking = self.trainer.tracking
         saved = self.elapsed_s
@@ -394,11 +397,12 @@ class _Session:
             return told or bool(self.interrupts)
 
         settings = self.run.settings
+        trained = TrainedAvatar(avatar, settings)
         capture = tracking.refined(capture)
         chosen = tracked_timesteps(settings, capture, tracked)
         seconds = None if settings.seconds is None else TRACKING_TIME_SHARE * settings.seconds
         try:
-            found = track_by_avatar(avatar, settings, capture, chosen, seconds, stops)
+            found = track_by_avatar(trained, capture, chosen, seconds, stops)
         except Cancelled:
             return None
         tracking.take(found, changed)

@@ -45,7 +45,7 @@ def train(capture, out, monkeypatch, choice):
     calls = Counter()
     for effect, (module, name) in CALLS.items():
         monkeypatch.setattr(module, name, counting(calls, effect, getattr(module, name)))
-    session.train(capture, out, Run(capture.root, None, "vhap", settings, plan))
+    session.train_run(capture, out, Run(capture.root, None, "vhap", settings, plan))
     return calls, read_checkpoint(out).state
 
 

@@ -12,7 +12,7 @@ from stga_addon.training.effects.plan import plan_effects
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize.image_preparation import view_exposure
 from stga_addon.training.run.folder import Run
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 from stga_addon.training.settings import make_settings
 
 from .scenes import Scene, photograph
@@ -86,7 +86,7 @@ def test_timesteps_that_are_left_out_look_like_the_recording(drifting, tmp_path)
     for choice in ("on", "off"):
         settings, _ = planned(drifting, iterations=200, exposure=choice)
         run = Run(drifting.root, None, "vhap", replace(settings, effects=None))
-        avatar = train(drifting, tmp_path / choice, run)
+        avatar = train_run(drifting, tmp_path / choice, run)
         quality = evaluate_avatar(read_avatar(avatar), drifting, "val")
         assert quality.psnr_unmatched is None
         psnr[choice] = quality.psnr

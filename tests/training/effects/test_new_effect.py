@@ -28,7 +28,7 @@ from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.continuation import starting_state
 from stga_addon.training.run.folder import Continuation, Run
 from stga_addon.training.run.identity import file_digest
-from stga_addon.training.run.session import train
+from stga_addon.training.run.session import train_run
 
 from ..test_driven_offsets import squeezed
 from ..toys import bits, quick_settings, stop_at
@@ -88,10 +88,10 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(
     run = planned(capture)
     assert run.settings.driven_offsets == (NAME,)
     assert dict(describe_effects(run.effect_plan))["toy-growth"] == "on: the head grows [6 numbers]"
-    train(capture, tmp_path / "whole", run)
-    train(capture, tmp_path / "parts", run, report=stop_at(13))
+    train_run(capture, tmp_path / "whole", run)
+    train_run(capture, tmp_path / "parts", run, report=stop_at(13))
     assert read_checkpoint(tmp_path / "parts").iteration == 13
-    train(capture, tmp_path / "parts", run, resume=True)
+    train_run(capture, tmp_path / "parts", run, resume=True)
     whole, parts = (read_checkpoint(tmp_path / name).state for name in ("whole", "parts"))
     for name, expected in bits(whole).items():
         np.testing.assert_array_equal(bits(parts)[name], expected, err_msg=name)
