@@ -7,7 +7,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -194,7 +194,8 @@ class _Session:
         started = self.elapsed_s
         first = trainer.iteration
         interval_s = _asked_interval_s()
-        with self._loader() as loader:
+        with ExitStack() as stack:
+            loader = stack.enter_context(self._loader())
             while self._refinement_is_due() or not self._spent().share >= 1:
                 begin = perf_counter()
                 # a run that was stopped in the middle of it has made the step before
@@ -210,6 +211,10 @@ class _Session:
                     self.elapsed_s += perf_counter() - begin
                     if not tracking.rounds:
                         break
+                    if self.run.settings.backdrop == "mesh":
+                        # what was read ahead or is kept was cut by the meshes of before
+                        loader.close()
+                        loader = stack.enter_context(self._loader())
                 if self.evaluator.is_due(self._spent()):
                     self._evaluate()
                     if self._is_finished():
@@ -300,9 +305,11 @@ class _Session:
             share = self._spent().share if total is None else (first + position) / total
             return coarse if share < settings.coarse_share else full
 
-        prepare = image_preparation(capture, settings)
+        tracking = self.trainer.tracking
         # refined meshes change halfway
-        mesh = self.trainer.frames.mesh_unless_kept if self.trainer.tracking is None else None
+        mesh = self.trainer.frames.mesh_unless_kept if tracking is None else None
+        shown = capture if tracking is None else tracking.refined(capture)
+        prepare = image_preparation(shown, settings)
         return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
 
     def _refine(self, tracking: RefinedTracking) -> None:
