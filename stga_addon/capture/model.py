@@ -76,6 +76,19 @@ class Capture:
     warnings: tuple[str, ...] = ()
     fps: float | None = None
 
+    @property
+    def all_views(self) -> list[View]:
+        """Of every split, in their order."""
+        return [view for views in self.views.values() for view in views]
+
+
+def views_by_timestep(views: Iterable[View]) -> dict[int, list[View]]:
+    """The views of each timestep, in the order of the views."""
+    found: dict[int, list[View]] = {}
+    for view in views:
+        found.setdefault(view.timestep, []).append(view)
+    return found
+
 
 def evenly_spread(items: Sequence[Item], limit: int) -> list[Item]:
     """At most `limit` of the items: the first, the last, and those evenly between."""
@@ -101,7 +114,7 @@ def parts_of(timesteps: Sequence[int], limit: int) -> list[list[int]]:
 
 def summarize_capture(capture: Capture) -> list[tuple[str, str]]:
     """(label, value) lines: recording, tracking, warnings. Reads no image."""
-    views = [view for split in capture.views.values() for view in split]
+    views = capture.all_views
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     masked = sum(view.mask is not None for view in views)
     splits = []

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from ..capture.loader import LoadedView, ViewLoader
-from ..capture.model import Capture, evenly_spread
+from ..capture.model import Capture, evenly_spread, views_by_timestep
 from ..errors import StgaError
 from ..selection import select_capture
 from .effects.plan import plan_effects
@@ -124,11 +124,10 @@ def _loaded_views(
     """Scale -> CALIBRATION_VIEWS as the loader gives them, in turn without end."""
     order = view_order(capture.views["train"], settings.views_per_visit, settings.seed)
     views = list(islice(order, CALIBRATION_VIEWS))
-    red, green, blue = (round(255 * c) for c in settings.background)
     loader = ViewLoader(
         [*views, *views],
         lambda position: scales[position // len(views)],
-        (red, green, blue),
+        settings.background_levels,
         prepare=image_preparation(capture, settings),
         mesh=capture.mesh,
     )
@@ -141,10 +140,7 @@ def _tracking_seconds(trainer: Trainer, settings: TrainingSettings) -> float:
     first one, which begins from a single start, is not."""
     capture = trainer.capture
     alone = replace(capture, views={"train": capture.views["train"]})
-    trained, every = (
-        {view.timestep for views in own.views.values() for view in views}
-        for own in (alone, capture)
-    )
+    trained, every = (views_by_timestep(own.all_views).keys() for own in (alone, capture))
     counts = [
         len(tracked_timesteps(settings, own, sorted(timesteps)))
         for own, timesteps in ((alone, trained), (capture, every - trained))

@@ -5,7 +5,7 @@ from itertools import count
 
 import numpy as np
 
-from ..capture.model import View
+from ..capture.model import View, views_by_timestep
 from .settings import Rates, TrainingSettings
 
 COARSE_SCALE = 0.5
@@ -22,9 +22,7 @@ def view_order(views: Sequence[View], per_visit: int, seed: int, start: int = 0)
     fully shuffled), and the groups in random order. Epoch e depends on (seed, e) alone, so a
     resumed run continues the same order.
     """
-    frames: dict[int, list[View]] = {}
-    for view in views:
-        frames.setdefault(view.timestep, []).append(view)
+    frames = views_by_timestep(views)
     skip = start % len(views)
     for epoch in count(start // len(views)):
         rng = np.random.default_rng([seed, epoch])

@@ -225,6 +225,12 @@ class TrainingSettings:
     )
 
     @property
+    def background_levels(self) -> tuple[int, int, int]:
+        """The background in 0…255, as images are read over it."""
+        red, green, blue = (round(255 * part) for part in self.background)
+        return red, green, blue
+
+    @property
     def follows_strain(self) -> bool:
         """Whether colors or positions depend on the deformation of the mesh."""
         return bool(self.driven_offsets)

@@ -174,7 +174,7 @@ def test_refined_meshes_cut_what_is_trained_on(
     ahead or kept from then: the head would lose a rim, and get one of the backdrop."""
     capture = right[0]
     views = tuple(replace(view, mask=None) for view in capture.views["train"])
-    run = make_run(capture, backdrop="mesh")
+    run = make_run(capture, backdrop="mesh", iterations=16, driven_offsets=())
     errors = iter((2.0, 1.0))
     step = Trainer.step
     moved = []

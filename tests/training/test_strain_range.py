@@ -165,7 +165,7 @@ def test_another_runs_range_is_refused(toy, tmp_path):
     limits = trained_range(len(toy.faces))
     digest = identity_of(toy, "vhap", settings).digest
     for (stored, identity), says in (
-        ((limits, "other"), "belongs to another run than run.json beside it"),
+        ((limits, "other"), "belongs to another run than run.json"),
         ((limits[1:], digest), r"strain_range is float32 .*, expected float32 \(320, 2, 6\)"),
     ):
         arrays = {"strain_range": stored, "identity": np.frombuffer(identity.encode(), np.uint8)}

@@ -23,7 +23,7 @@ from ...capture.camera import Camera
 from ...capture.images import read_view
 from ...capture.loader import Preparation
 from ...capture.mesh_geometry import ArrayPair, rasterize, silhouette, vertex_normals
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...capture.open import with_sequence
 from ...errors import StgaError
 from ...flame.forward import (
@@ -212,7 +212,7 @@ def tracked_timesteps(
     if settings.iterations is None:
         return list(timesteps)
     wanted = set(timesteps)
-    shown = sum(view.timestep in wanted for views in capture.views.values() for view in views)
+    shown = sum(view.timestep in wanted for view in capture.all_views)
     views = min(MAX_VIEWS, max(1.0, shown / max(1, len(timesteps))))
     most = int(TRACKED_SHARE * settings.iterations / views)
     return evenly_spread(timesteps, max(MIN_TRACKED_TIMESTEPS, most))
@@ -281,9 +281,8 @@ def read_small(
 ) -> tuple[View, np.ndarray]:
     """A view with a camera of at most that height, and its image (H, W, 3) uint8 as training with
     the settings sees it; prepare: their `image_preparation`."""
-    red, green, blue = (round(255 * part) for part in settings.background)
     scale = min(1.0, height_px / view.camera.height)
-    view, image, mask = read_view(view, scale, (red, green, blue))
+    view, image, mask = read_view(view, scale, settings.background_levels)
     return view, image if prepare is None else prepare(view, image, mask)[0]
 
 
@@ -313,9 +312,7 @@ class _Tracker:
         self._capture = capture
         self._settings = settings
         self._sequence = sequence
-        self._views: dict[int, list[View]] = {}
-        for view in (view for views in capture.views.values() for view in views):
-            self._views.setdefault(view.timestep, []).append(view)
+        self._views = views_by_timestep(capture.all_views)
         self._cuts = settings.backdrop == "mesh"
         whole = replace(settings, backdrop="masked") if self._cuts else settings
         self._prepare = image_preparation(capture, whole)

@@ -76,16 +76,22 @@ def write_selection(folder: Path, selection: Mapping[int, np.ndarray], identity:
 def read_selection(folder: Path, faces: int, identity: str | None = None) -> dict[int, np.ndarray]:
     """timestep -> (F,) bool. Raises StgaError for another mesh, or another `identity` if given."""
     path = folder / SELECTION
-    arrays = read_npz(path)
-    stored = arrays.pop(IDENTITY, None)
-    if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
-        raise StgaError(f"{path}: {OTHER_RUN}")
+    arrays = _arrays_of_run(path, identity)
     for name, mask in arrays.items():
         named = re.fullmatch(r"\d{1,18}", name, re.ASCII)
         if not named or mask.dtype != bool or mask.shape != (faces,):
             expected = f"expected bool ({faces},) by timestep"
             raise StgaError(f"{path}: '{name}' is {mask.dtype} {mask.shape}, {expected}")
     return {int(name): mask for name, mask in arrays.items()}
+
+
+def _arrays_of_run(path: Path, identity: str | None) -> dict[str, np.ndarray]:
+    """The arrays of a file of the run with this digest; None: of any. Raises StgaError."""
+    arrays = read_npz(path)
+    stored = arrays.pop(IDENTITY, None)
+    if identity is not None and (stored is None or stored.tobytes() != identity.encode()):
+        raise StgaError(f"{path}: {OTHER_RUN}")
+    return arrays
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -258,14 +264,11 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
     if not run.settings.follows_strain or run.settings.tracking:
         return None
     path = folder / STRAIN_RANGE
-    identity = _packed(run.digest)
     if not path.exists():
         limits = trained_strain_range(capture, capture.mesh, run.continuation)
-        write_npz(path, {"strain_range": limits, IDENTITY: identity}, compressed=True)
+        write_npz(path, {"strain_range": limits, IDENTITY: _packed(run.digest)}, compressed=True)
         return limits
-    arrays = read_npz(path)
-    if not np.array_equal(arrays.get(IDENTITY, ()), identity):
-        raise StgaError(f"{path}: belongs to another run than run.json beside it; remove it")
+    arrays = _arrays_of_run(path, run.digest)
     found = arrays.get("strain_range", np.zeros(0))
     shape = len(capture.faces), *TRAINED_RANGE.shape
     check_array(path, "strain_range", found, "float32", shape)

@@ -12,7 +12,7 @@ from operator import add
 import numpy as np
 
 from ...avatar.file import read_avatar
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...errors import StgaError
 from ...raster.cpu.layout import Parameters
 from ...schema import validate
@@ -241,9 +241,7 @@ def replayed_views(
     capture: Capture, views: Sequence[View], limit: int = REPLAY_VIEWS
 ) -> list[View]:
     """At most `limit` views: some cameras each of the timesteps that differ most."""
-    by_timestep: dict[int, list[View]] = {}
-    for view in views:
-        by_timestep.setdefault(view.timestep, []).append(view)
+    by_timestep = views_by_timestep(views)
     chosen = distinct_timesteps(capture, sorted(by_timestep))
     kept = []
     cameras = max(1, limit // max(1, len(chosen)))

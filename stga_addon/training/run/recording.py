@@ -87,8 +87,7 @@ def avatar_person(run: Path) -> tuple[KnownPerson, Path | None]:
 def cameras_of(capture: Capture) -> dict[int, Camera]:
     """By their index; where never two show one timestep, as a phone's in several takes, the first
     take's stands for all."""
-    views = [view for split in capture.views.values() for view in split]
-    views.sort(key=lambda view: view.timestep)
+    views = sorted(capture.all_views, key=lambda view: view.timestep)
     found = {view.camera_index: view.camera for view in views}
     if cameras_at_once(views) > 1:
         return found
@@ -180,7 +179,7 @@ def _fit_scale(run: Path, root: Path, helpers: Helpers, report: Callable[[], Non
     off by some percent. One camera does not see scale. Returns the factor."""
     source = run, (run / AVATAR).stat().st_mtime_ns, root, 1.0, 0
     avatar, settings, capture = _open(*source)
-    if cameras_at_once(view for views in capture.views.values() for view in views) < 2:
+    if cameras_at_once(capture.all_views) < 2:
         return 1.0
     chosen = evenly_spread(capture.timesteps, SCALE_TIMESTEPS)
     light = _light(avatar, settings, capture)
@@ -296,7 +295,7 @@ def _colors_by_camera(
     """EXPOSURE_VIEWS of each camera, and their colors on the head; world: the capture's is moved so
     before the avatar is drawn."""
     by_camera: dict[int, list[View]] = {}
-    for view in (view for views in capture.views.values() for view in views):
+    for view in capture.all_views:
         by_camera.setdefault(view.camera_index, []).append(view)
     for views in by_camera.values():
         chosen = evenly_spread(sorted(views, key=lambda view: view.timestep), EXPOSURE_VIEWS)
@@ -306,9 +305,8 @@ def _colors_by_camera(
 def _head_colors(
     avatar: Avatar, settings: TrainingSettings, capture: Capture, view: View, world: Similarity
 ) -> HeadColors:
-    levels = [round(255 * part) for part in settings.background]
     scale = min(1.0, EXPOSURE_HEIGHT_PX / view.camera.height)
-    view, image, mask = read_view(view, scale, (levels[0], levels[1], levels[2]))
+    view, image, mask = read_view(view, scale, settings.background_levels)
     mesh = world.apply(capture.mesh(view.timestep))
     camera = world.camera(view.camera)
     drawn = render_avatar(avatar, mesh, camera, settings.background)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...avatar.file import Avatar, read_avatar, write_avatar
 from ...capture.loader import ViewLoader
-from ...capture.model import Capture, View, evenly_spread
+from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
 from ...flame.sequence import SHIFT_SIZE
@@ -245,11 +245,10 @@ class _Session:
     def _unseen_timesteps(self) -> list[int]:
         """Timesteps without training views that the avatar is still to track."""
         tracking = self.trainer.tracking
-        views = self.capture.views
         if tracking is None or not tracking.has_moved or tracking.rounds != 1:
             return []
-        every = {view.timestep for members in views.values() for view in members}
-        return sorted(every - {view.timestep for view in views["train"]})
+        every = views_by_timestep(self.capture.all_views)
+        return sorted(every.keys() - views_by_timestep(self.capture.views["train"]).keys())
 
     def _stop(self) -> None:
         """Save the run for its resumption, and evaluate the avatar of now, which is kept meanwhile
@@ -290,7 +289,6 @@ class _Session:
         settings = self.run.settings
         capture = self.capture
         first = self.trainer.iteration
-        red, green, blue = (round(255 * c) for c in settings.background)
         if self.run.continuation is None:
             views = capture.views["train"]
             order = view_order(views, settings.views_per_visit, settings.seed, first)
@@ -310,7 +308,7 @@ class _Session:
         mesh = self.trainer.frames.mesh_unless_kept if tracking is None else None
         shown = capture if tracking is None else tracking.refined(capture)
         prepare = image_preparation(shown, settings)
-        return ViewLoader(order, scale, (red, green, blue), prepare=prepare, mesh=mesh)
+        return ViewLoader(order, scale, settings.background_levels, prepare=prepare, mesh=mesh)
 
     def _refine(self, tracking: RefinedTracking) -> None:
         """Let the avatar track the training timesteps; undone where views that are left out of it
