@@ -100,7 +100,7 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
-        shown = ("format", "avatar", *(("motion_only",) if self.format == "web" else ()))
+        shown = ("format", "avatar", *(("motion_only",) if FORMATS[self.format].has_rig else ()))
         for name in shown:
             self.layout.prop(self, name)
         if FORMATS[self.format].source == "range":
@@ -136,7 +136,7 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         check_head(avatar, head)
         motion = None
         playback = Playback(fps=fps)
-        if self.format == "web":
+        if format.has_rig:
             motion = None if self.motion_only else exact_motion(head, frames, self.warn)
             playback = scene_playback(context, head, frames, self.motion_only)
             playback = replace(playback, controls=page_controls(motion))

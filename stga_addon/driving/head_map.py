@@ -7,7 +7,7 @@ import numpy as np
 
 from ..capture.mesh_geometry import similarity
 from ..errors import StgaError
-from ..export.playback import ShapeControls
+from ..export.rig import ShapeControls
 from ..flame.forward import RIGID_SIZE, FlameFrame
 from ..flame.model import JOINTS, FlameModel
 from ..flame.quaternions import from_axis_angle, multiply, to_axis_angle

@@ -17,6 +17,7 @@ from ..format import format_bytes
 from .gltf import write_gltf
 from .playback import Playback, check_rate
 from .ply import ply_bytes, write_gaussian_avatars, write_ply, write_ply_sequence
+from .rig import RiggedAvatar, rigged_avatar
 from .spz import write_spz
 from .usd import usd_bytes, write_usd
 from .web.page import web_bytes, write_web
@@ -49,6 +50,15 @@ class Content:
         """The splats in world space on the first mesh. Raises StgaError as `frames`."""
         return next(self.frames(path))[1]
 
+    def rigged(self, path: Path) -> RiggedAvatar:
+        """The avatar with what moves it. Raises StgaError naming `path` where there is no pose."""
+        motion_only = self.playback.motion_only
+        controls = self.playback.controls
+        try:
+            return rigged_avatar(self.avatar, self.meshes, self.sequence, motion_only, controls)
+        except ValueError as error:
+            raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
+
 
 @dataclass(frozen=True)
 class Format:
@@ -61,8 +71,8 @@ class Format:
     write     writes `content` to a path: returns the files, None where that is the path alone
     size      bytes that `frames` of an avatar take, about; of a "range"
     has_rate  whether it records how many frames play in a second
-    is_page   whether it shows what `Playback` holds besides the rate, and takes the FLAME motion
-              where there is one
+    has_rig   whether it takes the avatar with its rig (`Content.rigged`), and what else `Playback`
+              holds; the source is a "range"
     """
 
     label: str
@@ -72,7 +82,7 @@ class Format:
     write: Callable[[Path, Content], list[Path] | None]
     size: Callable[[Avatar, int], int] = lambda avatar, frames: frames * ply_bytes(avatar.splats)
     has_rate: bool = False
-    is_page: bool = False
+    has_rig: bool = False
 
 
 def _moving_color(avatar: Avatar) -> bool:
@@ -117,10 +127,10 @@ FORMATS = {
         "The frames of the scene as a page that plays them, or as data for a server",
         (".html", ".stga"),
         "range",
-        lambda path, item: write_web(path, item.avatar, item.playback, item.meshes, item.sequence),
+        lambda path, item: write_web(path, item.rigged(path), item.playback),
         lambda avatar, frames: web_bytes(avatar),
         has_rate=True,
-        is_page=True,
+        has_rig=True,
     ),
     "gltf": Format(
         "glTF",
@@ -153,8 +163,8 @@ def export_avatar(
              number; an earlier sequence there is replaced as a whole) and "gaussian-avatars"
              (point_cloud.ply and flame_param.npz)
     meshes   taken one at a time; a "frame" takes the first
-    sequence the FLAME motion, for "gaussian-avatars"; for "web", where its rig is to go along
-    playback meshes per second, and what else a "web" page shows
+    sequence the FLAME motion, for "gaussian-avatars", and where its rig is to go along (`has_rig`)
+    playback meshes per second, and what else a format with a rig shows
     Raises StgaError where the suffix is another, the format needs what is not given or has no such
     frame rate, or a file cannot be written.
     """

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,30 +36,9 @@ def write_gltf(path: Path, world: Splats) -> None:
     extension shows.
     Source: Khronos, KHR_gaussian_splatting.
     """
-    opacity = world.opacities()
-    fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
-    # Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes.
-    attributes = {
-        "POSITION": world.xyz,
-        "COLOR_0": np.round(np.column_stack([fallback, opacity]) * 255).astype(np.uint8),
-        f"{EXTENSION}:ROTATION": world.unit_rotations()[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": world.scales(),
-        f"{EXTENSION}:OPACITY": opacity,
-    }
-    for k in range(world.sh.shape[1]):
-        degree = math.isqrt(k)
-        name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
-        attributes[name] = world.sh[:, k]
-    views = list[dict[str, Any]]()
-    accessors = list[dict[str, Any]]()
-    offset = 0
-    for array in attributes.values():
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
-        accessor = {"bufferView": len(views), "count": len(array)}
-        accessor |= _COMPONENTS[array.dtype.name]
-        accessors.append(accessor | {"type": _TYPES[array.shape[1] if array.ndim > 1 else 1]})
-        views.append(view | {"target": _VERTICES})
-        offset += array.nbytes
+    attributes = _attributes(world)
+    arrays = list(attributes.values())
+    accessors, views = _accessors(arrays)
     # The first is the position.
     accessors[0] |= {"min": world.xyz.min(axis=0).tolist(), "max": world.xyz.max(axis=0).tolist()}
     splatting = {
@@ -81,13 +61,52 @@ def write_gltf(path: Path, world: Splats) -> None:
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
+        "buffers": [{"byteLength": sum(array.nbytes for array in arrays)}],
     }
+    _write_glb(path, document, arrays)
+
+
+def _attributes(world: Splats) -> dict[str, np.ndarray]:
+    """Semantic -> values, (N,) or (N, 3 or 4), each row a multiple of four bytes."""
+    opacity = world.opacities()
+    fallback = srgb_to_linear(np.clip(0.5 + SH_C0 * world.sh[:, 0], 0, 1))
+    attributes = {
+        "POSITION": world.xyz,
+        "COLOR_0": np.round(np.column_stack([fallback, opacity]) * 255).astype(np.uint8),
+        f"{EXTENSION}:ROTATION": world.unit_rotations()[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": world.scales(),
+        f"{EXTENSION}:OPACITY": opacity,
+    }
+    for k in range(world.sh.shape[1]):
+        degree = math.isqrt(k)
+        name = f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
+        attributes[name] = world.sh[:, k]
+    return attributes
+
+
+def _accessors(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Accessors of vertex attributes that lie in the buffer one after the other, and their buffer
+    views."""
+    accessors = list[dict[str, Any]]()
+    views = list[dict[str, Any]]()
+    offset = 0
+    for array in arrays:
+        kind = _TYPES[array.shape[1] if array.ndim > 1 else 1]
+        accessor = {"bufferView": len(views), "count": len(array)}
+        accessors.append(accessor | _COMPONENTS[array.dtype.name] | {"type": kind})
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes}
+        views.append(view | {"target": _VERTICES})
+        offset += array.nbytes
+    return accessors, views
+
+
+def _write_glb(path: Path, document: dict[str, Any], arrays: Sequence[np.ndarray]) -> None:
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
+    size = sum(array.nbytes for array in arrays)
     with replacing(path) as partial, partial.open("wb") as out:
-        out.write(_MAGIC + struct.pack("<II", _VERSION, 12 + 8 + len(text) + 8 + offset))
+        out.write(_MAGIC + struct.pack("<II", _VERSION, 12 + 8 + len(text) + 8 + size))
         out.write(struct.pack("<I", len(text)) + _JSON_CHUNK + text)
-        out.write(struct.pack("<I", offset) + _BINARY_CHUNK)
-        for array in attributes.values():
+        out.write(struct.pack("<I", size) + _BINARY_CHUNK)
+        for array in arrays:
             out.write(array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes())

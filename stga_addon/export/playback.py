@@ -10,6 +10,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..capture.model import Capture
 from ..errors import StgaError
+from .rig import ShapeControls
 
 DEFAULT_FPS = 25.0
 MIN_FPS = 0.01
@@ -17,25 +18,6 @@ MAX_FPS = 1000.0
 """Frame rates that videos, USD files and the web player (player/data.js) take."""
 MAX_VIEWS = 32
 """Cameras that a page offers."""
-
-
-@dataclass(frozen=True)
-class ShapeControls:
-    """Sliders of a page that move expressions, jaw and eyes of its FLAME rig together, such as
-    ARKit's shapes.
-
-    linear    (C, E + 9): expression coefficients, then axis-angles of jaw, left and right eye, per
-              weight of control
-    products  (C, E): expression coefficients per product of a weight and that of the control
-              `opens`
-    limited   the control whose weight counts up to that of `opens` only
-    """
-
-    names: tuple[str, ...]
-    linear: np.ndarray
-    products: np.ndarray
-    opens: str
-    limited: str
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ..driving.open_motion import MotionOptions
 from ..errors import StgaError
 from ..export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
 from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
-from ..export.web.page import flame_notice
+from ..export.rig import flame_notice
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes, format_name
 from ..light.relight import albedo_avatar
@@ -24,6 +24,10 @@ from ..selection import SelectionOptions, select_capture
 from ..training.run.folder import AVATAR, SELECTION
 from . import avatar_source
 from .train import Train
+
+RATED = " and ".join(name for name, format in FORMATS.items() if format.has_rate)
+RIGGED = " and ".join(name for name, format in FORMATS.items() if format.has_rig)
+"""Names of formats, for help."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +53,15 @@ class Export:
         "of a format that holds several (default: all)", None, metavar="FIRST:LAST"
     )
     fps: float | None = option(
-        "frames per second of usd and web (default: the scene's or the capture's, else "
+        f"frames per second of {RATED} (default: the scene's or the capture's, else "
         f"{DEFAULT_FPS:g})",
         None,
         above=0,
     )
     motion_only: bool = option(
-        "web: leave out the blend shapes and skeleton of the FLAME file; the meshes of the take "
-        "stay in the page, and FLAME's licence decides who may receive it either way",
+        f"{RIGGED}: leave out the blend shapes and skeleton of the FLAME file; the "
+        "meshes of the take stay in the page, and FLAME's licence decides who may receive it "
+        "either way",
         False,
     )
     motion: Path | None = avatar_source.motion_field()
@@ -70,7 +75,7 @@ class Export:
         held = {
             "timestep": [name for name, format in FORMATS.items() if format.source == "frame"],
             "frames": [name for name, format in FORMATS.items() if format.source == "range"],
-            "motion_only": [name for name, format in FORMATS.items() if format.is_page],
+            "motion_only": [name for name, format in FORMATS.items() if format.has_rig],
         }
         chosen = f"--format {self.file_format}"
         for name, formats in held.items():
@@ -97,7 +102,7 @@ def export(request: Export, report: Report, say: Say) -> Written:
     playback = Playback(fps=fps)
     flame = None if capture is None else capture.flame
     meshes: Meshes = [(0, avatar.neutral)]
-    if format.is_page and capture is None and request.frames is None:
+    if format.has_rig and capture is None and request.frames is None:
         _say_size(request, avatar, 1, say)
         playback = Playback(title=_title(request), fps=fps, motion_only=True)
         _say_licence(flame_notice(avatar, None, motion_only=True), say)
@@ -105,7 +110,7 @@ def export(request: Export, report: Report, say: Say) -> Written:
         capture = avatar_source.required_capture(capture)
         timesteps = avatar_source.timesteps_between(capture, request.frames, say)
         _say_size(request, avatar, len(timesteps), say)
-        if format.is_page:
+        if format.has_rig:
             playback, flame = capture_playback(request, avatar, capture, timesteps, fps, say)
         posed = ((timestep, capture.mesh(timestep)) for timestep in timesteps)
         meshes = counted(posed, len(timesteps), report, "Exporting", "Frame")

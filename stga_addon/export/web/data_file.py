@@ -1,10 +1,9 @@
-"""Web data files: an avatar, a linear rig that moves it, and cameras (docs/formats.md)."""
+"""Web data files: a rigged avatar, how it plays, and cameras (docs/formats.md)."""
 
 import gzip
 import json
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,9 @@ from ...avatar.embedding import face_frames
 from ...avatar.file import Avatar
 from ...avatar.offsets import OFFSETS, POSITION
 from ...avatar.splats import Splats
-from ...capture.mesh_geometry import weighted_procrustes
-from ...flame.forward import joint_positions
-from ...flame.model import JOINTS
-from ...flame.quaternions import from_matrices, to_axis_angle
-from ...flame.sequence import FlameSequence, motion_arrays, with_identity
 from ...light.relight import Relighter
 from ..playback import Playback
+from ..rig import Rig, RiggedAvatar, ShapeControls
 from ..spz import smallest_three
 
 MAGIC = b"STGA"
@@ -80,120 +75,6 @@ def _entry(name: str, array: np.ndarray, step: float | None) -> tuple[dict[str, 
     return entry, b"".join(np.moveaxis(plane, -1, 0).tobytes() for plane in planes)
 
 
-BAKE_TOLERANCE_M = 5e-6
-"""Largest distance of a vertex of a baked mesh from the mesh that was baked."""
-
-
-@dataclass(frozen=True)
-class WebRig:
-    """Blend shapes, skeleton and motion: V vertices, R blend shapes, J joints, T frames; meters and
-    radians.
-
-    base         (V, 3) vertices before blend shapes
-    basis        (R, V, 3); the first `expressions` are sliders, which have the
-                 `expression_names` or, without any, numbers
-    correctives  (9·(J − 1), V, 3), factors: the entries of the rotations of joints 1… minus
-                 identity
-    joint_rest   (J, 3); they move with the blend shapes by joint_basis (R, J, 3)
-    parents      of the joints, -1 for the root
-    weights      (V, J) of linear blend skinning
-    coefficients (T, R); pose (T, J, 3) axis-angle; translation (T, 3), added last
-    """
-
-    base: np.ndarray
-    basis: np.ndarray
-    correctives: np.ndarray
-    joint_rest: np.ndarray
-    joint_basis: np.ndarray
-    joint_names: tuple[str, ...]
-    parents: tuple[int, ...]
-    weights: np.ndarray
-    coefficients: np.ndarray
-    pose: np.ndarray
-    translation: np.ndarray
-    expressions: int
-    expression_names: tuple[str, ...] = ()
-
-
-def flame_rig(sequence: FlameSequence) -> WebRig:
-    """The FLAME model with the person's identity baked in; dynamic offsets become blend shapes."""
-    person = with_identity(sequence)
-    model = person.model
-    motion = motion_arrays(person)
-    expressions = np.moveaxis(model.shapedirs, 2, 0)
-    coefficients = motion["expr"]
-    if motion["dynamic_offset"].any():
-        shapes, factors = principal_shapes(motion["dynamic_offset"])
-        expressions = np.concatenate([expressions, shapes])
-        coefficients = np.concatenate([coefficients, factors], axis=1)
-    turns = [motion[name] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")]
-    return WebRig(
-        base=model.v_template,
-        basis=expressions,
-        correctives=np.moveaxis(model.posedirs, 2, 0),
-        joint_rest=joint_positions(model, model.v_template),
-        joint_basis=np.einsum("jv,rvc->rjc", model.j_regressor, expressions),
-        joint_names=JOINTS,
-        parents=tuple(model.parents.tolist()),
-        weights=model.weights,
-        coefficients=coefficients,
-        pose=np.concatenate(turns, axis=1).reshape(len(coefficients), -1, 3),
-        translation=motion["translation"],
-        expressions=model.n_expression,
-        expression_names=model.expression_names,
-    )
-
-
-def baked_rig(meshes: Sequence[np.ndarray]) -> WebRig:
-    """Posed meshes (V, 3) as one rigid motion and the principal components of what is left: a rig
-    without sliders.
-
-    Raises ValueError where there is none.
-    """
-    if not len(meshes):
-        raise ValueError("there is no posed mesh")
-    stack = np.asarray(meshes, np.float64)
-    weights = np.ones(stack.shape[1])
-    translations = stack.mean(1)
-    rotations = np.stack([weighted_procrustes(stack[0], mesh, weights)[0] for mesh in stack])
-    aligned = np.einsum("tba,tvb->tva", rotations, stack - translations[:, None])
-    base = aligned.mean(0)
-    basis, coefficients = principal_shapes(aligned - base)
-    vertices = len(base)
-    return WebRig(
-        base=base,
-        basis=basis,
-        correctives=np.zeros((0, vertices, 3)),
-        joint_rest=np.zeros((1, 3)),
-        joint_basis=np.zeros((len(basis), 1, 3)),
-        joint_names=("root",),
-        parents=(-1,),
-        weights=np.ones((vertices, 1)),
-        coefficients=coefficients,
-        pose=to_axis_angle(from_matrices(rotations))[:, None],
-        translation=translations,
-        expressions=0,
-    )
-
-
-def principal_shapes(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes (R, V, 3) and coefficients (T, R) in −1…1 with products near offsets (T, V, 3)."""
-    flat = offsets.reshape(len(offsets), -1)
-    _, directions = np.linalg.eigh(flat @ flat.T)
-    directions = directions[:, ::-1]  # largest first
-    shapes = []
-    rest = flat.copy()
-    for column in directions.T:
-        if np.linalg.norm(rest.reshape(-1, 3), axis=1).max() <= BAKE_TOLERANCE_M:
-            break
-        shapes.append(column @ flat)
-        rest -= np.outer(column, shapes[-1])
-    coefficients = directions[:, : len(shapes)]
-    largest = np.abs(coefficients).max(0) if shapes else np.ones(0)
-    basis = np.array(shapes).reshape(-1, *offsets.shape[1:]) * largest[:, None, None]
-    return basis, coefficients / largest
-
-
 POSITION_STEP_M = 4e-6
 MOVED_STEP_M = 0.25e-6
 """Of splats, and of how far a driven offset moves them with a unit of its signal."""
@@ -233,11 +114,27 @@ SLIDER_HEADROOM = 1.5
 """Sliders reach beyond the motion by this factor, and to ±1 at least."""
 
 
-def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = False) -> bytes:
-    """The data file of an avatar that `rig` moves; `exact`: float32 instead of fixed point.
+MOVING = (
+    "base",
+    "basis",
+    "correctives",
+    "weights",
+    "joint_rest",
+    "joint_basis",
+    "coefficients",
+    "pose",
+    "translation",
+)
+"""Arrays of the rig."""
+
+
+def data_file(rigged: RiggedAvatar, playback: Playback, exact: bool = False) -> bytes:
+    """The data file of an avatar; `exact`: float32 instead of fixed point.
 
     Raises ValueError where a value is not finite, or the player lacks a driven offset.
     """
+    avatar = rigged.avatar
+    rig = rigged.rig
     relighter = None if avatar.light is None else Relighter(avatar)
     surface = avatar.splats.face if relighter is None else relighter.face
     # equal triangles side by side, which gzip likes
@@ -249,8 +146,7 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         "neutral": avatar.neutral,
         "splats_per_face": np.bincount(splats.face, minlength=faces),
     }
-    moving = "base basis correctives weights joint_rest joint_basis coefficients pose translation"
-    arrays |= {name: getattr(rig, name) for name in moving.split()}
+    arrays |= {name: getattr(rig, name) for name in MOVING}
     # meters of a unit of the splats' local frames, where it is largest
     frames = face_frames(avatar.neutral, avatar.faces, avatar.neutral, avatar.convention)
     unit = float(frames.scale.max(initial=1e-6))
@@ -265,28 +161,16 @@ def data_file(avatar: Avatar, rig: WebRig, playback: Playback, exact: bool = Fal
         header["offsets"][name] = offset.signal, "light" if offset.of_light else offset.target
         arrays[name] = coefficients.reshape(faces, -1)
         steps[name] = MOVED_STEP_M / unit if offset.target == POSITION else OFFSET_STEP
-    if playback.controls is not None and rig.expressions:
-        controls = playback.controls
-        arrays |= {"shape_linear": controls.linear, "shape_products": controls.products}
-        header["shapes"] = {"names": list(controls.names)}
-        header["shapes"] |= {"opens": controls.opens, "limited": controls.limited}
+    if rigged.controls is not None and rig.expressions:
+        _add_controls(header, arrays, rigged.controls)
         if rig.expression_names:  # they are ARKit's shapes, whose sliders these are
             header["sliders"] = []
     if relighter is not None:
-        light = relighter.light
-        lashes = relighter.lashes
-        by_vertex = "transfer", "occlusion", "irradiance", "roughness"
-        arrays |= {f"light_{name}": getattr(light, name) for name in by_vertex}
-        steps["light_irradiance"] = float(light.irradiance.max(initial=1e-6)) / IRRADIANCE_STEPS
         # of most splats 0: their own
-        arrays["light_face"] = ((relighter.face - avatar.splats.face) % faces)[order]
-        arrays["light_lash_face"] = lashes.face
-        arrays["light_lash_corners"] = lashes.corners.reshape(-1, 12)
-        header["light"] = {
-            "damping": light.damping,
-            "typical": relighter.typical_albedo.tolist(),
-            "recorded": relighter.recorded_light.ravel().tolist(),
-        }
+        moved = ((relighter.face - avatar.splats.face) % faces)[order]
+        _add_light(header, arrays, relighter, moved)
+        brightest = float(relighter.light.irradiance.max(initial=1e-6))
+        steps["light_irradiance"] = brightest / IRRADIANCE_STEPS
     if playback.selection is not None:
         arrays["selection"] = np.packbits(np.stack(playback.selection), axis=1)
     return pack(header, arrays, {} if exact else steps)
@@ -306,10 +190,42 @@ def _splat_arrays(splats: Splats) -> dict[str, np.ndarray]:
     }
 
 
-def _header(avatar: Avatar, rig: WebRig, playback: Playback) -> dict[str, Any]:
+def _add_controls(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], controls: ShapeControls
+) -> None:
+    arrays |= {"shape_linear": controls.linear, "shape_products": controls.products}
+    header["shapes"] = {
+        "names": list(controls.names),
+        "opens": controls.opens,
+        "limited": controls.limited,
+    }
+
+
+def _add_light(
+    header: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    relighter: Relighter,
+    moved: np.ndarray,
+) -> None:
+    """moved (N,): from a splat's triangle to that which lights it, in the file's order."""
+    light = relighter.light
+    lashes = relighter.lashes
+    by_vertex = "transfer", "occlusion", "irradiance", "roughness"
+    arrays |= {f"light_{name}": getattr(light, name) for name in by_vertex}
+    arrays["light_face"] = moved
+    arrays["light_lash_face"] = lashes.face
+    arrays["light_lash_corners"] = lashes.corners.reshape(-1, 12)
+    header["light"] = {
+        "damping": light.damping,
+        "typical": relighter.typical_albedo.tolist(),
+        "recorded": relighter.recorded_light.ravel().tolist(),
+    }
+
+
+def _header(avatar: Avatar, rig: Rig, playback: Playback) -> dict[str, Any]:
     """All but what tells of shapes, light and arrays."""
     # Sliders: every expression with its range, those that the motion uses most first.
-    names = rig.expression_names or [f"expr_{k:03d}" for k in range(rig.expressions)]
+    names = rig.shape_names
     used = rig.coefficients[:, : rig.expressions]
     reach = np.maximum(SLIDER_HEADROOM * np.abs(used).max(0, initial=0.0), MIN_SLIDER_RANGE)
     order = np.argsort(-used.std(0), kind="stable").tolist()

@@ -3,22 +3,18 @@
 import base64
 import html
 import re
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-
-import numpy as np
 
 from ...avatar.file import Avatar
 from ...avatar.splats import harmonics_text
 from ...errors import StgaError
 from ...files import replacing_together
-from ...flame.parts import FLAME_SIZES
-from ...flame.sequence import FlameSequence
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS
 from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..playback import Playback
-from .data_file import baked_rig, data_file, flame_rig
+from ..rig import RiggedAvatar
+from .data_file import data_file
 
 PLAYER = Path(__file__).parent / "player"
 ELEMENT = "stga-avatar.js"
@@ -73,37 +69,19 @@ def page(title: str, notice: str, data: bytes) -> str:
 BYTES_PER_SPLAT = 20
 BYTES_PER_COEFFICIENT = 0.75
 """About what a splat, and a coefficient of its color, takes in a page."""
-BUNDLED_NOTICE = (
-    "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
-    "Creative Technologies."
-)
-FLAME_LICENCE = ": FLAME's licence (flame.is.tue.mpg.de) decides who may receive them."
-RIG_NOTICE = f"Contains blend shapes and a skeleton derived from a FLAME model{FLAME_LICENCE}"
-MESH_NOTICE = f"Contains the triangles and the posed meshes of a FLAME head{FLAME_LICENCE}"
 
 
-def write_web(
-    path: Path,
-    avatar: Avatar,
-    playback: Playback,
-    meshes: Iterable[tuple[int, np.ndarray]] = (),
-    sequence: FlameSequence | None = None,
-) -> list[Path]:
+def write_web(path: Path, rigged: RiggedAvatar, playback: Playback) -> list[Path]:
     """Write a page that plays the avatar, or an .stga data file with the player beside it; returns
     the files.
 
-    sequence  the FLAME motion, whose rig and sliders go along unless `playback.motion_only`; else
-              the numbered posed `meshes` are baked, of which there is one at least
-    Raises StgaError where there is no pose, or a file cannot be written.
+    Raises StgaError where a value cannot be stored, or a file not be written.
     """
-    motion = None if playback.motion_only else sequence
     try:
-        rig = baked_rig([mesh for _, mesh in meshes]) if motion is None else flame_rig(motion)
-        data = data_file(avatar, rig, playback)
+        data = data_file(rigged, playback)
     except ValueError as error:
         raise StgaError(f"{path}: the avatar cannot be exported ({error})") from error
-    notice = flame_notice(avatar, sequence, playback.motion_only)
-    contents = {path: page(playback.title, notice, data).encode("utf-8")}
+    contents = {path: page(playback.title, rigged.notice, data).encode("utf-8")}
     if path.suffix.lower() == ".stga":
         contents = {path: data, path.with_name(ELEMENT): element_script().encode("utf-8")}
     with replacing_together() as new_file:
@@ -111,20 +89,6 @@ def write_web(
             with new_file(file) as partial:
                 partial.write_bytes(content)
     return list(contents)
-
-
-def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bool) -> str:
-    """What a page of the avatar holds of a head model, and whose licence that has; "" for a head of
-    the user's own.
-
-    Without a sequence, FLAME's mesh is known by its number of vertices.
-    """
-    if sequence is not None and sequence.model.expression_names:
-        return BUNDLED_NOTICE
-    if sequence is not None and not motion_only:
-        return RIG_NOTICE
-    is_flame = len(avatar.neutral) in FLAME_SIZES
-    return MESH_NOTICE if is_flame or sequence is not None else ""
 
 
 def web_bytes(avatar: Avatar) -> int:

@@ -160,17 +160,6 @@ def _sample_view(capture: Capture, view: View, faces: np.ndarray) -> dict[str, n
     }
 
 
-def _painted(camera: Camera, drawn: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """(H, W) the nearest triangle in each pixel, -1 for none, by the painter's algorithm: triangles
-    (D,) of corners (D, 3, 2) in pixels are drawn whole, from far to near."""
-    picture = Image.new("I", (camera.width, camera.height), -1)
-    polygons = (corners.reshape(-1, 6) - 0.5).tolist()
-    draw = ImageDraw.Draw(picture)
-    for face, polygon in zip(drawn.tolist(), polygons, strict=True):
-        draw.polygon(polygon, fill=face)
-    return np.asarray(picture)
-
-
 def _coverage(
     image: np.ndarray, mask: np.ndarray | None, covered: np.ndarray, area: float
 ) -> dict[str, np.ndarray]:

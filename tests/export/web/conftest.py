@@ -15,7 +15,8 @@ from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.avatar.strain import seen_range, strain_basis
 from stga_addon.capture.camera import Camera, look_at
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import WebRig, data_file, flame_rig
+from stga_addon.export.rig import Rig, RiggedAvatar, flame_rig
+from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import page
 from stga_addon.flame.forward import FlameFrame
 from stga_addon.flame.sequence import FlameSequence, neutral_mesh, sequence_mesh
@@ -55,13 +56,13 @@ class Head:
     camera: Camera
 
     @property
-    def rig(self) -> WebRig:
+    def rig(self) -> Rig:
         return flame_rig(self.sequence)
 
     def data(self, rig=None, exact=False, controls=None):
         playback = Playback("Zoë", 2.0, {"front": self.camera}, selection=self.selection)
-        playback = replace(playback, controls=controls)
-        return data_file(self.avatar, rig or self.rig, playback, exact)
+        rigged = RiggedAvatar(self.avatar, rig or self.rig, controls)
+        return data_file(rigged, playback, exact)
 
     @property
     def selection(self) -> list[np.ndarray]:

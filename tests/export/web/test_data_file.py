@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from stga_addon.avatar.offsets import OFFSETS
 from stga_addon.errors import StgaError
+from stga_addon.export.formats import export_avatar
 from stga_addon.export.playback import Playback
+from stga_addon.export.rig import BAKE_TOLERANCE_M, baked_rig
 from stga_addon.export.web import data_file
-from stga_addon.export.web.data_file import BAKE_TOLERANCE_M, baked_rig, pack
-from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules, write_web
+from stga_addon.export.web.data_file import pack
+from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules
 
 from .conftest import make_head
 from .web_data import read_web_data, splats_of
@@ -35,7 +37,7 @@ def test_values_that_no_step_holds(bad, head, tmp_path):
     splats = replace(head.avatar.splats, xyz=np.full_like(head.avatar.splats.xyz, bad))
     avatar = replace(head.avatar, splats=splats)
     with pytest.raises(StgaError, match="xyz"):
-        write_web(tmp_path / "a.html", avatar, Playback(), sequence=head.sequence)
+        export_avatar(tmp_path / "a.html", avatar, "web", sequence=head.sequence)
     assert not list(tmp_path.iterdir())
 
 
@@ -106,10 +108,11 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     meshes = list(enumerate(head.meshes))
     (tmp_path / ELEMENT).mkdir()
     with pytest.raises(StgaError, match=ELEMENT):
-        write_web(path, head.avatar, Playback(), meshes)
+        export_avatar(path, head.avatar, "web", meshes)
     assert not path.exists()
     (tmp_path / ELEMENT).rmdir()
-    write_web(path, head.avatar, Playback(motion_only=True), meshes, head.sequence)
+    alone = Playback(motion_only=True)
+    export_avatar(path, head.avatar, "web", meshes, head.sequence, alone)
     header, arrays = read_web_data(path.read_bytes())
     assert header["sliders"] == []
     assert arrays["weights"].shape[1] == 1
@@ -117,7 +120,8 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
 
     def notice(avatar, sequence, motion_only=True):
         path = tmp_path / "b.html"
-        write_web(path, avatar, Playback(motion_only=motion_only), meshes, sequence)
+        playback = Playback(motion_only=motion_only)
+        export_avatar(path, avatar, "web", meshes, sequence, playback)
         return re.search(r'<p id="notice">(.*?)</p>', path.read_text(encoding="utf-8"))[1]
 
     assert "derived from a FLAME model" in notice(head.avatar, head.sequence, False)

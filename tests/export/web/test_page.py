@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from export.web.browser import Browser
-from stga_addon.export.web.data_file import baked_rig
+from stga_addon.export.rig import baked_rig
 from stga_addon.export.web.page import page
 from stga_addon.render.render import render_avatar, to_uint8
 

@@ -18,8 +18,9 @@ from export.web.browser import Browser
 from stga_addon.driving.head_map import head_map, page_controls
 from stga_addon.driving.inverse import write_performance
 from stga_addon.driving.performance import ARKIT_SHAPES, COLUMN, COUNT, Performance
+from stga_addon.export.formats import export_avatar
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.page import ELEMENT, write_web
+from stga_addon.export.web.page import ELEMENT
 from stga_addon.flame.forward import FlameFrame, flame_forward
 
 from .conftest import Head, show
@@ -352,7 +353,8 @@ def test_the_documented_embedding_works(browser, head, tmp_path, server):
     """Catches a snippet of docs/web.md that does not work as it stands, and an element that loads
     something else."""
     site = tmp_path / "site"
-    write_web(site / "anna.stga", head.avatar, Playback(title="Anna"), sequence=head.sequence)
+    playback = Playback(title="Anna")
+    export_avatar(site / "anna.stga", head.avatar, "web", (), head.sequence, playback)
     text = (ROOT / "docs/web.md").read_text(encoding="utf-8")
     markup, script = (re.search(rf"```{k}\n(.*?)```", text, re.DOTALL)[1] for k in ("html", "js"))
     own = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><h1>Our team</h1>'

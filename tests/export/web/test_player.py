@@ -20,7 +20,8 @@ from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.offsets import COLOR, OFFSETS
 from stga_addon.avatar.strain import at_rest, trained_range
 from stga_addon.export.playback import Playback
-from stga_addon.export.web.data_file import baked_rig, data_file
+from stga_addon.export.rig import RiggedAvatar, baked_rig
+from stga_addon.export.web.data_file import data_file
 from stga_addon.export.web.page import PLAYER
 
 from .conftest import make_head
@@ -68,7 +69,7 @@ def test_a_head_at_rest_stays_where_it_is(tmp_path):
         neutral = head.avatar.neutral
         faces = head.avatar.faces
         avatar = replace(head.avatar, strain_range=trained_range(len(faces)))
-        data = data_file(avatar, baked_rig([neutral]), Playback(), exact=True)
+        data = data_file(RiggedAvatar(avatar, baked_rig([neutral])), Playback(), exact=True)
         [result] = evaluated(data, tmp_path)["results"]
         assert np.abs(colors(result)).max() < 1e-5
         assert np.abs(np.reshape(result["vertices"], (-1, 3)) - neutral).max() < 1e-6
@@ -121,7 +122,7 @@ def test_smoothed_strain_where_edges_have_any_number_of_triangles(tmp_path):
     avatar = replace(avatar, driven_offsets=driven)
     meshes = [neutral, neutral * [0.9, 1.0, 1.1], neutral + rng.normal(0, 0.01, neutral.shape)]
     meshes.append(0 * neutral)
-    data = data_file(avatar, baked_rig(meshes), Playback(), exact=True)
+    data = data_file(RiggedAvatar(avatar, baked_rig(meshes)), Playback(), exact=True)
     edges = [Counter(frozenset((face[k - 1], face[k])) for k in range(3)) for face in faces]
     pairs = itertools.product(edges, repeat=2)
     weight = [sum(n * other[edge] for edge, n in own.items()) for own, other in pairs]
