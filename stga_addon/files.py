@@ -27,7 +27,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from .errors import StgaError
+from .errors import StgaError, shorten
 
 MAX_FILE_BYTES = 1 << 30
 MAX_JSON_BYTES = 256 << 20
@@ -486,6 +486,17 @@ def write_json(path: Path, value: Any, patience_s: float = RENAME_PATIENCE_S) ->
     """Write `value` as indented JSON, atomically; `patience_s` as in `replacing`."""
     with replacing(path, patience_s) as content:
         content.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def check_version(path: Path, kind: str, found: object, known: int) -> None:
+    """Raise StgaError unless a file of this kind has the format version that is read; it says what
+    to do with what an earlier or a later version of the add-on has written."""
+    if type(found) is int and found == known:
+        return
+    problem = f"has {kind} format version {shorten(found)}, this add-on reads {known}"
+    if type(found) is int:
+        problem += "; train it again" if found < known else "; update the add-on"
+    raise StgaError(f"{path}: {problem}")
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:

@@ -12,15 +12,14 @@ import numpy as np
 
 from ..capture.transforms import DEFAULT_PRINCIPAL_POINT, PRINCIPAL_POINTS
 from ..errors import StgaError, shorten
-from ..files import npz_outlines, parse_json, read_npz, write_npz
+from ..files import check_version, npz_outlines, parse_json, read_npz, write_npz
 from .embedding import CONVENTIONS, FaceFrames, face_areas, face_frames
 from .offsets import COLOR, OFFSETS, POSITION, SCALE, SIGNALS, moved_frames, offset_of
-from .splats import ARRAYS, SH_C0, Splats
+from .splats import ARRAYS, Splats
 from .strain import STRAIN_COMPONENTS, TRAINED_RANGE, StrainBasis, at_rest, strain_basis
 
 FORMAT = "stga-avatar"
-VERSIONS = 2, 3
-"""Read; the last is written. In version 2, each splat has strain colors of its own."""
+VERSION = 3
 MAX_HEADER_BYTES = 16 << 20
 _HEADER = {
     "convention": str,
@@ -173,7 +172,7 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     triangles.
     """
     _check(path, avatar)
-    header: dict[str, Any] = {"format": FORMAT, "version": VERSIONS[-1]}
+    header: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     header |= {name: kind(getattr(avatar, name)) for name, kind in _HEADER.items()}
     arrays = {name: getattr(avatar.splats, name) for name in ARRAYS}
     masks = np.array(list(avatar.regions.values()), bool).reshape(-1, len(avatar.faces))
@@ -202,16 +201,11 @@ def read_avatar(path: Path) -> Avatar:
     missing = [name for name in needed if name not in outlines]
     if missing:
         raise StgaError(f"{path}: avatar file has no array {missing[0]!r}")
-    is_old = header["version"] == VERSIONS[0]
-    if is_old:
-        _check_old_strain(path, outlines)
     _check_shapes(path, _avatar_of(path, header, outlines))
     if "light" in header:
         _check_light_shapes(path, outlines)
-    optional = ("strain_range", "strain_color", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
+    optional = ("strain_range", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
     arrays = read_npz(path, (*needed, *optional))
-    if is_old:
-        _convert_strain(path, arrays)
     avatar = _avatar_of(path, header, arrays)
     _check(path, avatar)
     light = _light(path, arrays, header["light"]) if "light" in header else None
@@ -247,66 +241,13 @@ def _read_header(path: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]
         raise StgaError(f"{path}: header is not valid JSON ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise StgaError(f"{path}: is not an avatar file (header's format is not {FORMAT!r})")
-    if header.get("version") not in VERSIONS:
-        version = shorten(header.get("version"))
-        reads = " and ".join(map(str, VERSIONS))
-        raise StgaError(f"{path}: has avatar format version {version}, this add-on reads {reads}")
+    check_version(path, "avatar", header.get("version"), VERSION)
     for name, kind in _HEADER.items():
         if not isinstance(header.get(name), kind):
             raise StgaError(f"{path}: header field {name!r} is missing or not a {kind.__name__}")
     if not all(isinstance(name, str) for name in header["regions"]):
         raise StgaError(f"{path}: header field 'regions' holds something that is not a name")
     return header
-
-
-def _check_old_strain(path: Path, outlines: dict[str, np.ndarray]) -> None:
-    """Take what follows strain in version 2 out of the outlines. Raises StgaError for shapes."""
-    splats, faces = (len(outlines[name]) if outlines[name].ndim else 0 for name in ("xyz", "faces"))
-    for name, shape in (
-        ("strain_range", (faces, 2, STRAIN_COMPONENTS)),
-        ("strain_color", (splats, STRAIN_COMPONENTS, 3)),
-    ):
-        outline = outlines.pop(name, None)
-        if outline is not None and outline.size:
-            _check_shape(path, name, outline, "float32", shape)
-
-
-def _convert_strain(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Turn what follows strain in version 2 into that of version 3, in place. Raises StgaError.
-
-    `strain_color` (N, 3, 3) of splats becomes "older_strain_color" of their triangles: the mean of
-    its splats, by how much of it they cover. At rest, splats keep their colors. `strain_range` (F,
-    2, 3) gets the range of a normal's change.
-    """
-    if arrays["faces"].ndim != 2 or arrays["xyz"].ndim != 2:
-        return  # as `_check` says
-    faces = len(arrays["faces"])
-    count = len(arrays["xyz"])
-    known = (2, STRAIN_COMPONENTS)
-    limits = arrays.get("strain_range")
-    if limits is not None:
-        check_array(path, "strain_range", limits, "float32", (faces, *known))
-        of_normal = np.broadcast_to(TRAINED_RANGE[:, STRAIN_COMPONENTS:], limits.shape)
-        limits = arrays["strain_range"] = np.concatenate([limits, of_normal], axis=2)
-    colors = arrays.pop("strain_color", np.zeros((count, 0, 3), np.float32))
-    if not colors.size:
-        return
-    check_array(path, "strain_color", colors, "float32", (count, STRAIN_COMPONENTS, 3))
-    for name in ("log_scale", "opacity", "sh", "face"):
-        kind = ARRAYS[name]
-        check_array(path, name, arrays[name], kind.dtype, (count, *kind.shape))
-    face = arrays["face"]
-    _check_index(path, "face", face, faces, "faces")
-    if limits is not None:
-        rest = at_rest(limits)[face, :STRAIN_COMPONENTS]
-        arrays["sh"][:, 0] += np.einsum("ns,nsc->nc", rest, colors) / np.float32(SH_C0)
-    area = np.sort(arrays["log_scale"], axis=1)[:, 1:].sum(1)  # its logarithm
-    area -= np.logaddexp(0, -arrays["opacity"])
-    weight = np.exp(area - area.max())
-    share = weight / np.maximum(np.bincount(face, weight, faces), np.finfo(np.float32).tiny)[face]
-    parts = (share[:, None] * colors.reshape(count, -1)).T
-    sums = [np.bincount(face, part, faces) for part in parts]
-    arrays["older_strain_color"] = np.stack(sums, 1).reshape(faces, -1, 3).astype(np.float32)
 
 
 def _check(path: Path, avatar: Avatar) -> None:

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .embedding import FaceFrames
-from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain, strain_from_rest
+from .strain import STRAIN_COMPONENTS, StrainBasis, smoothed_strain
 
 SIGNALS: dict[str, Callable[[StrainBasis, FaceFrames], np.ndarray]] = {
-    "strain": lambda basis, frames: strain_from_rest(basis, frames.deformation),
     "smoothed_strain": lambda basis, frames: smoothed_strain(basis, frames.deformation),
     "normal": lambda basis, frames: frames.deformation[:, STRAIN_COMPONENTS:],
 }
@@ -46,13 +45,11 @@ _ROWS = (
     DrivenOffset("strain_scale", "smoothed_strain", SCALE, "log_scale", 0.5),
     DrivenOffset("strain_color", "smoothed_strain", COLOR, "strain_color", 0.8),
     DrivenOffset("normal_color", "normal", COLOR, "strain_color", 0.4, of_light=True),
-    DrivenOffset("older_strain_color", "strain", COLOR, "strain_color", 1.0),
 )
 OFFSETS: dict[str, DrivenOffset] = {offset.name: offset for offset in _ROWS}
 """By name. Everything that trains, stores or poses avatars goes by this table. Skin that is
 compressed bulges and darkens, and splats on what is stretched grow; skin that turns in a light that
-stays gets brighter or darker. The last is read from avatars of version 0.2.0, and trained where
-their runs are continued."""
+stays gets brighter or darker."""
 
 
 def offset_of(coefficients: np.ndarray, signal: np.ndarray) -> np.ndarray:

@@ -89,7 +89,11 @@ def test_avatars_that_do_not_fit_together_are_not_written(tmp_path, avatar, comp
         ({"header": np.frombuffer(b"[" * 100000, np.uint8)}, "JSON"),
         ({"header": np.frombuffer(b"[1]", np.uint8)}, "not an avatar file"),
         ({"header": {"format": "other"}}, "not an avatar file"),
-        ({"header": {"version": 1}}, "version 1"),
+        (
+            {"header": {"version": 2}},
+            "avatar format version 2, this add-on reads 3; train it again$",
+        ),
+        ({"header": {"version": 4}}, "version 4, this add-on reads 3; update the add-on$"),
         ({"header": {"convention": None}}, "'convention'"),
         ({"header": {"convention": "flame"}}, "convention is 'flame'"),
         ({"header": {"settings": []}}, "'settings'"),

@@ -18,7 +18,6 @@ from stga_addon.avatar.file import (
 )
 from stga_addon.avatar.lattice import lattice_splats
 from stga_addon.avatar.offsets import OFFSETS
-from stga_addon.avatar.splats import SH_C0
 from stga_addon.avatar.strain import (
     AVERAGING_ROUNDS,
     MAX_STRAIN,
@@ -242,29 +241,6 @@ def test_colors_follow_strain_and_normals(convention):
         np.testing.assert_allclose(avatar.frames(posed).color[f], skin + light, atol=1e-6)
         np.testing.assert_allclose(avatar.without_light.frames(posed).color[f], skin, atol=1e-6)
     np.testing.assert_allclose(avatar.frames(neutral).color, 0, atol=1e-6)
-
-
-def test_older_files_keep_their_colors(tmp_path):
-    """Catches files of version 2, where each splat has strain colors of its own, that are refused,
-    whose colors at rest change, or follow another splat or triangle."""
-    neutral = sheet()
-    rng = np.random.default_rng(5)
-    avatar = replace(colored(neutral), driven_offsets={})
-    write_avatar(tmp_path / "a.npz", avatar)
-    with np.load(tmp_path / "a.npz") as arrays:
-        header = arrays["header"].tobytes().replace(b'"version": 3', b'"version": 2')
-        arrays = {**arrays, "header": np.frombuffer(header, np.uint8)}
-    by_face = rng.normal(0, 0.2, (len(FACES), 3, 3)).astype(np.float32)
-    arrays["strain_color"] = by_face[avatar.splats.face]
-    arrays["strain_range"] = trained_range(len(FACES))[..., :3]
-    np.savez(tmp_path / "old.npz", **arrays)
-    found = read_avatar(tmp_path / "old.npz")
-    np.testing.assert_allclose(found.driven_offsets["older_strain_color"], by_face, atol=1e-6)
-    rest = -MIN_COMPRESSION * by_face[:, :2].sum(1)[avatar.splats.face]
-    np.testing.assert_allclose(
-        found.splats.sh[:, 0], avatar.splats.sh[:, 0] + rest / SH_C0, rtol=1e-5
-    )
-    np.testing.assert_allclose(found.frames(neutral).color, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("convention", ["stga", "gaussian_avatars"])

@@ -50,8 +50,8 @@ def test_run_round_trip(tmp_path, strategy):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("version", 2, "has run format version 2, this add-on reads 4 to 8$"),
-        ("version", None, "has run format version None"),
+        ("version", 7, "has run format version 7, this add-on reads 8; train it again$"),
+        ("version", None, "has run format version None, this add-on reads 8$"),
         ("format", "stga-avatar", "is not a run"),
         ("capture", None, "setting capture: expected a path, got None"),
         ("settings", None, "settings: fields are missing"),
@@ -128,7 +128,7 @@ def test_checkpoint_round_trip(tmp_path):
 
 def meta(**changes: Any) -> np.ndarray:
     values = {
-        "version": checkpoint_files.VERSIONS[-1],
+        "version": checkpoint_files.VERSION,
         **{k: v for k, v in vars(make_checkpoint()).items() if k not in ("state", "tracking")},
         **changes,
     }
@@ -143,7 +143,7 @@ def strain_position(**changes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 METAS: dict[str, dict[str, Any]] = {
-    "was written by another version": {"version": 1},
+    "has checkpoint format version 3, this add-on reads 4; train it again": {"version": 3},
     "malformed .*color": {"color": 3},
     "iteration is -1, expected a whole number from 0 up": {"iteration": -1},
     "iteration is 9007199254740992": {"iteration": 1 << 53},  # beyond what is exact
@@ -175,23 +175,6 @@ def test_damaged_checkpoints(tmp_path, says):
     np.savez(path, **{k: v for k, v in {**arrays, **DAMAGES[says]}.items() if v is not None})
     with pytest.raises(StgaError, match=rf"checkpoint\.npz: .*{says}"):
         checkpoint_files.read_checkpoint(tmp_path)
-
-
-def test_checkpoints_of_version_3(tmp_path):
-    """Catches an older run that says not why, and strain colors that are dropped."""
-    checkpoint_files.write_checkpoint(tmp_path, make_checkpoint())
-    path = tmp_path / "checkpoint.npz"
-    with np.load(path) as data:
-        arrays = {**data, "meta": meta(version=3)}
-    tables = "parameters", "first", "second", "average"
-    for size in (0, 3):
-        older = {f"{table}/strain_color": np.zeros((12, size, 3), np.float32) for table in tables}
-        np.savez(path, **arrays, **older)
-        if size == 0:
-            assert checkpoint_files.read_checkpoint(tmp_path).iteration == 34
-        else:
-            with pytest.raises(checkpoint_files.OlderCheckpointError, match="of their own"):
-                checkpoint_files.read_checkpoint(tmp_path)
 
 
 def line(iteration: int, **changes: Any) -> dict[str, Any]:

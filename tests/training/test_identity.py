@@ -1,6 +1,5 @@
 """What was trained on one capture is not continued, measured or rendered on another."""
 
-import hashlib
 import json
 import shutil
 import signal
@@ -22,7 +21,6 @@ from stga_addon.errors import StgaError
 from stga_addon.jobs.perform import request_folder, write_request
 from stga_addon.jobs.train import Resume
 from stga_addon.render import device as device_choice
-from stga_addon.schema import to_json
 from stga_addon.training.run import folder as open_run_module
 from stga_addon.training.run.checkpoint import read_checkpoint
 from stga_addon.training.run.folder import Run, device_of, open_run, read_run, write_run
@@ -32,8 +30,6 @@ from stga_addon.training.run.session import train_run
 from .toys import assert_same_state, quick_settings, stop_at
 
 ITERATIONS = 12
-OLD = {"adam_beta2": 0.999, "adam_nesterov": False, "split_share": 0.02, "coarse_lattice": False}
-"""What runs of format version 5 were trained with, and lack."""
 
 
 def make_run(capture: Capture, flame: Path | None = None, **changes: Any) -> Run:
@@ -134,46 +130,6 @@ def test_moved_captures_and_refined_meshes_are_accepted(copy, toy, tmp_path):
     train_run(opened.capture, copy, opened.run, resume=True)
     assert read_checkpoint(copy).iteration == ITERATIONS
     assert read_run(copy).capture == other
-
-
-AS_THEN = {"strain_color": True, "driven_offsets": ["strain_position"]}
-"""Before version 8, of a run whose driven offsets are now `FOLLOWS`."""
-FOLLOWS = "strain_position", "older_strain_color"
-
-
-@pytest.mark.parametrize(
-    ("version", "lacks"), [(4, {*OLD, "torso"}), (5, set(OLD)), (6, {"adam_nesterov"})]
-)
-def test_runs_of_earlier_format_versions_are_resumed(toy, tmp_path, monkeypatch, version, lacks):
-    """Catches a run of an earlier version that is refused for settings that it lacks, goes on with
-    other ones, or with another value of one."""
-    out = tmp_path / "run"
-
-    def recorded(capture, principal_point, settings):
-        known = {name: value for name, value in to_json(settings).items() if name not in lacks}
-        known |= AS_THEN
-        digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
-        return replace(identity_of(capture, principal_point, settings), settings=digest)
-
-    with monkeypatch.context() as before:
-        before.setattr(open_run_module, "identity_of", recorded)
-        begun = make_run(toy, driven_offsets=FOLLOWS, **OLD)
-        train_run(toy, out, begun, report=stop_at(ITERATIONS // 2))
-
-    def as_then(document):
-        document["version"] = version
-        for name in lacks:
-            del document["settings"][name]
-        document["settings"] |= AS_THEN
-
-    factory.edit(out / "run.json", as_then)
-    opened = open_run(out)
-    assert OLD.items() <= vars(opened.run.settings).items()
-    train_run(opened.capture, out, opened.run, resume=True)
-    assert read_checkpoint(out).iteration == ITERATIONS
-    assert open_run(out).run == opened.run
-    with pytest.raises(StgaError, match="begun with other settings"):
-        train_run(toy, out, make_run(toy, torso=True, driven_offsets=FOLLOWS, **OLD), resume=True)
 
 
 def test_last_bits_of_another_machine_are_accepted(toy):

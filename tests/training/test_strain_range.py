@@ -103,27 +103,6 @@ def test_colors_follow_compression_and_shear_but_no_stretch(toy):
     assert shear.max() > 0.05
 
 
-@pytest.mark.parametrize("limited", [True, False])
-def test_a_run_of_another_range_is_not_resumed(toy, tmp_path, limited):
-    """Catches an earlier version's run resumed in other colors, or that cannot be opened."""
-    settings = quick_settings("global", iterations=4, lattice=0, driven_offsets=COLORS)
-    run = Run(toy.root, None, "vhap", settings)
-    out = tmp_path / "run"
-    path = train_run(toy, out, run, report=stop_at(2))
-    avatar = read_avatar(path)
-    wider = np.broadcast_to(np.array([[-1], [1]], np.float32), (len(toy.faces), 2, 6)).copy()
-    write_avatar(path, replace(avatar, strain_range=wider if limited else None))
-    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
-    earlier = r"avatar\.npz: colors follow strain as in an earlier version; train it anew"
-    with pytest.raises(StgaError, match=earlier):
-        train_run(toy, out, run, resume=True)
-    assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
-    write_avatar(path, avatar)
-    train_run(toy, out, run, resume=True)
-    write_avatar(path, replace(avatar, strain_range=wider))
-    train_run(toy, out, run, resume=True)
-
-
 def test_the_range_covers_an_expression_of_few_timesteps(toy):
     """Catches a blink of six frames in 1,200 that is trained, but clipped."""
     view = toy.views["train"][0]

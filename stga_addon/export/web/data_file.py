@@ -81,7 +81,7 @@ MOVED_STEP_M = 0.25e-6
 OFFSET_STEP = 2.0**-12
 """Of other driven offsets. Signals are at most 2 in each of three components: half a step of each
 changes a color by 0.19 / 255, a size by 0.07 %, and moves a splat by 0.75 µm along an axis."""
-PLAYER_SIGNALS = ("strain", "smoothed_strain", "normal")
+PLAYER_SIGNALS = ("smoothed_strain", "normal")
 """Those of `face_frames.js`."""
 STEPS = {
     # The three smaller parts of a unit quaternion lie within ±0.7071: ten bits each.

@@ -13,7 +13,7 @@ from ...capture.camera import Camera
 from .device import Device, Recording
 from .layout import FRAME_STRIDE, list_words
 
-SIGNALS = "strain", "smoothed_strain", "normal"
+SIGNALS = "smoothed_strain", "normal"
 """Of `avatar.offsets.SIGNALS`, those that are computed on the device."""
 
 
@@ -117,7 +117,7 @@ class Embedding:
         if self._smoothed is not None:
             work.dispatch("frames.average_strain", self._count, tables)
             strain = tables["strain_from_rest"]
-            found = strain, self._smoothed.record(work, strain), tables["normal_change"]
+            found = self._smoothed.record(work, strain), tables["normal_change"]
             self.signals = dict(zip(SIGNALS, found, strict=True))
         for name in sorted(coefficients, key=list(OFFSETS).index):  # scale after position
             driving = self.signals[OFFSETS[name].signal]

@@ -170,12 +170,6 @@ def _strain_from_rest(nodes: Nodes) -> Any:
     return nodes.vector("SUBTRACT", strain, _in_range(nodes, (0, 0, 0), stored.STRAIN_RANGE))
 
 
-def _with_strain(nodes: Nodes, mesh: Any) -> Any:
-    """The mesh from DEFORMED with that strain stored."""
-    strain = _strain_from_rest(nodes)
-    return nodes.store(mesh, _SIGNAL.format("strain"), strain, "FLOAT_VECTOR", "FACE")
-
-
 def _with_smoothed_strain(nodes: Nodes, mesh: Any) -> Any:
     """The mesh from DEFORMED with `avatar.strain.smoothed_strain` stored."""
     # On faces, an iteration is the mean of a face and, by weight 1, those that share an edge.
@@ -207,7 +201,6 @@ def _in_range(nodes: Nodes, vector: Any, ends: tuple[str, str]) -> Any:
 
 DEFORMED = _meshes("Triangle Deformation", _deformed, "Posed", "Neutral")
 SIGNALS = {
-    "strain": _meshes("Strain", _with_strain, "Deformed"),
     "smoothed_strain": _meshes("Smoothed Strain", _with_smoothed_strain, "Deformed"),
     "normal": _meshes("Normal Change", _with_normal_change, "Deformed"),
 }

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...avatar.file import Avatar, check_array, read_avatar
+from ...avatar.file import check_array, read_avatar
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import ARRAYS
 from ...avatar.strain import (
@@ -23,18 +23,16 @@ from ...avatar.strain import (
 )
 from ...capture.model import Capture
 from ...errors import StgaError, shorten
-from ...files import read_npz, write_npz
+from ...files import check_version, read_npz, write_npz
 from ..optimize.state import OffsetState, TrainState, arrays_of, state_of
 from ..settings import TrainingSettings
 from .folder import AVATAR, CHECKPOINT, SELECTION, Continuation, Run
 
-VERSIONS = 3, 4
-"""Read; the last is written. In version 3, splats may have strain colors of their own."""
+VERSION = 4
 TRACKING = "tracking/parameters"
 IDENTITY = "identity"
 STRAIN_RANGE = "strain_range.npz"
 """`strain_range` (F, 2, 6) float32 of a run, and `identity`."""
-OLDER_COLORS = "colors follow strain as in an earlier version; train it anew"
 MAX_COUNT = 1 << 53
 """Largest iteration or timestep that a checkpoint may hold."""
 OTHER_RUN = "belongs to another run than run.json; remove it, or train into another folder"
@@ -103,35 +101,22 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     if checkpoint.tracking is not None:
         arrays[TRACKING] = checkpoint.tracking
     values = {k: v for k, v in vars(checkpoint).items() if k not in ("state", "tracking")}
-    arrays["meta"] = _packed(json.dumps({"version": VERSIONS[-1], **values}))
+    arrays["meta"] = _packed(json.dumps({"version": VERSION, **values}))
     write_npz(folder / CHECKPOINT, arrays)
 
 
-class OlderCheckpointError(StgaError):
-    """Of a run whose avatar can be read, but whose training cannot go on where it was."""
-
-
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """Raises StgaError where there is none, or it is damaged, and OlderCheckpointError."""
+    """Raises StgaError where there is none, or it is damaged or of another format version."""
     path = folder / CHECKPOINT
     arrays = read_npz(path)
     try:
         meta = _meta(arrays.pop("meta"))
-        version = meta.pop("version")
-        if version not in VERSIONS:
-            raise StgaError(f"{path}: was written by another version")
-        if version == VERSIONS[0]:
-            older = [arrays.pop(name) for name in [*arrays] if name.endswith("/strain_color")]
-            if any(array.size for array in older):
-                text = "its splats have strain colors of their own, as in version 0.2.0"
-                raise OlderCheckpointError(f"{path}: {text}; train into another folder")
+        check_version(path, "checkpoint", meta.pop("version"), VERSION)
+        _check_counts(meta)
         tracking = arrays.pop(TRACKING, None)
         if tracking is not None:
             timesteps, parameters = tracking.shape
             check_array(path, TRACKING, tracking, "float64", (timesteps, parameters))
-        elif any(name.startswith("tracking/") for name in arrays):
-            text = "refines the tracking as version 0.2.0 did; train into another folder"
-            raise StgaError(f"{path}: {text}")
         offsets = {}
         for effect in OFFSETS:
             names = [name for name in arrays if name.startswith(f"{effect}/")]
@@ -160,12 +145,15 @@ def _packed(text: str) -> np.ndarray:
 
 
 def _meta(packed: np.ndarray) -> dict[str, Any]:
-    """Everything of a checkpoint that is no array. Raises ValueError for what is none of that."""
+    """Everything of a checkpoint that is no array. Raises ValueError."""
     stored = json.loads(packed.tobytes())
     if not isinstance(stored, dict):
         raise ValueError("meta is no object")
-    meta = {"rounds": 0, "lines": None, "tracking_gain": None, **stored}
-    meta.pop("best_difference", None)  # of earlier checkpoints
+    return stored
+
+
+def _check_counts(meta: Mapping[str, Any]) -> None:
+    """Raise ValueError for a value that none of a checkpoint is."""
     lowest = {"iteration": 0, "visit": -1, "initial_count": 0, "evaluations": 0, "rounds": 0}
     last, seconds, losses = (meta[name] for name in ("last_timestep", "elapsed_s", "losses"))
     lines = meta["lines"]
@@ -189,7 +177,6 @@ def _meta(packed: np.ndarray) -> dict[str, Any]:
     for name, (fits, expected) in checks.items():
         if not fits:
             raise ValueError(f"{name} is {shorten(meta[name])}, expected {expected}")
-    return meta
 
 
 def _check_state(path: Path, state: TrainState) -> None:
@@ -276,16 +263,6 @@ def strain_range_of(folder: Path, capture: Capture, run: Run) -> np.ndarray | No
         text = "is not within the range that is trained; remove it"
         raise StgaError(f"{path}: 'strain_range' {text}")
     return found
-
-
-def require_trained_range(path: Path, avatar: Avatar) -> None:
-    """Raise StgaError, naming the path, where an avatar follows strain beyond TRAINED_RANGE.
-
-    An earlier version trained it: more training would change it at once.
-    """
-    limits = avatar.strain_range
-    if avatar.follows_strain and (limits is None or not _is_trained_range(limits)):
-        raise StgaError(f"{path}: {OLDER_COLORS}")
 
 
 def _is_trained_range(limits: np.ndarray) -> bool:

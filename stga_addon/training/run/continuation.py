@@ -4,7 +4,6 @@ of all others."""
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -23,7 +22,7 @@ from ..optimize.image_preparation import image_preparation
 from ..optimize.state import TrainState, state_of_avatar, with_offsets
 from ..schedule import learning_rates, view_order
 from ..settings import TrainingSettings
-from .checkpoint import OlderCheckpointError, read_checkpoint, require_trained_range
+from .checkpoint import read_checkpoint
 from .folder import AVATAR, CHECKPOINT, Continuation, Run
 from .identity import file_digest
 
@@ -90,7 +89,7 @@ def starting_state(
     Where the settings have colors or positions follow strain and the avatar's do not, they begin by
     zero. The optimizer continues where the parent's checkpoint is of that very avatar; otherwise
     its moments are zero. Raises StgaError where the avatar is not the one that the continuation was
-    made for, or `require_trained_range` does.
+    made for.
     """
     folder = continuation.parent
     if file_digest(folder / AVATAR) != continuation.avatar:
@@ -98,12 +97,10 @@ def starting_state(
             f"{folder / AVATAR}: has changed since this continuation was started from it"
         )
     avatar = read_avatar(folder / AVATAR)
-    require_trained_range(folder / AVATAR, avatar)
     state = state_of_avatar(avatar)
     kept = None
     if (folder / CHECKPOINT).exists():
-        with suppress(OlderCheckpointError):
-            kept = read_checkpoint(folder).state
+        kept = read_checkpoint(folder).state
     if kept is not None:
         offsets = {name: offset.average for name, offset in kept.driven_offsets.items()}
         ours = {**vars(avatar.splats), **avatar.driven_offsets}

@@ -12,8 +12,16 @@ import numpy as np
 from ...capture.model import Capture, join_takes
 from ...capture.open import open_capture, with_sequence
 from ...capture.transforms import PRINCIPAL_POINTS
-from ...errors import StgaError, shorten
-from ...files import naming, read_json, read_npz, remove_leftovers, write_json, write_npz
+from ...errors import StgaError
+from ...files import (
+    check_version,
+    naming,
+    read_json,
+    read_npz,
+    remove_leftovers,
+    write_json,
+    write_npz,
+)
 from ...flame.forward import FlameFrame, frame_of
 from ...flame.sequence import FRAME_FIELDS, SHIFT_SIZE, TORSO_SHIFT, FlameSequence, read_motion
 from ...render.device import EXPECTED_DEVICE, GPU, adapter_names, choose_device, is_device
@@ -21,19 +29,10 @@ from ...schema import from_json, setting, to_json
 from ...worker.lock import hold_folder
 from ..effect_catalog import EffectDecision
 from ..settings import TrainingSettings
-from .identity import (
-    LATER_SETTINGS,
-    RunIdentity,
-    difference,
-    earlier_identity,
-    identity_of,
-    read_settings,
-)
+from .identity import RunIdentity, difference, identity_of
 
 FORMAT = "stga-run"
-VERSION = max(LATER_SETTINGS)
-VERSIONS = range(min(LATER_SETTINGS) - 1, VERSION + 1)
-"""Read as well: LATER_SETTINGS are all that it lacks."""
+VERSION = 8
 RUN = "run.json"
 AVATAR = "avatar.npz"
 CHECKPOINT = "checkpoint.npz"
@@ -123,13 +122,7 @@ def read_run(folder: Path) -> Run:
     values = read_json(path)
     if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise StgaError(f"{path}: is not a run of this add-on (format is not '{FORMAT}')")
-    version = values.pop("version", None)
-    if version not in VERSIONS:
-        reads = f"{VERSIONS[0]} to {VERSION}"
-        found = f"has run format version {shorten(version)}"
-        raise StgaError(f"{path}: {found}, this add-on reads {reads}")
-    if isinstance(values.get("settings"), dict):
-        values["settings"] = read_settings(version, values["settings"])
+    check_version(path, "run", values.pop("version", None), VERSION)
     try:
         run: Run = from_json(Run, values)
     except StgaError as error:
@@ -247,8 +240,6 @@ def check_identity(folder: Path, run: Run, capture: Capture) -> RunIdentity:
     trained = stored.identity
     if trained is None or trained == given:  # None: the run was prepared, but has not begun
         return given
-    if trained in (earlier_identity(given, run.settings, version) for version in VERSIONS):
-        return trained
     changed = difference(trained, given)
     if trained.principal_point != given.principal_point:
         point = given.principal_point

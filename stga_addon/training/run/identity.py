@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,6 @@ QUANTUM = 1e-6 * 0.5**0.5
 """Cameras (meters, pixels) and meshes (meters) are compared in multiples of this: other machines
 compute other last bits. It is irrational, so that neither decimals nor binary fractions lie at the
 edge between two multiples."""
-LATER_SETTINGS: dict[int, dict[str, Any]] = {
-    5: {"torso": False},
-    6: {"adam_beta2": 0.999, "split_share": 0.02, "coarse_lattice": False},
-    7: {"adam_nesterov": False},
-    8: {},
-}
-"""Format version -> settings that earlier runs lack, with what these were trained with. Before 8,
-`strain_color` was a setting of its own (`read_settings`)."""
 
 
 @dataclass(frozen=True)
@@ -85,35 +77,6 @@ def identity_of(capture: Capture, principal_point: str, settings: TrainingSettin
         "" if capture.flame_file is None else file_digest(capture.flame_file),
         _settings_digest(to_json(settings)),
     )
-
-
-def read_settings(version: int, settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings of a run of this format version as those of today, with what they lack."""
-    found = settings | _settings_since(version)
-    offsets = found.get("driven_offsets")
-    if found.pop("strain_color", False) is True and isinstance(offsets, list):
-        found["driven_offsets"] = [*offsets, "older_strain_color"]
-    return found
-
-
-def _settings_since(version: int) -> dict[str, Any]:
-    later = (values for since, values in LATER_SETTINGS.items() if since > version)
-    return {name: value for values in later for name, value in values.items()}
-
-
-def earlier_identity(
-    identity: RunIdentity, settings: TrainingSettings, version: int
-) -> RunIdentity:
-    """As an earlier format version recorded it; the same for settings that are not of one."""
-    later = _settings_since(version)
-    known = to_json(settings)
-    if version < max(LATER_SETTINGS):
-        offsets = [name for name in known["driven_offsets"] if name != "older_strain_color"]
-        follows = len(offsets) < len(known["driven_offsets"])
-        known |= {"driven_offsets": offsets, "strain_color": follows}
-    if any(known.pop(name) != value for name, value in later.items()):
-        return identity
-    return replace(identity, settings=_settings_digest(known))
 
 
 def difference(trained: RunIdentity, given: RunIdentity) -> str | None:

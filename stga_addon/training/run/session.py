@@ -21,7 +21,6 @@ from ...capture.loader import ViewLoader
 from ...capture.model import Capture, View, evenly_spread, views_by_timestep
 from ...errors import DeviceError, StgaError, shorten
 from ...files import replacing
-from ...flame.sequence import SHIFT_SIZE
 from ...progress import Cancelled, Progress, Report, ignore
 from ...render.render import render_avatar
 from ...selection import select_capture
@@ -601,9 +600,6 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
     wanted = None
     if tracking is not None:
         wanted = tracking.parameters.shape
-        if refined is not None and refined.shape == tracking.tracked.shape:
-            # of a version that shifted no torso
-            refined = np.pad(refined, ((0, 0), (0, SHIFT_SIZE)))
     if wanted != (None if refined is None else refined.shape):
         text = "its checkpoint's refined tracking does not fit the capture or the settings"
         raise StgaError(f"{folder}: {text}")
@@ -625,8 +621,6 @@ def _resume(capture: Capture, folder: Path, run: Run, report: Report) -> _Sessio
             os.replace(folder / aside, folder / name)
     if not (folder / AVATAR).exists():
         evaluator.keeps_latest = True  # those before are lost
-    elif not session._is_finished():
-        checkpoints.require_trained_range(folder / AVATAR, read_avatar(folder / AVATAR))
     folders.write_run(folder, run)  # capture, model and device may be others now
     return session
 

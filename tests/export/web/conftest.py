@@ -103,7 +103,7 @@ def make_head(convention="stga", sh_degree=3, antialiased=True, offsets=tuple(OF
     meshes = np.stack([sequence_mesh(sequence, timestep) for timestep in sequence.timesteps])
     limits = seen_range(strain_basis(neutral, model.faces), 0.5 * (meshes[:1] + neutral))
     sizes = {"strain_position": 0.3 * unit, "strain_scale": 0.1, "strain_color": 0.1}
-    sizes |= {"normal_color": 0.5, "older_strain_color": 0.1}
+    sizes |= {"normal_color": 0.5}
     driven = {
         name: rng.normal(0, size, (len(model.faces), 3, 3)).astype(np.float32)
         for name, size in sizes.items()

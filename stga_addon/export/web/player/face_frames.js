@@ -197,7 +197,7 @@ function symmetricProduct(a, b, factor, out, at) {
 }
 
 // Three numbers a triangle, by name, which its splats may follow.
-export const SIGNALS = { strain: Strain, smoothed_strain: SmoothedStrain, normal: NormalChange };
+export const SIGNALS = { smoothed_strain: SmoothedStrain, normal: NormalChange };
 
 // What an offset's coefficients (faces, 9) change: for each component of its signal a vector in the
 // frame, the logarithm of its scale (and two zeros), or a color; 'light': one that is the light of
@@ -229,7 +229,7 @@ export class FaceFrames {
     const range =
       arrays.strain_range?.values ??
       new Float32Array(12 * this.count).fill(MAX_DEFORMATION).map((v, k) => (k % 12 < 6 ? -v : v));
-    /** @type {Partial<Record<keyof SIGNALS, Strain | SmoothedStrain | NormalChange>>} */
+    /** @type {Partial<Record<keyof SIGNALS, SmoothedStrain | NormalChange>>} */
     this.signals = {};
     this.offsets = Object.entries(offsets).map(([name, [signal, target]]) => {
       const followed = (this.signals[signal] ??= new SIGNALS[signal](this.sides, range, arrays));

@@ -1,0 +1,112 @@
+"""Files that versions of the add-on have written are read, with all that they hold."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture import factory
+from export.web.test_player import evaluated
+from export.web.web_data import posed_mesh, read_web_data
+
+from stga_addon.avatar.file import read_avatar
+from stga_addon.capture.open import open_capture, with_sequence
+from stga_addon.jobs.perform import read_request, read_result, request_folder
+from stga_addon.progress import Written
+from stga_addon.training.optimize.state import arrays_of
+from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
+from stga_addon.training.run.folder import (
+    read_residuals,
+    read_run,
+    with_refined_tracking,
+)
+from stga_addon.training.run.metrics_log import read_metrics
+
+from . import make
+
+FOLDERS = sorted(make.DATA.iterdir())
+pytestmark = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+
+
+def assert_same(found: object, expected: object) -> None:
+    """Values of two objects, with equal arrays of the same types."""
+    assert type(found) is type(expected)
+    assert vars(found).keys() == vars(expected).keys()
+    for name, value in vars(expected).items():
+        ours = getattr(found, name)
+        if isinstance(value, np.ndarray):
+            assert ours.dtype == value.dtype, name
+            np.testing.assert_array_equal(ours, value, err_msg=name)
+        elif isinstance(value, dict):
+            assert ours.keys() == value.keys()
+            for key, item in value.items():
+                np.testing.assert_array_equal(ours[key], item, err_msg=f"{name}.{key}")
+        elif not hasattr(value, "__dataclass_fields__"):
+            assert ours == value, name
+
+
+def test_avatar(folder: Path) -> None:
+    """Catches an avatar file of people that is refused, or loses its colors, light or regions."""
+    found = read_avatar(folder / "avatar.npz")
+    expected = make.avatar()
+    assert_same(found, expected)
+    assert_same(found.splats, expected.splats)
+    assert_same(found.light, expected.light)
+
+
+def test_run(folder: Path) -> None:
+    """Catches a run that cannot be resumed, or goes on with other settings or another selection."""
+    assert read_run(folder) == make.run()
+    assert read_run(folder).identity == make.IDENTITY
+    digest = make.IDENTITY.digest
+    assert_same(read_checkpoint(folder), make.checkpoint())
+    found = arrays_of(read_checkpoint(folder).state)
+    for name, array in arrays_of(make.checkpoint().state).items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    offset = read_checkpoint(folder).state.driven_offsets["strain_position"]
+    assert_same(offset, make.state().driven_offsets["strain_position"])
+    selection = read_selection(folder, len(make.FACES), digest)
+    assert selection.keys() == make.SELECTION.keys()
+    for timestep, faces in make.SELECTION.items():
+        np.testing.assert_array_equal(selection[timestep], faces)
+    np.testing.assert_array_equal(read_residuals(folder, len(make.FACES)), make.RESIDUAL)
+    assert read_metrics(folder) == [make.METRICS]
+
+
+def test_strain_range(folder: Path, tmp_path: Path) -> None:
+    """Catches a run's range of deformation that is refused, or measured anew in other numbers."""
+    found = make.strain_range(folder)
+    np.testing.assert_allclose(found, make.strain_range(tmp_path), atol=1e-6)
+    assert np.abs(found[:, :, :2]).max() > 0.3
+
+
+def test_tracking(folder: Path, tmp_path: Path) -> None:
+    """Catches refined tracking that is left out, or mixed up."""
+    root, model = factory.write_flame_capture(tmp_path, make.TIMESTEPS, (0,))
+    capture = with_sequence(open_capture(root, model), make.sequence(model))
+    refined = with_refined_tracking(capture, folder).flame
+    assert refined is not None
+    for timestep, expected in zip(make.TIMESTEPS, make.refined(), strict=True):
+        np.testing.assert_array_equal(refined.frame(timestep).parameters, expected[:-3])
+        assert refined.frame(timestep).dynamic_offset is not None
+
+
+def test_request(folder: Path) -> None:
+    """Catches a request of a batch or a run that a newer worker refuses."""
+    expected = make.train()
+    assert_same(read_request(request_folder(folder)), expected)
+    found = read_result(request_folder(folder))
+    assert found == Written(Path("/runs/anna/avatar.npz"), ("PSNR 30 dB",))
+
+
+@pytest.mark.needs("node")
+def test_web_data(folder: Path, tmp_path: Path) -> None:
+    """Catches data on people's servers that a newer player refuses, or poses in another way."""
+    data = (folder / make.WEB_DATA).read_bytes()
+    header, arrays = read_web_data(data)
+    results = evaluated(data, tmp_path)["results"]
+    rig = make.rigged().rig
+    assert len(results) == len(rig.pose)
+    for frame, result in enumerate(results):
+        expected = posed_mesh(header, arrays, rig.coefficients[frame], rig.pose[frame], frame)
+        np.testing.assert_allclose(np.reshape(result["vertices"], (-1, 3)), expected, atol=1e-5)
+        assert np.ptp(np.reshape(result["texels"], (-1, 5, 4))[:, 3, :3]) > 0.01
