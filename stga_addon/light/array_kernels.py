@@ -1,8 +1,6 @@
 """The kernels of `raster.cpu.shade` and `.shadow` in NumPy, for Pythons without Numba. Vectors are
 rows of their own, (3, N): NumPy is slow where the last axis is short."""
 
-from itertools import product
-
 import numpy as np
 
 CHUNK_TEXELS = 1 << 17
@@ -102,18 +100,25 @@ def lit_shares(
         z = points[part, 2] - bias[part]
         left = np.floor(x)
         top = np.floor(y)
-        right = x - left
-        lower = y - top
         at = top.astype(np.int64) * width + left.astype(np.int64)
         found = np.zeros(len(z), np.float32)
-        for row, (below, weight) in product(taps, ((0, 1 - lower), (1, lower))):
+        columns = _texel_weights(taps, x - left)
+        for row, weight in _texel_weights(taps, y - top).items():
             open_ = np.zeros(len(z), np.float32)
-            for column in taps:
-                place = at + ((row + below) * width + column)
-                open_ += np.where(z <= flat.take(place), 1 - right, 0)
-                open_ += np.where(z <= flat.take(place + 1), right, 0)
+            for column, share in columns.items():
+                open_ += np.where(z <= flat.take(at + (row * width + column)), share, 0)
             found += weight * open_
         lit[part] = found / np.float32(len(taps) ** 2)
+
+
+def _texel_weights(taps: tuple[int, ...], share: np.ndarray) -> dict[int, np.ndarray]:
+    """Of texels along an axis: where the taps at whole numbers, moved by the share (N,) of a texel,
+    look up linearly."""
+    weights: dict[int, np.ndarray] = {}
+    for tap in taps:
+        weights[tap] = weights.get(tap, np.float32(0)) + (1 - share)
+        weights[tap + 1] = weights.get(tap + 1, np.float32(0)) + share
+    return weights
 
 
 def add_lights(

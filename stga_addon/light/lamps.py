@@ -1,6 +1,5 @@
 """Lights of a scene at a posed head: shadow maps of what they see, and what they add."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -8,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..raster.kernel_cache import prefers_numba
 from . import array_kernels
 from .array_kernels import toward_light
 from .harmonics import COUNT, basis
@@ -142,9 +142,9 @@ class ShadowMap:
 
 
 def kernels(name: str) -> Any:
-    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`) where something
-    else has loaded Numba, else NumPy's: to load and compile takes longer than many images."""
-    if "numba" in sys.modules:
+    """`raster.cpu.shade` (`add_lights`) or `.shadow` (`add_depths`, `lit_shares`), three times as
+    fast, where Numba's kernels are compiled, else NumPy's."""
+    if prefers_numba():
         return import_module(f"...raster.cpu.{name}", __name__)
     return array_kernels
 

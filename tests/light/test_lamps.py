@@ -1,5 +1,6 @@
 """Irradiance of lights against closed forms, shadows against cast rays, NumPy against Numba."""
 
+import os
 import subprocess
 import sys
 
@@ -8,10 +9,12 @@ import pytest
 
 from light.scenes import ball_and_plate, blocked
 from stga_addon.capture.mesh_geometry import vertex_normals
-from stga_addon.light import array_kernels
+from stga_addon.light import array_kernels, lamps
 from stga_addon.light.lamps import LIFT_M, Lamps, ShadowMap, head_bounds, light_rows, light_view
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu import shade, shadow
+from stga_addon.raster.kernel_cache import prefers_numba
+from stga_addon.worker.launch import CACHE_VARIABLE
 
 NO_FACES = np.zeros((0, 3), np.int32)
 AROUND = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
@@ -108,19 +111,36 @@ LIGHTS = (
 )
 
 
-def test_a_light_loads_no_numba():
-    """Catches seconds of compiling at the first light in Blender, whose window stands still."""
+@pytest.mark.parametrize("imports", ["sys", "sys, numba"])
+def test_a_light_compiles_no_kernels(tmp_path, imports):
+    """Catches seconds of compiling at the first light in Blender, whose window stands still, and
+    other last bits because something else has loaded Numba."""
     script = (
-        "import sys, numpy as np\n"
+        f"import {imports}, numpy as np\n"
         "from stga_addon.light.lamps import Lamps\n"
         "from stga_addon.light.values import Light, Lighting\n"
         "sun = Light('sun', np.ones(3), direction=(0.0, 0.0, -1.0))\n"
         "mesh, faces = np.eye(3), np.array([[0, 1, 2]], np.int32)\n"
         "lamps = Lamps(Lighting(np.zeros((9, 3)), (sun,)), mesh, faces)\n"
         "assert lamps.irradiance(mesh, np.eye(3)).any()\n"
-        "assert 'numba' not in sys.modules\n"
+        "assert 'stga_addon.raster.cpu' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", script], check=True)
+    folders = {"NUMBA_CACHE_DIR": str(tmp_path / "own"), CACHE_VARIABLE: str(tmp_path)}
+    subprocess.run([sys.executable, "-c", script], check=True, env={**os.environ, **folders})
+
+
+def test_compiled_kernels_are_used(tmp_path, monkeypatch):
+    """Catches slow lights beside compiled kernels, or by those of Blender's own process."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(lamps, "prefers_numba", prefers_numba.__wrapped__)
+    assert lamps.kernels("shade") is array_kernels
+    (tmp_path / "cpu_0").mkdir()
+    (tmp_path / "cpu_0/image_loss.image_loss-10.py311.nbi").touch()
+    assert lamps.kernels("shade") is shade
+    assert lamps.kernels("shadow") is shadow
+    monkeypatch.setattr("stga_addon.raster.kernel_cache.find_spec", lambda name: None)
+    assert lamps.kernels("shade") is array_kernels
 
 
 def test_lights():
@@ -156,7 +176,7 @@ def test_shadow_maps(light):
     outside = np.float32([[-1e6, -1e6, 0.1], [300, 128, 0.1], [0.2, 0.1, 5]])
     places = np.concatenate([points, outside])
     bias = np.random.default_rng(0).uniform(0, 0.006, len(places)).astype(np.float32)
-    for step in (0.0, 2.0):
+    for step in (0.0, 1.0, 2.0):
         lit = [np.empty(len(places), np.float32) for _ in range(2)]
         for one, kernels in zip(lit, (shadow, array_kernels), strict=True):
             kernels.lit_shares(depth[0], places, bias, np.float32(step), one)
