@@ -2,14 +2,17 @@
 
 from pathlib import Path
 
-from . import lamps, relight
+from ..raster.shader_constants import printed_constants
+from . import lamps, relight, values
 
 _CONSTANTS = {"MAP_SIZE": lamps.MAP_SIZE, "LIFT": lamps.LIFT_M, "BIAS": lamps.BIAS_M}
 _CONSTANTS |= {"MAX_BIAS": lamps.MAX_BIAS_M, "TAP_STEP": lamps.TAP_STEP, "PI": 3.14159265358979}
 _SHARES = "HIGHLIGHT_SHARE", "WET_HIGHLIGHT_SHARE", "MIN_DIFFUSE_SHARE"
 for _name in ("REFLECTANCE", *_SHARES, "ALIKE_AT_SPLAT", "UNLIKE_AT_SPLAT"):
     _CONSTANTS[_name] = getattr(relight, _name)
-SHADING_DEFINES = "".join(f"#define {name} {value!r}\n" for name, value in _CONSTANTS.items())
+_CONSTANTS["SKIN_ROUGHNESS"] = values.SKIN_ROUGHNESS
+_CONSTANTS |= {f"VIEW_MEAN_{degree}": mean for degree, mean in enumerate(relight.VIEW_MEANS)}
+SHADING_DEFINES = printed_constants(_CONSTANTS, "glsl")
 SRGB_FUNCTIONS = """
 vec3 srgb_to_linear(vec3 srgb)
 {

@@ -8,6 +8,7 @@ import numpy as np
 from ...avatar import embedding, strain
 from ..cpu import blend, image_loss, layout, optimizer, splat_block
 from ..cpu.layout import Parameters
+from ..shader_constants import printed_constants
 
 WORKGROUP = 256
 """Threads of a workgroup: a tile's pixels, and the largest size that every adapter has."""
@@ -153,8 +154,5 @@ def prelude_wgsl() -> str:
             kind = f"vec{shape[-1]}{item.kind}" if shape else kinds[item.kind]
             lines.append(f"  {name}: {f'array<{kind}, {shape[0]}>' if len(shape) > 1 else kind},")
         lines.append("}")
-    for name, value in CONSTANTS.items():
-        is_count = isinstance(value, int)
-        text = f"{value}u" if is_count else f"{float(np.float32(value)).hex()}f"
-        lines.append(f"const {name}: {'u32' if is_count else 'f32'} = {text};")
+    lines.append(printed_constants(CONSTANTS, "wgsl"))
     return "\n".join(lines)

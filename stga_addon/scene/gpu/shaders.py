@@ -38,6 +38,7 @@ import numpy as np
 
 from ...avatar.splats import harmonics_text
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS, SRGB_FUNCTIONS
+from ...raster.shader_constants import printed_constants
 from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
@@ -71,10 +72,11 @@ NOTHING = 1e30  # depth of a shadow map where nothing is
 
 _CONSTANTS = {name: value for name, value in vars(packing).items() if name.endswith("_TEXELS")}
 _CONSTANTS |= {"WIDTH": TEXTURE_WIDTH, "BLOCK_SPLATS": BLOCK_SPLATS}
-_CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES, "FROZEN_COLOR": f"vec3{FROZEN_COLOR_SRGB}"}
-_CONSTANTS["TEXEL(image, k)"] = "texelFetch(image, ivec2((k) % WIDTH, (k) / WIDTH), 0)"
-_DEFINES = "".join(f"#define {name} {value}\n" for name, value in _CONSTANTS.items())
-_DEFINES += SPLAT_DEFINES
+_CONSTANTS |= {"CLIP_PLANES": packing.CLIP_PLANES}
+_DEFINES = f"""{printed_constants(_CONSTANTS, "glsl")}{SPLAT_DEFINES}
+#define FROZEN_COLOR vec3{FROZEN_COLOR_SRGB}
+#define TEXEL(image, k) texelFetch(image, ivec2((k) % WIDTH, (k) / WIDTH), 0)
+"""
 RELIT_DEFINES = f"""
 #define RELIT
 #define MAP_COLUMNS {MAP_COLUMNS}

@@ -12,7 +12,7 @@ from stga_addon.errors import StgaError
 from stga_addon.export.formats import export_avatar
 from stga_addon.export.playback import Playback
 from stga_addon.export.rig import BAKE_TOLERANCE_M, baked_rig
-from stga_addon.export.web import data_file
+from stga_addon.export.web import data_file, shared_constants
 from stga_addon.export.web.data_file import pack
 from stga_addon.export.web.page import ELEMENT, PAGE, PLAYER, element_script, modules
 
@@ -130,6 +130,11 @@ def test_motion_only_leaves_the_rig_out(head, tmp_path):
     padding = np.zeros((5143 - len(head.avatar.neutral), 3))
     flame_sized = replace(head.avatar, neutral=np.concatenate([head.avatar.neutral, padding]))
     assert "FLAME&#x27;s licence (flame.is.tue.mpg.de) decides" in notice(flame_sized, None)
+
+
+def test_the_players_constants_are_pythons():
+    """Catches a constant that was changed on one side."""
+    assert shared_constants.FILE.read_text(encoding="utf-8") == shared_constants.script()
 
 
 def test_every_module_is_in_the_page():

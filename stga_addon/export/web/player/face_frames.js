@@ -5,12 +5,15 @@
 
 /** @import { Arrays, Header, Vector } from './types.js' */
 
+import {
+  AVERAGING_ROUNDS,
+  MAX_DEFORMATION,
+  MIN_AREA_RATIO,
+  MIN_SQUARED_NORMAL,
+  STRAIN_GAIN,
+  UPRIGHT_COSINE,
+} from './constants.js';
 import { crossed, difference, dotProduct, scaled, unit } from './vector.js';
-
-const STRAIN_GAIN = 5;
-const MAX_DEFORMATION = 2; // where the file has no ranges
-const AVERAGING_ROUNDS = 3; // of smoothed strain
-const MIN_SQUARED_NORMAL = 1e-24;
 
 /** Strain of each triangle, less that at rest. */
 class Strain {
@@ -204,8 +207,6 @@ export const SIGNALS = { smoothed_strain: SmoothedStrain, normal: NormalChange }
 // the capture.
 export const TARGETS = ['position', 'scale', 'color', 'light'];
 
-const MIN_AREA_RATIO = 1e-4; // of a triangle that counts as a line, to its longest edge's square
-const UPRIGHT_COSINE = 0.8;
 // Of a triangle in the texture: three rows of matrix | origin, then color | selected, and what of
 // the color is the light of the capture.
 export const FACE_FLOATS = 20;

@@ -7,10 +7,11 @@
 /** @import { Sun, Uniforms, Values, Vector } from './types.js' */
 
 import { bounds, rotatedAbout } from './camera.js';
+import { LIFT_M, MAP_SIZE } from './constants.js';
 import { FaceFrames } from './face_frames.js';
 import { bindTexture, deleteTarget, floatTexture, makeTarget, paddedLength } from './renderer.js';
 import { program, updateTexture } from './renderer.js';
-import { LIFT_M, MAP_SIZE, SURFACE_TEXELS, TEXTURE_WIDTH, VERTEX_TEXELS } from './shaders.js';
+import { SURFACE_TEXELS, TEXTURE_WIDTH, VERTEX_TEXELS } from './shaders.js';
 import { OVER_VERTEX_SHADER, SHADOW_FRAGMENT_SHADER, SHADOW_VERTEX_SHADER } from './shaders.js';
 import { lightFragmentShader } from './shaders.js';
 import { box, crossed, difference, dotProduct, scaled, unit, vector } from './vector.js';

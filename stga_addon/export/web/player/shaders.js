@@ -9,11 +9,8 @@ export const SPLAT_TEXELS = 4; // xyz, triangle | rotation | scale, opacity | co
 export const FACE_TEXELS = 5; // rows of the frame in camera space | color, selected | light
 export const SURFACE_TEXELS = 4; // normal, roughness | irradiance, occlusion | corners | weights
 export const VERTEX_TEXELS = 3; // position | normal | irradiance of the world and of skin around
-export const MAP_SIZE = 512;
-export const LIFT_M = 0.001;
-const SKIN_ROUGHNESS = 0.45;
-/** Of the recorded color without what depends on the view, by degree from 1 (light/relight.py). */
-const VIEW_MEANS = [0.65, 0.195, -0.089375];
+/** Of the recorded color without what depends on the view, by degree from 1. */
+const VIEW_MEANS = ['VIEW_MEAN_1', 'VIEW_MEAN_2', 'VIEW_MEAN_3'];
 
 const PREAMBLE = `#version 300 es
 precision highp float;
@@ -42,11 +39,11 @@ const tailTriple = k =>
 
 // Add coefficients times basis functions of a direction to a variable, unrolled: dynamic indices
 // are slow on many GPUs.
-/** @type {(count: number, direction: string, sum: string, factors?: number[]) => string} */
-function harmonicsSum(count, direction, sum, factors = [1, 1, 1]) {
+/** @type {(count: number, direction: string, sum: string, factors?: string[]) => string} */
+function harmonicsSum(count, direction, sum, factors = ['1.0', '1.0', '1.0']) {
   const terms = SH.slice(0, count).map((term, k) => {
     const factor = factors[Math.floor(Math.sqrt(k + 1)) - 1];
-    return `${sum} += ${factor.toFixed(8)} * (${term}) * ${tailTriple(k)};`;
+    return `${sum} += ${factor} * (${term}) * ${tailTriple(k)};`;
   });
   return `{
     float x = ${direction}.x, y = ${direction}.y, z = ${direction}.z;
@@ -218,7 +215,7 @@ void main() {
   normal /= max(length(normal), 1e-12);
   vec3 point = mean(corners, weights, 0), lifted = point + LIFT * normal;
   vec3 arriving = mean(corners, weights, 2);
-  float roughness = surface.a > 0.0 ? surface.a : ${SKIN_ROUGHNESS};
+  float roughness = surface.a > 0.0 ? surface.a : SKIN_ROUGHNESS;
   vec3 highlight = sky_highlight(0, normal, normalize(uEye - point), roughness, old.a);
   vec3 view = normalize(uEye - lifted), towardSun = -vec3(uToSun[0].z, uToSun[1].z, uToSun[2].z);
   float facing = dot(normal, towardSun);
