@@ -137,15 +137,13 @@ def shader_nodes(owner: Any) -> Any:
 
 
 def native_splats(tree: Any, points: Any) -> Any:
-    """Add a node that makes points native splats; its output, None if it has no such type."""
+    """Add a node that makes points native splats; its output, still points in a version that names
+    them in another way."""
     node = tree.nodes.new("GeometryNodePointsSetType")
-    for name in ("3D Gaussian Splat", "3D Gaussian Splats"):  # as builds of 5.3 named it
-        with suppress(TypeError):  # there is no such item
-            node.inputs["Type"].default_value = name
-            tree.links.new(points, node.inputs["Points"])
-            return node.outputs["Points"]
-    tree.nodes.remove(node)
-    return None
+    with suppress(TypeError):  # there is no such item
+        node.inputs["Type"].default_value = "3D Gaussian Splat"
+    tree.links.new(points, node.inputs["Points"])
+    return node.outputs["Points"]
 
 
 def allow_depth_write(shader: Any) -> None:

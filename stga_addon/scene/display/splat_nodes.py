@@ -188,15 +188,15 @@ LIMITS = {
 
 def displayed(nodes: Nodes, mode: Any, splats: Any, visible: Any, size: Any, native: Any) -> Any:
     """The splats in the display mode of the menu socket `mode`. visible: field, which splats; size:
-    factor; native: points from NATIVE_GROUPS, None in a Blender without native splats."""
+    factor; native: splats from NATIVE_GROUPS, None in a Blender without native splats."""
     made = {name: nodes.group(group, splats, visible, size) for name, group in MODES.items()}
     # Nothing in viewports, where `viewport_display.py` draws; in images by EEVEE and Cycles, quads
     # that face the camera.
     choice = {"Switch": nodes.out("GeometryNodeIsViewport"), "False": made[QUADS]}
     in_images = nodes.out("GeometryNodeSwitch", choice, input_type="GEOMETRY")
     geometries = {AS_TRAINED: in_images, **made}
-    if native is not None and (points := native_splats(nodes.tree, native)) is not None:
-        geometries[NATIVE] = points
+    if native is not None:
+        geometries[NATIVE] = native
     menu = nodes.add("GeometryNodeMenuSwitch", data_type="GEOMETRY")
     menu.enum_definition.enum_items.clear()
     for name in geometries:
@@ -259,7 +259,7 @@ def _native(
     view_dependent: Any,
     gray: Any,
 ) -> bpy.types.NodeSocket:
-    """Points with what native splats are drawn from, harmonics in the object's axes. color:
+    """Native splats with what they are drawn from, harmonics in the object's axes. color:
     constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
     flat = nodes.logic("OR", gray, is_relit)
@@ -277,7 +277,8 @@ def _native(
     for index in range((degree + 1) ** 2 - 1):
         coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
         splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
-    return nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
+    points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
+    return native_splats(nodes.tree, points)
 
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
