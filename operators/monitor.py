@@ -35,6 +35,7 @@ from ..stga_addon.scene.display.splat_object import (
     hide_in_layers,
     is_enabled_on,
     keep_evaluated,
+    replace_native_splats,
 )
 from ..stga_addon.scene.objects import layers_with
 from ..stga_addon.tracking.folder import SPLIT_FILES
@@ -437,7 +438,15 @@ def _after_load(_: Any) -> None:
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
         del _states[key]  # of scenes of the file before; its videos are still rendered
     _choose_head()
+    _say(replace_native_splats(bpy.data.objects))
     _start_timer()
+
+
+def _say(sentence: str) -> None:
+    """Print a sentence, if it is not empty, and show it in the panel."""
+    if sentence:
+        print(f"STGA: {sentence}")
+        bpy.context.window_manager.stga_message = sentence
 
 
 @persistent
@@ -445,6 +454,8 @@ def _after_append(imported: Any) -> None:
     """Show what was appended or linked as its own file shows it, and let the panel find it."""
     scene = bpy.context.scene
     layer = bpy.context.view_layer
+    appended = [item.id for item in imported.import_items if item.id is not None]
+    _say(replace_native_splats(appended))
     for item in imported.import_items:
         thing = item.id
         if thing is None or tags.KIND not in thing:

@@ -11,9 +11,8 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export.splat_files import READERS, read_splats
 from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
-from ..stga_addon.scene import tags
+from ..stga_addon.scene import compat, tags
 from ..stga_addon.scene.avatar_scene import show_world
-from ..stga_addon.scene.compat import NATIVE_SPLATS
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE, POINTS, QUADS
 from ..stga_addon.scene.light import throw_shadow, throws_shadow
@@ -29,7 +28,7 @@ from .results import shown_splats
 
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""
-OFFERED = [mode for mode in LIMITS if mode != NATIVE or NATIVE_SPLATS]
+OFFERED = [mode for mode in LIMITS if mode != NATIVE or compat.NATIVE_SPLATS]
 UP_ROTATION_DEG = {"Y": 90.0, "-Y": -90.0, "Z": 0.0}
 """Up axis of a file -> rotation about x that turns it to Blender's."""
 
@@ -113,7 +112,7 @@ class ChooseDisplay(Edit, bpy.types.Operator):
     )
 
     def run(self, context: Any) -> None:
-        splat_object.set_input(context.scene.stga.splats, splat_nodes.DISPLAY, self.display)
+        splat_object.choose_display(context.scene.stga.splats, self.display)
         space = context.space_data
         is_viewport = getattr(space, "type", "") == "VIEW_3D"  # a script has none
         if is_viewport and self.display != AS_TRAINED and space.shading.type in GRAY:

@@ -1,9 +1,13 @@
-"""What Blender's native splats are drawn from, against numpy; also in STGA_BLENDER."""
+"""What Blender's native splats are drawn from, against numpy, also in STGA_BLENDER; files that go
+between Blenders with and without them."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
+import bpy
 import numpy as np
 import pytest
 
@@ -11,11 +15,17 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import write_avatar
 from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.color import linear_to_srgb
+from stga_addon.scene import compat
+from stga_addon.scene.display import splat_nodes
+from stga_addon.scene.display.splat_nodes import NATIVE, POINTS, QUADS
 from stga_addon.scene.layers import FROZEN_COLOR
 
+from .test_operators import write_ball_avatar
 from .test_splat_object import driven_avatar, same_rotation
-from .zips import BLENDERS, output_of
+from .test_versions import python_of
+from .zips import BLENDERS, output_of, result_of
 
+FILE_SCRIPT = Path(__file__).with_name("native_file_script.py")
 SCRIPT = Path(__file__).with_name("native_script.py")
 OPTIONS = ["--background", "--python-exit-code", "1", "--python"]
 COMMANDS = [[sys.executable], *([*command, *OPTIONS] for command in BLENDERS)]
@@ -56,3 +66,105 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
         for index in range(15):
             coefficient = wanted.sh[:, index + 1] if case == "recorded" else 0 * wanted.sh[:, 0]
             np.testing.assert_allclose(found[f"{case}/radiance:sh_{index}"], coefficient, atol=1e-6)
+
+
+@pytest.fixture
+def pretend(extension: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
+    """Makes this Blender one that has native splats, which stay points where it has none, or one
+    that has not."""
+    known = extension.stga_addon.scene.compat
+
+    def change(is_native: bool) -> None:
+        monkeypatch.setattr(known, "NATIVE_SPLATS", is_native)
+        if not compat.NATIVE_SPLATS:
+            monkeypatch.setattr(known, "native_splats", lambda tree, points: points)
+
+    return change
+
+
+@pytest.mark.parametrize("shows_again", [False, True])
+def test_a_file_from_before_native_splats_can_show_them(
+    extension, head, pretend, tmp_path, shows_again
+) -> None:
+    """Catches a menu that lacks the mode that the panel offers, also after Show Avatar, and
+    settings lost with the old node tree."""
+    splat_object = extension.stga_addon.scene.display.splat_object
+    path = str(tmp_path / "a.npz")
+    write_ball_avatar(tmp_path / "a.npz")
+    pretend(False)
+    bpy.ops.stga.show_avatar(filepath=path)
+    splat_object.set_input(bpy.context.scene.stga.splats, splat_nodes.SIZE, 1.5)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    pretend(True)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    settings = bpy.context.scene.stga
+    if shows_again:
+        bpy.ops.stga.show_avatar(filepath=path)
+        splat_object.set_input(settings.splats, splat_nodes.DISPLAY, NATIVE)
+    elif compat.NATIVE_SPLATS:
+        bpy.ops.stga.choose_display(display=NATIVE)
+    else:  # where the operator does not offer it
+        splat_object.choose_display(settings.splats, NATIVE)
+    assert splat_object.display_mode(settings.splats) == NATIVE
+    assert splat_object.get_input(settings.splats, splat_nodes.SIZE) == 1.5
+    assert splat_object.get_input(settings.splats, splat_nodes.HEAD) == settings.head
+    instances = bpy.context.evaluated_depsgraph_get().object_instances
+    (data,) = [each.object.data for each in instances if each.object.type == "POINTCLOUD"]
+    assert not compat.NATIVE_SPLATS or data.type == "GAUSSIAN_SPLAT"
+
+
+def test_world_splats_of_an_older_file_can_be_native(extension, pretend, tmp_path) -> None:
+    """Catches splats without a head that keep a tree without native splats."""
+    splat_object = extension.stga_addon.scene.display.splat_object
+    splats = driven_avatar("stga", count=20).splats
+    pretend(False)
+    shown = splat_object.show_world_splats(splats, "room")
+    pretend(True)
+    splat_object.choose_display(shown, NATIVE)
+    assert splat_object.display_mode(shown) == NATIVE
+
+
+def test_native_splats_become_quads_in_an_older_blender(
+    extension, head, pretend, tmp_path, capsys
+) -> None:
+    """Catches a file from a newer Blender that shows nothing, and no sentence that says why."""
+    splat_object = extension.stga_addon.scene.display.splat_object
+    write_ball_avatar(tmp_path / "a.npz")
+    pretend(True)
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    shown = bpy.context.scene.stga.splats
+    splat_object.set_input(shown, splat_nodes.DISPLAY, NATIVE)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert splat_object.display_mode(bpy.context.scene.stga.splats) == NATIVE
+    pretend(False)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    shown = bpy.context.scene.stga.splats
+    sentence = f"{shown.name} is displayed as {QUADS}; native splats need Blender 5.3 or newer"
+    assert splat_object.display_mode(shown) == QUADS
+    assert f"STGA: {sentence}\n" in capsys.readouterr().out
+    assert bpy.context.window_manager.stga_message == sentence
+    bpy.ops.stga.choose_display(display=POINTS)
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
+    assert splat_object.display_mode(shown) == POINTS
+
+
+@pytest.mark.parametrize("is_written_by_newer", [False, True])
+def test_files_between_blenders_with_and_without_native_splats(
+    tmp_path: Path, is_written_by_newer: bool
+) -> None:
+    """Catches what other versions store of modifiers and nodes in another way than is simulated
+    above."""
+    others = ("5.2", "this") if compat.NATIVE_SPLATS else ("this", "5.3")
+    older, newer = map(python_of, others)
+    write_avatar(tmp_path / "a.npz", driven_avatar("stga", count=50))
+    writer = newer if is_written_by_newer else older
+    reader = older if is_written_by_newer else newer
+    file = tmp_path / "a.blend"
+    output_of([writer, FILE_SCRIPT, "write", file, tmp_path / "a.npz"])
+    found = result_of([reader, FILE_SCRIPT, "read", file])
+    assert found["native"] != is_written_by_newer
+    assert found["mode"] == (QUADS if is_written_by_newer else NATIVE)
+    assert found["sentence"].startswith("head splats is displayed") == is_written_by_newer
+    assert (found["size"], found["head"]) == (1.5, "head")
+    assert found["drawn"] > 0

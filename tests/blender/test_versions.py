@@ -29,7 +29,9 @@ from .zips import result_of
 # bpy that the tests themselves run in, and others: (version, the variable with the path of a Python
 # that has it)
 TRAINING_PYTHON = "" if missing_packages() else sys.executable
-VERSIONS = {"this": None, "4.2": "STGA_BPY_4_2", "4.5": "STGA_BPY_4_5", "5.2": "STGA_BPY_5_2"}
+VERSIONS = {"this": None} | {
+    version: f"STGA_BPY_{version.replace('.', '_')}" for version in ("4.2", "4.5", "5.2", "5.3")
+}
 
 
 def python_of(version: str) -> str:

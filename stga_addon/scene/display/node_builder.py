@@ -9,9 +9,9 @@ from typing import Any
 import bpy
 
 from ... import __version__
-from ..compat import enable_nodes
+from .. import compat
 
-VERSION = "stga_version"  # property of our trees
+VERSION = "stga_version"  # property of our trees: `_version`
 _COLUMN_WIDTH = 220.0
 _ROW_HEIGHT = 200.0
 
@@ -19,16 +19,25 @@ _ROW_HEIGHT = 200.0
 def new_tree(name: str) -> bpy.types.NodeTree:
     """An empty geometry node tree that `find_tree` finds again."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    tree[VERSION] = __version__
+    tree[VERSION] = _version()
     return tree
 
 
 def find_tree(name: str) -> bpy.types.NodeTree | None:
-    """The tree of this name made by this version of the add-on, or None."""
+    """The tree of this name for which `is_current` is true, or None."""
     for tree in bpy.data.node_groups:
-        if tree.name.startswith(name) and tree.get(VERSION) == __version__:
+        if tree.name.startswith(name) and is_current(tree):
             return tree
     return None
+
+
+def is_current(tree: bpy.types.NodeTree) -> bool:
+    """Whether this version of the add-on made the tree, in a Blender with the same nodes."""
+    return bool(tree.get(VERSION) == _version())
+
+
+def _version() -> str:
+    return f"{__version__} with native splats" if compat.NATIVE_SPLATS else __version__
 
 
 def new_socket(tree: bpy.types.NodeTree, name: str, side: str, kind: str) -> Any:
@@ -66,7 +75,7 @@ class NodeGroup:
 def new_material(name: str, build: Callable[["Nodes"], bpy.types.NodeSocket]) -> bpy.types.Material:
     """A material whose surface is the shader that `build` returns."""
     material = bpy.data.materials.new(name)
-    tree = enable_nodes(material)
+    tree = compat.enable_nodes(material)
     tree.nodes.clear()
     nodes = Nodes(tree)
     nodes.finish("ShaderNodeOutputMaterial", {"Surface": build(nodes)})

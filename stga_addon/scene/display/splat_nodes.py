@@ -10,8 +10,7 @@ import bpy
 from ...avatar.offsets import COLOR, OFFSETS
 from ...avatar.splats import SH_C0, harmonics
 from ...capture.meshes import SELECTED_WEIGHT
-from .. import tags
-from ..compat import NATIVE_SPLATS, native_splats
+from .. import compat, tags
 from ..layers import FROZEN_COLOR
 from . import splat_attributes as stored
 from .frame_nodes import DEFORMED, FACE_COLOR, FRAMES, PLACED, SIGNALS, driven
@@ -181,7 +180,7 @@ LIMITS = {
     "EEVEE and Cycles render camera quads",
     POINTS: "Fast: a dot for each splat, in one color; for Material Preview",
     QUADS: "For EEVEE and Cycles; right through the scene's camera only",
-    NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; not tried in Blender 5.3",
+    NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; edges are lighter than trained",
 }
 """What each display is for and what it is not, in its tooltip and in the panel."""
 
@@ -278,7 +277,7 @@ def _native(
         coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
         splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
     points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
-    return native_splats(nodes.tree, points)
+    return compat.native_splats(nodes.tree, points)
 
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
@@ -351,7 +350,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
         groups += [driven(name, convention) for name in offsets]
     if degree > 0 or options.is_colored:
         groups.append(SRGB_TO_LINEAR)
-    groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if NATIVE_SPLATS else []
+    groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if compat.NATIVE_SPLATS else []
     missing = next((group for group in groups if find_tree(f".{group.name}") is None), None)
     if missing is None:
         splat_tree(options)
@@ -422,7 +421,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
         visible = nodes.logic("NIMPLY", visible, nodes.logic("AND", frozen, inputs[SELECTED_ONLY]))
     splats = nodes.store(splats, DISPLAY_COLOR, nodes.group(_RELIT, color), "FLOAT_COLOR")
     native = None
-    if NATIVE_SPLATS:
+    if compat.NATIVE_SPLATS:
         view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
         fields = inputs[SIZE], constant_color(nodes, added), view_dependent, gray
         native = nodes.group(NATIVE_GROUPS[options.degree], splats, visible, *fields)

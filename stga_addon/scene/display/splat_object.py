@@ -1,6 +1,7 @@
 """Splat objects: the Blender objects that display avatars and world-space splats."""
 
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 from uuid import uuid4
@@ -12,7 +13,7 @@ from ...avatar.file import Avatar, AvatarLight
 from ...avatar.offsets import OFFSETS
 from ...avatar.splats import Splats
 from ...errors import StgaError
-from .. import tags
+from .. import compat, tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
 from ..compat import animation_curves, modifier_input, set_modifier_input
 from ..layers import DisplaySettings
@@ -20,9 +21,9 @@ from ..objects import remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
-from .node_builder import VERSION, find_tree
+from .node_builder import VERSION, find_tree, is_current
 from .splat_attributes import SplatAttributes, avatar_attributes
-from .splat_nodes import AS_TRAINED, POINTS
+from .splat_nodes import AS_TRAINED, NATIVE, POINTS, QUADS
 
 
 def view_transform_hint(scene: bpy.types.Scene) -> str | None:
@@ -95,6 +96,7 @@ def show_avatar(
 
 def _exchange_tree(splat_object: Any, tree: Any) -> None:
     """Show the splats by another node tree; inputs keep their values and keyframes by name."""
+    replace_native_splats([splat_object])  # a mode that the other tree lacks
     modifier = splat_modifier(splat_object)
     before = input_identifiers(modifier)
     values = {name: modifier_input(modifier, identifier) for name, identifier in before.items()}
@@ -280,6 +282,42 @@ def input_identifiers(modifier: Any) -> dict[str, str]:
 def display_mode(splat_object: Any) -> str:
     """The display mode that is chosen for a splat object, a name in `LIMITS`."""
     return get_input(splat_object, splat_nodes.DISPLAY) or ""
+
+
+def choose_display(splat_object: Any, mode: str) -> None:
+    """Show splats in a display mode, a name in `LIMITS`. A node tree that is not of this version,
+    and may lack the mode, is built again. Raises StgaError where `stored_avatar` does."""
+    if not is_current(splat_modifier(splat_object).node_group):
+        if tags.CONVENTION in splat_object:
+            options = _tree_options(stored_avatar(splat_object))
+        else:
+            degree = stored.read_splats(splat_object.data).sh_degree
+            options = splat_nodes.TreeOptions(None, degree)
+        _exchange_tree(splat_object, splat_nodes.splat_tree(options))
+    set_input(splat_object, splat_nodes.DISPLAY, mode)
+
+
+def replace_native_splats(objects: Iterable[Any]) -> str:
+    """Show camera quads where a file from a newer Blender has native splats, which this Blender
+    would show as nothing; a sentence that says so, "" where there are none."""
+    if compat.NATIVE_SPLATS:
+        return ""
+    told = []
+    for each in objects:
+        if each.get(tags.KIND) != tags.SPLATS or not _is_native(each):
+            continue
+        if each.library is None:
+            set_input(each, splat_nodes.DISPLAY, QUADS)
+            told.append(f"{each.name} is displayed as {QUADS}")
+        else:
+            told.append(f"{each.name} is linked, and not displayed")
+    return "; ".join([*told, "native splats need Blender 5.3 or newer"]) if told else ""
+
+
+def _is_native(splat_object: Any) -> bool:
+    with suppress(StgaError):  # it has lost its modifier
+        return display_mode(splat_object) == NATIVE
+    return False
 
 
 def display_settings(modifier: Any) -> DisplaySettings:
