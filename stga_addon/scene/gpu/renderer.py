@@ -16,7 +16,7 @@ from ...avatar.embedding import FaceFrames
 from ...light.lamps import MAP_SIZE
 from ...raster.posed_splats import ComposedImage
 from ..layers import SceneLayer
-from . import packing, shaders
+from . import packing, shaders, trial
 from .packing import RelitScene, ShadowView, StaticSplats, View, relit_scene, surface, with_eye
 from .shaders import EXACT, MAP_COLUMNS, PROJECTED_TEXTURES, TEXTURE_WIDTH, texture
 
@@ -196,11 +196,14 @@ COMPACT = "RGBA16F"  # format of the color target, beside EXACT
 DEPTH_FORMAT = "RG32F"
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swiftshader", "basic render")
 """Parts of the names, in lower case, of OpenGL and Vulkan drivers that compute on the CPU."""
+_problems: dict[str, str] = {}
+"""Format of the color target -> what was wrong with the first picture, "" where nothing was."""
 
 
 class SplatRenderer:
     """Shaders, the textures of the layers drawn last, and the targets they were drawn to.
-    color_format: EXACT or COMPACT; short_keys: as of `packing.drawing_order`, for viewports."""
+    color_format: EXACT or COMPACT; short_keys: as of `packing.drawing_order`, for viewports. Raises
+    WrongPicture where splats are drawn wrong here."""
 
     def __init__(self, color_format: str = EXACT, short_keys: bool = False) -> None:
         self._projection_shader = shaders.projection_shader()
@@ -219,6 +222,24 @@ class SplatRenderer:
         self._color = self._depth = self._target = None
         self._projected: dict[str, Any] = {}
         self._projected_target: Any = None
+        if color_format not in _problems:
+            _problems[color_format] = self._problem()
+        if _problems[color_format]:
+            raise trial.WrongPicture(_problems[color_format])
+
+    def _problem(self) -> str:
+        """Try the shaders; one sentence where they draw splats wrong."""
+
+        def drawn(layers: Sequence[SceneLayer], view: View) -> ComposedImage:
+            self.draw(layers, view)
+            return self.read()
+
+        try:
+            trial.check(drawn, hidden=shaders.BLOCK_SPLATS)
+        except trial.WrongPicture as error:
+            device = f"{gpu.platform.backend_type_get()}, {gpu.platform.renderer_get()}"
+            return f"Blender {bpy.app.version_string} draws splats wrong ({device}): {error}"
+        return ""
 
     def draw(self, layers: Sequence[SceneLayer], view: View) -> None:
         """Draw layers, sorted together, to this renderer's own targets: the first pass projects and

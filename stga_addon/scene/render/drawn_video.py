@@ -35,7 +35,7 @@ class DrawnVideo:
         """Draw an image. Raises StgaError where the GPU cannot, or the disk is full."""
         image = draw_image(list(layers), camera)
         if image is None:
-            raise StgaError("The video cannot be drawn: Blender has no GPU context or its memory")
+            raise StgaError("The video cannot be drawn: Blender has no GPU context, or it fails")
         path = self._folder / f"{len(self._images) + 1:04d}.png"
         pixels = finished(image, self._background, is_video(self._output))
         with replacing(path) as partial:

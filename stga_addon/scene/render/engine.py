@@ -1,13 +1,12 @@
 """The render engine "STGA Splats": images and viewports of splats exactly as trained, with alpha
 and depth for compositing. The GPU draws them, or, where it cannot, the training rasterizer."""
 
-import logging
 import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 from weakref import ref
 
@@ -26,6 +25,7 @@ from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer, has_gpu_context
 from ..layers import SceneLayer
 from ..light import settings_values
+from ..objects import Warn, log_warning
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, is_drawn_by_engine, region_view
@@ -385,7 +385,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         return render_camera(evaluated, depsgraph, *size, border, eye)
 
     def _image(self, layers: list[SceneLayer], camera: Camera) -> ComposedImage:
-        image = draw_image(layers, camera)
+        image = draw_image(layers, camera, partial(self.report, {"WARNING"}))
         if image is None:
             _rasterizer.update()
             posed = [layer.posed(camera.position) for layer in layers]
@@ -427,8 +427,15 @@ def view_camera(scene: Any, view_name: str) -> Any:
     return scene.objects.get(name) or camera
 
 
-def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None:
-    """A final image drawn by the GPU; None without a GPU context, or its memory."""
+_told: set[str] = set()
+"""Why the GPU cannot draw, each sentence once in this process."""
+
+
+def draw_image(
+    layers: list[SceneLayer], camera: Camera, warn: Warn = log_warning
+) -> ComposedImage | None:
+    """A final image drawn by the GPU; None where Blender has no context of it, or the GPU fails,
+    which is told once."""
     if not has_gpu_context():
         return None
     try:
@@ -436,7 +443,10 @@ def draw_image(layers: list[SceneLayer], camera: Camera) -> ComposedImage | None
         renderer.draw(layers, View(camera))
         return renderer.read()
     except Exception as error:  # of many kinds, by device and version
-        logging.getLogger(__name__).info("No GPU rendering (%s); the rasterizer renders", error)
+        reason = f"Splats are not drawn by Blender's GPU module ({error})"
+        if reason not in _told:
+            _told.add(reason)
+            warn(reason)
         return None
 
 

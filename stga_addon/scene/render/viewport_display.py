@@ -19,6 +19,7 @@ from ..display.splat_object import display_mode, set_input
 from ..gpu.packing import NEAR_M, View
 from ..gpu.renderer import COMPACT, NO_BONES, SOFTWARE_RENDERERS, SplatRenderer, front_bones
 from ..gpu.shaders import EXACT
+from ..gpu.trial import WrongPicture
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import keeps_colors, srgb, world_color
 
@@ -70,9 +71,11 @@ class GpuDisplay:
         except StgaError as error:
             self.problem = str(error)
         except Exception as error:  # raised again at each redraw otherwise: reported once, then off
-            traceback.print_exc()
+            reason = str(error)
+            if not isinstance(error, WrongPicture):
+                traceback.print_exc()
+                reason = f"{type(error).__name__}: {error}"
             self.stop()
-            reason = f"{type(error).__name__}: {error}"
             self.problem = f"Splats cannot be drawn as trained here ({reason}); points are shown"
             self.failed = True
             print(f"STGA: {self.problem}")
