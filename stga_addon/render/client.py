@@ -52,7 +52,6 @@ class RenderClient:
         self._composer = Composer()
         self._server: tuple[str, subprocess.Popen[bytes]] | None = None
         self._server_device = self.failure = ""
-        self._sent: Sequence[PosedSplats] | None = None
 
     def compose(
         self, layers: Sequence[PosedSplats], camera: Camera, with_depth: bool = False
@@ -74,7 +73,6 @@ class RenderClient:
         """End the server, if one is running; the next image starts another."""
         running = self._server
         self._server = None
-        self._sent = None
         if running is not None:
             _, server = running
             server.kill()
@@ -101,9 +99,7 @@ class RenderClient:
             started = start_python(python, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             self._server = python, started
         python, server = self._server
-        request = {**pack_camera(camera), "with_depth": with_depth}
-        if layers is not self._sent:
-            request |= pack_layers(layers)
+        request = {**pack_camera(camera), **pack_layers(layers), "with_depth": with_depth}
         try:
             send(cast(BinaryIO, server.stdin), request)
             reply = receive(cast(BinaryIO, server.stdout))
@@ -112,7 +108,6 @@ class RenderClient:
             raise StgaError(
                 f"{python}: the render server exited unexpectedly; that Python needs numba"
             ) from error
-        self._sent = layers
         self.failure = str(reply.get("failure", ""))
         if "error" in reply:
             reason = f"could not render the image ({reply['error']})"
@@ -202,11 +197,7 @@ def unpack_layers(
 
 
 def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
-    """Answer requests until the stream ends; layers are kept until a request brings others.
-
-    device: as `Composer` takes it.
-    """
-    layers: list[PosedSplats] = []
+    """Answer requests until the stream ends; device: as `Composer` takes it."""
     composer = Composer(device)
     while True:
         try:
@@ -214,8 +205,7 @@ def serve(requests: BinaryIO, replies: BinaryIO, device: str) -> None:
         except EOFError:
             return
         try:
-            if "layers" in request:
-                layers = unpack_layers(request)
+            layers = unpack_layers(request)
             image = composer.compose(layers, unpack_camera(request), bool(request["with_depth"]))
         except Exception as error:  # the client reports it, whatever it is
             kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "

@@ -1,6 +1,5 @@
 """The render engine against `render_avatar`, through files that Blender writes, and its errors."""
 
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -393,7 +392,7 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
     on_cpu = render(tmp_path)
     wanted[0] = f"gpu:{gpu_device.device().name}"
     passes = render(tmp_path)
-    assert engine._rasterizer.client._composer.device == wanted[0]
+    assert engine._rasterizer._composer.device == wanted[0]
     for channel in "RGBA":
         np.testing.assert_allclose(passes[channel], on_cpu[channel], atol=1e-4)
     seen = on_cpu["A"] > 0.05
@@ -459,32 +458,6 @@ def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, m
     combined = [values for name, values in passes.items() if "Combined" in name]
     assert len(combined) == 4
     assert all(values.shape == (HEIGHT, WIDTH) and not values.any() for values in combined)
-
-
-def test_render_environment_is_looked_up_by_the_main_thread(monkeypatch):
-    """Catches preferences read from a render thread, and an error that is lost."""
-    monkeypatch.setattr(engine, "missing_packages", lambda: ["numba"])
-    answers = [StgaError("no environment"), "python"]
-    callers = []
-
-    def find() -> str:
-        callers.append(threading.current_thread())
-        answer = answers.pop(0)
-        if isinstance(answer, StgaError):
-            raise answer
-        return answer
-
-    environment = engine.Rasterizer(find, lambda: "cpu")
-    environment.update()
-    with pytest.raises(StgaError, match="no environment"):
-        environment.python()
-    environment.update()
-    found: list[str] = []
-    thread = threading.Thread(target=lambda: found.append(environment.python()))
-    thread.start()
-    thread.join()
-    assert found == ["python"]
-    assert callers == [threading.main_thread()] * 2
 
 
 @pytest.mark.parametrize("mode", ["OFFAXIS", "PARALLEL", "MULTIVIEW"])

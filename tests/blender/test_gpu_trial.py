@@ -82,13 +82,25 @@ def test_broken_shaders_are_found(monkeypatch, name):
 
 
 @needs_gpu
-def test_viewports_fall_back_to_points(monkeypatch, capsys):
-    """Catches a viewport of garbage, and a traceback or a sentence in each redraw."""
+@pytest.mark.parametrize("is_engine", [False, True])
+def test_viewports_fall_back_to_points(monkeypatch, capsys, is_engine):
+    """Catches a viewport of garbage, or of nothing where the engine draws it, and a traceback or a
+    sentence in each redraw."""
     break_shader(monkeypatch, "one texture for all")
     display = GpuDisplay()
-    monkeypatch.setattr(viewport_display, "display", display)
+    for module in (viewport_display, engine):
+        monkeypatch.setattr(module, "display", display)
     monkeypatch.setattr(display, "_draw_region", lambda context: SplatRenderer(COMPACT, True))
-    run_with_gpu(display._draw)
+    monkeypatch.setattr(engine, "is_drawn_by_engine", lambda context: True)
+    monkeypatch.setattr(engine, "settings_values", lambda scene: ())
+    monkeypatch.setattr(engine, "visible_layers", lambda *_: [trial._layer(0)])
+    viewport = engine.EngineViewport()
+
+    def draw() -> None:
+        for _ in range(2 if is_engine else 1):  # the display's handler is removed
+            viewport.draw(bpy.context, bpy.context.evaluated_depsgraph_get())
+
+    run_with_gpu(draw if is_engine else display._draw)
     output = capsys.readouterr()
     assert display.failed
     assert "draws splats wrong" in display.problem
@@ -96,6 +108,20 @@ def test_viewports_fall_back_to_points(monkeypatch, capsys):
     assert output.out.count("draws splats wrong") == 1
     assert "Traceback" not in output.err
     bpy.app.timers.unregister(viewport_display.show_points)
+
+
+def test_points_are_shown_in_material_preview():
+    """Catches viewports of the engine, which draws no points, that stay empty."""
+    screen = bpy.context.window_manager.windows[0].screen
+    shading = next(area for area in screen.areas if area.type == "VIEW_3D").spaces.active.shading
+    shading.type = "RENDERED"
+    viewport_display.show_points()
+    assert shading.type == "RENDERED"
+    bpy.utils.register_class(engine.SplatsEngine)
+    bpy.context.scene.render.engine = engine.ENGINE
+    viewport_display.show_points()
+    bpy.utils.unregister_class(engine.SplatsEngine)
+    assert shading.type == "MATERIAL"
 
 
 @needs_gpu

@@ -91,7 +91,7 @@ def test_layers_are_sorted_together():
 
 @pytest.mark.slow
 def test_the_server_renders_the_same(monkeypatch):
-    """Catches a server that renders something else, forgets its layers, or is left running."""
+    """Catches a server that renders something else, or is left running."""
     monkeypatch.setattr(render_client, "missing_packages", lambda: ["numba"])
     remote = RenderClient(lambda: sys.executable)
     layers = [embedded(), world(cloud())]

@@ -1,14 +1,10 @@
 """The render engine "STGA Splats": images and viewports of splats exactly as trained, with alpha
 and depth for compositing. The GPU draws them, or, where it cannot, the training rasterizer."""
 
-import threading
-import time
 import traceback
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, NamedTuple
-from weakref import ref
+from typing import Any
 
 import bpy
 import gpu
@@ -17,10 +13,10 @@ from bpy.app.handlers import persistent
 
 from ...capture.camera import Camera
 from ...errors import StgaError
-from ...raster.posed_splats import ComposedImage, PosedSplats
+from ...raster.posed_splats import ComposedImage
 from ...raster.splat_shader import MIN_ALPHA
-from ...render.client import RenderClient, missing_packages
-from ..cameras import Eye, render_camera, viewport_camera
+from ...render.client import RenderClient
+from ..cameras import Eye, render_camera
 from ..gpu.packing import View
 from ..gpu.renderer import SplatRenderer, has_gpu_context
 from ..layers import SceneLayer
@@ -28,190 +24,18 @@ from ..light import settings_values
 from ..objects import Warn, log_warning
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
-from .viewport_display import ENGINE, is_drawn_by_engine, region_view
-
-MAX_RENDER_TIME_S = 0.05
-"""Time an image of a moving view may take; its resolution is adapted to that."""
-# fractions of the viewport's width and height in pixels
-INITIAL_SCALE = 0.5
-MIN_SCALE = 1 / 8
-POLL_INTERVAL_S = 1 / 60
-
-
-class RenderRequest(NamedTuple):
-    """A viewport image: splats, a camera of full size, and the scene-linear color behind, or
-    None."""
-
-    layers: Sequence[PosedSplats]
-    camera: Camera
-    background: tuple[float, ...] | None
-
-    def key(self) -> tuple[Any, ...]:
-        """Equal for requests that show the same layers (by identity) from the same camera."""
-        *intrinsics, pose = (getattr(self.camera, each.name) for each in fields(Camera))
-        return id(self.layers), *intrinsics, pose.tobytes(), self.background
-
-
-class ViewportRenderer:
-    """Renders the latest request in a thread, which touches nothing of Blender and ends with the
-    image in full resolution. render: (request, scale of the camera's size) -> image (H, W, 4)
-    float32. image: the last one, or None; error: why the last request failed, else empty."""
-
-    def __init__(self, render: Callable[[RenderRequest, float], np.ndarray]) -> None:
-        self._render = render
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-        self._request: RenderRequest | None = None
-        self._moving_scale = INITIAL_SCALE
-        self._has_update = False
-        self.image: np.ndarray | None = None
-        self.error = ""
-
-    def request(self, request: RenderRequest) -> bool:
-        """Render this next, instead of what was requested; False if it is the same."""
-        with self._lock:
-            if self._request is not None and request.key() == self._request.key():
-                return False
-            self._request = request
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, daemon=True)
-                self._thread.start()
-            return True
-
-    def cancel(self) -> None:
-        """Render nothing more than the image in progress."""
-        with self._lock:
-            self._request = None
-
-    def join(self) -> None:
-        """Wait for the end of the thread, if it runs."""
-        if (thread := self._thread) is not None:
-            thread.join()
-
-    def is_busy(self) -> bool:
-        return self._thread is not None
-
-    def take_update(self) -> bool:
-        """Whether `image` or `error` has changed since the last call."""
-        with self._lock:
-            had_update = self._has_update
-            self._has_update = False
-        return had_update
-
-    def _run(self) -> None:
-        request: RenderRequest | None = None
-        scale = 0.0
-        while True:
-            with self._lock:
-                last = request
-                request = self._request
-                if request is None or (request is last and scale == 1):
-                    self._thread = None
-                    return
-                scale = 1.0 if request is last else self._moving_scale
-            begin = time.perf_counter()
-            try:
-                self.image = self._render(request, scale)
-                self.error = ""
-            except Exception as error:  # shown in the viewport: it would end the thread unseen
-                kind = "" if isinstance(error, StgaError) else f"{type(error).__name__}: "
-                self.error = f"{kind}{error}"
-                scale = 1.0
-            elapsed_s = time.perf_counter() - begin
-            if scale < 1 or elapsed_s < MAX_RENDER_TIME_S:
-                factor = np.sqrt(MAX_RENDER_TIME_S / max(elapsed_s, 1e-3))
-                self._moving_scale = float(np.clip(self._moving_scale * factor, MIN_SCALE, 1.0))
-            with self._lock:
-                self._has_update = True
-
-
-_active: dict[ViewportRenderer, "ref[Any]"] = {}
-"""Renderers whose threads run, and engines, which Blender frees with their viewports."""
-
-
-def redraw_when_rendered(renderer: ViewportRenderer, engine: Any) -> None:
-    """Call `engine.tag_redraw()` for each image of the renderer, until its thread ends."""
-    _active[renderer] = ref(engine)
-    if not bpy.app.timers.is_registered(_poll):
-        bpy.app.timers.register(_poll, first_interval=POLL_INTERVAL_S, persistent=True)
-
-
-def stop_redraws() -> None:
-    """End the timer and the render threads; waits for the images in progress."""
-    if bpy.app.timers.is_registered(_poll):
-        bpy.app.timers.unregister(_poll)
-    for renderer in _active:
-        renderer.cancel()
-    while _active:
-        _active.popitem()[0].join()
-
-
-def _poll() -> float | None:
-    """Redraw what has changed; seconds until the next call, None once no thread runs."""
-    for renderer, known in list(_active.items()):
-        # before the update is taken, so that the last one is not missed
-        is_busy = renderer.is_busy()
-        engine = known()
-        try:
-            if engine is not None and renderer.take_update():
-                engine.tag_redraw()
-        except ReferenceError:  # Blender has freed its part of the engine
-            engine = None
-        if engine is None:
-            renderer.cancel()
-        if engine is None or not is_busy:
-            del _active[renderer]
-    return POLL_INTERVAL_S if _active else None
-
-
-class Rasterizer:
-    """A render client whose Python (`find_python`, which may raise StgaError) and device
-    (`find_device`) the main thread looks up, for render threads."""
-
-    def __init__(self, find_python: Callable[[], str], find_device: Callable[[], str]) -> None:
-        self._find_python = find_python
-        self._find_device = find_device
-        self._python: str | StgaError = ""
-        self._device = "auto"
-        self.client = RenderClient(self.python, lambda: self._device)
-
-    def update(self) -> None:
-        """Look them up again; reads preferences, and files where another Python is needed."""
-        self._device = self._find_device()
-        if missing_packages():
-            try:
-                self._python = self._find_python()
-            except StgaError as error:
-                self._python = error
-
-    def python(self) -> str:
-        """As last looked up. Raises StgaError where there was none."""
-        if isinstance(self._python, StgaError):
-            raise self._python
-        return self._python
+from .viewport_display import ENGINE, display, is_drawn_by_engine, region_view
 
 
 class EngineViewport:
     """What one viewport of the engine keeps between redraws; its engine alone owns it, so that the
-    main thread frees the texture."""
+    main thread frees its textures. error: one sentence, why splats are not shown, or empty."""
 
-    def __init__(self, rasterizer: Rasterizer) -> None:
-        def render(request: RenderRequest, scale: float) -> np.ndarray:
-            """Scene-linear RGBA, bottom row first; runs in a render thread."""
-            image = rasterizer.client.compose(request.layers, request.camera.scaled(scale))
-            return np.ascontiguousarray(combined(image.rgb, image.alpha, request.background)[::-1])
-
-        self._rasterizer = rasterizer
-        self.renderer = ViewportRenderer(render)
+    def __init__(self) -> None:
         self.error = ""
-        self._uploaded: np.ndarray | None = None
-        self._texture: Any = None
-        self._gpu: SplatRenderer | None = None
-        self._gpu_failed = False
+        self._renderer: SplatRenderer | None = None
         self._cache = SplatCache()
         self._layers: list[SceneLayer] | None = None
-        self._posed: list[PosedSplats] = []
-        self._posed_for = b""
         self._lighting: tuple[Any, ...] = ()
 
     def update(self, depsgraph: Any) -> None:
@@ -219,81 +43,42 @@ class EngineViewport:
         self._layers = None
         self._cache.scene_changed(depsgraph)
 
-    def draw(self, context: Any, depsgraph: Any) -> bool:
-        """Draw the current view with the GPU; returns False where it cannot."""
-        if self._gpu_failed:
-            return False
+    def draw(self, context: Any, depsgraph: Any) -> None:
+        """Draw the current view; where the GPU cannot, all viewports show points from then on."""
+        if display.failed:
+            return
         try:
-            color = scene_background(depsgraph.scene)
-            if color is not None:
-                gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
-            is_read = is_drawn_by_engine(context) and self._update_layers(context, depsgraph)
-            if is_read and self._layers:
-                self._gpu = self._gpu or SplatRenderer()
-                x, y, width, height = gpu.state.viewport_get()
-                view, to_depth = region_view(context.region_data, width, height)
-                self._gpu.draw(self._layers, view)
-                self._gpu.composite((x, y), to_depth, None if color is None else srgb(color))
-        except Exception:  # from then on, the rasterizer renders
-            traceback.print_exc()
-            self._gpu = None
-            self._gpu_failed = True
-            self._layers = None
-        return not self._gpu_failed
+            self._draw(context, depsgraph)
+        except StgaError as error:
+            self.error = str(error)
+        except Exception as error:  # of many kinds, by device and version
+            self._renderer = None
+            display.fail(error)
 
-    def request_image(self, context: Any, depsgraph: Any) -> bool:
-        """Request an image of the current view; whether it differs from the last one requested."""
-        region = context.region
-        if not self._update_layers(context, depsgraph):
-            self.renderer.error = self.error
-            self.renderer.image = None
-            return False
-        camera = viewport_camera(context.region_data, region.width, region.height)
-        # Posed again for another camera where highlights depend on it.
-        assert self._layers is not None
-        is_lit = any(layer.relit for layer in self._layers)
-        seen_from = camera.position.tobytes() if is_lit else b"anywhere"
-        if seen_from != self._posed_for:
-            self._posed = [layer.posed(camera.position) for layer in self._layers]
-            self._posed_for = seen_from
-        if not self.renderer.is_busy():
-            self._rasterizer.update()
-        background = scene_background(depsgraph.scene)
-        return self.renderer.request(RenderRequest(self._posed, camera, background))
-
-    def _update_layers(self, context: Any, depsgraph: Any) -> bool:
-        """Read the scene if it has changed; returns False, and sets `error`, where that fails."""
+    def _draw(self, context: Any, depsgraph: Any) -> None:
+        color = scene_background(depsgraph.scene)
+        if color is not None:
+            gpu.state.active_framebuffer_get().clear(color=(*color, 1.0))
+        if not is_drawn_by_engine(context):
+            return
         lighting = settings_values(depsgraph.scene)
         if self._layers is None or lighting != self._lighting:
             self._lighting = lighting
-            try:
-                self._layers = visible_layers(depsgraph, self._cache, context.space_data)
-            except StgaError as error:
-                self.error = str(error)
-                return False
-            self._posed = []
-            self._posed_for = b""
-            self.error = ""
-        return True
-
-    def draw_image(self, image: np.ndarray, width: int, height: int) -> None:
-        """Draw an image (H, W, 4), bottom row first, over a region of width × height pixels."""
-        from gpu_extras.presets import draw_texture_2d
-
-        if image is not self._uploaded:
-            rows, columns, _ = image.shape
-            pixels = gpu.types.Buffer("FLOAT", image.size, image.ravel())
-            self._texture = gpu.types.GPUTexture((columns, rows), format="RGBA16F", data=pixels)
-            self._uploaded = image
-        gpu.state.blend_set("ALPHA_PREMULT")
-        draw_texture_2d(self._texture, (0, 0), width, height)
-        gpu.state.blend_set("NONE")
+            self._layers = None
+            self._layers = visible_layers(depsgraph, self._cache, context.space_data)
+        self.error = ""
+        if self._layers:
+            self._renderer = self._renderer or SplatRenderer()
+            x, y, width, height = gpu.state.viewport_get()
+            view, to_depth = region_view(context.region_data, width, height)
+            self._renderer.draw(self._layers, view)
+            self._renderer.composite((x, y), to_depth, None if color is None else srgb(color))
 
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing
 SHARED_PANELS = ("EEVEE_WORLD_PT_surface", "VIEWLAYER_PT_layer")  # for some engines, and this one
 
-_rasterizer = Rasterizer(lambda: "", lambda: "auto")
+_rasterizer = RenderClient(lambda: "")
 
 
 class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -304,7 +89,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
     @cached_property  # no __init__: its signature differs between Blender's versions
     def _viewport(self) -> EngineViewport:
-        return EngineViewport(_rasterizer)
+        return EngineViewport()
 
     def update_render_passes(self, scene: Any = None, renderlayer: Any = None) -> None:
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
@@ -387,30 +172,18 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
     def _image(self, layers: list[SceneLayer], camera: Camera) -> ComposedImage:
         image = draw_image(layers, camera, partial(self.report, {"WARNING"}))
         if image is None:
-            _rasterizer.update()
             posed = [layer.posed(camera.position) for layer in layers]
-            image = _rasterizer.client.compose(posed, camera, with_depth=True)
-            if _rasterizer.client.failure:
-                self.report({"WARNING"}, _rasterizer.client.failure)
+            image = _rasterizer.compose(posed, camera, with_depth=True)
+            if _rasterizer.failure:
+                self.report({"WARNING"}, _rasterizer.failure)
         return image
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
         self._viewport.update(depsgraph)
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
-        viewport = self._viewport
-        region = context.region
-        renderer = viewport.renderer
-        if viewport.draw(context, depsgraph):
-            self.update_stats("", viewport.error)
-            return
-        if viewport.request_image(context, depsgraph):
-            redraw_when_rendered(renderer, self)
-        self.update_stats("", renderer.error)
-        if renderer.image is not None:
-            self.bind_display_space_shader(depsgraph.scene)
-            viewport.draw_image(renderer.image, region.width, region.height)
-            self.unbind_display_space_shader()
+        self._viewport.draw(context, depsgraph)
+        self.update_stats("", display.problem if display.failed else self._viewport.error)
 
 
 def view_camera(scene: Any, view_name: str) -> Any:
@@ -460,9 +233,9 @@ def _before_render(*_: Any) -> None:
 def register(
     find_python: Callable[[], str], find_device: Callable[[], str] = lambda: "auto"
 ) -> None:
-    """find_python, find_device: as in `Rasterizer`."""
+    """find_python, find_device: as in `RenderClient`."""
     global _rasterizer
-    _rasterizer = Rasterizer(find_python, find_device)
+    _rasterizer = RenderClient(find_python, find_device)
     bpy.utils.register_class(SplatsEngine)
     bpy.app.handlers.render_pre.append(_before_render)
     for panel in _panels_by_engine():
@@ -475,8 +248,7 @@ def unregister() -> None:
         panel.COMPAT_ENGINES.discard(ENGINE)
     bpy.app.handlers.render_pre.remove(_before_render)
     bpy.utils.unregister_class(SplatsEngine)
-    stop_redraws()
-    _rasterizer.client.close()
+    _rasterizer.close()
 
 
 def _panels_by_engine() -> list[Any]:

@@ -70,19 +70,24 @@ class GpuDisplay:
             self.problem = ""
         except StgaError as error:
             self.problem = str(error)
-        except Exception as error:  # raised again at each redraw otherwise: reported once, then off
-            reason = str(error)
-            if not isinstance(error, WrongPicture):
-                traceback.print_exc()
-                reason = f"{type(error).__name__}: {error}"
-            self.stop()
-            self.problem = f"Splats cannot be drawn as trained here ({reason}); points are shown"
-            self.failed = True
-            print(f"STGA: {self.problem}")
-            # while drawing, Blender's data cannot be changed
-            bpy.app.timers.register(show_points, persistent=True)
+        except Exception as error:  # raised again at each redraw otherwise
+            self.fail(error)
         finally:
             self._scene_target = None
+
+    def fail(self, error: Exception) -> None:
+        """Report once why nothing can be drawn, while that exception is handled, and show points in
+        all viewports from then on."""
+        reason = str(error)
+        if not isinstance(error, WrongPicture):
+            traceback.print_exc()
+            reason = f"{type(error).__name__}: {error}"
+        self.stop()
+        self.problem = f"Splats cannot be drawn as trained here ({reason}); points are shown"
+        self.failed = True
+        print(f"STGA: {self.problem}")
+        # while drawing, Blender's data cannot be changed
+        bpy.app.timers.register(show_points, persistent=True)
 
     def _draw_region(self, context: Any) -> None:
         if is_drawn_by_engine(context):
@@ -133,7 +138,13 @@ def is_shown_as_trained(candidate: Any) -> bool:
 
 
 def show_points() -> float | None:
-    """Display as points what should be as trained, also what is added or opened later."""
+    """Display as points what should be as trained, also what is added or opened later, and show
+    that in place of the engine, in Material Preview."""
+    for window in bpy.context.window_manager.windows:
+        is_engine = window.scene.render.engine == ENGINE
+        for area in window.screen.areas if is_engine else ():
+            if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
+                area.spaces.active.shading.type = "MATERIAL"
     for candidate in bpy.data.objects:
         if candidate.library is None and is_shown_as_trained(candidate):
             set_input(candidate, splat_nodes.DISPLAY, POINTS)
