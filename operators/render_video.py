@@ -23,7 +23,7 @@ from ..stga_addon.raster.posed_splats import PosedSplats
 from ..stga_addon.render.video import Recorder, check_output
 from ..stga_addon.scene import light
 from ..stga_addon.scene.cameras import scene_camera, turntable_cameras
-from ..stga_addon.scene.gpu.renderer import has_gpu_context
+from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.layers import SceneLayer
 from ..stga_addon.scene.objects import Identity, SceneView, frame_kept, frames_per_second
 from ..stga_addon.scene.render import engine, viewport_display

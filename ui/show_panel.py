@@ -18,7 +18,7 @@ from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
 from ..stga_addon.scene.display.splat_object import shows_nodes
-from ..stga_addon.scene.gpu.renderer import has_gpu_context
+from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
 from ..stga_addon.scene.render import viewport_display
 from ..stga_addon.scene.render.scene_splats import level_exposure, light_hint

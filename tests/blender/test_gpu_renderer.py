@@ -22,8 +22,10 @@ from stga_addon.light.relight import Relighter
 from stga_addon.light.values import Caster, Light, Lighting
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.raster.posed_splats import ComposedImage
+from stga_addon.scene.gpu.buffers import read_pixels
+from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.gpu.packing import View
-from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer, _pixels, has_gpu_context
+from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer
 from stga_addon.scene.layers import DisplaySettings, Relit, SceneLayer
 
 from .gpu_context import run_with_gpu
@@ -252,7 +254,7 @@ def test_shadow_maps() -> None:
         camera = look_at((0.3, 0.2, 0.7), (0, 0, 0), 16, 20, 30)
         renderer.draw([replace(shown, relit=relit)], View(camera))
         assert renderer._relit is not None
-        atlas.append(_pixels(renderer._relit[0].textures["shadows"], 1)[..., 0])
+        atlas.append(read_pixels(renderer._relit[0].textures["shadows"], 1)[..., 0])
 
     run_with_gpu(draw)
     for index, light in enumerate(lighting.lights):

@@ -7,8 +7,8 @@ import pytest
 
 from stga_addon.raster.cpu.compose import compose
 from stga_addon.scene.gpu import renderer, shaders, trial
+from stga_addon.scene.gpu.buffers import EXACT
 from stga_addon.scene.gpu.renderer import COMPACT, SplatRenderer
-from stga_addon.scene.gpu.shaders import EXACT
 from stga_addon.scene.gpu.trial import WrongPicture
 from stga_addon.scene.render import engine, viewport_display
 from stga_addon.scene.render.viewport_display import GpuDisplay

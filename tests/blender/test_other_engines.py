@@ -20,7 +20,7 @@ from stga_addon.scene.cameras import render_camera
 from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display.splat_nodes import DISPLAY, QUADS
 from stga_addon.scene.display.splat_object import set_input, show_world_splats
-from stga_addon.scene.gpu.renderer import has_gpu_context
+from stga_addon.scene.gpu.context import has_gpu_context
 from stga_addon.scene.render.scene_splats import (
     SplatCache,
     forget_frame,

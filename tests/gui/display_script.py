@@ -33,7 +33,8 @@ from stga_addon.scene.arrays import triangle_mesh  # noqa: E402
 from stga_addon.scene.display import splat_nodes  # noqa: E402
 from stga_addon.scene.display.splat_nodes import AS_TRAINED, POINTS  # noqa: E402
 from stga_addon.scene.display.splat_object import display_mode, set_input, show_avatar  # noqa: E402
-from stga_addon.scene.gpu.renderer import SplatRenderer, _pixels  # noqa: E402
+from stga_addon.scene.gpu.buffers import read_pixels  # noqa: E402
+from stga_addon.scene.gpu.renderer import SplatRenderer  # noqa: E402
 from stga_addon.scene.render import engine, viewport_display  # noqa: E402
 from stga_addon.scene.render.view_transform import inverse_view  # noqa: E402
 from stga_addon.scene.render.viewport_display import display, region_view  # noqa: E402
@@ -196,7 +197,7 @@ def shadows() -> None:
     seen["lights"] = {
         light.kind: [*light.position, *light.direction] for light in relit.lighting.lights
     }
-    np.save(FOLDER / "shadows.npy", _pixels(drawn._relit[0].textures["shadows"], 1)[..., 0])
+    np.save(FOLDER / "shadows.npy", read_pixels(drawn._relit[0].textures["shadows"], 1)[..., 0])
     settings.mode = "recorded"
     for lamp in lamps:
         bpy.data.objects.remove(lamp)

@@ -1,5 +1,5 @@
-"""GLSL that projects, lights and draws splats and puts them into a viewport; shaders made of it,
-and textures.
+"""GLSL that projects, lights and draws splats and puts them into a viewport, and shaders made of
+it.
 
 Textures of `packing.py`, each 2048 texels wide and read by texel index:
     orders   per splat drawn, farthest first: index of the splat (one channel)
@@ -31,10 +31,10 @@ drawing:
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import gpu
-import numpy as np
 
 from ...avatar.splats import harmonics_text
 from ...light.shading import SHADING_DEFINES, SHADING_FUNCTIONS, SRGB_FUNCTIONS
@@ -43,24 +43,7 @@ from ...raster.splat_shader import SPLAT_DEFINES, SPLAT_FUNCTIONS
 from ..compat import allow_depth_write
 from ..layers import FROZEN_COLOR_SRGB
 from . import packing
-
-TEXTURE_WIDTH = 2048
-EXACT = "RGBA32F"
-
-
-def texture_rows(count: int) -> int:
-    """Rows of a texture TEXTURE_WIDTH wide for `count` texels."""
-    return max(1, -(-count // TEXTURE_WIDTH))
-
-
-def texture(texels: np.ndarray, texel_format: str = EXACT) -> Any:
-    """Texels (M, C) as a texture TEXTURE_WIDTH wide, its last row filled with zeros."""
-    rows = texture_rows(len(texels))
-    padded = np.zeros((rows * TEXTURE_WIDTH, texels.shape[1]), np.float32)
-    padded[: len(texels)] = texels
-    pixels = gpu.types.Buffer("FLOAT", padded.size, padded.reshape(-1))
-    return gpu.types.GPUTexture((TEXTURE_WIDTH, rows), format=texel_format, data=pixels)
-
+from .buffers import TEXTURE_WIDTH
 
 PACKED_TEXTURES = ("orders", "centers", "axes", "colors", "frames", "table")
 PROJECTED_TEXTURES = ("places", "sides", "shades")
@@ -187,44 +170,59 @@ void main()
 def shadow_map_shader() -> Any:
     """Draws triangles into a shadow map, depth in meters along the light's axis. rows: as packed;
     lens: scale to device coordinates, whether parallel, least depth in perspective."""
-    # In perspective, depth itself is interpolated as it should be: linear in space.
-    rows = dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4")
-    outputs = {"depth_out": "FLOAT"}
-    passed = {"distance_out": ("smooth", "FLOAT")}
-    position = "VEC3", "position"
-    return _shader(_MAP_VERTEX, _MAP_FRAGMENT, outputs, rows, (), "", passed, position)
+    return _Source(
+        vertex=_MAP_VERTEX,
+        fragment=_MAP_FRAGMENT,
+        outputs={"depth_out": "FLOAT"},
+        constants=dict.fromkeys(("row_x", "row_y", "row_z", "lens"), "VEC4"),
+        defines="",
+        # in perspective, depth itself is interpolated as it should be: linear in space
+        passed={"distance_out": ("smooth", "FLOAT")},
+        attribute=("VEC3", "position"),
+    ).compiled()
 
 
-def _shader(
-    vertex: str,
-    fragment: str,
-    outputs: Mapping[str, str],
-    constants: Mapping[str, str],
-    samplers: Sequence[str],
-    defines: str,
-    passed: Mapping[str, tuple[str, str]] | None = None,
-    attribute: tuple[str, str] = ("VEC2", "corner"),
-) -> Any:
-    """passed: name -> qualifier and type; attribute: of vertices, by default rectangles' at ±1."""
-    info = gpu.types.GPUShaderCreateInfo()
-    info.typedef_source(defines)
-    info.vertex_in(0, *attribute)
-    for slot, (name, kind) in enumerate(outputs.items()):
-        info.fragment_out(slot, kind, name)
-    for slot, name in enumerate(samplers):
-        info.sampler(slot, "FLOAT_2D", name)
-    for name, kind in constants.items():
-        info.push_constant(kind, name)
-    if passed:
-        stage = gpu.types.GPUStageInterfaceInfo("stga_stage")
-        for name, (qualifier, kind) in passed.items():
-            getattr(stage, qualifier)(kind, name)
-        info.vertex_out(stage)
-    if "gl_FragDepth" in fragment:
-        allow_depth_write(info)
-    info.vertex_source(vertex)
-    info.fragment_source(fragment)
-    return gpu.shader.create_from_info(info)
+@dataclass(frozen=True)
+class _Source:
+    """What a shader is compiled from.
+
+    vertex, fragment, defines  GLSL
+    outputs  of the fragment, name -> type, in the order of the targets
+    constants  push constants, name -> type
+    samplers  names of textures
+    passed  from vertex to fragment, name -> qualifier and type
+    attribute  type and name of that of vertices; by default of rectangles, at ±1
+    """
+
+    vertex: str
+    fragment: str
+    outputs: Mapping[str, str]
+    constants: Mapping[str, str]
+    samplers: Sequence[str] = ()
+    defines: str = _DEFINES
+    passed: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    attribute: tuple[str, str] = ("VEC2", "corner")
+
+    def compiled(self) -> Any:
+        info = gpu.types.GPUShaderCreateInfo()
+        info.typedef_source(self.defines)
+        info.vertex_in(0, *self.attribute)
+        for slot, (name, kind) in enumerate(self.outputs.items()):
+            info.fragment_out(slot, kind, name)
+        for slot, name in enumerate(self.samplers):
+            info.sampler(slot, "FLOAT_2D", name)
+        for name, kind in self.constants.items():
+            info.push_constant(kind, name)
+        if self.passed:
+            stage = gpu.types.GPUStageInterfaceInfo("stga_stage")
+            for name, (qualifier, kind) in self.passed.items():
+                getattr(stage, qualifier)(kind, name)
+            info.vertex_out(stage)
+        if "gl_FragDepth" in self.fragment:
+            allow_depth_write(info)
+        info.vertex_source(self.vertex)
+        info.fragment_source(self.fragment)
+        return gpu.shader.create_from_info(info)
 
 
 _TERMS = "\n".join(
@@ -394,10 +392,14 @@ def projection_shader(relit: bool = False) -> Any:
         defines += RELIT_DEFINES
         functions += SHADING_FUNCTIONS + RELIT_FUNCTIONS
         samplers += "surface", "vertices", "lights", "shadows"
-    outputs = dict.fromkeys(("place_out", "sides_out", "shade_out"), "VEC4")
-    fragment = functions + _PROJECTION_FRAGMENT
-    constants = {"faces": "INT", "count": "INT"}
-    return _shader(_SCREEN_VERTEX, fragment, outputs, constants, samplers, defines)
+    return _Source(
+        vertex=_SCREEN_VERTEX,
+        fragment=functions + _PROJECTION_FRAGMENT,
+        outputs=dict.fromkeys(("place_out", "sides_out", "shade_out"), "VEC4"),
+        constants={"faces": "INT", "count": "INT"},
+        samplers=samplers,
+        defines=defines,
+    ).compiled()
 
 
 def splat_shader() -> Any:
@@ -409,16 +411,18 @@ def splat_shader() -> Any:
     to its first sampler, which then reads another texture, if there is no push constant. Hence
     `first_block`, which has to be set after the textures.
     """
-    outputs = dict.fromkeys(("color_out", "depth_out"), "VEC4")
-    constants = {"first_block": "INT"}
-    passed = {
-        "offset": ("no_perspective", "VEC2"),
-        "shade": ("flat", "VEC4"),
-        "depth": ("flat", "FLOAT"),
-    }
-    vertex = _SPLAT_VERTEX
-    fragment = _SPLAT_FRAGMENT
-    return _shader(vertex, fragment, outputs, constants, PROJECTED_TEXTURES, _DEFINES, passed)
+    return _Source(
+        vertex=_SPLAT_VERTEX,
+        fragment=_SPLAT_FRAGMENT,
+        outputs=dict.fromkeys(("color_out", "depth_out"), "VEC4"),
+        constants={"first_block": "INT"},
+        samplers=PROJECTED_TEXTURES,
+        passed={
+            "offset": ("no_perspective", "VEC2"),
+            "shade": ("flat", "VEC4"),
+            "depth": ("flat", "FLOAT"),
+        },
+    ).compiled()
 
 
 def composite_shader() -> Any:
@@ -426,7 +430,10 @@ def composite_shader() -> Any:
     premultiplied. part.x: 0 all that is not near a bone; 1 what is; 2 what is, as the light of
     `behind` that it covers. part.y: how many bones; bones: for each, two texels as `front_bones`
     returns them."""
-    constants = dict.fromkeys(("corner_px", "to_depth", "behind", "part"), "VEC4")
-    samplers = "color_image", "depth_image", "bones"
-    fragment = SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT
-    return _shader(_SCREEN_VERTEX, fragment, {"color_final": "VEC4"}, constants, samplers, _DEFINES)
+    return _Source(
+        vertex=_SCREEN_VERTEX,
+        fragment=SRGB_FUNCTIONS + _COMPOSITE_FRAGMENT,
+        outputs={"color_final": "VEC4"},
+        constants=dict.fromkeys(("corner_px", "to_depth", "behind", "part"), "VEC4"),
+        samplers=("color_image", "depth_image", "bones"),
+    ).compiled()

@@ -17,8 +17,9 @@ from ...raster.posed_splats import ComposedImage
 from ...raster.splat_shader import MIN_ALPHA
 from ...render.client import RenderClient
 from ..cameras import Eye, render_camera
+from ..gpu.context import has_gpu_context
 from ..gpu.packing import View
-from ..gpu.renderer import SplatRenderer, has_gpu_context
+from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
 from ..objects import Warn, log_warning
@@ -72,7 +73,8 @@ class EngineViewport:
             x, y, width, height = gpu.state.viewport_get()
             view, to_depth = region_view(context.region_data, width, height)
             self._renderer.draw(self._layers, view)
-            self._renderer.composite((x, y), to_depth, None if color is None else srgb(color))
+            behind = None if color is None else srgb(color)
+            self._renderer.composite(CompositeTarget((x, y), to_depth, behind))
 
 
 BACKGROUND_DEPTH = 1e10  # meters: what Blender's engines write where a pixel shows nothing

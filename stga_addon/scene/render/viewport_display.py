@@ -16,9 +16,11 @@ from ..cameras import viewport_camera
 from ..display import splat_nodes
 from ..display.splat_nodes import AS_TRAINED, POINTS
 from ..display.splat_object import display_mode, set_input
+from ..gpu.buffers import EXACT
+from ..gpu.context import is_software
+from ..gpu.front_bones import NO_BONES, front_bones
 from ..gpu.packing import NEAR_M, View
-from ..gpu.renderer import COMPACT, NO_BONES, SOFTWARE_RENDERERS, SplatRenderer, front_bones
-from ..gpu.shaders import EXACT
+from ..gpu.renderer import COMPACT, CompositeTarget, SplatRenderer
 from ..gpu.trial import WrongPicture
 from .scene_splats import SplatCache, visible_layers
 from .view_transform import keeps_colors, srgb, world_color
@@ -109,9 +111,7 @@ class GpuDisplay:
             return
         if self._renderer is None:
             # half the traffic on a card, but slow in software
-            name = gpu.platform.renderer_get().lower()
-            is_software = any(software in name for software in SOFTWARE_RENDERERS)
-            self._renderer = SplatRenderer(EXACT if is_software else COMPACT, short_keys=True)
+            self._renderer = SplatRenderer(EXACT if is_software() else COMPACT, short_keys=True)
         x, y, width, height = gpu.state.viewport_get()
         view, to_depth = region_view(context.region_data, width, height)
         self._renderer.draw(layers, view)
@@ -121,9 +121,16 @@ class GpuDisplay:
         # Whether the depth buffer holds the scene: render engines leave it zero where overlays are
         # off, always in 4.3, at times in 5.2.
         has_depth = space.overlay.show_overlays or space.shading.type in ("SOLID", "WIREFRAME")
-        test_depth = has_depth and not everything
         self._renderer.composite(
-            (x, y), to_depth, background, test_depth, bones, self._scene_target, has_background
+            CompositeTarget(
+                corner=(x, y),
+                to_depth=to_depth,
+                behind=background,
+                test_depth=has_depth and not everything,
+                bones=bones,
+                scene=self._scene_target,
+                has_background=has_background,
+            )
         )
 
 
@@ -163,7 +170,7 @@ def is_drawn_by_engine(context: Any) -> bool:
 
 
 def region_view(region: Any, width: int, height: int) -> tuple[View, tuple[float, ...]]:
-    """The view of a RegionView3D, and `to_depth` of `SplatRenderer.composite`."""
+    """The view of a RegionView3D, and its `CompositeTarget.to_depth`."""
     camera = viewport_camera(region, width, height)
     matrix = np.array(region.window_matrix, np.float64)
     # A view that is not in perspective is drawn from this far behind Blender's camera.
