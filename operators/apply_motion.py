@@ -17,7 +17,12 @@ from ..stga_addon.flame.forward import FlameFrame
 from ..stga_addon.flame.sequence import PARTS, FlameSequence, retimed
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.rig import motion as rig_motion
-from ..stga_addon.scene.rig.keyframes import apply_weights, checked_shape_keys, has_shapes
+from ..stga_addon.scene.rig.keyframes import (
+    Placement,
+    apply_weights,
+    checked_shape_keys,
+    has_shapes,
+)
 from . import common, options
 from .common import Edit, FileImport, file_path, head_of, is_head, own_motion, rig_or_none
 from .options import ONCE
@@ -212,7 +217,8 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             own = own_motion(head)
             first = own.timesteps[0]
             tracked = own, [self.start + (each - first) / step for each in own.timesteps]
-        self._apply(head, frames, name, parts, tracked=tracked)
+        placement = self._placement(name, parts)
+        rig_motion.apply_motion(head, frames, placement, tracked, warn=self.warn)
         return name, len(frames)
 
     def _apply_performance(
@@ -236,25 +242,26 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
             motion = open_motion.performed(performance, own, head.name, options, trained, rate)
             frames = [motion.sequence.frame(timestep) for timestep in motion.sequence.timesteps]
             self._report_range(motion.outside)
-            self._apply(head, frames, name, parts)
+            placement = self._placement(name, parts)
+            rig_motion.apply_motion(head, frames, placement, warn=self.warn)
             return name, len(frames)
         kept = {part: float(own in parts) for part, own in PART_OF_SHAPES.items()}
         performance = open_motion.prepared_performance(amplified(performance, kept), options, rate)
         weights = np.clip(performance.weights, *rig_motion.WEIGHT_RANGE)
         if rig is None:
-            where = self.start, name, self.place == "strip"
-            apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, *where)
+            placement = self._placement(name, parts)
+            apply_weights(head.data.shape_keys, checked_shape_keys(head), weights, placement)
             return name, len(weights)
         still = np.zeros(3)
         turns = head_turns(performance.head)
         frames = [FlameFrame(np.zeros(0), still, turn, still, still, np.zeros(6)) for turn in turns]
         # on the expression the sliders would act
-        self._apply(head, frames, name, list({*parts, "expression"}), weights=weights)
+        placement = self._placement(name, list({*parts, "expression"}))
+        rig_motion.apply_motion(head, frames, placement, weights=weights, warn=self.warn)
         return name, len(frames)
 
-    def _apply(self, head: Any, frames: Any, name: str, parts: list[str], **more: Any) -> None:
-        as_strip = self.place == "strip"
-        rig_motion.apply_motion(head, frames, self.start, name, parts, as_strip, self.warn, **more)
+    def _placement(self, name: str, parts: list[str]) -> Placement:
+        return Placement(self.start, name, parts, as_strip=self.place == "strip")
 
     def _options(self) -> MotionOptions:
         gains = {part: getattr(self, f"{part}_gain") for part in PART_OF_SHAPES}

@@ -229,6 +229,21 @@ def world_light(world: Any) -> WorldLight | None:
 MAX_KEPT = 64
 
 
+class PosedAvatar(NamedTuple):
+    """An avatar on its head in a frame.
+
+    splat_object, head  original objects
+    vertices  (V, 3) of the head, in the avatar's space
+    to_world  (4, 4) from that space
+    """
+
+    splat_object: Any
+    head: Any
+    avatar: Avatar
+    vertices: np.ndarray
+    to_world: np.ndarray
+
+
 class SceneLight:
     """What is kept between redraws, so that nothing is computed while nothing moves."""
 
@@ -246,49 +261,46 @@ class SceneLight:
 
     def relit(
         self,
-        splat_object: Any,
-        head: Any,
-        avatar: Avatar,
-        vertices: np.ndarray,
-        to_world: np.ndarray,
+        posed: PosedAvatar,
         find_visible: Callable[[], Sequence[tuple[Any, Any]]],
         depsgraph: Any,
     ) -> Relit | None:
-        """How the scene lights a head of vertices (V, 3), None where colors are as recorded; the
-        same object while all is the same, `vertices` by identity. to_world (4, 4): from the
-        avatar's space. find_visible: objects and their matrices."""
+        """How the scene lights an avatar, None where colors are as recorded; the same object while
+        all is the same, `posed.vertices` by identity. find_visible: objects and their matrices."""
         # A change of the settings of a viewport does not evaluate its scene anew.
         is_viewport = depsgraph.mode == "VIEWPORT"
         settings = lighting_settings(depsgraph.scene if is_viewport else depsgraph.scene_eval)
-        if avatar.light is None or settings is None or settings.mode == "recorded":
+        if posed.avatar.light is None or settings is None or settings.mode == "recorded":
             return None
         visible = find_visible()
-        lighting = self._lighting(settings, (splat_object, head), to_world, visible, depsgraph)
+        to_world = posed.to_world
+        receivers = posed.splat_object, posed.head
+        lighting = self._lighting(settings, receivers, to_world, visible, depsgraph)
         casters: tuple[Caster, ...] = ()
         if lighting.shadows:
             if self._casters is None:
                 self._casters = list(_casters(visible, depsgraph))
-            place = head, to_world.tobytes()
+            place = posed.head, to_world.tobytes()
             if place not in self._placed:
-                others = [caster for owner, caster in self._casters if owner != head]
+                others = [caster for owner, caster in self._casters if owner != posed.head]
                 to_avatar = np.linalg.inv(to_world)
                 self._placed[place] = tuple(_moved(caster, to_avatar) for caster in others)
             casters = self._placed[place]
-        uid = splat_object.session_uid
+        uid = posed.splat_object.session_uid
         relighter = self._relighters.get(uid)
-        if relighter is None or relighter.avatar is not avatar:
-            relighter = self._relighters[uid] = Relighter(avatar)
+        if relighter is None or relighter.avatar is not posed.avatar:
+            relighter = self._relighters[uid] = Relighter(posed.avatar)
         # Equal for lightings of the same values.
         values = [value for name, value in vars(lighting).items() if name != "lights"]
         values += [value for light in lighting.lights for value in vars(light).values()]
         same = [each.tobytes() if isinstance(each, np.ndarray) else each for each in values]
-        key = (*same, id(relighter), id(vertices), id(casters))
+        key = (*same, id(relighter), id(posed.vertices), id(casters))
         place = (uid, to_world.tobytes())
         known = self._relit.get(place)
         if known is None or known[0] != key:
             if len(self._relit) > MAX_KEPT:  # objects that move leave an entry at each place
                 self._relit.clear()
-            known = self._relit[place] = key, Relit(relighter, vertices, lighting, casters)
+            known = self._relit[place] = key, Relit(relighter, posed.vertices, lighting, casters)
         return known[1]
 
     def _lighting(

@@ -15,6 +15,7 @@ from stga_addon.driving.performers import read_performance
 from stga_addon.flame.forward import FlameFrame, flame_forward
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import rig_of
+from stga_addon.scene.rig.keyframes import Placement
 from stga_addon.scene.rig.motion import apply_motion, sample_pose
 
 from .captures import at_frame, import_small_head
@@ -78,7 +79,7 @@ def test_sliders(scene):
         np.testing.assert_allclose(at(frame), before[frame], atol=1e-7)
     zero = np.zeros(3)
     neutral = FlameFrame(np.zeros(10), zero, zero, zero, zero, np.zeros(6))
-    apply_motion(head, [neutral], 1, "neutral")
+    apply_motion(head, [neutral], Placement(1, "neutral"))
     bpy.context.scene.frame_set(1)
     keys.animation_data.action = None
     cases = ["mouthSmileLeft"], ["jawOpen", "mouthPucker"], ["jawOpen", "mouthClose"]

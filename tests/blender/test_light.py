@@ -92,6 +92,7 @@ def baked_irradiance(shown, head) -> np.ndarray:
     scene.cycles.samples = 32
     scene.cycles.use_denoising = False
     head.hide_set(False)
+    head.hide_viewport = False
     head.hide_render = False
     material = bpy.data.materials.new("white")
     nodes = enable_nodes(material).nodes

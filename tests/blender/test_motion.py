@@ -15,6 +15,7 @@ from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.compat import SLOTTED_ACTIONS
 from stga_addon.scene.rig import keyframes
 from stga_addon.scene.rig.head import import_head, rig_of
+from stga_addon.scene.rig.keyframes import Placement
 from stga_addon.scene.rig.motion import apply_motion, sample_motion
 
 from .captures import at_frame, flame_model, flame_sequence, mesh_capture, motion_capture
@@ -59,7 +60,7 @@ def curves_of(owner, action) -> dict:
 @pytest.mark.parametrize("part", PARTS)
 def test_applying_one_part_keeps_the_other_parts(head, own, other, part, as_strip):
     """Fails when a part that was not chosen is replaced, frozen, or reset."""
-    apply_motion(head, retimed(other), 2, "other", (part,), as_strip)
+    apply_motion(head, retimed(other), Placement(2, "other", (part,), as_strip))
     for index in range(4):
         theirs = {name: getattr(other.frame(index), name) for name in PARTS[part]}
         frame = replace(own.frame(2 + index), **theirs)
@@ -70,7 +71,7 @@ def test_the_old_action_is_unchanged(head, own, other, tmp_path):
     """Fails when the action is edited in place, or the old one is lost in the file."""
     actions = [(owner, owner.animation_data.action) for owner in owners(head)]
     before = [(action.name, curves_of(owner, action)) for owner, action in actions]
-    apply_motion(head, retimed(other), 2, "other")
+    apply_motion(head, retimed(other), Placement(2, "other"))
     name = head.name
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -86,8 +87,8 @@ def test_the_old_action_is_unchanged(head, own, other, tmp_path):
 
 def test_strips_override_only_their_frames(head, own, other):
     """Fails when a strip changes frames outside it, or a second one removes the first."""
-    apply_motion(head, retimed(other), 2, "once", as_strip=True)
-    apply_motion(head, retimed(other), 4, "twice", as_strip=True)
+    apply_motion(head, retimed(other), Placement(2, "once", as_strip=True))
+    apply_motion(head, retimed(other), Placement(4, "twice", as_strip=True))
     seen = {1: own.frame(1), 2: other.frame(0), 4: other.frame(0), 7: other.frame(3)}
     for frame, expected in seen.items():
         np.testing.assert_allclose(at_frame(head, frame), mesh(own, expected), atol=TOLERANCE)
@@ -140,21 +141,21 @@ def test_applying_to_a_head_without_animation(head, own, other):
     """Fails without an action to copy, by another's identity, or with empty actions and strips."""
     for owner in owners(head):
         owner.animation_data.action = None
-    apply_motion(head, retimed(other), 3, "other")
+    apply_motion(head, retimed(other), Placement(3, "other"))
     for index in range(4):
         expected = mesh(own, other.frame(index))
         np.testing.assert_allclose(at_frame(head, 3 + index), expected, atol=TOLERANCE)
     assert np.abs(expected - sequence_mesh(other, 3)).max() > 1e-3
     keys = head.data.shape_keys.animation_data
     action = keys.action
-    apply_motion(head, retimed(other), 3, "jaw", ("jaw",))
+    apply_motion(head, retimed(other), Placement(3, "jaw", ("jaw",)))
     assert keys.action == action
-    apply_motion(head, retimed(other), 3, "strip", ("expression",), as_strip=True)
+    apply_motion(head, retimed(other), Placement(3, "strip", ("expression",), as_strip=True))
     assert not rig_of(head).animation_data.nla_tracks
     assert len(keys.nla_tracks) == 2
     rig_of(head).animation_data_clear()
     head.data.shape_keys.animation_data.action = None
-    apply_motion(head, retimed(other), 3, "again", ("head",), as_strip=True)
+    apply_motion(head, retimed(other), Placement(3, "again", ("head",), as_strip=True))
 
 
 def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
@@ -163,7 +164,7 @@ def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
     rig.pose.bones["jaw"].rotation_mode = "XYZ"
     actions = len(bpy.data.actions)
     with pytest.raises(StgaError, match="rotation mode of bone jaw"):
-        apply_motion(head, retimed(other), 1, "other")
+        apply_motion(head, retimed(other), Placement(1, "other"))
     rig.pose.bones["jaw"].rotation_mode = "QUATERNION"
     compat.push_down_action(rig)
     rig.animation_data.nla_tracks[0].select = True
@@ -171,14 +172,15 @@ def test_unsuitable_rigs_are_refused_unchanged(head, other, tmp_path):
     rig.animation_data.use_tweak_mode = True
     assert rig.animation_data.use_tweak_mode
     with pytest.raises(StgaError, match="leave tweak mode first"):
-        apply_motion(head, retimed(other), 1, "other")
+        apply_motion(head, retimed(other), Placement(1, "other"))
     rig.animation_data.use_tweak_mode = False
     head.shape_key_remove(head.data.shape_keys.key_blocks["expr_004"])
     with pytest.raises(StgaError, match="has no slider expr_004"):
-        apply_motion(head, retimed(other), 1, "other")
+        apply_motion(head, retimed(other), Placement(1, "other"))
     assert len(bpy.data.actions) == actions
+    plain = import_head(mesh_capture(tmp_path / "mesh"))
     with pytest.raises(StgaError, match="has no FLAME rig"):
-        apply_motion(import_head(mesh_capture(tmp_path / "mesh")), retimed(other), 1, "other")
+        apply_motion(plain, retimed(other), Placement(1, "other"))
 
 
 def test_sampled_motion_equals_the_keyframes(head, own):
@@ -239,5 +241,5 @@ def test_tracked_offsets(own, other, tmp_path):
         np.testing.assert_allclose(sequence_mesh(read, index), expected, atol=1e-5)
     assert said == []
     for as_strip in (False, True):
-        apply_motion(head, retimed(other), 2, "other", as_strip=as_strip)
+        apply_motion(head, retimed(other), Placement(2, "other", as_strip=as_strip))
         np.testing.assert_allclose(at_frame(head, 3), mesh(tracked, other.frame(1)), atol=TOLERANCE)

@@ -248,35 +248,40 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     return nodes.out("GeometryNodeSetInstanceTransform", placed)
 
 
-def _native(
-    degree: int,
-    nodes: Nodes,
-    splats: Any,
-    visible: Any,
-    size: Any,
-    color: Any,
-    view_dependent: Any,
-    gray: Any,
-) -> bpy.types.NodeSocket:
-    """Native splats with what they are drawn from, harmonics in the object's axes. color:
-    constant part, sRGB; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
+class _NativeInputs(NamedTuple):
+    """Sockets of NATIVE_GROUPS. color: constant part, sRGB; view_dependent: whether harmonics are
+    added; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
+
+    splats: Any
+    visible: Any
+    size: Any
+    color: Any
+    view_dependent: Any
+    gray: Any
+
+
+def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
+    """Native splats with what they are drawn from, harmonics in the object's axes; sockets: as
+    _NativeInputs."""
+    given = _NativeInputs(*sockets)
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
-    flat = nodes.logic("OR", gray, is_relit)
+    flat = nodes.logic("OR", given.gray, is_relit)
     shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
-    color = nodes.vector("SUBTRACT", nodes.switch("VECTOR", flat, color, shown), (0.5, 0.5, 0.5))
+    color = nodes.switch("VECTOR", flat, given.color, shown)
+    color = nodes.vector("SUBTRACT", color, (0.5, 0.5, 0.5))
     red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
     opacity = nodes.attribute(stored.OPACITY, "FLOAT")
     base = {"Red": red, "Green": green, "Blue": blue, "Alpha": opacity}
     # A color, which 5.3 draws as four floats; of FLOAT4, this node of 5.2 stores three.
     radiance = nodes.out("FunctionNodeCombineColor", base)
-    splats = nodes.store(splats, RADIANCE, radiance, "FLOAT_COLOR")
-    scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), size)
+    splats = nodes.store(given.splats, RADIANCE, radiance, "FLOAT_COLOR")
+    scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), given.size)
     splats = nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
-    factor = nodes.logic("NIMPLY", view_dependent, flat)
+    factor = nodes.logic("NIMPLY", given.view_dependent, flat)
     for index in range((degree + 1) ** 2 - 1):
         coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
         splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
-    points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": visible})
+    points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": given.visible})
     return compat.native_splats(nodes.tree, points)
 
 

@@ -25,7 +25,7 @@ from ..display.splat_object import (
     stored_light,
 )
 from ..layers import SceneLayer
-from ..light import SceneLight, lighting_settings
+from ..light import PosedAvatar, SceneLight, lighting_settings
 from ..vertex_groups import frame_group, frame_selection
 
 
@@ -135,12 +135,23 @@ def visible_layers(
         to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
         vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
         vertices, frames = cache.frames(each, stored, vertices)
-        relit = cache.light.relit(each, head, stored, vertices, to_world, find_visible, depsgraph)
+        avatar = PosedAvatar(each, head, stored, vertices, to_world)
+        relit = cache.light.relit(avatar, find_visible, depsgraph)
         asks = settings.show_selection or settings.selected_only
         selected = cache.selection(head, depsgraph.scene.frame_current) if asks else None
         frozen = None if selected is None else ~selected
-        how = stored.antialiased, settings, frozen, relit, holdout
-        layers.append(SceneLayer(stored.splats, frames, to_world, *how))
+        layers.append(
+            SceneLayer(
+                splats=stored.splats,
+                frames=frames,
+                to_world=to_world,
+                antialiased=stored.antialiased,
+                settings=settings,
+                frozen=frozen,
+                relit=relit,
+                holdout=holdout,
+            )
+        )
     return layers
 
 

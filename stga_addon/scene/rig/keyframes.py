@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -146,14 +146,25 @@ def check_keyable(owner: Any, bones: Sequence[str] = ()) -> None:
             raise StgaError(f"{owner.name}: the rotation mode of bone {name} must be Quaternion")
 
 
+class Placement(NamedTuple):
+    """Where keyframes of a motion go. start: the first frame; name: of the motion, which new
+    actions get; parts: of PARTS, those that are replaced; as_strip: into a strip of the NLA editor,
+    with effect only where it lasts, instead of a copy of the action."""
+
+    start: int
+    name: str
+    parts: Sequence[str] = tuple(PARTS)
+    as_strip: bool = False
+
+
 @contextmanager
 def new_actions(
-    owners: Sequence[Any], name: str, replaces: Callable[[str], bool], as_strip: bool
+    owners: Sequence[Any], placement: Placement, replaces: Callable[[str], bool]
 ) -> Iterator[None]:
     """Keyframe `owners` in new actions: copies less the replaced curves, or strips on the old."""
     for owner in owners:
-        title = f"{owner.name} {name}"
-        if as_strip:
+        title = f"{owner.name} {placement.name}"
+        if placement.as_strip:
             push_down_action(owner)
             animation = owner.animation_data or owner.animation_data_create()
             animation.action = bpy.data.actions.new(title)
@@ -164,7 +175,7 @@ def new_actions(
     yield
     for owner in owners:
         owner.animation_data.action.use_fake_user = True
-        if as_strip:
+        if placement.as_strip:
             push_down_action(owner, extrapolation="NOTHING")
 
 
@@ -267,19 +278,14 @@ def shape_key_names(head: Any) -> dict[int, str]:
 
 
 def apply_weights(
-    owner: Any,
-    paths: dict[int, str],
-    weights: np.ndarray,
-    start: int,
-    name: str,
-    as_strip: bool = False,
+    owner: Any, paths: dict[int, str], weights: np.ndarray, placement: Placement
 ) -> None:
     """Animate the values at `paths` (column -> data path) of `owner` by weights (T, 52), a row per
-    frame from `start` on, and keep the previous animation as `motion.apply_motion` does. Raises
-    StgaError as `check_keyable` does."""
+    frame, and keep the previous animation as `motion.apply_motion` does. Raises StgaError as
+    `check_keyable` does."""
     check_keyable(owner)
-    with new_actions([owner], name, set(paths.values()).__contains__, as_strip):
-        key_values(owner, paths, np.arange(start, start + len(weights)), weights)
+    with new_actions([owner], placement, set(paths.values()).__contains__):
+        key_values(owner, paths, placement.start + np.arange(len(weights)), weights)
 
 
 def checked_shape_keys(head: Any) -> dict[int, str]:

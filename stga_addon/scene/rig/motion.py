@@ -16,11 +16,12 @@ from ...errors import StgaError
 from ...flame.forward import FlameFrame, flame_forward
 from ...flame.model import JOINTS, FlameModel
 from ...flame.quaternions import from_axis_angle, multiply, to_axis_angle
-from ...flame.sequence import PARTS, FlameSequence
+from ...flame.sequence import FlameSequence
 from ..arrays import evaluated_vertices, key_points, read_values, write_curves
 from ..objects import Identity, Warn, iterate_frames, log_warning
 from . import keyframes
 from .head import rig_of
+from .keyframes import Placement
 
 MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sampled parameters
 
@@ -28,21 +29,17 @@ MESH_TOLERANCE = 1e-4  # metres that the mesh may differ from FLAME's of the sam
 def apply_motion(
     head: Any,
     frames: Sequence[FlameFrame],
-    start: int,
-    name: str,
-    parts: Sequence[str] = tuple(PARTS),
-    as_strip: bool = False,
-    warn: Warn = log_warning,
+    placement: Placement,
     tracked: tuple[FlameSequence, Sequence[float]] | None = None,
     weights: np.ndarray | None = None,
+    warn: Warn = log_warning,
 ) -> None:
-    """Animate the chosen parts of a FLAME head by `frames`, one per Blender frame from `start` on.
-    The previous animation is kept: the new action is a copy of it in which the parts are replaced,
-    or a strip in the NLA editor, with effect only where it lasts. tracked: the sequence that the
-    head was imported from and the Blender frame of each timestep, where its per-frame offsets are
-    to play along. weights: (T, 52) of ARKit's shapes, on a head that was given them. Without, both
-    stay zero. Raises StgaError, and changes nothing, where the head has no rig, or one that cannot
-    take the motion."""
+    """Animate parts of a FLAME head by `frames`, one per Blender frame. The previous animation is
+    kept. tracked: the sequence that the head was imported from and the Blender frame of each
+    timestep, where its per-frame offsets are to play along. weights: (T, 52) of ARKit's shapes, on
+    a head that was given them. Without, both stay zero. Raises StgaError, and changes nothing,
+    where the head has no rig, or one that cannot take the motion."""
+    parts = placement.parts
     rig = rig_of(head)
     keyframes.check_keyable(rig, JOINTS)
     keyframes.check_keyable(head.data.shape_keys)
@@ -60,21 +57,23 @@ def apply_motion(
     offsets = keyframes.offset_keys(head) if has_expression else []
     owners = [rig] if offsets or set(parts) & set(keyframes.PART_JOINTS) else []
     owners += [keys] if has_expression else []
-    at = np.arange(start, start + len(frames))
-    with keyframes.new_actions(owners, name, lambda p: keyframes.is_of_parts(p, parts), as_strip):
+    at = placement.start + np.arange(len(frames))
+    with keyframes.new_actions(owners, placement, lambda p: keyframes.is_of_parts(p, parts)):
         keyframes.key_motion(head, rig, at, frames, parts, warn)
         if has_expression and keyframes.has_shapes(head):
             shapes = np.zeros((1, len(ARKIT_SHAPES))) if weights is None else weights
             paths = {column: keyframes.key_value_path(key) for key, column in COLUMN.items()}
-            keyframes.key_values(keys, paths, np.arange(start, start + len(shapes)), shapes)
+            keyframes.key_values(keys, paths, placement.start + np.arange(len(shapes)), shapes)
         if offsets and tracked is not None:
             keyframes.key_tracked_offsets(head, rig, *tracked)
         elif offsets:
             for key in offsets:
-                write_curves(keys, keyframes.key_value_path(key.name), [start], np.zeros(1))
+                path = keyframes.key_value_path(key.name)
+                write_curves(keys, path, [placement.start], np.zeros(1))
             for offset in map(keyframes.offset_property, JOINTS):
                 if offset in rig:
-                    write_curves(rig, keyframes.property_path(offset), [start], np.zeros((1, 3)))
+                    path = keyframes.property_path(offset)
+                    write_curves(rig, path, [placement.start], np.zeros((1, 3)))
 
 
 def sample_motion(
