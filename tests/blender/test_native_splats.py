@@ -1,6 +1,7 @@
 """What Blender's native splats are drawn from, against numpy, also in STGA_BLENDER; files that go
 between Blenders with and without them."""
 
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -144,6 +145,10 @@ def test_native_splats_become_quads_in_an_older_blender(
     assert splat_object.display_mode(shown) == QUADS
     assert f"STGA: {sentence}\n" in capsys.readouterr().out
     assert bpy.context.window_manager.stga_message == sentence
+    shutil.copy(tmp_path / "a.blend", tmp_path / "library.blend")
+    with bpy.data.libraries.load(str(tmp_path / "library.blend")) as (_, target):
+        target.objects = [shown.name]
+    assert splat_object.display_mode(target.objects[0]) == (QUADS if compat.APPENDED else NATIVE)
     bpy.ops.stga.choose_display(display=POINTS)
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "a.npz"))
     assert splat_object.display_mode(shown) == POINTS

@@ -125,15 +125,7 @@ def visible_layers(
         head = get_input(each, splat_nodes.HEAD)
         if head is None:
             raise StgaError(f"{each.name}: has no head to follow; choose one in its modifier")
-        posed = head.evaluated_get(depsgraph)
-        if posed.type != "MESH" or len(posed.data.loops) != stored.faces.size:
-            reason = f"has other triangles than {each.name}, which follows it; check its modifiers"
-            if head.mode == "EDIT":
-                reason = f"is in Edit Mode; {each.name} is drawn again when you leave it"
-            raise StgaError(f"{head.name}: {reason}")
-        placed = each.evaluated_get(depsgraph).matrix_world
-        to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
-        vertices = mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
+        vertices = _posed_vertices(each, head, stored.faces, depsgraph)
         vertices, frames = cache.frames(each, stored, vertices)
         avatar = PosedAvatar(each, head, stored, vertices, to_world)
         relit = cache.light.relit(avatar, find_visible, depsgraph)
@@ -153,6 +145,21 @@ def visible_layers(
             )
         )
     return layers
+
+
+def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: Any) -> np.ndarray:
+    """(V, 3) of the evaluated head in the splat object's space. Raises StgaError where the head has
+    not as many triangles as `faces`."""
+    posed = head.evaluated_get(depsgraph)
+    if posed.type != "MESH" or len(posed.data.loops) != faces.size:
+        follower = splat_object.name
+        reason = f"has other triangles than {follower}, which follows it; check its modifiers"
+        if head.mode == "EDIT":
+            reason = f"is in Edit Mode; {follower} is drawn again when you leave it"
+        raise StgaError(f"{head.name}: {reason}")
+    placed = splat_object.evaluated_get(depsgraph).matrix_world
+    to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
+    return np.asarray(mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3])
 
 
 def _may_show_splats(candidate: Any) -> bool:
