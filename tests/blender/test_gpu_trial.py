@@ -110,17 +110,15 @@ def test_viewports_fall_back_to_points(monkeypatch, capsys, is_engine):
     bpy.app.timers.unregister(viewport_display.show_points)
 
 
-def test_points_are_shown_in_material_preview():
+def test_points_are_shown_in_material_preview(monkeypatch):
     """Catches viewports of the engine, which draws no points, that stay empty."""
     screen = bpy.context.window_manager.windows[0].screen
     shading = next(area for area in screen.areas if area.type == "VIEW_3D").spaces.active.shading
     shading.type = "RENDERED"
     viewport_display.show_points()
     assert shading.type == "RENDERED"
-    bpy.utils.register_class(engine.SplatsEngine)
-    bpy.context.scene.render.engine = engine.ENGINE
+    monkeypatch.setattr(viewport_display, "ENGINE", bpy.context.scene.render.engine)
     viewport_display.show_points()
-    bpy.utils.unregister_class(engine.SplatsEngine)
     assert shading.type == "MATERIAL"
 
 

@@ -1,5 +1,6 @@
 """Which head the result of a request reaches, and by which splat object an avatar is shown."""
 
+import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,12 +16,13 @@ from stga_addon.jobs.table import Kind
 from stga_addon.progress import Progress
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
-from stga_addon.scene.compat import modifier_input
+from stga_addon.scene.compat import modifier_input, modifier_input_owner
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import (
     evaluated_splats,
     get_input,
     input_identifier,
+    set_input,
     splat_modifier,
 )
 from stga_addon.training.run.folder import Run, write_run
@@ -167,8 +169,9 @@ def test_show_avatar_again_changes_the_object(head, tmp_path):
     bpy.ops.stga.choose_display(display=splat_nodes.POINTS)
     named = identifiers(modifier)
     for name, value in ((splat_nodes.SIZE, 0.5), (splat_nodes.SELECTED_ONLY, True)):
-        modifier[named[name]] = value
-        modifier.keyframe_insert(f'["{named[name]}"]', frame=1)
+        set_input(shown, name, value)
+        owner, prop = modifier_input_owner(modifier, named[name])
+        owner.keyframe_insert(prop, frame=1)
     shown.location = (0.5, 0, 0)
     shown.keyframe_insert("location", frame=1)
     shown.name = "mine"
@@ -187,15 +190,15 @@ def test_show_avatar_again_changes_the_object(head, tmp_path):
     assert values[splat_nodes.DISPLAY] == splat_nodes.POINTS
     assert (values[splat_nodes.SIZE], values[splat_nodes.SELECTED_ONLY]) == (0.5, True)
     curves = shown.animation_data.action.layers[0].strips[0].channelbags[0].fcurves
-    animated = {curve.data_path.partition('"]["')[2].rstrip('"]') for curve in curves} - {""}
+    animated = set(re.findall(r"Socket_\d+", " ".join(curve.data_path for curve in curves)))
     assert animated == {renamed[splat_nodes.SIZE], renamed[splat_nodes.SELECTED_ONLY]}
     neutral = get_input(shown, splat_nodes.NEUTRAL).data
     assert np.allclose([vertex.co for vertex in neutral.vertices], moved, atol=1e-6)
     assert "stga_sh_1" not in shown.data.attributes
     shown.animation_data_clear()
     shown.location = (0, 0, 0)
-    modifier[renamed[splat_nodes.SIZE]] = 1.0
-    modifier[renamed[splat_nodes.SELECTED_ONLY]] = False
+    set_input(shown, splat_nodes.SIZE, 1.0)
+    set_input(shown, splat_nodes.SELECTED_ONLY, False)
     bpy.context.view_layer.update()
     expected = expected_world(second, evaluated_vertices(head)).xyz
     np.testing.assert_allclose(evaluated_splats(shown)[0], expected, atol=1e-5)
