@@ -84,5 +84,5 @@ def test_mistakes(parts, tmp_path, capsys):
     (tmp_path / "scan.ply").write_bytes(b"ply\n")
     scan = parts | {"avatar": tmp_path / "scan.ply"}
     assert render(scan, tmp_path / "out", "--flame", parts["model"]) == 2
-    assert "scan.ply: is a PLY" in capsys.readouterr().err
+    assert "scan.ply: holds splats in the world" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -100,10 +100,12 @@ def stored_mask(view: View) -> np.ndarray:
 
 
 def is_labeled(mask: np.ndarray) -> bool:
-    """Whether a stored mask holds 0 and one other number that is not 255, as segmentation networks
-    write 1 for a head. A matte has numbers between."""
+    """Whether a stored mask holds 0 and one other number that is not 255, or 1 alone, as
+    segmentation networks write it for a head. A matte has numbers between."""
     level = mask.max(initial=0)
-    return bool(0 < level < 255 and ((mask == 0) | (mask == level)).all())
+    is_background = mask == 0
+    is_two = 0 < level < 255 and (is_background | (mask == level)).all()
+    return bool(is_two and (level == 1 or is_background.any()))
 
 
 def read_view(

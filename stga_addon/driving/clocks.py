@@ -88,7 +88,7 @@ def seconds_of_numbers(
         if 1 / MAX_ROWS_PER_S <= step * unit <= 1 / MIN_ROWS_PER_S:
             guess = f"{column} holds {UNIT_NAMES.get(unit)}, by its steps of {step:g}"
             return values * unit, guess if unit in UNIT_NAMES else None
-    if step <= MAX_FRAME_STEP and (values % 1 == 0).all():
+    if step <= MAX_FRAME_STEP and np.isfinite(values).all() and (values % 1 == 0).all():
         rate = fps or DEFAULT_FPS
         counts = f"{column} counts frames; they are taken as {rate:g} a second"
         return values / rate, counts

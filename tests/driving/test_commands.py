@@ -22,6 +22,7 @@ from stga_addon.driving.performers import read_performance
 from stga_addon.export.playback import DEFAULT_FPS
 from stga_addon.files import write_json
 from stga_addon.flame.forward import flame_forward, neutral_frame
+from stga_addon.flame.model import FlameModel
 from stga_addon.flame.sequence import read_motion, sequence_mesh
 from stga_addon.jobs.track import MAX_MISFIT
 from stga_addon.render.video import video_writer
@@ -128,6 +129,17 @@ def test_render_and_export_a_performance(files, tmp_path, capsys):
     assert "--mirror: has no effect without --motion" in capsys.readouterr().err
 
 
+def write_moving_capture(root: Path, model: FlameModel) -> None:
+    """A FLAME capture whose head turns, and speaks, at random."""
+    write_flame_capture(root)
+    rng = np.random.default_rng(0)
+    for path in [*(root / "flame_param").iterdir(), root / "canonical_flame_param.npz"]:
+        sizes = {"expr": model.n_expression, "rotation": 3, "jaw_pose": 3, "neck_pose": 3}
+        values = {name: rng.normal(0, 0.1, (1, size)) for name, size in sizes.items()}
+        other = {"shape": np.zeros(model.n_identity), "translation": rng.normal(0, 0.1, (1, 3))}
+        np.savez(path, **values, **other)
+
+
 @pytest.mark.parametrize("misfit", [0.1, 0.8])
 def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit):
     """Catches another motion, rate or head than tracked, a stranger's avatar, what a cancelled
@@ -136,14 +148,8 @@ def test_a_performers_avatar_tracks_a_video(files, tmp_path, monkeypatch, misfit
     run = tmp_path / "run"
     video = tmp_path / "face.mp4"
     steps = []
-    write_flame_capture(root)
-    rng = np.random.default_rng(0)
     model = small_head(0)
-    for path in [*(root / "flame_param").iterdir(), root / "canonical_flame_param.npz"]:
-        sizes = {"expr": model.n_expression, "rotation": 3, "jaw_pose": 3, "neck_pose": 3}
-        values = {name: rng.normal(0, 0.1, (1, size)) for name, size in sizes.items()}
-        other = {"shape": np.zeros(model.n_identity), "translation": rng.normal(0, 0.1, (1, 3))}
-        np.savez(path, **values, **other)
+    write_moving_capture(root, model)
     run.mkdir()
     write_run(run, Run(root, files["flame.npz"], "vhap", TrainingSettings(iterations=1)))
     (run / AVATAR).touch()

@@ -1,20 +1,15 @@
 """The public functions of `render.render`, and the example of its docstring."""
 
-import doctest
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 pytest.importorskip("numba")
 
 from stga_addon.avatar.splats import SH_C0, Splats
 from stga_addon.capture.camera import Camera, look_at
-from stga_addon.export.ply import write_ply
 from stga_addon.raster.posed_splats import PosedSplats
-from stga_addon.render import render as render_module
 from stga_addon.render.render import render, render_layers
 
 
@@ -29,22 +24,6 @@ def one_splat(color: tuple[float, float, float]) -> Splats:
         face=np.zeros(1, np.int32),
         unbound=np.zeros(1, bool),
     )
-
-
-def test_the_example_renders_a_ply_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Catches an example that no longer runs, and splats at another place."""
-    monkeypatch.chdir(tmp_path)
-    write_ply(Path("splats.ply"), one_splat((0.8, 0.4, 0.1)))
-    example = doctest.DocTestParser().get_doctest(
-        render_module.__doc__ or "", {}, "example", None, 0
-    )
-    runner = doctest.DocTestRunner()
-    assert len(example.examples) == 9
-    assert runner.run(example).failed == 0
-    pixels = np.asarray(Image.open("splats.png"))
-    assert pixels.shape == (480, 640, 3)
-    np.testing.assert_allclose(pixels[240, 320], [204, 102, 26], atol=2)
-    np.testing.assert_array_equal(pixels[0, 0], [255, 255, 255])
 
 
 def test_look_at_gives_the_pose_worked_out_by_hand():

@@ -98,9 +98,10 @@ def _prefetch_batch(pair_splat, first, past, projected):
 
 
 @part_jit
-def _copy_batch(pair_splat, first, count, projected, x0, y0, batch):
+def _copy_batch(pair_splat, first, count, projected, corner, batch):
     """Copy the projected splats of `count` pairs from `first` on; centers relative to the tile's
-    corner (x0, y0)."""
+    corner (x, y)."""
+    x0, y0 = corner
     for q in range(np.uint64(count)):
         i = np.uint64(pair_splat[np.uint64(first) + q])
         batch[AT_MEAN_X + q] = projected[i, layout.MEAN_X] - x0
@@ -375,9 +376,8 @@ def blend_forward(work, tiles, tiles_x, tile_blocks, lists, projection, backgrou
                 _prefetch_batch(pair_splat, batch_begin + count, next_end, projected)
                 for j in range(np.uint64(batch_begin + count), np.uint64(next_end)):
                     prefetch(extent_y, np.uint64(pair_splat[j]))
-                x0 = np.float32(left)
-                y0 = np.float32(top)
-                _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
+                corner = (np.float32(left), np.float32(top))
+                _copy_batch(pair_splat, batch_begin, count, projected, corner, batch)
                 for q in range(np.uint64(count)):
                     i = np.uint64(pair_splat[np.uint64(batch_begin) + q])
                     batch[AT_EXTENT_Y + q] = extent_y[i]
@@ -488,9 +488,10 @@ def _store_pair(grads, j, q, batch, sums):
 
 
 @part_jit
-def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
-    """Copy what the backward pass needs of a tile's pixels. Returns the deepest of their last
-    pairs, counted from 1."""
+def _load_tile(s, left, top, background, v_pixels, blended):
+    """Copy what the backward pass needs of a tile's pixels; v_pixels: the image's gradient and the
+    transmittance's. Returns the deepest of their last pairs, counted from 1."""
+    v_image, v_transmittance = v_pixels
     transmittance = blended.transmittance
     last = blended.last
     height, width = last.shape
@@ -522,6 +523,15 @@ def _load_tile(s, left, top, background, v_image, v_transmittance, blended):
                 s[LAST + p] = np.float32(last[y, x])
                 deepest = max(deepest, last[y, x])
     return np.int64(deepest)
+
+
+@part_jit
+def _first_wanted(begin, deepest, pair_splat, wanted):
+    """The first wanted one of a tile's pairs: nothing in front of it needs to be walked."""
+    nearest = begin
+    while nearest < deepest and not wanted[pair_splat[nearest]]:
+        nearest += 1
+    return nearest
 
 
 @part_jit
@@ -568,6 +578,7 @@ def blend_backward(
     start = lists.start
     pair_splat = lists.pair_splat
     pair_blocks = blended.pair_blocks
+    v_pixels = (v_image, v_transmittance)
     s = np.empty(BACKWARD_SIZE, np.float32)
     batch = np.empty(BATCH_SIZE, np.float32)
     sums = np.empty(PROJECTED, np.float32)
@@ -582,22 +593,17 @@ def blend_backward(
             begin = start[tile]
             if begin == start[tile + 1]:
                 continue
-            deepest = begin + _load_tile(
-                s, left, top, background, v_image, v_transmittance, blended
-            )
+            deepest = begin + _load_tile(s, left, top, background, v_pixels, blended)
             pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
-            nearest = begin  # nothing in front of the first wanted pair needs to be walked
-            while nearest < deepest and not wanted[pair_splat[nearest]]:
-                nearest += 1
+            nearest = _first_wanted(begin, deepest, pair_splat, wanted)
             stepped = _blocks_of_wanted(nearest, deepest, pair_splat, pair_blocks, wanted)
             for batch_end in range(deepest, nearest, -BATCH_PAIRS):
                 batch_begin = max(nearest, batch_end - BATCH_PAIRS)
                 count = batch_end - batch_begin
                 before = max(nearest, batch_begin - BATCH_PAIRS)
                 _prefetch_batch(pair_splat, before, batch_begin, projected)
-                x0 = np.float32(left)
-                y0 = np.float32(top)
-                _copy_batch(pair_splat, batch_begin, count, projected, x0, y0, batch)
+                corner = (np.float32(left), np.float32(top))
+                _copy_batch(pair_splat, batch_begin, count, projected, corner, batch)
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)
                     pairs = (batch_begin, group_end, group)

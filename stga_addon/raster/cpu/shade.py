@@ -51,6 +51,30 @@ def ggx(facing, toward_eye, half, fresnel_cosine, square, reflectance):
     return distribution * fresnel * HALF / shadowing
 
 
+@part_jit
+def _toward_light(light, px, py, pz):
+    """Unit vector from a point to a light, factor of its color there, and the light's width as
+    WIDTH has a sun's."""
+    if int(light[KIND]) == SUN:
+        return -light[4], -light[5], -light[6], ONE, light[WIDTH]
+    dx = light[1] - px
+    dy = light[2] - py
+    dz = light[3] - pz
+    square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
+    away = ONE / math.sqrt(square)
+    dx = dx * away
+    dy = dy * away
+    dz = dz * away
+    strength = ONE / square
+    along = -(dx * light[4] + dy * light[5] + dz * light[6])
+    if int(light[KIND]) == AREA:
+        strength *= max(along, ZERO)
+    elif int(light[KIND]) == SPOT:
+        inside = min(max((along - light[CONE]) / light[FADE], ZERO), ONE)
+        strength *= inside * inside * (np.float32(3.0) - TWO * inside)
+    return dx, dy, dz, strength, light[WIDTH] * away
+
+
 @parallel(lambda points, *_: len(points), piece=256)
 def add_lights(
     work, points, normals, eye, roughness, reflectance, lights, lit, irradiance, highlight
@@ -80,30 +104,8 @@ def add_lights(
             alpha = roughness[n] * roughness[n]
             for s in range(len(lights)):
                 light = lights[s]
-                kind = int(light[KIND])
                 row = int(light[MAP])
-                dx = -light[4]
-                dy = -light[5]
-                dz = -light[6]
-                strength = ONE
-                width = light[WIDTH]
-                if kind != SUN:
-                    dx = light[1] - px
-                    dy = light[2] - py
-                    dz = light[3] - pz
-                    square = max(dx * dx + dy * dy + dz * dz, np.float32(1e-8))
-                    away = ONE / math.sqrt(square)
-                    dx = dx * away
-                    dy = dy * away
-                    dz = dz * away
-                    strength = ONE / square
-                    width = width * away
-                    along = -(dx * light[4] + dy * light[5] + dz * light[6])
-                    if kind == AREA:
-                        strength *= max(along, ZERO)
-                    elif kind == SPOT:
-                        inside = min(max((along - light[CONE]) / light[FADE], ZERO), ONE)
-                        strength *= inside * inside * (np.float32(3.0) - TWO * inside)
+                dx, dy, dz, strength, width = _toward_light(light, px, py, pz)
                 facing = nx * dx + ny * dy + nz * dz
                 if row >= 0:
                     strength *= lit[row, n]

@@ -15,6 +15,7 @@ from stga_addon.files import read_npz
 from stga_addon.flame.forward import flame_forward
 
 MAX_BYTES = 4e6
+MOUTH_INSIDE = 11248, 13294  # ICT-FaceKit's vertices
 
 
 @pytest.fixture(scope="module")
@@ -55,12 +56,14 @@ def test_heads_are_where_the_pictures_show_them(capture):
 
 
 def test_the_pictured_head_moves_as_the_bundled_one(capture, shared_data):
-    """Catches skinning, shapes or joints in the pictures other than in the files."""
+    """Catches skinning, shapes or joints in the pictures other than in the files; the mouth's
+    lining, which the pictures do not show, moves in its own way."""
     whole = whole_head(read_npz(shared_data / "ict_facekit.npz"))
     of = cKDTree(whole.v_template).query(capture.flame.model.v_template)[1]
+    shown = (of < MOUTH_INSIDE[0]) | (of >= MOUTH_INSIDE[1])
     for timestep in capture.timesteps:
         posed = flame_forward(whole, capture.flame.shape, capture.flame.frame(timestep))
-        np.testing.assert_allclose(posed[of], capture.mesh(timestep), atol=3e-4)
+        np.testing.assert_allclose(posed[of][shown], capture.mesh(timestep)[shown], atol=3e-4)
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):
