@@ -25,7 +25,7 @@ PAGES = [
 ]
 FOR_DEVELOPERS = ("CONTRIBUTING.md", "architecture.md", "dependencies.md")
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
-FOLDERS = ("stga_addon", "operators", "ui", "tests", "benchmarks", "docs", ".ci")
+FOLDERS = ("stga_addon", "operators", "ui", "tests", "docs", ".ci")
 FILES = [
     *ROOT.glob("*.*"),
     *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix != ".pyc"),
@@ -130,7 +130,7 @@ def is_there(names: list[str], used: set[str]) -> bool:
     return names[0] in used or names[0][0].isupper()
 
 
-@pytest.mark.parametrize("folder", ["stga_addon", "operators", "ui", "tests", "benchmarks"])
+@pytest.mark.parametrize("folder", ["stga_addon", "operators", "ui", "tests"])
 def test_what_comments_and_docstrings_name_is_there(folder):
     """Catches references that a move or another name made stale."""
     sources = [path for path in SOURCES if path.is_relative_to(ROOT / folder)]

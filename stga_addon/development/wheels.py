@@ -71,7 +71,7 @@ BLENDER_RANGES = {"3.11": ("4.2.0", "5.1.0"), "3.13": ("5.1.0", "")}
 PROVIDED = frozenset({"numpy"})
 """Packages that Blender brings."""
 LOCK = Path(__file__).with_name("wheels.lock")
-"""SHA-256 and file name of each wheel that an edition may hold, as `sha256sum` writes them. SciPy
+"""SHA-256 and file name of each wheel that an edition may hold, as coreutils write them. SciPy
 and Matplotlib of Python 3.11 are the last that run with numpy 1.24, as in Blender 4.2 and 4.3."""
 
 

@@ -110,7 +110,7 @@ def test_a_strip_keeps_the_animation_below_where_it_is(head, own, other):
     rig.animation_data.action.frame_end = 12.5
     times = (0.0, 2.5, 6.0, 10.25, 13.5, 25.0)
     before = [at_frame(head, time) for time in times]
-    apply_motion(head, retimed(other), 40, "other", ("jaw",), as_strip=True)
+    apply_motion(head, retimed(other), Placement(40, "other", ("jaw",), as_strip=True))
     for time, expected in zip(times, before, strict=True):
         np.testing.assert_allclose(at_frame(head, time), expected, atol=TOLERANCE)
 
@@ -125,7 +125,7 @@ def test_moved_and_removed_sliders(head, own, other):
         head.active_shape_key_index = keys.find(name)
         with bpy.context.temp_override(object=head):
             bpy.ops.object.shape_key_move(type=way)
-    apply_motion(head, frames, 20, "other")
+    apply_motion(head, frames, Placement(20, "other"))
     for index, frame in enumerate(frames):
         np.testing.assert_allclose(at_frame(head, 20 + index), mesh(own, frame), atol=TOLERANCE)
     keyframes.write_curves(head.data.shape_keys, 'key_blocks["expr_004"].value', [1, 9], [1, 2])

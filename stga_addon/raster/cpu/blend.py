@@ -575,9 +575,7 @@ def blend_backward(
     background and of the transmittance. Each pair has a row of its own, so that the sum over a
     splat's pairs has one order whatever the threads do.
     """
-    start = lists.start
     pair_splat = lists.pair_splat
-    pair_blocks = blended.pair_blocks
     v_pixels = (v_image, v_transmittance)
     s = np.empty(BACKWARD_SIZE, np.float32)
     batch = np.empty(BATCH_SIZE, np.float32)
@@ -590,13 +588,13 @@ def blend_backward(
             tile = tiles[k]
             left = (tile % tiles_x) * TILE
             top = (tile // tiles_x) * TILE
-            begin = start[tile]
-            if begin == start[tile + 1]:
+            begin = lists.start[tile]
+            if begin == lists.start[tile + 1]:
                 continue
             deepest = begin + _load_tile(s, left, top, background, v_pixels, blended)
-            pair_gradients[deepest : start[tile + 1], :] = np.float32(0.0)
+            pair_gradients[deepest : lists.start[tile + 1], :] = np.float32(0.0)
             nearest = _first_wanted(begin, deepest, pair_splat, wanted)
-            stepped = _blocks_of_wanted(nearest, deepest, pair_splat, pair_blocks, wanted)
+            stepped = _blocks_of_wanted(nearest, deepest, pair_splat, blended.pair_blocks, wanted)
             for batch_end in range(deepest, nearest, -BATCH_PAIRS):
                 batch_begin = max(nearest, batch_end - BATCH_PAIRS)
                 count = batch_end - batch_begin
@@ -607,7 +605,7 @@ def blend_backward(
                 for group_end in range(count, 0, -PAIRS_PER_GROUP):
                     group = min(group_end, PAIRS_PER_GROUP)
                     pairs = (batch_begin, group_end, group)
-                    blocks = _list_group(pairs, pair_blocks, stepped, places, listed)
+                    blocks = _list_group(pairs, blended.pair_blocks, stepped, places, listed)
                     _falloff(blocks, listed, batch, True, s)
                     _unblend(blocks, listed, batch_begin - begin, batch, s)
                     for n in range(group):
