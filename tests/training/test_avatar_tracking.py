@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from stga_addon.progress import Cancelled, Progress, Report
 from stga_addon.raster.cpu.layout import Parameters
 from stga_addon.report import report_run
 from stga_addon.tracking.folder import is_in_order
+from stga_addon.tracking.solve import RIGID_SIZE, WEIGHT_EXCESS_SIGMA
 from stga_addon.training.evaluate import evaluator
 from stga_addon.training.evaluate.metrics import evaluate_avatar
 from stga_addon.training.optimize import avatar_tracking
@@ -144,6 +146,26 @@ def test_a_timestep_begins_where_the_one_before_led(
         track_by_avatar(person, capture, TIMESTEPS[:2])
         assert not starts[TIMESTEPS[0]].any()
         np.testing.assert_allclose(starts[TIMESTEPS[1]], led if better else 0 * led, atol=1e-12)
+
+
+def test_weights_that_leave_0_to_1_are_pulled_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Catches a pull into the range of ARKit's shapes that counts as energy and not in its
+    gradient, or the other way round: the search then ends where it begins. Against the minimum
+    worked out by hand, where images say nothing."""
+    tracked = np.concatenate([[1.4, -0.3, 0.5], np.zeros(RIGID_SIZE)])
+    tracker = object.__new__(avatar_tracking._Tracker)
+    tracker._head = SimpleNamespace(model=SimpleNamespace(expression_names=("a", "b", "c")))
+    tracker._added = 0
+    precision = 25.0
+    size = len(tracked)
+    monkeypatch.setattr(tracker, "_precision", lambda: np.full(size, precision))
+    monkeypatch.setattr(tracker, "_gauss_newton", lambda *_: np.zeros((size, size)))
+    monkeypatch.setattr(tracker, "_loss", lambda *_: (0.0, np.zeros(size)))
+    found, _ = tracker._minimize([], tracked, tracked, avatar_tracking._Effort(60, 0.0))
+    pull = WEIGHT_EXCESS_SIGMA**-2
+    expected = tracked.copy()
+    expected[:2] = (precision * tracked[:2] + pull * np.array([1.0, 0.0])) / (precision + pull)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_without_masks_the_mesh_that_is_tried_cuts(
