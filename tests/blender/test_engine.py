@@ -383,7 +383,7 @@ def test_webgpu_renders_where_blender_has_no_gpu_context(tmp_path, monkeypatch):
 
     from stga_addon.raster.gpu import compose as on_gpu
 
-    monkeypatch.setattr(engine, "draw_image", lambda layers, camera: None)
+    monkeypatch.setattr(engine, "draw_image", lambda *_: None)
     wanted = ["cpu"]
     engine.unregister()
     engine.register(no_python, lambda: wanted[0])
