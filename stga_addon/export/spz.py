@@ -75,7 +75,8 @@ def read_spz(path: Path, say: Say = warn) -> Splats:
     try:
         return _unpacked(path, data, say)
     except (ValueError, struct.error, zlib.error, EOFError) as error:
-        problem = CHANGED_LINE_ENDS if line_ends_changed(data) else f"({error})"
+        reason = "it ends within its header" if isinstance(error, struct.error) else error
+        problem = CHANGED_LINE_ENDS if line_ends_changed(data) else f"({reason})"
         unread = f"is not a readable SPZ file {problem}; expected {READ_FILES}"
         raise StgaError(f"{path}: {unread}") from error
 
