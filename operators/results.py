@@ -19,6 +19,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
+from ..stga_addon.scene.objects import Identity
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
@@ -44,8 +45,8 @@ def _operate(scene: Any, operator: Any, **options: Any) -> Shown:
 # The head that a request is about
 
 
-_heads: dict[tuple[int, Kind], int] = {}
-"""Session ids of a scene and, by the kind of its request, of the head that it is about."""
+_heads: dict[tuple[int, Kind], Identity] = {}
+"""Session id of a scene and kind of its request -> the head that it is about."""
 
 
 def panel_head(scene: Any, kind: Kind) -> Any:
@@ -65,7 +66,7 @@ def record_head(scene: Any, kind: Kind, head: Any) -> None:
     if head is None:
         _heads.pop((scene.session_uid, kind), None)
     else:
-        _heads[scene.session_uid, kind] = head.session_uid
+        _heads[scene.session_uid, kind] = Identity(head)
     store_head(scene, kind)
 
 
@@ -76,10 +77,8 @@ def store_head(scene: Any, kind: Kind) -> None:
 
 
 def _head_in_session(scene: Any, kind: Kind) -> Any:
-    uid = _heads.get((scene.session_uid, kind))
-    # one that was deleted stays in the file while a property points to it
-    there = (each for each in bpy.data.objects if each.session_uid == uid and each.users_collection)
-    return None if uid is None else next(there, None)
+    head = _heads.get((scene.session_uid, kind))
+    return None if head is None else head.find()
 
 
 def request_head(scene: Any, state: RequestState) -> Any:

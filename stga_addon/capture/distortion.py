@@ -9,6 +9,7 @@ from .transforms import Frame
 RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
 TANGENTIAL = ("p1", "p2")
 LISTED = (*RADIAL[:4], *TANGENTIAL)  # nerfstudio's order in `distortion_params`
+# Camera models as nerfstudio and COLMAP name them.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE")
 PERSPECTIVES = (*PINHOLES, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")  # Of instant-ngp

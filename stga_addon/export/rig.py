@@ -10,9 +10,9 @@ from ..avatar.file import Avatar
 from ..capture.mesh_geometry import weighted_procrustes
 from ..flame.forward import joint_positions
 from ..flame.model import JOINTS
+from ..flame.parts import FLAME_SIZES
 from ..flame.quaternions import from_matrices, to_axis_angle
 from ..flame.sequence import FlameSequence, motion_arrays, with_identity
-from ..flame.teeth import TEETH_VERTICES, TEMPLATE_VERTICES
 
 BUNDLED_NOTICE = (
     "Contains a head derived from ICT-FaceKit. MIT License, Copyright (c) 2020 USC Institute for "
@@ -211,5 +211,5 @@ def flame_notice(avatar: Avatar, sequence: FlameSequence | None, motion_only: bo
         return BUNDLED_NOTICE
     if sequence is not None and not motion_only:
         return RIG_NOTICE
-    is_flame = len(avatar.neutral) in (TEMPLATE_VERTICES, TEMPLATE_VERTICES + TEETH_VERTICES)
+    is_flame = len(avatar.neutral) in FLAME_SIZES
     return MESH_NOTICE if is_flame or sequence is not None else ""

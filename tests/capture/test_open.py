@@ -80,7 +80,7 @@ DISTORTED: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("lens", "says"), DISTORTED)
 @pytest.mark.parametrize("layout", ["mesh", "flame"])
 def test_distorted_images(tmp_path, lens, says, layout):
-    """Catches images of a lens that is no pinhole, trained on as if they were, without a word."""
+    """Catches images of a lens that is no pinhole, silently trained on as if they were."""
     if layout == "mesh":
         root = factory.write_mesh_capture(tmp_path / "capture")
         model = None
@@ -131,7 +131,7 @@ def paletted(mask: np.ndarray) -> Image.Image:
 )
 def test_masks_of_labels(tmp_path, store, level):
     """Catches masks of 0 and 1, as segmentation networks write them, taken for nearly transparent:
-    3 dB are lost without a word."""
+    3 dB are silently lost."""
     capture = open_capture(stored_masks(factory.write_mesh_capture(tmp_path / "capture"), store))
     for view in capture.views["train"]:
         np.testing.assert_array_equal(read_mask(view), factory.silhouette() * 255)
@@ -141,7 +141,7 @@ def test_masks_of_labels(tmp_path, store, level):
 
 
 def test_masks_of_parts(tmp_path):
-    """Catches a map of many parts' numbers taken for a mask without a word; a matte keeps its."""
+    """Catches a map of many parts' numbers silently taken for a mask; a matte keeps its."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     parts = (factory.silhouette() * (1 + np.arange(factory.WIDTH) % 9)).astype(np.uint8)
     stored_masks(root, lambda _: Image.fromarray(parts))
@@ -182,7 +182,7 @@ def test_capture_of_a_monocular_tracker(tmp_path):
 
 
 def test_images_that_no_frame_names(tmp_path):
-    """Catches recorded images that nobody trains on, without a word: a split that is missing, or a
+    """Catches recorded images that are silently not trained on: a split that is missing, or a
     tracker that lost its frames."""
     root = factory.write_mesh_capture(tmp_path / "capture")
     (root / "transforms_test.json").unlink()

@@ -138,7 +138,7 @@ def test_tab_separated_suffix(tmp_path):
 
 
 def test_degrees_and_percent(tmp_path):
-    """Catches a head that spins, shapes a hundred times too strong, and a guess without a word."""
+    """Catches a head that spins, shapes a hundred times too strong, and an unsaid guess."""
     path = write_rows(tmp_path / "a.csv", "time", lambda n: n / 30, WEIGHTS * 100, (20.0, -7.5, 3))
     found = read_performance(path)
     np.testing.assert_allclose(found.weights, WEIGHTS, atol=1e-9)

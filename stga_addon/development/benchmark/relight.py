@@ -38,7 +38,6 @@ from ...training.evaluate.lpips import load_network
 from ...training.evaluate.metrics import psnr
 
 LIGHTS = "ABCDE"
-BARS = {"B": (27.5, 0.036), "C": (29.0, 0.032), "D": (27.5, 0.052)}
 SMALL_PARTS = "left_eye", "right_eye", "mouth"
 CARD_REFLECTANCE = 0.18
 

@@ -3,13 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+from ...capture.distortion import PERSPECTIVES, PINHOLES
 from ...capture.model import FPS_LIMIT
 from ...capture.transforms import Record, read_transforms, repairs, with_principal_point
 from ...errors import StgaError, shorten
 from .shots import Calibrated, Lens, Shot
 
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-PERSPECTIVE_MODELS = (*PINHOLE_MODELS, "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 MARKS = b'"frames"', b'"transform_matrix"'
 HEAD_BYTES = 1 << 16
@@ -54,11 +53,11 @@ def _lens(record: Record) -> Lens:
     """The lens of a frame."""
     usual = "OPENCV_FISHEYE" if record.values.get("is_fisheye") else "OPENCV"
     model = record.values.get("camera_model") or usual
-    known = PERSPECTIVE_MODELS + FISHEYE_MODELS
+    known = PERSPECTIVES + FISHEYE_MODELS
     if model not in known:
         one = f"{shorten(model)} is not one of {', '.join(known)}"
         raise StgaError(f"{record.where('camera_model')}: {one}")
-    if model in PINHOLE_MODELS:
+    if model in PINHOLES:
         return Lens()
     names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     *k, p1, p2 = (record.number(name) if record.has(name) else 0.0 for name in names)
