@@ -12,7 +12,7 @@ from ...avatar.embedding import FaceFrames
 from ...capture.camera import Camera
 from . import tiles as tiling
 from .blend import blend_backward, blend_forward
-from .layout import PROJECTED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
+from .layout import PROJECTED, RED, TILE, Blended, CameraFrames, Parameters, Projection, TileLists
 from .project import compose_frames, project_backward, project_forward
 
 BLACK_BACKGROUND = np.zeros(3, np.float32)
@@ -207,6 +207,31 @@ def render_backward(
         screen_gradient,
     )
     return rows, screen_gradient
+
+
+def blend_weights(output: RenderOutput, buffers: BufferPool) -> np.ndarray:
+    """How many pixels each splat fills: the sum of its blend weights over the image, (N,) float64.
+
+    output: of the whole image. A color's gradient, where the image's is 1, is this sum.
+    """
+    n = len(output.projection.depth)
+    lists = output.lists
+    ones = np.zeros_like(output.image)
+    ones[0] = 1
+    pair_gradients = buffers.get("pair_gradients", (len(lists.pair_splat), PROJECTED))
+    blend_backward(
+        output.tiles,
+        tile_grid(*output.image.shape[:0:-1])[0],
+        lists,
+        output.blended,
+        np.ones(n, bool),
+        output.projection.columns,
+        BLACK_BACKGROUND,
+        ones,
+        np.zeros(output.transmittance.shape, np.float32),
+        pair_gradients,
+    )
+    return np.bincount(lists.pair_splat, pair_gradients[:, RED], n)
 
 
 def _in_focus(

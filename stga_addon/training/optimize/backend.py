@@ -82,6 +82,10 @@ class Backend(Protocol):
         sRGB in 0…1."""
         ...
 
+    def blend_weights(self, view: View) -> np.ndarray:
+        """How many of the view's pixels each splat fills: (N,), the sums of its blend weights."""
+        ...
+
     def coefficients(self) -> dict[str, np.ndarray]:
         """Driven offset -> its latest coefficients (F, 3, 3) float32, not to be written to."""
         ...

@@ -16,12 +16,18 @@ class Turn:
     progress       share of the budget spent, 0…1
     initial_count  splats of the whole lattice and hull points
     region         (F,) bool: the triangles whose splats may change; None for all
+    before         progress at the step before
     """
 
     iteration: int
     progress: float
     initial_count: int
     region: np.ndarray | None = None
+    before: float = 0.0
+
+    def passes(self, share: float) -> bool:
+        """Whether this is the first step at which that share of the budget is spent."""
+        return self.before < share <= self.progress
 
 
 class Change(Protocol):

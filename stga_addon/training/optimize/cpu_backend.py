@@ -19,6 +19,8 @@ from .frames import FrameStore
 from .image_loss import image_gradient, tile_rectangles, whole_image
 from .state import Halving, TrainState, arrays_of, assign_rows, keep_rows, with_halves
 
+WITHOUT_COLOR = RenderOptions(rasterize.BLACK_BACKGROUND, sh_degree=0)
+
 
 class CpuBackend:
     """Trains in host memory: `state` is the trained arrays, and losses are returned at once."""
@@ -83,6 +85,11 @@ class CpuBackend:
         frames = self._moved_frames(view.timestep, averaged=True)
         seen = rasterize.frames_in_camera(frames, view.camera)
         return self._forward(self.state.average, seen, options).image.copy()
+
+    def blend_weights(self, view: View) -> np.ndarray:
+        seen = rasterize.frames_in_camera(self._moved_frames(view.timestep), view.camera)
+        rendering = self._forward(self.state.parameters, seen, WITHOUT_COLOR)
+        return rasterize.blend_weights(rendering, self._buffers)
 
     def coefficients(self) -> dict[str, np.ndarray]:
         return {name: offset.value for name, offset in self.state.driven_offsets.items()}

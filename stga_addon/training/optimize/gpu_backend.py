@@ -16,6 +16,7 @@ from ...raster.gpu.optimizer import OffsetTables, OptimizerTables, image_loss, u
 from ..settings import TrainingSettings
 from .adam import adam_options
 from .backend import Batch, RenderOptions
+from .cpu_backend import CpuBackend
 from .frames import FrameStore
 from .state import (
     Halving,
@@ -157,6 +158,10 @@ class GpuBackend:
         if self._edited is not None and self._is_changed:
             self.state = self._edited
         self._edited = None
+
+    def blend_weights(self, view: View) -> np.ndarray:
+        host = CpuBackend(self._settings, self._frames, self._host_state())
+        return host.blend_weights(view)
 
     def coefficients(self) -> dict[str, np.ndarray]:
         offsets = self._host_state().driven_offsets.items()

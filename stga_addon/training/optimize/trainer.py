@@ -15,6 +15,7 @@ from .avatar_tracking import RefinedTracking
 from .backend import Batch, RenderOptions
 from .change import Change, Turn, is_turn_of
 from .density import DensityControl
+from .dust import DustPruning
 from .frames import FrameStore
 from .initial_splats import initial_splats, unseen_share
 from .make_backend import make_backend
@@ -115,6 +116,7 @@ class Trainer:
         self.iteration = 0
         self.visit = -1
         self.last_timestep: int | None = None
+        self._progress: float | None = None
         self._background = np.array(settings.background, np.float32)
         state = _placed_splats(capture, settings) if start.state is None else start.state
         self._backend = make_backend(device, settings, self.frames, state)
@@ -129,6 +131,7 @@ class Trainer:
         }
         if settings.random_background:  # alpha is learned from masks
             self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
+        self.changes["dust"] = DustPruning(capture)
         if cameras_at_once(capture.views["train"]) == 1 and self.strategy.region is None:
             self.changes["unseen sides"] = UnseenSideColors(capture)
 
@@ -218,7 +221,11 @@ class Trainer:
 
     def _post_step(self, progress: float) -> None:
         """Change the splats after an optimizer step, where it is the turn of one of the changes."""
-        turn = Turn(self.iteration, progress, self.initial_count, self.strategy.region)
+        before = self._progress
+        if before is None:  # begun or resumed: as of steps that all take the same share
+            before = progress * (1 - 1 / max(1, self.iteration - 1))
+        self._progress = progress
+        turn = Turn(self.iteration, progress, self.initial_count, self.strategy.region, before)
         for change in self.changes.values():
             if is_turn_of(change, turn):
                 change.apply(self._backend, turn)

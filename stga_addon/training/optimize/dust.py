@@ -1,0 +1,48 @@
+"""Pruning of dust: unbound splats in the air that fill next to nothing of any image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...capture.model import Capture, evenly_spread
+from .backend import Backend
+from .change import Turn
+
+MIN_WEIGHT_PX = 0.5
+"""A splat that fills less in every view serves the rays of a few pixels, and hangs in the air for
+all other cameras."""
+TURNS = (0.6, 0.8)
+"""Shares of the budget at which splats are weighed; what is trained afterwards fills in."""
+MAX_WEIGHED_VIEWS = 40
+WEIGHED_SHARE = 0.03
+"""Training views that are looked at, spread over all: at most, and as a share of all iterations,
+which take longer than a look."""
+
+
+@dataclass(frozen=True)
+class DustPruning:
+    """Prunes unbound splats by what they do: the largest sum of a splat's blend weights in any one
+    view. Neither opacity nor density tells dust from the faint rim of hair."""
+
+    capture: Capture
+    interval: int = 1
+
+    def prepare(self) -> None:
+        """Nothing is found out once."""
+
+    def apply(self, backend: Backend, turn: Turn) -> None:
+        if not any(map(turn.passes, TURNS)):
+            return
+        columns = backend.columns(("face", "unbound"))
+        weighed = columns["unbound"]
+        if turn.region is not None:
+            weighed = weighed & turn.region[columns["face"]]
+        if not weighed.any():
+            return
+        iterations = turn.iteration / turn.progress
+        count = min(MAX_WEIGHED_VIEWS, max(1, round(WEIGHED_SHARE * iterations)))
+        views = evenly_spread(self.capture.views["train"], count)
+        weight = np.max([backend.blend_weights(view) for view in views], axis=0)
+        dust = weighed & (weight < MIN_WEIGHT_PX)
+        if dust.any():
+            backend.keep(~dust)
