@@ -30,7 +30,6 @@ from stga_addon.training.optimize.avatar_tracking import (
     normal_images,
     track_by_avatar,
 )
-from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
     avatar_person,
@@ -209,4 +208,3 @@ def test_a_phone_is_one_camera_in_all_its_takes(lost, person, tmp_path):  # noqa
     settings = quick_settings("global", lattice=0)
     for capture, is_one in ((joined, True), (first, False)):
         assert depth_limits(CaptureFacts(capture, settings)).on == is_one
-        assert ("unseen sides" in Trainer(capture, settings, {}).changes) == is_one

@@ -5,18 +5,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from capture import factory
+from PIL import Image
 
+from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
-from stga_addon.capture.model import Capture
+from stga_addon.capture.mesh_geometry import rasterize
+from stga_addon.capture.model import Capture, View
+from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.frames import FrameStore
 from stga_addon.training.optimize.trainer import Trainer
-from stga_addon.training.optimize.unseen_sides import UnseenSideColors, unseen_sides
+from stga_addon.training.optimize.unseen_sides import (
+    UnseenSideColors,
+    UnseenSides,
+    unseen_sides,
+)
 
 from .heads import PLACES, write_head
 from .toys import Rows, quick_settings
 
 CAMERA = 3
 """Sees the ball's +x side and front, from 40° beside the middle."""
+
+
+def sides_of(capture: Capture) -> UnseenSides:
+    return unseen_sides(capture, FrameStore(capture, "stga").facing)
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +43,7 @@ def from_one_side(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     """Catches another side, normal or mirror plane, and a far side that takes any color."""
     capture = from_one_side
-    sides = unseen_sides(from_one_side)
+    sides = sides_of(from_one_side)
     neutral, posed = (
         mesh[capture.faces].mean(1) - mesh.mean(0) for mesh in (capture.neutral, capture.mesh(0))
     )
@@ -52,7 +65,7 @@ def test_what_is_hidden_and_what_it_looks_like(from_one_side):
     image = read_image(view)
     for n in range(200):
         trainer.step(view, image, n / 200)
-    sides = unseen_sides(capture)
+    sides = sides_of(capture)
     splats = trainer.state.splats()
     far = sides.triangles[splats.face]
     expected = (sides.color[splats.face[far]] - 0.5) / 0.28209479177387814
@@ -72,10 +85,10 @@ def test_a_side_that_one_view_shows_is_not_unseen(from_one_side):
     moved = view.camera.world_to_camera @ center @ away @ np.linalg.inv(center)
     turned = replace(view, camera=replace(view.camera, world_to_camera=moved))
     alone, beside = (
-        unseen_sides(replace(capture, views={"train": views})).triangles
+        sides_of(replace(capture, views={"train": views})).triangles
         for views in ((view,), (turned,))
     )
-    both = unseen_sides(replace(capture, views={"train": (view, turned)})).triangles
+    both = sides_of(replace(capture, views={"train": (view, turned)})).triangles
     assert (alone & ~beside).sum() > 20
     assert (beside & ~alone).sum() > 20
     np.testing.assert_array_equal(both, alone & beside)
@@ -87,13 +100,13 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
     capture = from_one_side
     trainer = Trainer(capture, quick_settings("global", lattice=1, sh_degree=1, sh_steps=()), {})
     state = trainer.state
-    sides = unseen_sides(capture)
+    sides = sides_of(capture)
     rng = np.random.default_rng(0)
     for part in (state.parameters, state.average, state.first, state.second):
         part.sh[:] = rng.random(part.sh.shape)
     state.unbound[::7] = True
     before = {name: getattr(state, name).sh.copy() for name in ("average", "first", "second")}
-    UnseenSideColors(capture).apply(Rows(state), Turn(0, 0.5, len(state)))
+    UnseenSideColors(FrameStore(capture, "stga")).apply(Rows(state), Turn(0, 0.5, len(state)))
     far = sides.triangles[state.face] & ~state.unbound
     assert 0 < far.sum() < len(far)
     expected = (sides.color[state.face[far]] - 0.5) / 0.28209479177387814
@@ -104,3 +117,65 @@ def test_restored_colors_are_those_of_the_avatar(from_one_side):
         np.testing.assert_array_equal(getattr(state, name).sh[~far], old[~far])
     assert (state.first.sh[far] == 0).all()
     assert (state.second.sh[far] == 0).all()
+
+
+def test_a_glance_counts(from_one_side):
+    """Catches a side that a few of many frames show, and that is painted over."""
+    capture = from_one_side
+    (view, *_) = capture.views["train"]
+    half_turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    center = np.eye(4)
+    center[:3, 3] = capture.mesh(view.timestep).mean(0)
+    back = view.camera.world_to_camera @ center @ half_turn @ np.linalg.inv(center)
+    glance = replace(view, camera=replace(view.camera, world_to_camera=back))
+    views = [view] * 900 + [glance] * 15 + [view] * 885
+    facing = FrameStore(replace(capture, views={"train": tuple(views)}), "stga").facing
+    both = FrameStore(replace(capture, views={"train": (view, glance)}), "stga").facing
+    np.testing.assert_array_equal(facing, both)
+
+
+HAIR = np.array([40, 25, 15], np.uint8)
+SKIN = np.array([220, 170, 150], np.uint8)
+CLOTH = np.array([30, 60, 160], np.uint8)
+
+
+def test_hair_goes_round_the_head(from_one_side, tmp_path):
+    """Catches a back of the head in the color of skin, a neck with hair or in the color of clothes,
+    and clothes that end where the camera does."""
+    model = flame_model(None)
+    neutral = model.v_template
+    centers = neutral[model.faces].mean(1)
+    bare = replace(
+        from_one_side,
+        faces=model.faces,
+        neutral=neutral,
+        mesh=lambda _: neutral,
+        regions=key_regions(model),
+    )
+    level = (centers[:, 1] - 0.04) / 0.07  # over the eyes, in their distance from the mouth
+    hairline = np.interp(centers[:, 2], (-0.02, 0.06), (-1.1, 0.75))
+    color = np.where((level > hairline)[:, None], HAIR, SKIN)
+    color[level < -2.2] = CLOTH
+    views = []
+    for number, angle in enumerate(np.radians((-45, -20, 0, 20, 45))):
+        eye = [np.sin(angle), 0, np.cos(angle)]
+        camera = look_at(eye, [0, -0.02, 0], 160, 200, 480)
+        triangle, _ = rasterize(neutral, model.faces, camera)
+        picture = np.full((200, 160, 3), 255, np.uint8)
+        picture[triangle >= 0] = color[triangle[triangle >= 0]]
+        path = tmp_path / f"{number}.png"
+        Image.fromarray(picture).save(path)
+        Image.fromarray(np.uint8(255 * (triangle >= 0))).save(tmp_path / f"{number}_mask.png")
+        views.append(View(0, 0, camera, path.name, path, tmp_path / f"{number}_mask.png"))
+    sides = sides_of(replace(bare, views={"train": tuple(views)}))
+    back = sides.triangles & (centers[:, 2] < -0.03) & (np.abs(centers[:, 0]) < 0.05)
+    for part, expected in {
+        (0.2, 1.0): HAIR,
+        (-0.9, -0.2): HAIR,
+        (-1.9, -1.4): SKIN,
+        (-3.0, -2.5): CLOTH,
+    }.items():
+        rows = back & (level > part[0]) & (level < part[1])
+        assert rows.sum() > 8, part
+        off = np.abs(255 * sides.color[rows] - expected).max(1)
+        assert (off < 25).mean() > 0.9, (part, np.median(255 * sides.color[rows], 0))

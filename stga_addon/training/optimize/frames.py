@@ -3,13 +3,14 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from ...avatar.embedding import MIN_DIVISOR, FaceFrames, face_areas, face_frames
 from ...avatar.offsets import SIGNALS, moved_frames
 from ...avatar.strain import strain_basis, trained_range
-from ...capture.model import Capture
+from ...capture.model import Capture, evenly_spread
 from ..settings import TrainingSettings
 from .initial_splats import voxel_size
 
@@ -17,6 +18,16 @@ CACHE_BYTES = 256e6
 BYTES_PER_TRIANGLE = 170
 """Of the timesteps kept in memory; of a triangle's frame, deformation, signals and corners in one.
 Posing a mesh anew takes a seventh of an iteration."""
+
+FACING_VIEWS = 300
+"""Training views that are looked at, spread over all, so that a glance of half a second counts in a
+recording of minutes."""
+UNSEEN_COSINE = -0.1
+"""Of the angle between a triangle and a camera: below it, the triangle faces away so far that not
+even its hair stands in the outline."""
+UNSEEN_LIMIT_SHARE = 0.35
+"""Of the scale limits, on triangles that face away from all cameras: a large splat that serves an
+outline hangs in the air for other cameras."""
 
 
 @dataclass
@@ -62,7 +73,24 @@ class FrameStore:
         frames = face_frames(neutral, self.capture.faces, neutral, self.convention)
         limit = settings.unbound_scale_limit * voxel_size(neutral)
         unbound = limit / np.maximum(frames.scale, MIN_DIVISOR)
-        return np.asarray(np.stack([settings.scale_limit * self.units, unbound]), np.float32)
+        limits = np.stack([settings.scale_limit * self.units, unbound])
+        limits[:, self.facing < UNSEEN_COSINE] *= UNSEEN_LIMIT_SHARE
+        return np.asarray(limits, np.float32)
+
+    @cached_property
+    def facing(self) -> np.ndarray:
+        """(F,) cosine of the angle between each triangle's normal and the camera of the training
+        views that it faces most; -1 at least."""
+        capture = self.capture
+        cosine = np.full(len(capture.faces), -1.0)
+        for view in evenly_spread(capture.views["train"], FACING_VIEWS):
+            a, b, c = np.asarray(capture.mesh(view.timestep))[capture.faces].swapaxes(0, 1)
+            normal = np.cross(b - a, c - a)
+            towards = view.camera.position - (a + b + c) / 3
+            length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
+            found = (normal * towards).sum(1) / np.maximum(length, 1e-20)
+            np.maximum(cosine, found, out=cosine)
+        return cosine
 
     def of(self, timestep: int) -> FaceFrames:
         entry = self._latest(timestep)

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...avatar.file import Avatar
 from ...avatar.lattice import splats_per_triangle
-from ...capture.model import Capture, View, cameras_at_once
+from ...capture.model import Capture, View
 from ...schema import to_json
 from ..schedule import learning_rates, sh_degree
 from ..settings import CONTINUATIONS, TrainingSettings
@@ -132,8 +132,8 @@ class Trainer:
         if settings.random_background:  # alpha is learned from masks
             self.changes["outlines"] = OutlinePruning(capture, settings.seed, self.frames.moved)
         self.changes["dust"] = DustPruning(capture)
-        if cameras_at_once(capture.views["train"]) == 1 and self.strategy.region is None:
-            self.changes["unseen sides"] = UnseenSideColors(capture)
+        if self.strategy.region is None:
+            self.changes["unseen sides"] = UnseenSideColors(self.frames)
 
     def __len__(self) -> int:
         """How many splats there are."""

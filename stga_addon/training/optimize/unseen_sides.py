@@ -13,15 +13,15 @@ from ...capture.mesh_geometry import connected_parts, rasterize
 from ...capture.model import Capture, evenly_spread
 from .backend import Backend
 from .change import Turn
+from .frames import UNSEEN_COSINE, FrameStore
 from .initial_splats import mean_colors, mirror_images
+from .likeness import around, head_coordinates, kinds_of, with_hair
 
-SIDE_VIEWS = 48
-"""Training views that are looked at, spread over all."""
-MIN_COSINE = -0.1
+COLOR_VIEWS = 48
+"""Training views whose colors are looked at, spread over all."""
 SOURCE_COSINE = 0.5
-"""Of the angle between a triangle and a camera: below the first, it faces away so far that not even
-its hair stands in the outline; below the second, others do not take its color, which a matte's edge
-may be in."""
+"""Of the angle between a triangle and a camera: below it, others do not take its color, which a
+matte's edge may be in."""
 SOURCE_TRIANGLES = 100
 """Of whose colors a hidden triangle has the median."""
 OUTSIDE_CAMERAS = 18
@@ -40,14 +40,14 @@ class UnseenSides:
 class UnseenSideColors:
     """Gives bound splats of unseen sides their color, from everywhere and in every expression."""
 
-    interval = 100
+    interval = 20
 
-    def __init__(self, capture: Capture) -> None:
-        self._capture = capture
+    def __init__(self, frames: FrameStore) -> None:
+        self._frames = frames
 
     @cached_property
     def sides(self) -> UnseenSides:
-        return unseen_sides(self._capture)
+        return unseen_sides(self._frames.capture, self._frames.facing)
 
     def prepare(self) -> None:
         self.sides  # noqa: B018
@@ -63,35 +63,41 @@ class UnseenSideColors:
         )
 
 
-def unseen_sides(capture: Capture) -> UnseenSides:
-    """Colored as mirror images that are shown, else as the nearest connected triangles."""
-    views = evenly_spread(capture.views["train"], SIDE_VIEWS)
-    cosine = np.full(len(capture.faces), -1.0)  # with the camera that a triangle faces most
-    for view in views:
-        a, b, c = np.asarray(capture.mesh(view.timestep))[capture.faces].swapaxes(0, 1)
-        normal = np.cross(b - a, c - a)
-        towards = view.camera.position - (a + b + c) / 3
-        length = np.linalg.norm(normal, axis=1) * np.linalg.norm(towards, axis=1)
-        cosine = np.maximum(cosine, (normal * towards).sum(1) / np.maximum(length, 1e-20))
-    outside = _outside(capture)
-    (color, shown) = mean_colors(capture, views)
-    sources = np.flatnonzero(shown & outside & (cosine > SOURCE_COSINE))
-    unseen = outside & (cosine < MIN_COSINE)
+def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
+    """Unseen triangles look as their mirror images that are shown; those of scalp, neck and
+    shoulders else as a shown one of their height, back and forth around the head; any other as the
+    nearest connected ones. cosine: of `FrameStore.facing`."""
+    views = evenly_spread(capture.views["train"], COLOR_VIEWS)
+    is_outside = outside(capture)
+    color, shown = mean_colors(capture, views)
+    is_source = shown & is_outside & (cosine > SOURCE_COSINE)
+    sources = np.flatnonzero(is_source)
+    unseen = is_outside & (cosine < UNSEEN_COSINE)
     if not len(sources):
         return UnseenSides(np.zeros_like(unseen), color)
+    found = color.copy()
     centers = np.asarray(capture.neutral)[capture.faces].mean(1)
     part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
     for number in np.unique(part[unseen]):
         rows = np.flatnonzero(unseen & (part == number))
         own = sources[part[sources] == number] if (part[sources] == number).any() else sources
         _, near = cKDTree(centers[own]).query(centers[rows], min(SOURCE_TRIANGLES, len(own)))
-        color[rows] = np.median(color[own[near.reshape(len(rows), -1)]], axis=1)
-    hidden, partner = mirror_images(capture, unseen, shown & (cosine > SOURCE_COSINE))
-    color[hidden] = color[partner]
-    return UnseenSides(unseen, color)
+        found[rows] = np.median(color[own[near.reshape(len(rows), -1)]], axis=1)
+    at = head_coordinates(capture)
+    kinds = {} if at is None else kinds_of(at, is_outside)
+    for kind, members in kinds.items():
+        own = np.flatnonzero(members & is_source)
+        if kind == "scalp":
+            own = with_hair(own, centers, color, capture.regions)
+        rows = np.flatnonzero(members & unseen)
+        if at is not None and len(own) and len(rows):
+            found[rows] = color[around(at, own, rows)]
+    hidden, partner = mirror_images(capture, unseen, is_source)
+    found[hidden] = color[partner]
+    return UnseenSides(unseen, found)
 
 
-def _outside(capture: Capture) -> np.ndarray:
+def outside(capture: Capture) -> np.ndarray:
     """(F,) bool: triangles of the neutral mesh that some camera around it sees."""
     neutral = np.asarray(capture.neutral, np.float64)
     center = neutral.mean(0)

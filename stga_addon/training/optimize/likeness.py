@@ -1,0 +1,139 @@
+"""Which seen triangles of a head unseen ones look like: hair has hair, a neck a neck."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...capture.model import Capture
+
+SCALP_ANGLE_DEG = 66.0
+SCALP_ELEVATION_DEG = 38.0
+NECK_ANGLE_DEG = 60.0
+"""Hair grows behind the first or above the second, seen from the middle of the head; the neck
+begins behind the third."""
+EYES_TO_MIDDLE = 1.35
+BROWS_OVER_EYES = 0.15
+JAW_LEVEL = -0.5
+CHIN_LEVEL = -2.0
+"""Places on a head, in distances of its eyes from its mouth: how far its middle lies behind the
+eyes and above them; heights over the eyes."""
+HAIRLINE_DEG = (90.0, 140.0)
+HAIRLINE = (-0.55, -1.15)
+"""Angles from straight ahead, and heights over the eyes in that unit, below which no hair grows."""
+MIN_UNIT_SHARE = 0.1
+"""Of the eyes' distance from each other, that they are above the mouth at least."""
+EAR_SIDE = 0.93
+EAR_LEVEL = -0.2
+EAR_HEIGHT = 0.75
+EAR_ANGLE_DEG = 82.5
+EAR_WIDTH_DEG = 32.5
+"""How far from the middle plane ears begin, where they are, and half their extent."""
+BAND = 0.3
+MIN_BAND_TRIANGLES = 20
+"""Height within which the seen stretch of a kind is measured, if so many triangles lie there."""
+LEVELS = (0.04, 0.99)
+STRETCH = (0.5, 0.9)
+MIN_STRETCH_RAD = 0.05
+MIN_NARROWING = 0.2
+"""Quantiles of the heights and of the angles from straight ahead at which a kind is seen, between
+which it serves as a source: its back looks as what is seen farthest back."""
+MIN_HAIR_CONTRAST = 0.6
+SMOOTHED = 24
+"""A scalp's triangle has hair if its color is that far from the skin's, as a share of the scalp's
+most different ones, and so are most of that many around it."""
+
+
+@dataclass(frozen=True)
+class HeadCoordinates:
+    """Triangles' places around the neutral head, seen from its middle at the height of the brows.
+
+    azimuth    (F,) radians from straight ahead, positive on the left
+    elevation  (F,) radians
+    level      (F,) height over the eyes, in distances of the eyes from the mouth
+    side       (F,) distance from the middle plane, in the same unit
+    """
+
+    azimuth: np.ndarray
+    elevation: np.ndarray
+    level: np.ndarray
+    side: np.ndarray
+
+
+def head_coordinates(capture: Capture) -> HeadCoordinates | None:
+    """None for a mesh whose eyes and mouth are not known, or not apart."""
+    centers = np.asarray(capture.neutral, np.float64)[capture.faces].mean(1)
+    regions = [capture.regions.get(name) for name in ("left_eye", "right_eye", "mouth")]
+    if not all(region is not None and region.any() for region in regions):
+        return None
+    left, right, mouth = (centers[region].mean(0) for region in regions)
+    eyes = (left + right) / 2
+    across = (left - right) / max(float(np.linalg.norm(left - right)), 1e-12)
+    up = eyes - mouth
+    up -= (up @ across) * across
+    unit = float(np.linalg.norm(up))
+    if not unit > MIN_UNIT_SHARE * np.linalg.norm(left - right):
+        return None
+    up /= unit
+    ahead = np.cross(across, up)
+    middle = eyes + unit * (BROWS_OVER_EYES * up - EYES_TO_MIDDLE * ahead)
+    x, y, z = ((centers - middle) @ axis for axis in (across, up, ahead))
+    return HeadCoordinates(
+        azimuth=np.arctan2(x, z),
+        elevation=np.arctan2(y, np.hypot(x, z)),
+        level=(centers - eyes) @ up / unit,
+        side=np.abs(x) / unit,
+    )
+
+
+def kinds_of(at: HeadCoordinates, is_outside: np.ndarray) -> dict[str, np.ndarray]:
+    """Kind -> (F,) bool: scalp, neck with shoulders, whose unseen parts look as seen ones."""
+    angle = np.degrees(np.abs(at.azimuth))
+    elevation = np.degrees(at.elevation)
+    ear = (at.side > EAR_SIDE) & (abs(angle - EAR_ANGLE_DEG) < EAR_WIDTH_DEG)
+    ear &= abs(at.level - EAR_LEVEL) < EAR_HEIGHT
+    hairline = np.interp(angle, HAIRLINE_DEG, HAIRLINE)
+    hairy = (angle > SCALP_ANGLE_DEG) | (elevation > SCALP_ELEVATION_DEG)
+    scalp = is_outside & ~ear & hairy & (at.level > hairline)
+    beside = (angle > NECK_ANGLE_DEG) | (at.level < CHIN_LEVEL)
+    body = is_outside & ~ear & ~scalp & beside & (at.level < JAW_LEVEL)
+    return {"scalp": scalp, "body": body}
+
+
+def with_hair(
+    sources: np.ndarray, centers: np.ndarray, color: np.ndarray, regions: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    """Those of a scalp's triangles whose color is not the skin's; all of a bald one."""
+    if not len(sources):
+        return sources
+    skin = np.median(color[regions["nose"]] if "nose" in regions else color, axis=0)
+    near = cKDTree(centers[sources]).query(centers[sources], min(SMOOTHED, len(sources)))[1]
+    contrast = np.linalg.norm(color[sources] - skin, axis=1)[near.reshape(len(sources), -1)]
+    contrast = np.quantile(contrast, 0.1, axis=1)
+    return np.asarray(sources[contrast > MIN_HAIR_CONTRAST * np.quantile(contrast, 0.9)])
+
+
+def around(at: HeadCoordinates, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """The source of each target: the stretch of azimuth that is seen at its height, back and forth,
+    on both sides of the head alike."""
+    angle = np.abs(at.azimuth)
+    lowest, highest = np.quantile(at.level[sources], LEVELS)
+    sources = sources[(at.level[sources] >= lowest) & (at.level[sources] <= highest)]
+    level = np.clip(at.level[targets], lowest, highest)
+    near = cKDTree(at.level[sources, None])
+    members = near.query_ball_point(level[:, None], BAND)
+    low, high = np.empty((2, len(targets)))
+    for n, rows in enumerate(members):
+        seen = angle[sources[rows]] if len(rows) >= MIN_BAND_TRIANGLES else angle[sources]
+        low[n], high[n] = np.quantile(seen, STRETCH)
+    width = np.maximum(high - low, MIN_STRETCH_RAD)
+    beyond = (angle[targets] - high) % (2 * width)
+    back = np.where(beyond < width, high - beyond, low + beyond - width)
+    wanted = np.where(angle[targets] > high, back, np.clip(angle[targets], low, high))
+    stretch = np.maximum(np.cos(at.elevation), MIN_NARROWING)
+    # along the head, that is, which is narrower at the top
+    places = np.stack([at.level, stretch * angle], 1)
+    goals = np.stack([level, stretch[targets] * wanted], 1)
+    _, nearest = cKDTree(places[sources]).query(goals)
+    return np.asarray(sources[nearest])

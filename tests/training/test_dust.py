@@ -1,0 +1,114 @@
+"""Pruning of dust, and the sums of blend weights that tell it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stga_addon.avatar.splats import SH_C0
+from stga_addon.raster.cpu.layout import Parameters
+from stga_addon.raster.cpu.rasterize import (
+    BufferPool,
+    blend_weights,
+    frames_in_camera,
+    render_forward,
+)
+from stga_addon.training.optimize.change import Turn
+from stga_addon.training.optimize.dust import TURNS, DustPruning
+from stga_addon.training.optimize.frames import FrameStore
+from stga_addon.training.optimize.trainer import Trainer
+
+from .toys import Rows, quick_settings, random_splats
+
+
+def test_blend_weights(toy):
+    """Catches weights of another splat, of hidden ones, or of other pixels: the weights of one
+    are an image in which it alone is red."""
+    splats = random_splats(60, len(toy.faces), degree=0)
+    splats = replace(splats, xyz=0.02 * splats.xyz, log_scale=np.log(0.05) + 0 * splats.log_scale)
+    view = toy.views["train"][0]
+    frames = frames_in_camera(FrameStore(toy, "stga").of(view.timestep), view.camera)
+
+    def rendered(red):
+        sh = np.full((len(splats), 1, 3), -0.5 / SH_C0, np.float32)
+        sh[red] = 0.5 / SH_C0
+        arrays = Parameters(splats.xyz, splats.rotation, splats.log_scale, splats.opacity, sh)
+        return render_forward(arrays, splats.face, frames, 0)
+
+    weights = blend_weights(rendered([]), BufferPool())
+    assert (weights > 1).sum() > 20
+    for row in np.argsort(weights)[::7]:
+        assert weights[row] == pytest.approx(rendered([row]).image[0].sum(), rel=1e-4, abs=1e-4)
+
+
+def test_what_fills_no_view_is_dust(toy):
+    """Catches dust that stays, bound splats or those outside the trained region that go, and a look
+    at every step."""
+    trainer = Trainer(toy, quick_settings("global", lattice=1), {})
+    state = trainer.state
+    state.unbound[:] = np.arange(len(state)) % 3 > 0
+    tiny = np.arange(len(state)) % 3 == 1
+    state.parameters.log_scale[tiny] = np.log(1e-5)
+    state.parameters.opacity[tiny] = -3.0
+    state.gradient_count[:] = np.arange(len(state))
+    near = state.face < 40
+
+    class Backend(Rows):
+        looks = 0
+
+        def blend_weights(self, view):
+            self.looks += 1
+            return trainer._backend.blend_weights(view)
+
+    for before, now, region, gone in (
+        (0.1, TURNS[0] - 0.01, None, None),
+        (TURNS[0] - 0.01, TURNS[0], None, tiny),
+        (0.7, 0.9, np.arange(len(toy.faces)) < 40, tiny & near),
+        (TURNS[1], 0.9, None, None),
+    ):
+        backend = Backend(state)
+        DustPruning(toy).apply(backend, Turn(round(1000 * now), now, len(state), region, before))
+        kept = np.isin(np.arange(len(state)), backend.state.gradient_count)
+        assert bool(backend.looks) == (gone is not None)
+        if gone is None:
+            assert kept.all()
+            continue
+        assert not kept[gone].any()
+        assert kept[~state.unbound].all()
+        assert kept[~near].all() == (region is not None)
+        assert kept[state.unbound & ~tiny].mean() > 0.3  # others are hidden in all views
+
+
+def test_a_turn_comes_once(toy):
+    """Catches a look that is missed or made twice where steps take different shares of the budget,
+    or where a run is resumed between two steps."""
+    shares = np.cumsum(np.random.default_rng(0).uniform(0.001, 0.05, 60))
+    shares = shares[shares < 1]
+    trainer = Trainer(toy, quick_settings("global", lattice=0), {})
+    turns = []
+    trainer.changes = {"all": Recorded(turns)}
+    for share in shares:
+        trainer.iteration += 1
+        trainer._post_step(share)
+    assert sum(turn.passes(0.6) for turn in turns) == 1
+    steps = [n / 50 for n in range(50)]
+    for stop in range(1, 49):
+        turns.clear()
+        for part in (steps[:stop], steps[stop:]):
+            resumed = Trainer(toy, quick_settings("global", lattice=0), {})
+            resumed.iteration = 0 if part[0] == 0 else stop
+            resumed.changes = {"all": Recorded(turns)}
+            for share in part:
+                resumed.iteration += 1
+                resumed._post_step(share)
+        assert [n for n, turn in enumerate(turns) if turn.passes(0.6)] == [30]
+
+
+class Recorded:
+    interval = 1
+
+    def __init__(self, turns):
+        self.turns = turns
+
+    def apply(self, backend, turn):
+        self.turns.append(turn)
