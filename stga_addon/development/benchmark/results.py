@@ -27,12 +27,11 @@ HEADER = """# Results
 Written by `python -m stga_addon.development.benchmark.results {capture}`, on {machine}.
 RUN is a new folder. Compare figures within a table.
 
-PSNR in dB; LPIPS, lower is better; means over views. *val*: the camera held out of training, which
-chooses the run's avatar. *test*: expressions held out of training, all cameras. *head*: pixels
-inside the head mask. *moving*: pixels of the triangles that the default selection rule (2 mm) picks
-in that frame. ± is the standard deviation over seeds. `studio_head` is development data outside
-this repository: a path-traced head with 12 training timesteps, 15 training cameras at 275×401 and a
-tracked mesh of 10,696 triangles.
+PSNR in dB; LPIPS, lower is better; means over views. *val*: the held-out camera, which chooses the
+run's avatar. *test*: held-out expressions, all cameras. *head*: inside the head mask. *moving*:
+triangles that the default selection (2 mm) picks in that frame. ±: standard deviation over seeds.
+`studio_head`, not in this repository: a path-traced head with 12 training timesteps, 15 training
+cameras at 275×401 and a tracked mesh of 10,696 triangles.
 """
 EXTENDING = """
 The training timesteps become two takes. *before* is an avatar of the first, which the arms continue
