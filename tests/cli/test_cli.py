@@ -214,15 +214,15 @@ def test_files_that_have_moved(tmp_path, capsys, trained, root):
 # Mistakes
 
 NONSENSE_OPTIONS = [
-    *(("train", "--iterations", value) for value in ("0", "-3", "many", "1.5", "1e3", "9" * 5000)),
-    *(("train", "--budget", value) for value in ("0s", "soon", "-5", "9" * 400)),
-    *(("train", "--seed", value) for value in ("-1", "nan", "9" * 30)),
-    *(("train", "--threshold", value) for value in ("nan", "inf", "-1", "1mm")),
-    *(("train", "--target-psnr", value) for value in ("nan", "inf", "-1")),
+    *(("train", "--iterations", value) for value in ("0", "1.5", "9" * 5000)),
+    *(("train", "--budget", value) for value in ("0s", "soon", "9" * 400)),
+    ("train", "--seed", "-1"),
+    ("train", "--threshold", "1mm"),
+    ("train", "--target-psnr", "nan"),
     *(("train", "--out", value) for value in ("", "a" * 300, "no/" + "a" * 300, "a\0b", "\ud800")),
     ("train", "--budget=5m --iterations", "5"),
-    *(("refine", "--growth", value) for value in ("1e9", "101", "-1")),
-    *(("select", "--threshold", value) for value in ("nan", "-1", "inf")),
+    ("refine", "--growth", "101"),
+    ("select", "--threshold", "inf"),
 ]
 
 
@@ -254,19 +254,35 @@ NUMPY_ALONE = "torch numba wgpu trimesh scipy PIL tqdm matplotlib platformdirs b
 
 
 def test_commands_need_few_packages(root: Path, trained: Path, tmp_path: Path) -> None:
-    """Catches an import that looking at a capture, selecting or exporting cannot do without."""
+    """Catches an import that looking at a capture, selecting or exporting cannot do without, and a
+    traceback where Blender, with numpy alone, lacks a package."""
     flame, model = factory.write_flame_capture(tmp_path / "flame")
     ply = tmp_path / "a.ply"
     exported = ["export", str(trained / "avatar.npz"), "--format", "ply", "--out", str(ply)]
     known = "162 vertices, 320 triangles", "40 x 60", "view-color"
+    meshes = {
+        suffix: factory.write_mesh_capture(tmp_path / suffix, suffix=f".{suffix}")
+        for suffix in ("ply", "stl")
+    }
+    unsized = factory.write_mesh_capture(tmp_path / "unsized")
+    for path in unsized.glob("transforms_*.json"):
+        factory.edit(path, lambda document: [entry.pop("w") for entry in document["frames"]])
+    pillow = "frames[0].w: w and h are missing; to take them from the image needs Pillow"
     for missing, arguments, says in (
         ("torch numba wgpu", ["info", str(root)], known),
         (NUMPY_ALONE, ["select", str(flame), "--flame", str(model)], ("320 triangles",)),
+        (NUMPY_ALONE, ["select", str(meshes["ply"])], ("320 triangles",)),
+        (NUMPY_ALONE, ["select", str(meshes["stl"])], "reading STL needs the Python package"),
+        (NUMPY_ALONE, ["select", str(unsized)], pillow),
         (NUMPY_ALONE, exported, ()),
     ):
         command = [sys.executable, "-c", WITHOUT, missing, *arguments]
         here = Path(__file__).parents[2]
         done = subprocess.run(command, capture_output=True, text=True, cwd=here)
+        if isinstance(says, str):
+            assert done.returncode == 2
+            assert says in done.stderr
+            continue
         assert (done.returncode, done.stderr) == (0, "")
         assert all(part in done.stdout for part in says)
     assert len(read_ply(ply)) == len(read_avatar(trained / "avatar.npz").splats)
@@ -299,7 +315,7 @@ def test_interruption_and_mistakes_have_their_codes(root, monkeypatch, capsys):
 # In a process of its own
 
 
-@pytest.mark.parametrize("content", ["{}", "[]", "null", "3", '{"capture": 5}', "{", None])
+@pytest.mark.parametrize("content", ["[]", '{"capture": 5}', "{", None])
 def test_damaged_folder_of_the_open_head(tmp_path, capsys, monkeypatch, content):
     """Catches a traceback for a folder in STGA_HEAD that is damaged, empty or missing."""
     if content is not None:

@@ -12,7 +12,7 @@ from capture import factory
 from stga_addon.cli.main import main
 from stga_addon.training.run.folder import read_run
 
-from .conftest import TIMESTEPS, refused
+from .conftest import refused
 
 REFUSALS = [
     # Options that have no effect, or none there
@@ -101,7 +101,7 @@ REFUSALS = [
             f"train {{root}} --out {{run}} --resume {option}",
             f"{option.split()[0]}: this run began with",
         )
-        for option in ("--stop-when-flat", "--target-psnr 30", "--preset final", "--seed 5")
+        for option in ("--stop-when-flat", "--preset final")
     ),
     *(
         (
@@ -112,10 +112,8 @@ REFUSALS = [
         for command, option in (
             ("refine", "--region mouth"),
             ("refine", "--frames 1-3"),
-            ("refine", "--growth 0.5"),
             ("refine", "--budget 1m"),
             ("refine", "--out anna_2"),
-            ("extend", "--iterations 9"),
             ("extend", "--seed 1"),
             ("extend", "smile"),
         )
@@ -132,11 +130,6 @@ REFUSALS = [
         )
     ),
     ("train {bare} --out {o} --iterations 3", "has no training views"),
-    ("eval {moved} --split test", "has other images"),
-    (
-        "train {cameras5} --out {run} --resume",
-        "was trained on {root} (3 cameras, 3 timesteps), but {cameras5} (5 cameras",
-    ),
     (
         "render {avatar} --capture {coarse} --cameras {cameras} --out {o}",
         "{coarse}: its mesh has other triangles",
@@ -186,7 +179,7 @@ REFUSALS = [
 def refusable(root, trained, tmp_path_factory):
     """What REFUSALS name, by name."""
     folder = tmp_path_factory.mktemp("refusals")
-    own = "broken", "bare", "cameras5", "coarse", "moved", "file", "none", "o", "run"
+    own = "broken", "bare", "coarse", "file", "none", "o", "run"
     names = {name: folder / name for name in own} | {"root": folder / "ball", "folder": folder}
     shutil.copytree(trained, names["run"])
     shutil.copytree(root, names["root"])
@@ -195,16 +188,12 @@ def refusable(root, trained, tmp_path_factory):
     names |= {name: folder / path for name, path in inside.items()}
     for name in ("broken", "bare", "coarse"):
         shutil.copytree(root, names[name])
-    factory.write_mesh_capture(names["cameras5"], TIMESTEPS, range(5))
+
     (names["broken"] / "transforms_val.json").write_text('{"frames": [')
     for split in ("train", "test"):
         (names["bare"] / f"transforms_{split}.json").unlink()
-    shutil.copytree(trained, names["moved"])
-    for name, capture in (("moved", "bare"), ("run", "root")):
-        path = str(names[capture])
-        factory.edit(
-            names[name] / "run.json", lambda document, path=path: document.update(capture=path)
-        )
+    at = str(names["root"])
+    factory.edit(names["run"] / "run.json", lambda document: document.update(capture=at))
     sphere = trimesh.creation.icosphere(1, factory.RADIUS)
     for path in (names["coarse"] / "meshes").iterdir():
         factory.write_mesh(path, np.array(sphere.vertices), np.array(sphere.faces))

@@ -14,20 +14,11 @@ import pytest
 import torch
 
 from raster import reference
-from stga_addon.avatar.embedding import WORLD
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import (
-    MEAN_X,
-    OPACITY,
-    PRECISION_X,
-    PRECISION_Y,
-    PROJECTED,
-    RED,
-    SHEAR,
     Parameters,
 )
-from stga_addon.raster.cpu.rasterize import frames_in_camera, render_forward
 
 from .test_kernels import NAMES
 
@@ -70,44 +61,6 @@ def test_reference_image_is_gsplats(antialiased):
     kind = "antialiased" if antialiased else "classic"
     np.testing.assert_allclose(rgb, DATA[f"image_{kind}"], atol=1e-6)
     np.testing.assert_allclose(alpha, DATA[f"alpha_{kind}"], atol=1e-6)
-
-
-def projected_columns(back_end: str, antialiased: bool) -> np.ndarray:
-    """(N, PROJECTED) of the scene, by the kernels of one back end."""
-    parameters = Parameters(*(DATA[name] for name in NAMES))
-    face = np.zeros(24, np.int32)
-    frames = frames_in_camera(WORLD, CAMERA)
-    if back_end == "cpu":
-        return render_forward(parameters, face, frames, 3, antialiased=antialiased).projection[0]
-    from raster.gpu_autograd import render, shared_rasterizer
-    from stga_addon.raster.gpu.rasterize import ViewOptions
-
-    render(ViewOptions(CAMERA, 3, antialiased=antialiased), frames, face, parameters)
-    device = shared_rasterizer().device
-    return device.read(device.buffer("projected", 0), (24, PROJECTED))
-
-
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_projection_kernels_are_gsplats(back_end, antialiased):
-    """Catches a projection that is wrong in both our reference and our kernels."""
-    columns = projected_columns(back_end, antialiased)
-    x = columns[:, PRECISION_X]
-    shear = columns[:, SHEAR]
-    y = columns[:, PRECISION_Y]
-    opacity = 1 / (1 + np.exp(-DATA["opacity"])) * (DATA["compensations"] if antialiased else 1)
-    # Splats below 1/255 are never projected.
-    seen = (opacity > 1 / 254) & (
-        np.abs(DATA["means2d"] - DATA["size"] / 2) < DATA["size"] / 2
-    ).all(1)
-    assert seen.sum() > 12
-    found = {
-        "means2d": (columns[:, MEAN_X : MEAN_X + 2], DATA["means2d"]),
-        "conics": (np.stack([x, -x * shear, y + x * shear * shear], axis=-1), DATA["conics"]),
-        "opacities": (columns[:, OPACITY], opacity),
-        "colors": (columns[:, RED : RED + 3], DATA["colors"]),
-    }
-    for name, (values, expected) in found.items():
-        np.testing.assert_allclose(values[seen], expected[seen], rtol=5e-5, atol=1e-5, err_msg=name)
 
 
 @pytest.fixture(params=["tiny_case", "basic_case"])

@@ -212,20 +212,9 @@ def test_a_given_selection_survives_an_early_crash(toy: Capture, tmp_path: Path)
     assert all((kept[timestep] == painted[timestep]).all() for timestep in painted)
 
 
-def test_resuming_a_finished_run_changes_nothing(
-    toy: Capture, unbroken: Path, tmp_path: Path
-) -> None:
-    """Catches steps beyond the budget and evaluations that pile up."""
-    shutil.copytree(unbroken, tmp_path / "run")
-    train_run(toy, tmp_path / "run", make_run(toy), resume=True)
-    assert_same_state(tmp_path / "run", unbroken)
-    ours = read_metrics(tmp_path / "run")
-    theirs = read_metrics(unbroken)
-    assert [line["iteration"] for line in ours] == [line["iteration"] for line in theirs]
-
-
 def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: Path) -> None:
-    """Catches "--resume" of a finished run that ends without an avatar and says nothing."""
+    """Catches "--resume" of a finished run that ends without an avatar and says nothing, trains on,
+    or evaluates again."""
     out = tmp_path / "run"
     shutil.copytree(unbroken, out)
     for name in ("avatar.npz", "residuals.npz"):
@@ -237,6 +226,8 @@ def test_a_lost_avatar_is_written_anew(toy: Capture, unbroken: Path, tmp_path: P
 
     train_run(toy, out, make_run(toy), resume=True, report=note)
     assert "Writing the missing avatar from the checkpoint" in told
+    assert_same_state(out, unbroken)
+    assert len(read_metrics(out)) == len(read_metrics(unbroken))
     written = read_avatar(out / "avatar.npz").splats
     np.testing.assert_array_equal(written.xyz, read_checkpoint(unbroken).state.average.xyz)
     assert read_residuals(out, len(toy.faces)).shape == (len(toy.faces),)

@@ -19,7 +19,6 @@ from stga_addon.training.effect_catalog import EFFECTS, Effect
 from stga_addon.training.effects.plan import (
     RULES,
     Verdict,
-    add_effects,
     describe_effects,
     plan_effects,
 )
@@ -108,15 +107,6 @@ def test_it_is_decided_trained_and_resumed_to_the_same_bits(
     np.testing.assert_array_equal(
         state.driven_offsets[NAME].second, whole.driven_offsets[NAME].second
     )
-
-
-def test_a_continuation_adds_it(capture: Capture) -> None:
-    """Catches an effect that only runs which began with it can have."""
-    run = planned(capture)
-    (decision,) = (each for each in run.effect_plan if each.effect == "toy-growth")
-    without = replace(run.settings, driven_offsets=())
-    settings, _ = add_effects(capture, without, (replace(decision, on=False),))
-    assert settings.driven_offsets == (NAME,)
 
 
 def test_a_device_without_its_kernels_says_so(capture: Capture) -> None:
