@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 from PIL import Image
 
-from stga_addon.avatar.splats import SH_C0, Splats
+from stga_addon.avatar.splats import SH_C0
 from stga_addon.cli.main import make_parser
 from stga_addon.export.ply import write_ply
 
@@ -169,15 +170,7 @@ def test_what_a_page_names_is_there(page):
 
 def test_readme_renders_a_ply(tmp_path, monkeypatch):
     """Catches a public rendering function that is not the one which the README shows."""
-    splats = Splats(
-        xyz=np.zeros((1, 3), np.float32),
-        rotation=np.array([[1, 0, 0, 0]], np.float32),
-        log_scale=np.full((1, 3), np.log(0.05), np.float32),
-        opacity=np.full(1, 5, np.float32),
-        sh=np.full((1, 1, 3), -0.5 / SH_C0, np.float32),
-        face=np.zeros(1, np.int32),
-        unbound=np.zeros(1, bool),
-    )
+    splats = splats_of(np.zeros((1, 3)), log_scale=np.log(0.05), opacity=5, sh=-0.5 / SH_C0)
     write_ply(tmp_path / "splats.ply", splats)
     monkeypatch.chdir(tmp_path)
     (example,) = re.findall(r"```python\n(.*?)```", TEXTS[ROOT / "README.md"], re.DOTALL)

@@ -1,5 +1,7 @@
 """A small mesh with splats on it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,21 +10,40 @@ from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import look_at
 
 
+def splats_of(xyz, rotation=(1, 0, 0, 0), log_scale=-4.0, opacity=0.0, sh=0.0, face=0) -> Splats:
+    """Bound splats, of these values or of one for all: sh (3,) is a color's."""
+    count = len(xyz)
+
+    def each(value, *shape, dtype=np.float32):
+        whole = np.broadcast_shapes(np.shape(value), (count, *shape))
+        return np.array(np.broadcast_to(value, whole), dtype)
+
+    return Splats(
+        xyz=each(xyz, 3),
+        rotation=each(rotation, 4),
+        log_scale=each(log_scale, 3),
+        opacity=each(opacity),
+        sh=each(sh, 1, 3),
+        face=each(face, dtype=np.int32),
+        unbound=np.zeros(count, bool),
+    )
+
+
 def random_splats(seed: int, count: int, faces: int, sh_degree: int = 3) -> Splats:
     rng = np.random.default_rng(seed)
 
     def normal(*shape: int) -> np.ndarray:
         return rng.normal(size=shape).astype(np.float32)
 
-    return Splats(
-        xyz=normal(count, 3),
+    bound = splats_of(
+        normal(count, 3),
         rotation=normal(count, 4) * 3,
         log_scale=normal(count, 3) - 4,
         opacity=normal(count),
         sh=normal(count, (sh_degree + 1) ** 2, 3),
-        face=rng.integers(0, faces, count).astype(np.int32),
-        unbound=rng.random(count) < 0.3,
+        face=rng.integers(0, faces, count),
     )
+    return replace(bound, unbound=rng.random(count) < 0.3)
 
 
 def world_splats(xyz, rotation, log_scale, opacity, sh) -> Splats:

@@ -131,22 +131,6 @@ def test_splats_follow_the_animated_head(convention, tmp_path):
         np.testing.assert_allclose(assert_follows(shown, head, avatar), at[frame], atol=1e-6)
 
 
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_degenerate_triangles_stay_finite(convention):
-    """Catches divisions by zero: closed eyelids and mouths fold triangles to lines and points."""
-    avatar = avatar_of(convention)
-    flat = avatar.neutral.copy()
-    flat[avatar.faces[0]] = flat[avatar.faces[0, 0]]  # to a point
-    flat[avatar.faces[40, 2]] = flat[avatar.faces[40, 1]]  # to a line
-    for neutral, posed in ((avatar.neutral, flat), (flat, avatar.neutral)):
-        avatar = replace(avatar, neutral=neutral)
-        head = animated_head(posed, avatar.faces)
-        bpy.context.scene.frame_set(FRAMES[0])
-        head.shape_key_clear()
-        for values in evaluated_splats(show_avatar(avatar, head)):
-            assert np.isfinite(values).all()
-
-
 def displayed_colors(shown) -> np.ndarray:
     """(N, 3) scene-linear colors of the splats as points."""
     set_input(shown, splat_nodes.DISPLAY, POINTS)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from tracking.test_head_model import glb
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.mesh_geometry import rasterize, weighted_procrustes, without_head_motion
@@ -119,27 +120,22 @@ def repeated(nodes: int, primitives: int) -> bytes:
     corners = np.arange(4_998)
     data = points.astype("<f4").tobytes() + corners.astype("<u4").tobytes()
     one = {"attributes": {"POSITION": 0}, "indices": 1}
-    document = json.dumps(
-        {
-            "asset": {"version": "2.0"},
-            "scenes": [{"nodes": list(range(nodes))}],
-            "nodes": [{"mesh": 0}] * nodes,
-            "meshes": [{"primitives": [one] * primitives}],
-            "accessors": [
-                {"bufferView": 0, "componentType": 5126, "count": 5_000, "type": "VEC3"},
-                {"bufferView": 1, "componentType": 5125, "count": 4_998, "type": "SCALAR"},
-            ],
-            "bufferViews": [
-                {"buffer": 0, "byteLength": 60_000},
-                {"buffer": 0, "byteOffset": 60_000, "byteLength": len(data) - 60_000},
-            ],
-            "buffers": [{"byteLength": len(data)}],
-        }
-    ).encode()
-    document += b" " * (-len(document) % 4)
-    chunks = struct.pack("<I4s", len(document), b"JSON") + document
-    chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    document = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": list(range(nodes))}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "meshes": [{"primitives": [one] * primitives}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 5_000, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 4_998, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 60_000},
+            {"buffer": 0, "byteOffset": 60_000, "byteLength": len(data) - 60_000},
+        ],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    return glb(document, data)
 
 
 def test_glb_that_repeats_its_mesh(tmp_path):

@@ -76,7 +76,7 @@ def test_npz_with_masks_and_identity_count(tmp_path):
 
 
 def test_mask_file_beside_the_model(tmp_path):
-    # Catches masks that are not picked up, and eye regions that miss the eyeballs.
+    """Catches masks that are not picked up, and eye regions that miss the eyeballs."""
     arrays = random_arrays()
     path = tmp_path / "model.pkl"
     path.write_bytes(pickle.dumps(arrays))
@@ -171,8 +171,8 @@ class _Attack:
 )
 @pytest.mark.parametrize("protocol", [0, 2, 4])
 def test_other_classes_are_refused_by_name(tmp_path, attack, name, protocol):
-    # Catches a pickle that gets anything executed: the witness file must not appear, and the class
-    # must be named.
+    """Catches a pickle that gets anything executed: the witness file must not appear, and the class
+    must be named."""
     witness = tmp_path / "witness"
     texts = (a.format(witness) if isinstance(a, str) else a for a in attack.arguments)
     attack.arguments = tuple(texts)

@@ -53,8 +53,8 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
 
 
 def test_a_frame_as_written(tmp_path, tiny_flame):
-    # Catches a field read into another's place, a lost leading axis, and a loader that insists on
-    # what real exports leave out.
+    """Catches a field read into another's place, a lost leading axis, and a loader that insists on
+    what real exports leave out."""
     arrays = _arrays(1, tiny_flame)
     path = _write(tmp_path / "00003.npz", arrays)
     frame = read_frame(path, tiny_flame)
@@ -88,7 +88,7 @@ def test_a_damaged_number_is_a_sentence(tmp_path, tiny_flame):
 
 @pytest.mark.parametrize("rows", [160, 280])
 def test_offsets_without_and_with_teeth(tmp_path, tiny_flame, rows):
-    # Catches offsets of a mesh with 120 teeth vertices more or fewer being refused or shifted.
+    """Catches offsets of a mesh with 120 teeth vertices more or fewer being refused or shifted."""
     model = replace(tiny_flame, v_template=np.zeros((280 if rows == 160 else 160, 3)))
     given = np.random.default_rng(3).normal(size=(1, rows, 3))
     path = _write(tmp_path / "a.npz", {"shape": np.zeros(8), "static_offset": given})
@@ -99,7 +99,7 @@ def test_offsets_without_and_with_teeth(tmp_path, tiny_flame, rows):
 
 
 def test_meshes_of_a_sequence(tiny_flame):
-    # Catches which parameters count as head motion and which as expression.
+    """Catches which parameters count as head motion and which as expression."""
     rng = np.random.default_rng(6)
     shape = rng.normal(size=8)
     offset = rng.normal(0, 0.01, (40, 3))
@@ -124,8 +124,8 @@ def test_meshes_of_a_sequence(tiny_flame):
 
 
 def test_a_motion_is_its_frames(tmp_path, tiny_flame):
-    # Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and
-    # GaussianAvatars' files alike.
+    """Catches frames of a motion read from the wrong row, for VHAP's (shape (I,)) and
+    GaussianAvatars' files alike."""
     frames = [_arrays(seed, tiny_flame) for seed in (10, 11, 12)]
     moving = {name: np.concatenate([own[name] for own in frames]) for name in FRAME_FIELDS}
     shape = frames[0]["shape"]
@@ -147,8 +147,8 @@ def test_a_motion_is_its_frames(tmp_path, tiny_flame):
 
 
 def test_plain_expression_and_pose_files(tmp_path, tiny_flame):
-    # Catches another tracker's names or packing read into the wrong joint, and an identity that is
-    # insisted on.
+    """Catches another tracker's names or packing read into the wrong joint, and an identity that is
+    insisted on."""
     rng = np.random.default_rng(20)
     expr = rng.normal(size=(3, 4))
     pose = rng.normal(0, 0.4, (3, 15))
@@ -238,8 +238,8 @@ def test_parameters_between_timesteps_against_scipy():
 
 
 def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
-    # Catches frames shifted by gaps in the timesteps, keyframes that are resampled although nothing
-    # asked for it, and a last frame lost to rounding (0.1 is not a tenth).
+    """Catches frames shifted by gaps in the timesteps, keyframes that are resampled although
+    nothing asked for it, and a last frame lost to rounding (0.1 is not a tenth)."""
     motion = _motion(tiny_flame)
     frames = retimed(motion)
     assert len(frames) == 6  # timesteps 2 to 7
@@ -262,8 +262,8 @@ def test_the_same_speed_gives_the_frames_and_what_lies_between(tiny_flame):
 
 
 def test_strength(tiny_flame):
-    # Catches a head that drifts to the origin, or faces elsewhere, when only its movement should
-    # shrink, and a field of a frame that no part of a motion switches.
+    """Catches a head that drifts to the origin, or faces elsewhere, when only its movement should
+    shrink, and a field of a frame that no part of a motion switches."""
     assert {name for fields in PARTS.values() for name in fields} == set(FRAME_FIELDS)
     frames = retimed(_motion(tiny_flame))
     for whole, same in zip(frames, strengthened(frames, 1.0), strict=True):
@@ -281,7 +281,7 @@ def test_strength(tiny_flame):
 
 
 def test_driven_by_the_neutral_mesh_alone(tiny_flame):
-    # Catches joints of the mean face, and the other person's identity or offsets on this one.
+    """Catches joints of the mean face, and the other person's identity or offsets on this one."""
     rng = np.random.default_rng(3)
     ones = np.ones((40, 3))
     shape = rng.normal(size=8)

@@ -3,7 +3,6 @@
 import json
 import pickle
 import shutil
-import struct
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from capture import factory
 from flame.conftest import model_of, random_arrays
 from PIL import Image
 from tracking import scenes, test_calibrations, test_head_model
+from tracking.test_field_footage import write_colmap_binary
 from training.test_folder import make_checkpoint, make_run
 
 from stga_addon.avatar.file import Avatar, read_avatar, write_avatar
@@ -130,7 +130,7 @@ def colmap_target(file: str) -> Target:
     def write(path: Path, alone: bool = True) -> None:
         scenes.write_colmap_text(path.parent, RIG, NAMES)
         if suffix == ".bin":
-            write_colmap_binary(path.parent)
+            write_colmap_binary(path.parent, RIG, NAMES, 4, (0.1, 0.0, 0.0, 0.0))
         for other in path.parent.iterdir():
             if (alone and other != path) or other.suffix != suffix:
                 other.unlink()
@@ -142,18 +142,6 @@ def colmap_target(file: str) -> Target:
             undistorted(read_colmap(Path(folder))[0])
 
     return Target(file, write, read)
-
-
-def write_colmap_binary(folder: Path) -> None:
-    cameras = [struct.pack("<Q", 2)]
-    images = [struct.pack("<Q", 2)]
-    for number, (camera, name) in enumerate(zip(RIG, NAMES, strict=True), start=1):
-        values = camera.fl_x, camera.fl_y, camera.cx, camera.cy, 0.1, 0.0, 0.0, 0.0
-        cameras.append(struct.pack("<IiQQ8d", number, 4, camera.width, camera.height, *values))
-        pose = *scenes.quaternion(camera.world_to_camera[:3, :3]), *camera.world_to_camera[:3, 3]
-        images.append(struct.pack("<I7dI", number, *pose, number) + name.encode() + bytes(9))
-    (folder / "cameras.bin").write_bytes(b"".join(cameras))
-    (folder / "images.bin").write_bytes(b"".join(images))
 
 
 def undistorted(shots: list[Shot]) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from avatar.conftest import splats_of
 
 from stga_addon.avatar.file import Avatar, AvatarLight
 from stga_addon.avatar.splats import SH_C0, Splats
@@ -44,16 +45,12 @@ def blocked(points, direction, vertices, faces):
 
 def middle_splats(face: np.ndarray, log_scale: float, coefficients: int = 1) -> Splats:
     """A gray splat in the middle of each of the triangles."""
-    zeros = np.zeros((len(face), 3), np.float32)
-    turn = np.float32([1, 0, 0, 0])
-    return Splats(
-        xyz=zeros,
-        rotation=np.tile(turn, (len(face), 1)),
-        log_scale=zeros + np.float32(log_scale),
-        opacity=zeros[:, 0] + 3,
-        sh=np.zeros((len(face), coefficients, 3), np.float32),
-        face=face.astype(np.int32),
-        unbound=np.zeros(len(face), bool),
+    return splats_of(
+        np.zeros((len(face), 3)),
+        log_scale=log_scale,
+        opacity=3,
+        sh=np.zeros((1, coefficients, 3)),
+        face=face,
     )
 
 

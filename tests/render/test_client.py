@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 
 from stga_addon.avatar.embedding import WORLD, face_frames
 from stga_addon.avatar.splats import Splats
@@ -25,14 +26,13 @@ CAMERA = Camera(50, 40, 60.0, 60.0, 25.0, 20.0, HERE)
 
 def cloud(count: int = 200, seed: int = 0, face: int = 1) -> Splats:
     rng = np.random.default_rng(seed)
-    return Splats(
-        xyz=(rng.normal(0, 0.2, (count, 3)) + AHEAD).astype(np.float32),
-        rotation=rng.normal(0, 1, (count, 4)).astype(np.float32),
-        log_scale=rng.normal(-3.5, 0.4, (count, 3)).astype(np.float32),
-        opacity=rng.normal(0, 1.5, count).astype(np.float32),
-        sh=rng.normal(0, 0.15, (count, 9, 3)).astype(np.float32),
-        face=rng.integers(0, face, count).astype(np.int32),
-        unbound=np.zeros(count, bool),
+    return splats_of(
+        rng.normal(0, 0.2, (count, 3)) + AHEAD,
+        rotation=rng.normal(0, 1, (count, 4)),
+        log_scale=rng.normal(-3.5, 0.4, (count, 3)),
+        opacity=rng.normal(0, 1.5, count),
+        sh=rng.normal(0, 0.15, (count, 9, 3)),
+        face=rng.integers(0, face, count),
     )
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 
 pytest.importorskip("numba")
 
@@ -15,15 +16,8 @@ from stga_addon.render.render import render, render_layers
 
 def one_splat(color: tuple[float, float, float]) -> Splats:
     """A nearly opaque ball of 2 cm at the world's origin."""
-    return Splats(
-        xyz=np.zeros((1, 3), np.float32),
-        rotation=np.float32([[1, 0, 0, 0]]),
-        log_scale=np.full((1, 3), np.log(0.02), np.float32),
-        opacity=np.float32([6]),
-        sh=((np.float32(color) - 0.5) / np.float32(SH_C0))[None, None],
-        face=np.zeros(1, np.int32),
-        unbound=np.zeros(1, bool),
-    )
+    sh = (np.array(color) - 0.5) / SH_C0
+    return splats_of(np.zeros((1, 3)), log_scale=np.log(0.02), opacity=6, sh=sh)
 
 
 def test_look_at_gives_the_pose_worked_out_by_hand():
@@ -59,14 +53,13 @@ def test_a_gpu_renders_the_same_picture() -> None:
     posed, neutral, faces = bent_ball()
     count = len(faces)
     random = np.random.default_rng(3)
-    splats = Splats(
-        xyz=random.normal(0, 0.1, (count, 3)).astype(np.float32),
-        rotation=random.normal(size=(count, 4)).astype(np.float32),
-        log_scale=random.normal(-1, 0.5, (count, 3)).astype(np.float32),
-        opacity=random.normal(1, 1, count).astype(np.float32),
-        sh=random.normal(0, 0.4, (count, 4, 3)).astype(np.float32),
-        face=np.arange(count, dtype=np.int32),
-        unbound=np.zeros(count, bool),
+    splats = splats_of(
+        random.normal(0, 0.1, (count, 3)),
+        rotation=random.normal(size=(count, 4)),
+        log_scale=random.normal(-1, 0.5, (count, 3)),
+        opacity=random.normal(1, 1, count),
+        sh=random.normal(0, 0.4, (count, 4, 3)),
+        face=np.arange(count),
     )
     size = float(np.ptp(posed, axis=0).max())
     camera = look_at((0, 0, 2.5 * size), posed.mean(0), width=90, height=70, focal_length=150)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from avatar.conftest import splats_of
 from scipy.spatial.transform import Rotation
 
-from stga_addon.avatar.splats import Splats
 from stga_addon.capture.camera import Camera
 from stga_addon.raster.cpu.autograd import render_differentiable
 from stga_addon.raster.cpu.layout import Parameters
@@ -107,14 +107,11 @@ def test_children_stand_on_either_side_along_the_longest_axis():
 @pytest.mark.parametrize("opacity", [0.2, 0.5, 0.9, 0.99])
 def test_a_split_covers_about_what_its_parent_did(opacity):
     """Catches halves that leave a hole or darken the picture, for the next steps to repair."""
-    splats = Splats(
-        xyz=np.zeros((1, 3), np.float32),
-        rotation=np.array([[0.9, 0.1, -0.3, 0.2]], np.float32),
-        log_scale=np.log(np.array([[0.2, 0.1, 0.1]], np.float32)),
-        opacity=np.array([np.log(opacity / (1 - opacity))], np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-        face=np.zeros(1, np.int32),
-        unbound=np.zeros(1, bool),
+    splats = splats_of(
+        np.zeros((1, 3)),
+        rotation=(0.9, 0.1, -0.3, 0.2),
+        log_scale=np.log([0.2, 0.1, 0.1]),
+        opacity=np.log(opacity / (1 - opacity)),
     )
     pose = np.eye(4)
     pose[2, 3] = 4.0

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from avatar.conftest import splats_of
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.capture.model import Capture
@@ -31,16 +32,9 @@ Counts = tuple[int, int, int]
 
 def splats_on(capture: Capture, count: int, log_scale: float) -> Splats:
     """Splats of SH degree 3 on the first triangles."""
-    turn = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
-    return Splats(
-        xyz=np.zeros((count, 3), np.float32),
-        rotation=turn,
-        log_scale=np.full((count, 3), log_scale, np.float32),
-        opacity=np.zeros(count, np.float32),
-        sh=np.zeros((count, 16, 3), np.float32),
-        face=(np.arange(count) % len(capture.faces)).astype(np.int32),
-        unbound=np.zeros(count, bool),
-    )
+    face = np.arange(count) % len(capture.faces)
+    sh = np.zeros((1, 16, 3))
+    return splats_of(np.zeros((count, 3)), log_scale=log_scale, sh=sh, face=face)
 
 
 def batch_of(capture: Capture, width: int, height: int) -> Batch:

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from avatar.conftest import splats_of
 
 from stga_addon.avatar.splats import Splats
 from stga_addon.progress import Report
@@ -17,15 +19,15 @@ from stga_addon.training.settings import TrainingSettings, make_settings
 
 def random_splats(count: int, faces: int, seed: int = 0, degree: int = 1) -> Splats:
     rng = np.random.default_rng(seed)
-    return Splats(
-        xyz=rng.normal(size=(count, 3)).astype(np.float32) * np.float32(0.01),
-        rotation=rng.normal(size=(count, 4)).astype(np.float32),
-        log_scale=rng.normal(-5, 0.5, (count, 3)).astype(np.float32),
-        opacity=rng.normal(size=count).astype(np.float32),
-        sh=rng.normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32),
-        face=rng.integers(0, faces, count).astype(np.int32),
-        unbound=rng.random(count) < 0.3,
+    bound = splats_of(
+        0.01 * rng.normal(size=(count, 3)),
+        rotation=rng.normal(size=(count, 4)),
+        log_scale=rng.normal(-5, 0.5, (count, 3)),
+        opacity=rng.normal(size=count),
+        sh=rng.normal(size=(count, (degree + 1) ** 2, 3)),
+        face=rng.integers(0, faces, count),
     )
+    return replace(bound, unbound=rng.random(count) < 0.3)
 
 
 def random_state(count: int, faces: int, seed: int = 0, degree: int = 1) -> TrainState:
