@@ -26,9 +26,10 @@ from stga_addon.tracking.folder import (
 )
 from stga_addon.training.effects.facts import CaptureFacts
 from stga_addon.training.effects.plan import depth_limits
+from stga_addon.training.optimize import avatar_tracking
 from stga_addon.training.optimize.avatar_tracking import (
+    AvatarTracking,
     normal_images,
-    track_by_avatar,
 )
 from stga_addon.training.run.folder import AVATAR, Run, write_run
 from stga_addon.training.run.recording import (
@@ -153,7 +154,14 @@ def test_the_world_is_turned_as_the_avatars_was(light_turns, keeps_world, record
     np.testing.assert_allclose(found[:3, :3], expected, atol=1e-5)
 
 
-def test_another_person_is_missed(recording):
+@pytest.fixture
+def hasty(monkeypatch):
+    """Searches of two renderings, for what does not depend on where they lead."""
+    for name in ("RENDERINGS", "RENDERINGS_AGAIN", "PYRAMID_RENDERINGS"):
+        monkeypatch.setattr(avatar_tracking, name, 2)
+
+
+def test_another_person_is_missed(recording, hasty):
     """Catches a misfit that is small whatever the images show."""
     run, root = recording
     for path in (root / "images").iterdir():
@@ -169,11 +177,15 @@ def test_parts_of_another_avatar_are_not_taken(recording, tmp_path, monkeypatch)
     twice = [len(TIMESTEPS)] * 2
     shutil.copytree(root, tmp_path / "start")
 
-    def counted(*arguments):
-        calls.append(len(arguments[2]))
-        return track_by_avatar(*arguments)
+    def as_tracked(trained, capture, timesteps, *_):
+        calls.append(len(timesteps))
+        values = np.stack([capture.flame.frame(timestep).parameters for timestep in timesteps])
+        none = np.zeros(len(values))
+        known = np.tile(np.eye(values.shape[1] + 3), (len(values), 1, 1))
+        shift = np.zeros((len(values), 3))
+        return AvatarTracking(tuple(timesteps), values, none, shift, none + 1, known)
 
-    monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", counted)
+    monkeypatch.setattr("stga_addon.training.run.recording.track_by_avatar", as_tracked)
     for trained_ns, expected in ((1, [*every, *twice]), (1, []), (2, [*every, *twice])):
         shutil.rmtree(root)
         shutil.copytree(tmp_path / "start", root)
