@@ -116,8 +116,7 @@ def test_several_callers_at_a_time():
         caller.join()
     assert len(found) == 15
     for gradients in found:
-        for name, value in gradients.items():
-            np.testing.assert_array_equal(value, expected[name], err_msg=name)
+        np.testing.assert_equal(expected, gradients)
 
 
 @jit

@@ -73,8 +73,7 @@ def test_frames_are_those_of_the_timesteps_mesh(toy, convention):
     store = FrameStore(toy, convention)
     for timestep in (3, 0, 3):
         expected = face_frames(toy.mesh(timestep), toy.faces, toy.neutral, convention)
-        for name, value in vars(expected).items():
-            np.testing.assert_array_equal(getattr(store.of(timestep), name), value)
+        np.testing.assert_equal(vars(store.of(timestep)), vars(expected))
     assert np.abs(store.of(3).origin - store.of(0).origin).max() > 1e-3
 
 
