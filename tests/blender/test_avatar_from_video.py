@@ -108,7 +108,7 @@ def test_from_a_video_to_splats_on_the_head(extension, tmp_path):
     """Catches a head, splats, picture or run that does not arrive, or is another's."""
     pytest.importorskip("torch")
     video = tmp_path / "head.mp4"
-    write_head_video(video, 6)
+    write_head_video(video, 3)
     bpy.ops.stga.avatar_from_video(filepath=str(video), minutes=0.05, python=sys.executable)
     settings = bpy.context.scene.stga
     out = tmp_path / "head avatar"

@@ -104,7 +104,7 @@ def test_track_and_train_at_once(archive: Path, demo: Path, tmp_path: Path) -> N
     """Catches a missing wheel, a worker that needs more, and files that uninstalling leaves."""
     python = bare_python(tmp_path / "bare")
     video = tmp_path / "head.mp4"
-    write_head_video(video, 6)
+    write_head_video(video, 3)
     offline = OFFLINE if subprocess.run([*OFFLINE, "true"], check=False).returncode == 0 else []
     profile = {"BLENDER_USER_RESOURCES": str(tmp_path / "profile"), "HOME": str(tmp_path)}
     others = ("PYTHON", "NUMBA_")
