@@ -549,7 +549,7 @@ def test_frames(tmp_path, name):
 
 @pytest.mark.parametrize("key", ["canonical_mesh_path", "regions_path"])
 @pytest.mark.parametrize(
-    "value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ".", 3, ["a"]]
+    "value", ["a\0b", "\ud800.obj", "x" * 5000 + ".obj", "../..", "/etc/passwd", ["a"]]
 )
 def test_files_of_the_top_level(tmp_path, key, value):
     """Catches the same in the paths that are not a frame's."""
@@ -595,13 +595,11 @@ LANDMARK_ROWS = [
     ({"points": full(0.0, 4, 3)}, r"points has shape \(4, 3\), expected \(4, any, 2\)"),
     ({"points": full("x", 4, 6, 2)}, "points holds <U1, expected floating-point numbers"),
     ({"points": full(1e300, 4, 6, 2)}, "points: expected pixels of at most 100000"),
-    ({"points": full(np.longdouble("1e4000"), 4, 6, 2)}, "points: expected finite pixels where"),
     ({"points": full(np.nan, 4, 6, 2)}, "points: expected finite pixels where confidence is not 0"),
     ({"points": full(0.0, 4, 7, 2)}, r"confidence has shape \(4, 6\), expected \(4, 7\)"),
     ({"timesteps": np.array([0, 1, 2, 99])}, "timesteps: expected timesteps of camera cam0"),
     ({"timesteps": np.array([0, 1, 2, 2])}, "timesteps: expected timesteps of camera cam0"),
     ({"confidence": full(-1.0, 4, 6)}, r"confidence: expected numbers from 0 to 1e\+06"),
-    ({"confidence": full(1e308, 4, 6)}, r"confidence: expected numbers from 0 to 1e\+06"),
     ({"confidence": full(np.nan, 4, 6)}, r"confidence: expected numbers from 0 to 1e\+06"),
     ({"confidence": full("high", 4, 6)}, "confidence holds <U4, expected numbers"),
 ]
@@ -621,13 +619,11 @@ HEAD_ROWS = [
     ({"mean": 30 * np.eye(4, 3)}, "meters"),
     ({"identity": full(1.0, 5, 3, 1)}, "identity has shape"),
     ({"mean": full("x", 4, 3)}, "mean holds <U1, expected numbers"),
-    ({"mean": np.eye(4, 3) + 1e200}, r"mean reaches 1e\+200, expected at most 100000"),
     ({"mean": np.eye(4, 3) * 1e308 * [1, -1, 1]}, r"mean reaches 1e\+308"),
     ({"faces": full("x", 1, 3)}, "faces is <U1"),
     ({"identity": full(1e300, 4, 3, 1)}, r"identity reaches 1e\+300, expected at most 100"),
     ({"identity": full(np.longdouble("1e4000"), 4, 3, 1)}, "identity holds .* not finite"),
     ({"expression": full(np.nan, 4, 3, 1)}, "expression holds values that are not finite"),
-    ({"J_regressor": full(1e300, 5, 4)}, r"J_regressor reaches 1e\+300"),
     ({"weights": full(-1e300, 4, 5)}, r"weights reaches 1e\+300"),
 ]
 FRAME_ROWS = [
@@ -650,17 +646,10 @@ MOTION_ROWS = [
     ({"rotation": full(np.nan, 4, 3)}, "rotation holds values that are not finite"),
     ({"shape": full(np.inf, 9)}, "shape holds values that are not finite"),
     ({"pose": full(0.0, 4, 9)}, r"pose .* expected \(timesteps, 6\) or \(timesteps, 15\)"),
-    ({"pose": full(0.0, 0, 6)}, "pose has shape"),
     ({"pose": full(0.0, 6)}, "pose has shape"),
     *(
         ({"timesteps": np.array(own)}, "timesteps: expected 4 whole numbers")
-        for own in (
-            [0, 1],
-            [0, 2, 2, 3],
-            [0.0, 1.0, 2.0, 3.0],
-            [0, 1, 2, 2**63 + 1],
-            [0, 1, 2, 2**40],
-        )
+        for own in ([0, 1], [0, 2, 2, 3], [0.0, 1.0, 2.0, 3.0], [0, 1, 2, 2**63 + 1])
     ),
 ]
 MODEL_ROWS = [
@@ -675,7 +664,6 @@ MODEL_ROWS = [
     ({"masks/nose": np.array([40])}, "mask nose"),
     ({"f": full(40, 3, 3)}, "f names vertices 40 to 40, expected 0 to 5"),
     ({"f": full(0.5, 3, 3)}, "f holds float64, expected whole numbers"),
-    ({"f": full(1e30, 3, 3)}, "f holds float64, expected whole numbers"),
     ({"kintree_table": np.array([[0, 4, 1, 1, 1], range(5)])}, "kintree_table names the parents"),
     ({"n_identity": np.array(13)}, "n_identity is 13, expected one number from 0 to 12"),
 ]
@@ -773,15 +761,15 @@ def test_wrong_fields_are_named(tmp_path, reader, change, message):
 
 
 META_VALUES: dict[str, Any] = {
-    "iteration": ["5", -2, 1.5, None, 10**40, True],
-    "visit": ["5", None],
-    "last_timestep": ["5", 1.5, [1]],
-    "elapsed_s": ["5", None, float("nan"), [], True],
-    "lines": ["5", -1, 1.5],
-    "tracking_gain": ["5", 1, []],
-    "evaluations": [None, "x"],
-    "losses": ["5", None, [None], ["a"], [float("nan")], {"a": 1}, 7],
-    "initial_count": [None, "x"],
+    "iteration": [-2, 1.5, 10**40, True],
+    "visit": ["5"],
+    "last_timestep": [1.5, [1]],
+    "elapsed_s": [None, float("nan"), True],
+    "lines": [-1, 1.5],
+    "tracking_gain": [1, []],
+    "evaluations": [None],
+    "losses": [[None], [float("nan")], {"a": 1}, 7],
+    "initial_count": ["x"],
 }
 
 

@@ -195,28 +195,28 @@ def posed_head(model: FlameModel, frame: FlameFrame) -> FlameSequence:
     return FlameSequence(model, np.zeros(model.n_identity), None, (TIMESTEP,), lambda _: frame)
 
 
+def capture_of(root, head, views, neutral=None):
+    """Of a FLAME head's motion, and views of the ball."""
+
+    def mesh(timestep, *_):
+        return sequence_mesh(head, timestep)
+
+    model = head.model
+    neutral = model.v_template if neutral is None else neutral
+    timesteps = head.timesteps
+    return Capture(root, "flame", model.faces, neutral, views, timesteps, {}, mesh, mesh, head)
+
+
 @pytest.mark.parametrize("one", [False, True])
 def test_what_lies_below_the_neck_follows_the_torso(tmp_path, one):
     """Catches a collar that turns with the chin it lies under, and hair beside the neck that does
     not."""
     model = small_head(0)
     head = posed_head(model, turned(model))
-    mesh = sequence_mesh(head, TIMESTEP)
     for centre, carried in (([0.0, -0.175, 0.115], True), ([0.0, -0.135, 0.115], False)):
         views = scene(tmp_path, np.array(centre), 0.015).views
         side = max(views["train"], key=lambda view: float(view.camera.position[0]))
-        capture = Capture(
-            tmp_path,
-            "flame",
-            model.faces,
-            model.v_template,
-            views,
-            (TIMESTEP,),
-            {},
-            lambda timestep: mesh,
-            lambda timestep, pose: mesh,
-            head,
-        )
+        capture = capture_of(tmp_path, head, views)
         place, shown = (flat_points, side) if one else (hull_points, views["train"])
         before, after = (place(capture, shown, "stga", 0, torso) for torso in (False, True))
         assert len(before) == len(after) > 20
@@ -235,18 +235,8 @@ def test_few_cameras_take_the_torso_from_where_it_was_seen(tmp_path):
     frames = {TIMESTEP: turned(model), TIMESTEP + 1: neutral_frame(model)}
     head = FlameSequence(model, np.zeros(model.n_identity), None, tuple(frames), frames.__getitem__)
     views = scene(tmp_path, np.array([0.0, -0.175, 0.115]), 0.015).views["train"]
-    capture = Capture(
-        tmp_path,
-        "flame",
-        model.faces,
-        sequence_mesh(head, TIMESTEP + 1),
-        {"train": views},
-        tuple(frames),
-        {},
-        lambda timestep: sequence_mesh(head, timestep),
-        lambda timestep, pose: sequence_mesh(head, timestep),
-        head,
-    )
+    neutral = sequence_mesh(head, TIMESTEP + 1)
+    capture = capture_of(tmp_path, head, {"train": views}, neutral)
     hull, many = (hull_points(capture, own, "stga", 0, torso=True) for own in (views[:3], views))
     at = np.array([0.0, -0.16, 0.09]) + np.random.default_rng(0).uniform(-0.01, 0.01, (200, 3))
     write_torso_points(tmp_path, TorsoPoints(TIMESTEP + 1, at))
@@ -298,21 +288,9 @@ def test_a_single_camera_continues_the_torso_that_it_cuts_off(tmp_path, right, u
     head = posed_head(model, neutral_frame(model))
     number = min(range(20), key=lambda n: abs(float(cameras()[n].position[1])))
     ball = right * cameras()[number].world_to_camera[0, :3] + [0.0, up, 0.0]
-    mesh = sequence_mesh(head, TIMESTEP)
     views = scene(tmp_path, ball, 0.08).views
     side = views["train"][number]
-    capture = Capture(
-        tmp_path,
-        "flame",
-        model.faces,
-        model.v_template,
-        views,
-        (TIMESTEP,),
-        {},
-        lambda timestep: mesh,
-        lambda timestep, pose: mesh,
-        head,
-    )
+    capture = capture_of(tmp_path, head, views)
     cut, whole = (
         in_world(capture, flat_points(capture, side, "stga", 0, torso)) for torso in (False, True)
     )
