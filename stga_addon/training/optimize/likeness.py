@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ...capture.mesh_geometry import connected_parts
 from ...capture.model import Capture
+from ...flame.model import faces_within
 
 SCALP_ANGLE_DEG = 66.0
 SCALP_ELEVATION_DEG = 38.0
@@ -44,6 +46,15 @@ SMOOTHED = 24
 """A scalp's triangle has hair if its color is that far from the skin's, as a share of the scalp's
 most different ones, and so are most of that many around it."""
 
+MOUTH_REACH = 1.1
+"""How far a mouth's inside is from its middle, in that unit."""
+LINING_SHARES = np.array([0.2, 0.1, 0.1])
+GUM_SHARE = 0.75
+TOOTH_COLOR = np.array([0.86, 0.82, 0.74])
+LIT_SKIN = 0.85
+"""A mouth's lining (red, green, blue) and gums, as shares of the lips' color; sRGB of teeth in a
+light in which skin has so much red."""
+
 
 @dataclass(frozen=True)
 class HeadCoordinates:
@@ -53,12 +64,14 @@ class HeadCoordinates:
     elevation  (F,) radians
     level      (F,) height over the eyes, in distances of the eyes from the mouth
     side       (F,) distance from the middle plane, in the same unit
+    unit       meters from the eyes to the mouth
     """
 
     azimuth: np.ndarray
     elevation: np.ndarray
     level: np.ndarray
     side: np.ndarray
+    unit: float
 
 
 def head_coordinates(capture: Capture) -> HeadCoordinates | None:
@@ -84,6 +97,7 @@ def head_coordinates(capture: Capture) -> HeadCoordinates | None:
         elevation=np.arctan2(y, np.hypot(x, z)),
         level=(centers - eyes) @ up / unit,
         side=np.abs(x) / unit,
+        unit=unit,
     )
 
 
@@ -137,3 +151,49 @@ def around(at: HeadCoordinates, sources: np.ndarray, targets: np.ndarray) -> np.
     goals = np.stack([level, stretch[targets] * wanted], 1)
     _, nearest = cKDTree(places[sources]).query(goals)
     return np.asarray(sources[nearest])
+
+
+def inside_colors(
+    capture: Capture, color: np.ndarray, shown: np.ndarray, inside: np.ndarray
+) -> np.ndarray:
+    """Colors (M, 3) of triangles `inside` (F,) bool, which show where mouth or lids move as in no
+    view: teeth, gums and a dark lining near the mouth, in the light on the person's lips and skin;
+    elsewhere as the skin around. color, shown: of `mean_colors`."""
+    faces = capture.faces
+    centers = np.asarray(capture.neutral)[faces].mean(1)
+    skin = skin_of(capture)
+    known = np.flatnonzero(shown & skin)
+    if not len(known):
+        return np.asarray(color[inside])
+    near = cKDTree(centers[known]).query(centers[inside], min(SMOOTHED, len(known)))[1]
+    found = np.median(color[known[near.reshape(int(inside.sum()), -1)]], axis=1)
+    at = head_coordinates(capture)
+    if at is None:
+        return np.asarray(found)
+    mouth = capture.regions["mouth"]
+    lips = mouth & shown
+    nose = capture.regions.get("nose", lips) & shown
+    if not lips.any() or not nose.any():
+        return np.asarray(found)
+    light = min(1.0, float(np.median(color[nose], axis=0).max()) / LIT_SKIN)
+    away = np.linalg.norm(centers - centers[mouth].mean(0), axis=1)
+    near = away < MOUTH_REACH * at.unit
+    teeth = teeth_of(capture)
+    found[(near & skin)[inside]] = LINING_SHARES * np.median(color[lips], axis=0)
+    found[(near & ~skin)[inside]] = GUM_SHARE * np.median(color[lips], axis=0)
+    found[(teeth & near)[inside]] = light * TOOTH_COLOR
+    return np.asarray(found)
+
+
+def skin_of(capture: Capture) -> np.ndarray:
+    """(F,) bool: the largest connected part of the mesh."""
+    part = connected_parts(len(capture.neutral), capture.faces)[capture.faces[:, 0]]
+    return np.asarray(part == np.bincount(part).argmax())
+
+
+def teeth_of(capture: Capture) -> np.ndarray:
+    """(F,) bool: teeth, where the head model says which they are."""
+    masks = {} if capture.flame is None else capture.flame.model.masks
+    if "teeth" not in masks:
+        return np.zeros(len(capture.faces), bool)
+    return faces_within(capture.faces, masks["teeth"])

@@ -1,6 +1,7 @@
 """Colors of sides of the head that no training view shows: only what shines through the front
 trains a hidden side, which gives it any color."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,15 +11,27 @@ from scipy.spatial import cKDTree
 from ...avatar.splats import SH_C0
 from ...capture.camera import look_at
 from ...capture.mesh_geometry import connected_parts, rasterize
-from ...capture.model import Capture, evenly_spread
+from ...capture.model import Capture, View, evenly_spread
 from .backend import Backend
 from .change import Turn
 from .frames import UNSEEN_COSINE, FrameStore
 from .initial_splats import mean_colors, mirror_images
-from .likeness import around, head_coordinates, kinds_of, with_hair
+from .likeness import (
+    around,
+    head_coordinates,
+    inside_colors,
+    kinds_of,
+    skin_of,
+    teeth_of,
+    with_hair,
+)
 
 COLOR_VIEWS = 48
 """Training views whose colors are looked at, spread over all."""
+SIGHT_HEIGHT_PX = 400
+"""Of the views in which the inside of mouth and eyes is looked for."""
+MIN_TEETH_SHARE = 0.08
+"""Of the teeth's triangles, half of which are behind others, that views show at least."""
 SOURCE_COSINE = 0.5
 """Of the angle between a triangle and a camera: below it, others do not take its color, which a
 matte's edge may be in."""
@@ -94,7 +107,29 @@ def unseen_sides(capture: Capture, cosine: np.ndarray) -> UnseenSides:
             found[rows] = color[around(at, own, rows)]
     hidden, partner = mirror_images(capture, unseen, is_source)
     found[hidden] = color[partner]
-    return UnseenSides(unseen, found)
+    inside = _unseen_inside(capture, views, is_outside)
+    found[inside] = inside_colors(capture, color, shown, inside)
+    return UnseenSides(unseen | inside, found)
+
+
+def _unseen_inside(capture: Capture, views: Sequence[View], is_outside: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles of the inside, of lids and of teeth that no view shows; but for lids,
+    none of whose neighbors either. Teeth of which hardly any is shown count as unseen."""
+    faces = capture.faces
+    in_sight = np.zeros(len(faces), bool)
+    for view in views:
+        camera = view.camera.scaled(min(1.0, SIGHT_HEIGHT_PX / view.camera.height))
+        triangle, _ = rasterize(capture.mesh(view.timestep), faces, camera)
+        in_sight[np.unique(triangle[triangle >= 0])] = True
+    touched = np.zeros(len(capture.neutral), bool)
+    touched[faces[in_sight]] = True
+    inside = ~is_outside & ~touched[faces].any(1)
+    for name in ("left_eye", "right_eye"):
+        inside |= capture.regions.get(name, inside) & ~in_sight & skin_of(capture)
+    teeth = teeth_of(capture)
+    if (teeth & in_sight).sum() < MIN_TEETH_SHARE * teeth.sum():
+        inside |= teeth
+    return np.asarray(inside)
 
 
 def outside(capture: Capture) -> np.ndarray:
