@@ -9,7 +9,9 @@ from . import (
     drive,
     export,
     import_capture,
+    kernels,
     monitor,
+    opened_files,
     pose,
     render_video,
     request,
@@ -17,6 +19,7 @@ from . import (
     show,
     track,
     train,
+    training_python,
 )
 from .common import AtEnd, close_steps, register_classes
 
@@ -26,6 +29,7 @@ MODULES = (
     select,
     train,
     request,
+    training_python,
     pose,
     show,
     render_video,
@@ -80,6 +84,6 @@ def register(at_end: AtEnd) -> None:
     for name, space, operator, key in KEYS if keys is not None else ():  # none without a window
         items = keys.keymaps.new(name=name, space_type=space).keymap_items
         at_end(items.remove, items.new(operator, key, "PRESS"))
-    for part in (request, monitor, pose, render_video, drive):
+    for part in (kernels, opened_files, monitor, pose, render_video, drive):
         part.register(at_end)
     at_end(close_steps)

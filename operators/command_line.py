@@ -21,7 +21,7 @@ from ..stga_addon.scene.vertex_groups import training_selection
 from ..stga_addon.training.run.folder import TRACKING
 from ..stga_addon.worker.launch import start_python
 from .common import AtEnd, capture_source, file_path, is_head, scene_frames
-from .request import training_python
+from .training_python import training_python
 
 IN_BLENDER = ("select", "export", "demo")
 """Commands that need none of the packages that Blender's Python may lack, or need Blender itself;

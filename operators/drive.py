@@ -29,11 +29,13 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.objects import Identity, show_progress
 from ..stga_addon.scene.rig.motion import LivePose, stored_range
 from ..stga_addon.training.run.folder import has_run, read_run
-from . import common, monitor, options
+from . import common, options, timers
 from .apply_motion import exchange_property, exchanged_pairs, own_range, stay_trained_property
 from .common import Action, Edit, FileImport, file_path, head_of, need, own_motion, rig_or_none
 from .options import ONCE
-from .request import idle, start, training_python
+from .request import idle, start
+from .training_python import training_python
+from .windows import redraw
 
 MAX_PORT = 65535
 TICK_S = 1 / 60
@@ -98,7 +100,7 @@ class MeasureRange(Edit, bpy.types.Operator):
 
 
 class LiveSession:
-    """Receives packets, poses the head and records. A timer calls `tick` (`monitor.watch`).
+    """Receives packets, poses the head and records. A timer calls `tick` (`watch`).
 
     found, trained: the head's map and the range that its avatar was trained on; None where shape
     keys of ARKit's names are posed.
@@ -155,7 +157,7 @@ class LiveSession:
             self.show_again()
         if begin - self._drawn_at >= PANEL_INTERVAL_S:
             self._drawn_at = begin
-            monitor.redraw()
+            redraw()
         took = monotonic() - begin
         self.ticks_s.append(took)
         return max(MIN_WAIT_S, TICK_S - took)
@@ -241,7 +243,7 @@ class LiveSession:
         _session = None
         gc.unfreeze()
         self.receiver.close()
-        monitor.unwatch(self)
+        timers.unwatch(self)
         bpy.app.handlers.frame_change_post.remove(_show_again)
         self.save_recording()
         self._show_said()  # also in the window of a file that was opened
@@ -346,7 +348,7 @@ class DriveLive(Action, bpy.types.Operator):
         _session = LiveSession(Identity(context.scene), pose, found, trained, receiver)
         bpy.app.handlers.frame_change_post.append(_show_again)
         gc.freeze()  # a collection of all that Blender's add-ons hold takes longer than a frame
-        monitor.watch(_session)
+        timers.watch(_session)
 
 
 class _OfSession(Action):

@@ -30,11 +30,12 @@ from ..stga_addon.scene.rig.head import import_head
 from ..stga_addon.tracking.folder import is_tracked
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.run.folder import has_run
-from . import monitor, options
+from . import options
 from .common import Edit, FileImport, call, file_path, flame_model_path, is_head, need, package
+from .kernels import begin_preparing
 from .options import ONCE
 from .pose import begin_sliders
-from .request import begin_preparing
+from .windows import show_panel
 
 FOLDERS_ABOVE_FILE = 3
 """In which the capture of an image, mask, mesh or parameter file is looked for."""
@@ -101,7 +102,7 @@ class HeadImport(Edit):
         counted = {"timesteps": capture.timesteps, "triangles": capture.faces, "cameras": cameras}
         self.inform(", ".join(f"{len(all_)} {name}" for name, all_ in counted.items()))
         begin_sliders(head)
-        monitor.show_panel()
+        show_panel()
         begin_preparing()
 
 

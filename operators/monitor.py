@@ -1,54 +1,39 @@
 """Request monitor: a timer, which reads the status of workers and brings their results into their
-scenes, and timers of what else goes on beside the interface.
+scenes.
 
 What is to be done is decided by `jobs.monitor_state`; this module reads files, owns the timer and
 carries out effects, those that depend on the kind of request by the tables in `results`.
 """
 
-import os
 import shutil
 from contextlib import suppress
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from subprocess import Popen
 from time import sleep
-from typing import Any, Protocol
+from typing import Any
 
 import bpy
 import numpy as np
-from bpy.app.handlers import persistent
 
 from ..stga_addon.errors import StgaError
 from ..stga_addon.files import read_npz
 from ..stga_addon.jobs import monitor_state as states
-from ..stga_addon.jobs.monitor_state import CHECK_INTERVAL_S, RequestState, transition
+from ..stga_addon.jobs.monitor_state import RequestState, transition
 from ..stga_addon.jobs.perform import remove_request, request_folder
 from ..stga_addon.jobs.table import STORED, TRANSIENT, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.report import curve_image
-from ..stga_addon.scene import tags
-from ..stga_addon.scene.avatar_scene import open_sidebar
-from ..stga_addon.scene.compat import APPENDED
-from ..stga_addon.scene.display.splat_object import (
-    hide_covered,
-    hide_in_layers,
-    is_enabled_on,
-    keep_evaluated,
-    replace_native_splats,
-)
-from ..stga_addon.scene.objects import layers_with
 from ..stga_addon.tracking.folder import SPLIT_FILES
-from ..stga_addon.training.run.folder import AVATAR, TRACKING, has_run
+from ..stga_addon.training.run.folder import AVATAR, TRACKING
 from ..stga_addon.training.run.metrics_log import METRICS, read_metrics
 from ..stga_addon.worker import status
 from ..stga_addon.worker.status import PICTURE, PREVIEW
-from .common import TAB, AtEnd, describe, is_head, register_handlers
+from . import timers
+from .common import AtEnd, describe
 from .results import (
-    HEADS,
     PLACES,
     SHOW,
-    avatar_of,
     changed_object,
     forget_heads,
     load_avatar,
@@ -58,8 +43,7 @@ from .results import (
     store_avatar,
     store_head,
 )
-
-MAX_SIDEBAR_ATTEMPTS = 10
+from .windows import push_undo, redraw
 
 Curve = tuple[np.ndarray, str, str]
 """Pixels of a run's curve, the ranges of its axes and of the detail difference; or those of a
@@ -73,52 +57,12 @@ _processes: dict[Path, "Popen[bytes]"] = {}
 """Folder of a request -> worker that this Blender started, whose exit code is known."""
 
 
-class Watched(Protocol):
-    """What has a timer of its own."""
-
-    def tick(self) -> float | None:
-        """Do a little; seconds until the next call, None: that was the last."""
-
-    def close(self) -> None:
-        """End: file or extension is gone, or `tick` has raised."""
-
-
-_watched: list[Watched] = []
-
-
-def watch(thing: Watched) -> None:
-    """Call its `tick` from a timer until that returns None, the file is closed, or the extension
-    ends."""
-
-    def tick() -> float | None:
-        interval = None
-        if thing in _watched:
-            try:
-                interval = thing.tick()
-            except Exception as error:
-                print(describe(error))
-                thing.close()
-        if interval is None:
-            unwatch(thing)
-        return interval
-
-    _watched.append(thing)
-    if has_timer():
-        bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
-
-
-def unwatch(thing: Watched) -> None:
-    """Call it no more; without an effect where it is not called."""
-    with suppress(ValueError):
-        _watched.remove(thing)
-
-
 def state_of(scene: Any, kind: Kind) -> RequestState:
     """The scene's request as the timer last saw it; as it is, without a window and so a timer."""
-    if has_timer():
+    if timers.has_timer():
         state = _states.get((scene.session_uid, kind))
         if state is None:
-            _start_timer()
+            start_timer()
         return state or RequestState(kind)
     state = _last_state(scene, kind)
     if state.folder is None:
@@ -158,17 +102,12 @@ def check_now(scene: Any, kind: Kind) -> None:
     state = _read_scene(scene, kind)
     if state.folder is not None:
         handle(scene, kind, _read_status(scene, state))
-    _start_timer()
+    start_timer()
 
 
 def inspect_status(folder: Path) -> status.WorkerSnapshot:
     """Status of a worker as it is now, with its exit code where this Blender started it."""
     return status.inspect_worker(folder, _processes.get(folder))
-
-
-def has_timer() -> bool:
-    """Whether Blender has a window, and so runs timers."""
-    return not bpy.app.background
 
 
 # The timer
@@ -203,8 +142,8 @@ def _check(scene: Any, kind: Kind) -> float | None:
         return None
 
 
-def _start_timer() -> None:
-    if has_timer() and not bpy.app.timers.is_registered(tick):
+def start_timer() -> None:
+    if timers.has_timer() and not bpy.app.timers.is_registered(tick):
         bpy.app.timers.register(tick, first_interval=0.0, persistent=True)
 
 
@@ -333,7 +272,7 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
         case states.RemoveFiles(folder):
             _remove(state.kind, folder)
         case states.PushUndo():
-            if has_timer():  # later: saving the scene's state takes as long as a slice
+            if timers.has_timer():  # later: saving the scene's state takes as long as a slice
                 bpy.app.timers.register(push_undo, first_interval=states.SLICE_INTERVAL_S)
         case states.Redraw():
             redraw()
@@ -353,169 +292,31 @@ def _remove(kind: Kind, folder: Path) -> None:
         curves.pop(drawn, None)
 
 
-def push_undo() -> None:
-    """Let undo come back to what is in the file now."""
-    if bpy.ops.ed.undo_push.poll():
-        bpy.ops.ed.undo_push(message="Show Result")
-
-
-def redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "PREFERENCES"):
-                for region in area.regions:
-                    if area.type == "PREFERENCES" or region.type == "UI":
-                        region.tag_redraw()
-
-
-def show_panel() -> None:
-    """Open the sidebar at the add-on's tab, from a timer and for a few seconds at most."""
-    attempts = count(1)
-
-    def attempt() -> float | None:
-        screens = [window.screen for window in bpy.context.window_manager.windows]
-        is_over = open_sidebar(TAB, screens) or next(attempts) >= MAX_SIDEBAR_ATTEMPTS
-        return None if is_over else CHECK_INTERVAL_S
-
-    if has_timer():
-        bpy.app.timers.register(attempt, first_interval=CHECK_INTERVAL_S)
-
-
-# Files that are opened and saved
+# The open file
 
 
 def _close() -> None:
     """Stop what belongs to the open file, and workers whose result only its scenes were to have."""
     stop_loading()
-    for thing in list(_watched):
-        thing.close()
-    _watched.clear()
+    timers.close_watched()
     for (_, kind), state in list(_states.items()):
         if kind in TRANSIENT and state.folder is not None:
             for effect in transition(state, states.CancelAsked())[1]:
                 _carry_out(None, state, effect)
 
 
-@persistent
-def _before_save(path: str) -> None:
-    _rebase(bpy.data.filepath, path)
-
-
-@persistent
-def _after_save(path: str) -> None:
-    if bpy.data.filepath != path:  # a copy was saved
-        _rebase(path, bpy.data.filepath)
-
-
-def _rebase(old: str, new: str) -> None:
-    """Let scenes and splats find their run and avatar from another .blend file."""
-    for settings in [scene.stga for scene in bpy.data.scenes if scene.library is None]:
-        for name in ("run_folder", "avatar"):
-            value = getattr(settings, name)
-            moved = _rebased(value, old, new)
-            if moved != value:
-                setattr(settings, name, moved)
-    for thing in bpy.data.objects:
-        if tags.AVATAR in thing and thing.library is None:
-            thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], old, new)
-
-
-def _rebased(value: str, old: str, new: str) -> str:
-    """A path of the .blend file `old` ("": not saved) for `new`: relative where it lies beside that
-    or below, so that all can be moved together; as it is where there is nothing."""
-    place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
-    beside = Path(new).parent
-    if not value or (value.startswith("//") and not old) or not place.exists():
-        return value
-    is_beside = bool(new) and place.is_relative_to(beside)
-    return f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
-
-
-@persistent
-def _after_load(_: Any) -> None:
+def forget_file() -> None:
+    """Stop what belongs to the file before, and forget its scenes; its videos are still
+    rendered."""
     _close()
     forget_heads()
     for key in [key for key in _states if key[1] != Kind.VIDEO]:
-        del _states[key]  # of scenes of the file before; its videos are still rendered
-    _choose_head()
-    _say(replace_native_splats(bpy.data.objects))
-    _start_timer()
-
-
-def _say(sentence: str) -> None:
-    """Print a sentence, if it is not empty, and show it in the panel."""
-    if sentence:
-        print(f"STGA: {sentence}")
-        bpy.context.window_manager.stga_message = sentence
-
-
-@persistent
-def _after_append(imported: Any) -> None:
-    """Show what was appended or linked as its own file shows it, and let the panel find it."""
-    scene = bpy.context.scene
-    layer = bpy.context.view_layer
-    appended = [item.id for item in imported.import_items if item.id is not None]
-    _say(replace_native_splats(appended))
-    for item in imported.import_items:
-        thing = item.id
-        if thing is None or tags.KIND not in thing:
-            continue
-        if isinstance(thing, bpy.types.Collection):  # of bones or cameras
-            for shown in layers_with(thing, layer):
-                shown.hide_viewport = True
-        elif tags.WORLD in thing:
-            hide_in_layers(thing, scene)
-        elif tags.CONVENTION in thing:
-            hide_covered(thing, scene)
-            if tags.AVATAR in thing and thing.library is None and item.source_library is not None:
-                source = bpy.path.abspath(item.source_library.filepath)
-                thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], source, bpy.data.filepath)
-    _choose_head()
-
-
-def _choose_head() -> None:
-    """Let the panel work on the one head, and the splats, of a file that was made without it, as
-    `stga demo` does, or into which an avatar was appended."""
-    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
-        settings = scene.stga
-        heads = [thing for thing in scene.objects if is_head(thing)]
-        shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
-        if settings.head is None and len(heads) == 1:
-            settings.head = heads[0]
-            show_panel()
-            if settings.splats is None and len(shown) == 1:
-                settings.splats = shown[0]
-                settings.avatar = settings.avatar or avatar_of(shown[0])
-        if not has_run(Path(bpy.path.abspath(settings.run_folder))):
-            settings.run_folder = run_of(settings.avatar) or settings.run_folder
-
-
-def run_of(avatar: str) -> str:
-    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
-    folder = os.path.dirname(avatar)
-    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
-
-
-@persistent
-def _after_update(scene: Any, *_: Any) -> None:
-    """Let the panel work on no head, and no splats, that were deleted: its pointers keep them."""
-    for name in ("head", "splats", *HEADS.values()):
-        thing = getattr(scene.stga, name)
-        if thing is not None and thing.name not in scene.objects and not thing.users_collection:
-            setattr(scene.stga, name, None)
-    head = scene.stga.head
-    splats = scene.stga.splats
-    if is_head(head) and head.hide_viewport and not (splats and is_enabled_on(splats, head)):
-        keep_evaluated(head, scene)  # which looks at all objects
+        del _states[key]
 
 
 def register(at_end: AtEnd) -> None:
-    handlers = bpy.app.handlers
-    files = (handlers.load_post, _after_load), (APPENDED, _after_append)
-    saving = (handlers.save_pre, _before_save), (handlers.save_post, _after_save)
-    register_handlers(at_end, *files, *saving, (handlers.depsgraph_update_post, _after_update))
     at_end(_end)
-    _start_timer()
+    start_timer()
 
 
 def _end() -> None:

@@ -14,8 +14,9 @@ from ..stga_addon.scene.compat import select_bones
 from ..stga_addon.scene.objects import Identity, leave_edit_mode, show_kind
 from ..stga_addon.scene.rig import keyframes
 from ..stga_addon.scene.rig.head import rig_of
-from . import common, monitor
+from . import common, timers
 from .common import AtEnd, Edit, head_of, need, needs_rig, rig_or_none
+from .windows import push_undo, redraw
 
 POLL_INTERVAL_S = 0.3
 
@@ -113,8 +114,8 @@ def needs_sliders(head: Any) -> bool:
 def begin_sliders(head: Any) -> None:
     """Give a head that needs them its sliders as soon as a thread has computed them, and any its
     map, for which *Drive Live* would wait; scripts call the operators."""
-    if monitor.has_timer() and rig_or_none(head) is not None and head.library is None:
-        monitor.watch(_Sliders(head))
+    if timers.has_timer() and rig_or_none(head) is not None and head.library is None:
+        timers.watch(_Sliders(head))
 
 
 preparing: set[int] = set()
@@ -149,8 +150,8 @@ class _Sliders:
             if head.mode == "EDIT":
                 return POLL_INTERVAL_S
             keyframes.add_shapes(head, *self._made[0])
-            monitor.push_undo()
-            monitor.redraw()
+            push_undo()
+            redraw()
         return None
 
     def close(self) -> None:

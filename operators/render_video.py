@@ -43,7 +43,8 @@ from .common import (
     scene_frames,
 )
 from .options import ONCE
-from .request import has_training_python, idle, start, training_python
+from .request import idle, start
+from .training_python import has_training_python, training_python
 
 RECORDING = "recording.bin"
 RECORDING_INTERVAL_S = 0.001

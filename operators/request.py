@@ -1,18 +1,12 @@
 """Requests from Blender: starting a worker for one, or carrying it out here; cancelling, dismissing
-and reporting it. The Python that tracks and trains: its choice, its test, and the kernels that it
-compiles before they are asked for."""
+and reporting it."""
 
-import os
 import platform
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterable
-from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
-from subprocess import Popen
-from time import monotonic
 from typing import Any
 
 import bpy
@@ -21,24 +15,13 @@ from ..stga_addon import __version__
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs import perform, table
 from ..stga_addon.jobs.monitor_state import CancelAsked, Dismissed
-from ..stga_addon.jobs.python_check import CHECK_TIMEOUT_S, Checked, finish_check, start_check
 from ..stga_addon.jobs.table import KINDS, Kind
-from ..stga_addon.raster.kernel_cache import has_kernels
 from ..stga_addon.scene.objects import show_progress
-from ..stga_addon.worker import launch
-from ..stga_addon.worker.launch import CACHE_VARIABLE, start_worker
+from ..stga_addon.worker.launch import start_worker
 from ..stga_addon.worker.status import WorkerState, failure_report
-from ..stga_addon.worker.training_python import find_training_python
-from . import monitor, options
-from .common import Action, AtEnd, Poll, file_path, need, package, polled, preferences
+from . import monitor, options, timers
+from .common import Action, Poll, file_path, need, polled
 from .options import ONCE
-
-POLL_INTERVAL_S = 0.3
-PREPARATION = "stga_addon.jobs.compile_ahead"
-START_DELAY_S = 1.0
-"""After the extension was enabled: neither enabling nor Blender's start waits for a process."""
-
-_preparations: list["Popen[bytes]"] = []
 
 
 def start(
@@ -75,7 +58,7 @@ def start(
     monitor.follow(scene, kind, subject, folder, process)
     if process is None:
         perform.perform_in_folder(folder, also=_show)
-    elif not wait and monitor.has_timer():
+    elif not wait and timers.has_timer():
         monitor.check_now(scene, kind)
         return False
     else:
@@ -180,130 +163,3 @@ class CopyReport(Action, bpy.types.Operator):
         report = failure_report(folder, monitor.inspect_status(folder))
         context.window_manager.clipboard = f"{versions}\n{report}"
         self.inform("Copied to the clipboard")
-
-
-# The Python that tracks and trains
-
-
-def training_python(context: Any, given: str = "") -> str:
-    """The interpreter given, else that of `find_training_python`, which may raise StgaError."""
-    return bpy.path.abspath(given) if given else find_training_python(_preferred(context))
-
-
-def has_training_python(context: Any) -> bool:
-    """Whether `training_python` finds one, for panels."""
-    return bool(_lookup(_preferred(context)))
-
-
-@lru_cache(maxsize=1)
-def _lookup(preferred: str) -> str:
-    try:
-        return find_training_python(preferred)
-    except StgaError:
-        return ""
-
-
-def _preferred(context: Any) -> str:
-    """The Python in the preferences; "" where none is."""
-    stored = preferences(context)
-    return bpy.path.abspath(stored.training_python) if stored and stored.training_python else ""
-
-
-class _Test:
-    """The last test of an interpreter: running, or with what it found."""
-
-    python = error = ""
-    found: Checked | None = None
-    process: "Popen[str] | None" = None
-
-    def begin(self, python: str) -> None:
-        """Raises StgaError where the interpreter cannot be started."""
-        self.process = start_check(python)
-        self._begun_s = monotonic()
-        self.python = python
-        self.found = None
-        self.error = ""
-
-    def end(self, timeout_s: float = 1.0) -> None:
-        """Wait for what the test finds, unless it has ended."""
-        if self.process is None:
-            return
-        try:
-            self.found = finish_check(self.python, self.process, timeout_s)
-        except StgaError as error:
-            self.error = str(error)
-        self.process = None
-
-    def tick(self) -> float | None:
-        is_running = self.process is not None and self.process.poll() is None
-        if is_running and monotonic() - self._begun_s < CHECK_TIMEOUT_S:
-            return POLL_INTERVAL_S
-        self.end()
-        monitor.redraw()
-        return None
-
-    def close(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.end()
-
-
-test = _Test()
-
-
-class TestPython(Action, bpy.types.Operator):
-    """Start the Python that tracks and trains, and report its versions of torch and numba and its
-    device, or what it lacks"""
-
-    bl_label = "Test"
-    needs = (need(lambda _: test.process is None, "A test is running"),)
-
-    python: options.text(
-        "Python", "The interpreter to test; empty: the one that trains", subtype="FILE_PATH"
-    )
-
-    def run(self, context: Any) -> None:
-        test.begin(training_python(context, self.python))
-        if monitor.has_timer():
-            monitor.watch(test)
-            return
-        test.end(CHECK_TIMEOUT_S)
-        if test.found is None:
-            raise StgaError(test.error)
-        self.inform(test.found.line)
-
-
-# Kernels
-
-
-def begin_preparing() -> None:
-    """Compile in the background what the first training would wait for; nothing without a window,
-    without a Python that trains, or where it is compiled or is being compiled."""
-    if bpy.app.background or CACHE_VARIABLE not in os.environ:
-        return
-    if has_kernels(launch.cache_folder() / launch.KERNELS):
-        return
-    if all(process.poll() is not None for process in _preparations):
-        with suppress(StgaError):  # training says what is missing
-            python = training_python(bpy.context)
-            _preparations.append(launch.start_in_background(python, [PREPARATION]))
-
-
-def register(at_end: AtEnd) -> None:
-    with suppress(ValueError):  # a checkout, which is no extension
-        cache = bpy.utils.extension_path_user(package(), path="cache")
-        if os.environ.setdefault(CACHE_VARIABLE, cache) == cache:
-            at_end(os.environ.pop, CACHE_VARIABLE, None)
-    at_end(_end_preparing)
-    if not bpy.app.background:
-        bpy.app.timers.register(begin_preparing, first_interval=START_DELAY_S)
-
-
-def _end_preparing() -> None:
-    """End what is compiling, which would write into a folder that is being removed."""
-    if bpy.app.timers.is_registered(begin_preparing):
-        bpy.app.timers.unregister(begin_preparing)
-    for process in _preparations:
-        process.kill()
-        process.wait()
-    _preparations.clear()

@@ -21,10 +21,11 @@ from ..stga_addon.scene.render.scene_splats import forget_frame, relight_frame
 from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, need
-from .monitor import run_of
+from .opened_files import run_of
 from .options import ONCE
-from .request import idle, start, training_python
+from .request import idle, start
 from .results import shown_splats
+from .training_python import training_python
 
 GRAY = ("WIREFRAME", "SOLID")
 """Kinds of shading that show colors of splats as trained only."""

@@ -25,10 +25,12 @@ from ..stga_addon.scene.rig.keyframes import key_current_pose
 from ..stga_addon.scene.rig.motion import sample_pose
 from ..stga_addon.tracking.footage.sources import VIDEO_SUFFIXES
 from ..stga_addon.training.settings import TrainingSettings, make_settings
-from . import common, monitor, options
+from . import common, options
 from .common import Action, Edit, FileImport, file_path, head_of, is_head, need, needs_rig
 from .options import ONCE
-from .request import idle, start, training_python
+from .request import idle, start
+from .training_python import training_python
+from .windows import show_panel
 
 XRAY_ALPHA = 0.4
 TRACK_FIELDS = ("footage", "start", "step", "cameras", "model", "avatar", "landmarks", "stop")
@@ -232,7 +234,7 @@ class AvatarFromVideo(Action, bpy.types.Operator, FileImport):
             settings = make_settings("global", seconds=seconds, effects={})
         train = Train(capture.parent / jobs.RUN_FOLDER, capture, settings)
         request = jobs.MakeAvatar(self._tracking(video, capture), train)
-        monitor.show_panel()  # where it can be watched and cancelled, also after a drop
+        show_panel()  # where it can be watched and cancelled, also after a drop
         if start(context.scene, request, python):
             self.inform(f"Made {request.out}")
 

@@ -19,7 +19,8 @@ from ..stga_addon.worker.training_python import missing_packages
 from . import options
 from .common import Action, Edit, capture_source, file_path, head_of, needs_head, needs_own_head
 from .options import ONCE
-from .request import idle, start, test, training_python
+from .request import idle, start
+from .training_python import test, training_python
 
 ALL_FRAMES = {"default": -1, "min": -1, "options": ONCE}
 

@@ -10,7 +10,7 @@ from ..operators import monitor
 from ..operators.common import is_head, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
-from ..operators.request import has_training_python
+from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene.display import splat_nodes

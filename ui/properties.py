@@ -8,10 +8,10 @@ import bpy
 from ..operators import options
 from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
-from ..operators.request import has_training_python, test
 from ..operators.results import follow_head
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
+from ..operators.training_python import has_training_python, test
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .sidebar import draw_text
 

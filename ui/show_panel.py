@@ -9,8 +9,8 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..operators.common import AtEnd, register_handlers
-from ..operators.request import has_training_python
 from ..operators.show import GRAY
+from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages

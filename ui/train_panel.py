@@ -7,7 +7,7 @@ import bpy
 
 from ..operators import monitor, train
 from ..operators.common import is_head, package
-from ..operators.request import has_training_python
+from ..operators.training_python import has_training_python
 from ..stga_addon.format import describe_figures, format_duration
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags

@@ -86,7 +86,7 @@ def analyze(extension, monkeypatch, tmp_path):
         monkeypatch.setattr(extension.operators.train, "training_python", lambda context: python)
         bpy.ops.stga.analyze_capture()
 
-    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     yield start
     extension.operators.monitor._close()
 

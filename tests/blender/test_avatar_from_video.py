@@ -47,7 +47,7 @@ def test_it_is_the_request_of_the_command_line(extension, asked, video, tmp_path
     out = tmp_path / "out"
     opened = list[bool]()
     show_panel = lambda: opened.append(True)  # noqa: E731
-    monkeypatch.setattr(extension.operators.monitor, "show_panel", show_panel)
+    monkeypatch.setattr(extension.operators.track, "show_panel", show_panel)
     bpy.ops.stga.avatar_from_video(filepath=str(video), folder=str(out), minutes=0.05, focal=2308.3)
     main, commands = (
         import_module(f"{extension.__name__}.stga_addon.cli.{name}")

@@ -116,7 +116,7 @@ def test_the_chosen_python_carries_commands_out(stga, extension, tmp_path, monke
     chosen.write_text(f'#!/bin/sh\necho "$@" > "{tmp_path}/asked"\nexit 7\n')
     chosen.chmod(0o755)
     monkeypatch.setenv(extension.stga_addon.worker.training_python.PYTHON_VARIABLE, str(chosen))
-    given = extension.operators.request.training_python(bpy.context, "/given/python")
+    given = extension.operators.training_python.training_python(bpy.context, "/given/python")
     assert given == "/given/python"
     model = [] if command == "train" else ["--model", "HEAD"]
     more = ["--iterations", "2"] if command != "track" else []

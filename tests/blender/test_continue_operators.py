@@ -71,7 +71,7 @@ def test_the_panel_stays_at_the_run_until_another_continues_it(
     does not go on to the run that was trained."""
     monitor = extension.operators.monitor
     settings = bpy.context.scene.stga
-    monkeypatch.setattr(monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     settings.run_folder = str(run)
     settings.avatar = str(run / "avatar.npz")
     ends = {
@@ -173,7 +173,7 @@ def test_selection_of_another_head_or_cancelled_changes_nothing(
     wait = f"while not pathlib.Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.02)\n"
     worker(wait + given)
     settings = bpy.context.scene.stga
-    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     bpy.ops.stga.select_extension(directory=str(run))
     assert any(temporary.iterdir())
     assert not bpy.ops.stga.select_extension.poll()
@@ -195,7 +195,7 @@ def test_selection_waits_for_the_end_of_edit_mode(
     """Catches a result lost in Edit Mode, a failure held back, and an old error."""
     worker(answer(extension, tmp_path, {0: np.ones(len(head.data.polygons), bool)}))
     monitor = extension.operators.monitor
-    monkeypatch.setattr(monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     bpy.context.view_layer.objects.active = head
     bpy.ops.object.mode_set(mode="EDIT")
     state = RequestState(Kind.SELECTION, error="of last time")

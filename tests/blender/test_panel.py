@@ -39,8 +39,8 @@ def trained(extension, head, tmp_path, monkeypatch):
         monitor.tick()
         if bpy.context.scene.stga.result_shown:
             break
-    monkeypatch.setattr(monitor, "has_timer", lambda: True)
-    monkeypatch.setattr(monitor, "_start_timer", lambda: None)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
+    monkeypatch.setattr(monitor, "start_timer", lambda: None)
     return run
 
 
@@ -75,7 +75,7 @@ def test_panels(extension, trained, monkeypatch, capsys):
     """Catches files read while drawing, which block redraws, and an error without a trace, or
     repeated."""
     monitor = extension.operators.monitor
-    extension.operators.request.has_training_python(bpy.context)
+    extension.operators.training_python.has_training_python(bpy.context)
 
     def refuse(*arguments, **_):
         raise AssertionError(f"file access while drawing: {arguments}")

@@ -137,7 +137,7 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
     settings.tracking_capture = str(out)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     perform_in_folder(out / "job")
-    monkeypatch.setattr(extension.operators.monitor, "has_timer", lambda: True)
+    monkeypatch.setattr(extension.operators.timers, "has_timer", lambda: True)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
     extension.operators.monitor.tick()
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]

@@ -73,7 +73,7 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
 def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
     """Catches a device or GPU's name that training does not get, and another Python's list."""
     asked = ask_only(monkeypatch, extension)
-    test = extension.operators.request.test
+    test = extension.operators.training_python.test
     for device, adapter, wanted in (
         ("gpu", "", "gpu"),
         ("gpu", "Card (Vulkan)", "gpu:Card (Vulkan)"),
@@ -82,7 +82,7 @@ def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):
         bpy.ops.stga.train(directory=str(tmp_path / "run"), device=device, adapter=adapter)
         assert asked[-1].device == wanted
     for adapters in ((), ("Card (Vulkan)", "Card (Vulkan) #2")):
-        checked = extension.operators.request.Checked("", adapters) if adapters else None
+        checked = extension.operators.training_python.Checked("", adapters) if adapters else None
         monkeypatch.setattr(test, "found", checked)
         assert extension.operators.train.list_adapters(None, None, "") == [*adapters]
 
@@ -250,6 +250,6 @@ def test_python_is_tested_without_a_window(extension):
     with pytest.raises(RuntimeError, match="is not a Python that runs this add-on"):
         bpy.ops.stga.test_python(python="false")
     bpy.ops.stga.test_python(python=sys.executable)
-    assert extension.operators.request.test.found.line.startswith(
+    assert extension.operators.training_python.test.found.line.startswith(
         f"Python {sys.version.split()[0]}, torch "
     )

@@ -23,7 +23,7 @@ PART, RESULT, CAPTURE, BLEND, PYTHON = ARGUMENTS
 PATIENCE_S = 1200.0
 """Compiling kernels for the first time takes a minute, and far longer on a busy machine."""
 monitor = module("operators.monitor")
-test = module("operators.request").test
+test = module("operators.training_python").test
 lock_owner = module("stga_addon.worker.lock").lock_owner
 
 

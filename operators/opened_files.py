@@ -1,0 +1,142 @@
+"""What follows when a file is opened, saved, appended to, or changed: paths, and the head that the
+panel works on."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..stga_addon.scene import tags
+from ..stga_addon.scene.compat import APPENDED
+from ..stga_addon.scene.display.splat_object import (
+    hide_covered,
+    hide_in_layers,
+    is_enabled_on,
+    keep_evaluated,
+    replace_native_splats,
+)
+from ..stga_addon.scene.objects import layers_with
+from ..stga_addon.training.run.folder import has_run
+from . import monitor
+from .common import AtEnd, is_head, register_handlers
+from .results import HEADS, avatar_of
+from .windows import show_panel
+
+
+@persistent
+def _before_save(path: str) -> None:
+    _rebase(bpy.data.filepath, path)
+
+
+@persistent
+def _after_save(path: str) -> None:
+    if bpy.data.filepath != path:  # a copy was saved
+        _rebase(path, bpy.data.filepath)
+
+
+def _rebase(old: str, new: str) -> None:
+    """Let scenes and splats find their run and avatar from another .blend file."""
+    for settings in [scene.stga for scene in bpy.data.scenes if scene.library is None]:
+        for name in ("run_folder", "avatar"):
+            value = getattr(settings, name)
+            moved = _rebased(value, old, new)
+            if moved != value:
+                setattr(settings, name, moved)
+    for thing in bpy.data.objects:
+        if tags.AVATAR in thing and thing.library is None:
+            thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], old, new)
+
+
+def _rebased(value: str, old: str, new: str) -> str:
+    """A path of the .blend file `old` ("": not saved) for `new`: relative where it lies beside that
+    or below, so that all can be moved together; as it is where there is nothing."""
+    place = Path(bpy.path.abspath(value, start=str(Path(old).parent)))
+    beside = Path(new).parent
+    if not value or (value.startswith("//") and not old) or not place.exists():
+        return value
+    is_beside = bool(new) and place.is_relative_to(beside)
+    return f"//{place.relative_to(beside).as_posix()}" if is_beside else str(place)
+
+
+@persistent
+def _after_load(_: Any) -> None:
+    monitor.forget_file()
+    _choose_head()
+    _say(replace_native_splats(bpy.data.objects))
+    monitor.start_timer()
+
+
+def _say(sentence: str) -> None:
+    """Print a sentence, if it is not empty, and show it in the panel."""
+    if sentence:
+        print(f"STGA: {sentence}")
+        bpy.context.window_manager.stga_message = sentence
+
+
+@persistent
+def _after_append(imported: Any) -> None:
+    """Show what was appended or linked as its own file shows it, and let the panel find it."""
+    scene = bpy.context.scene
+    layer = bpy.context.view_layer
+    appended = [item.id for item in imported.import_items if item.id is not None]
+    _say(replace_native_splats(appended))
+    for item in imported.import_items:
+        thing = item.id
+        if thing is None or tags.KIND not in thing:
+            continue
+        if isinstance(thing, bpy.types.Collection):  # of bones or cameras
+            for shown in layers_with(thing, layer):
+                shown.hide_viewport = True
+        elif tags.WORLD in thing:
+            hide_in_layers(thing, scene)
+        elif tags.CONVENTION in thing:
+            hide_covered(thing, scene)
+            if tags.AVATAR in thing and thing.library is None and item.source_library is not None:
+                source = bpy.path.abspath(item.source_library.filepath)
+                thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], source, bpy.data.filepath)
+    _choose_head()
+
+
+def _choose_head() -> None:
+    """Let the panel work on the one head, and the splats, of a file that was made without it, as
+    `stga demo` does, or into which an avatar was appended."""
+    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+        settings = scene.stga
+        heads = [thing for thing in scene.objects if is_head(thing)]
+        shown = [thing for thing in scene.objects if thing.get(tags.KIND) == tags.SPLATS]
+        if settings.head is None and len(heads) == 1:
+            settings.head = heads[0]
+            show_panel()
+            if settings.splats is None and len(shown) == 1:
+                settings.splats = shown[0]
+                settings.avatar = settings.avatar or avatar_of(shown[0])
+        if not has_run(Path(bpy.path.abspath(settings.run_folder))):
+            settings.run_folder = run_of(settings.avatar) or settings.run_folder
+
+
+def run_of(avatar: str) -> str:
+    """The folder of the run that an avatar's path, which may begin with "//", lies in; or ""."""
+    folder = os.path.dirname(avatar)
+    return folder if has_run(Path(bpy.path.abspath(folder))) else ""
+
+
+@persistent
+def _after_update(scene: Any, *_: Any) -> None:
+    """Let the panel work on no head, and no splats, that were deleted: its pointers keep them."""
+    for name in ("head", "splats", *HEADS.values()):
+        thing = getattr(scene.stga, name)
+        if thing is not None and thing.name not in scene.objects and not thing.users_collection:
+            setattr(scene.stga, name, None)
+    head = scene.stga.head
+    splats = scene.stga.splats
+    if is_head(head) and head.hide_viewport and not (splats and is_enabled_on(splats, head)):
+        keep_evaluated(head, scene)  # which looks at all objects
+
+
+def register(at_end: AtEnd) -> None:
+    handlers = bpy.app.handlers
+    files = (handlers.load_post, _after_load), (APPENDED, _after_append)
+    saving = (handlers.save_pre, _before_save), (handlers.save_post, _after_save)
+    register_handlers(at_end, *files, *saving, (handlers.depsgraph_update_post, _after_update))
