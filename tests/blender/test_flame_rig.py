@@ -15,8 +15,8 @@ from stga_addon.flame.teeth import with_teeth
 from stga_addon.scene import tags
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.rig.head import import_head, rig_of
-from stga_addon.scene.rig.keyframes import is_of_parts
-from stga_addon.scene.rig.motion import sample_motion
+from stga_addon.scene.rig.keyframes import Placement, is_of_parts
+from stga_addon.scene.rig.motion import LivePose, apply_motion, sample_motion
 
 from .captures import at_frame, flame_model, flame_sequence, motion_capture
 
@@ -125,7 +125,8 @@ def test_between_frames_the_head_turns_and_does_not_shrink(source):
 
 
 def test_all_components_have_sliders(source):
-    """Fails when another motion's component has no key, or sliders end too early."""
+    """Fails when another motion's component has no key, a slider runs far beyond what a face does,
+    or clamps a motion beyond its range."""
     model = flame_model(identity=12)
     used = np.isin(np.arange(model.n_expression), [3, 17])
     sparse = changed(flame_sequence(model), lambda full: {"expr": full.expr * used})
@@ -134,8 +135,16 @@ def test_all_components_have_sliders(source):
     expected = [f"expr_{k:03d}" for k in range(model.n_expression)]
     expected += [f"identity_{k:03d}" for k in range(10)]
     assert [key.name for key in keys] == ["Basis", *expected]
-    assert {(key.slider_min, key.slider_max) for key in keys[1:]} == {(-10, 10)}
+    assert {(key.slider_min, key.slider_max) for key in keys[1:]} == {(-3, 3)}
     assert_parity(head, sparse)
+    strong = changed(flame_sequence(model), lambda full: {"expr": np.full_like(full.expr, -7.0)})
+    frames = [strong.frame(timestep) for timestep in strong.timesteps]
+    apply_motion(head, frames, Placement(0, "strong"))
+    bpy.context.scene.frame_set(0)
+    blocks = head.data.shape_keys.key_blocks
+    assert blocks["expr_003"].value == -7
+    LivePose(head, rig_of(head)).set_frame(replace(frames[0], expr=-frames[0].expr))
+    assert blocks["expr_003"].value == 7
 
 
 def test_the_published_topology_with_teeth(source, shared_data):
@@ -157,7 +166,7 @@ def test_the_published_topology_with_teeth(source, shared_data):
     head = import_head(motion_capture(sequence, source))
     assert_parity(head, sequence)
     other = np.zeros(model.n_identity)
-    other[:10] = np.random.default_rng(4).normal(0, 2, 10)
+    other[:10] = np.random.default_rng(4).uniform(-3, 3, 10)
     for component, value in enumerate(other[:10]):
         head.data.shape_keys.key_blocks[f"identity_{component:03d}"].value = value
     assert_parity(head, replace(sequence, shape=sequence.shape + other), 1e-5)
@@ -223,7 +232,8 @@ def test_a_saved_rig_shows_the_same(source, tmp_path, capfd):
 
 
 def test_the_bundled_head_has_arkits_sliders(source):
-    """Fails when the bundled head's keys have numbers, or do not come back as its coefficients."""
+    """Fails when the bundled head's keys have numbers, do not come back as its coefficients, or run
+    beyond 0 to 1 and what was tracked."""
     sequence = flame_sequence(bundled_model(None))
     head = import_head(motion_capture(sequence, source))
     names = [key.name for key in head.data.shape_keys.key_blocks[1:]]
@@ -239,5 +249,7 @@ def test_the_bundled_head_has_arkits_sliders(source):
     key = head.data.shape_keys.key_blocks["jawOpen"]
     assert is_of_parts(key.path_from_id("value"), ["expression"])
     assert not is_of_parts(key.path_from_id("value"), ["head", "jaw"])
-    key.value = -9.5  # tracked coefficients leave 0 to 1
-    assert key.value == -9.5
+    column = expected.index("jawOpen")
+    tracked = [sequence.frame(timestep).expr[column] for timestep in sequence.timesteps]
+    limits = min(0.0, *tracked), max(1.0, *tracked)
+    assert (key.slider_min, key.slider_max) == pytest.approx(limits)

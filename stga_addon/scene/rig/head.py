@@ -148,7 +148,8 @@ def add_rig(
     if model.expression_names:
         head[keyframes.EXPRESSION_NAMES] = ",".join(model.expression_names)
     for name, component in sliders.items():
-        _new_shape_key(head, name, basis + model.shapedirs[:, :, component], MAX_SLIDER)
+        shape = basis + model.shapedirs[:, :, component]
+        _new_shape_key(head, name, shape, *keyframes.slider_range(name))
     corrected = np.array(correctives == "all") | (joint_angles(frames) > MIN_JOINT_ANGLE_DEG)
     _add_correctives(head, rig, model, basis, corrected)
     keyframes.key_motion(head, rig, np.array(sequence.timesteps), frames, warn=warn)
@@ -159,7 +160,7 @@ def add_rig(
         )
         for timestep, frame in zip(sequence.timesteps, frames, strict=True):
             offset = 0 if frame.dynamic_offset is None else frame.dynamic_offset
-            _new_shape_key(head, keyframes.offset_key(timestep), basis + offset, 1.0)
+            _new_shape_key(head, keyframes.offset_key(timestep), basis + offset, 0.0, 1.0)
         for name in JOINTS:
             rig[keyframes.offset_property(name)] = [0.0] * 3
         keyframes.key_tracked_offsets(head, rig, sequence, sequence.timesteps)
@@ -195,7 +196,7 @@ def _add_correctives(
             continue
         name = f"pose_{JOINTS[joint]}_{row}{column}"
         path = rotation_path(JOINTS[joint])
-        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], 2.0)
+        _new_shape_key(head, name, basis + model.posedirs[:, :, feature], -2.0, 2.0)
         expression = f"2*({ROTATION_MINUS_IDENTITY[row][column]})/{SQUARED_NORM}"
         rotation = {letter: (rig, f"{path}[{k}]") for k, letter in enumerate("wxyz")}
         add_driver(head.data.shape_keys, key_value_path(name), -1, expression, rotation)
@@ -294,11 +295,13 @@ def _draw_at_skin(rig: Any, basis: np.ndarray, weights: np.ndarray, joints: np.n
             bone.custom_shape_rotation_euler = tip.to_track_quat("Y", "Z").to_euler()
 
 
-def _new_shape_key(head: Any, name: str, vertices: np.ndarray, limit: float) -> None:
+def _new_shape_key(
+    head: Any, name: str, vertices: np.ndarray, lowest: float, highest: float
+) -> None:
     key = head.shape_key_add(name=name, from_mix=False)
     key.points.foreach_set("co", flat_floats(vertices))
-    key.slider_min = -limit
-    key.slider_max = limit
+    key.slider_min = lowest
+    key.slider_max = highest
     key.value = 0.0  # a key made from a script starts at 1
 
 

@@ -98,6 +98,19 @@ def bones_of(parts: Sequence[str]) -> list[str]:
 
 UNCHANGED = 1e-6  # change of a slider's value below which it is not keyframed
 MAX_SLIDER = 10.0  # the widest range that Blender allows a shape key's value: -10 to 10
+COEFFICIENT_RANGE = (-3.0, 3.0)
+"""Of components without names, as a slider shows them: standard deviations, or near to them."""
+
+
+def slider_range(name: str) -> tuple[float, float]:
+    """The range that a slider begins with; `widen` makes room for motions beyond."""
+    return (0.0, 1.0) if name in ARKIT_SHAPES else COEFFICIENT_RANGE
+
+
+def widen(key: Any, low: float, high: float) -> None:
+    """Let a shape key's range, at which Blender clamps its value, hold these two as well."""
+    key.slider_min = min(key.slider_min, low)
+    key.slider_max = max(key.slider_max, high)
 
 
 def key_motion(
@@ -131,8 +144,11 @@ def key_motion(
 
 
 def key_values(owner: Any, paths: dict[int, str], at: np.ndarray, values: np.ndarray) -> None:
-    """Keyframe columns of values (T, C) at their paths; one that stays 0 once."""
+    """Keyframe columns of values (T, C) of shape keys at their paths; one that stays 0 once."""
+    keys = {key_value_path(key.name): key for key in owner.key_blocks}
     for column, path in paths.items():
+        if path in keys and len(values):
+            widen(keys[path], values[:, column].min(), values[:, column].max())
         keyed = slice(None if values[:, column].any() else 1)
         write_curves(owner, path, at[keyed], values[keyed, column])
 
@@ -261,6 +277,7 @@ def add_shapes(head: Any, found: HeadMap, alone: np.ndarray, pairs: np.ndarray) 
             key.value = 0.0  # a key made from a script starts at 1
             factors = [(keys, key_value_path(factor)) for factor in name.split(" * ")]
             if len(factors) == 2:
+                widen(key, -MAX_SLIDER, MAX_SLIDER)
                 variables = dict(zip("ab", factors, strict=True))
                 add_driver(keys, key_value_path(name), -1, "a*b", variables)
         key.points.foreach_set("co", flat_floats(basis + displacement))

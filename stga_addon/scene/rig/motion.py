@@ -213,11 +213,15 @@ class LivePose:
     def _set_sliders(self, values: Mapping[str, float]) -> None:
         mesh = self.head.get().data
         blocks = mesh.shape_keys.key_blocks
-        held = read_values(blocks, "value", 1)
+        held = read_values(blocks, "value", 1)[:, 0]
+        lowest = read_values(blocks, "slider_min", 1)[:, 0]
+        highest = read_values(blocks, "slider_max", 1)[:, 0]
         for row, name in enumerate(blocks.keys()):
             if name in values:
                 held[row] = values[name]
-        blocks.foreach_set("value", held.ravel())
+                if not lowest[row] <= held[row] <= highest[row]:
+                    keyframes.widen(blocks[row], held[row], held[row])
+        blocks.foreach_set("value", held)
         mesh.shape_keys.update_tag()
         mesh.update_tag()
 
