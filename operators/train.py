@@ -1,6 +1,7 @@
 """The Train step, in a worker process beside Blender: analyzing the capture, training an avatar,
 refining a region of it, and extending it by a further take of the same head."""
 
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -13,7 +14,7 @@ from ..stga_addon.jobs.analyze import Analyze
 from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.scene import vertex_groups as groups
 from ..stga_addon.training.effect_catalog import parse_choice
-from ..stga_addon.training.run.folder import AVATAR, next_folder, read_run
+from ..stga_addon.training.run.folder import AVATAR, has_run, next_folder, read_run
 from ..stga_addon.training.settings import PRESETS, TrainingSettings, make_settings
 from ..stga_addon.worker.training_python import missing_packages
 from . import options
@@ -165,6 +166,9 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         "Continue the run in the folder with the settings and budget that it was started with",
         options=ONCE,
     )
+    more: options.boolean(
+        "More", "Train the run in the folder for so many minutes more", options=ONCE
+    )
 
     def run(self, context: Any) -> None:
         head = head_of(context)
@@ -174,12 +178,15 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
             expected = "expected the capture that the head was imported from"
             raise StgaError(f"{capture}: is not a folder; {expected}")
         selection = groups.training_selection(head)
-        if self.resume:
+        if self.resume or self.more:
             # with takes, the head may be that of any of them
             moved = None if read_run(run).takes else capture
             device = self.chosen_device
-            self.start(context, jobs.Resume(run, moved, flame, point, device, selection))
+            more_s = 60 * self.minutes if self.more else None
+            self.start(context, jobs.Resume(run, moved, flame, point, device, selection, more_s))
             return
+        if has_run(run):
+            run = self._take_next_folder(context, run)
         preset = None if self.preset == "none" else self.preset
         effects = None
         if self.strategy != "gaussian-avatars":
@@ -190,6 +197,16 @@ class Train(TrainingOperator, TrainOptions, bpy.types.Operator):
         )
         request = jobs.Train(run, capture, settings, flame, point, self.chosen_device, selection)
         self.start(context, request)
+
+    def _take_next_folder(self, context: Any, occupied: Path) -> Path:
+        """The next free folder beside one that holds a run, also in the panel."""
+        free = next_folder(occupied)
+        settings = context.scene.stga
+        if Path(bpy.path.abspath(settings.run_folder)).resolve() == occupied:
+            given = settings.run_folder.rstrip("/\\")
+            settings.run_folder = given.removesuffix(occupied.name) + free.name
+        self.inform(f"{occupied.name} holds a run; training into {free.name} beside it")
+        return free
 
 
 class ContinueOperator(TrainingOperator, Edit):

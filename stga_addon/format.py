@@ -40,6 +40,16 @@ def format_table(rows: Sequence[tuple[str, str]]) -> list[str]:
     return [f"{label:<{width}}  {value}" for label, value in rows]
 
 
+QUALITIES_DB = {"Good": 30.0, "Usable": 25.0, "Rough": -math.inf}
+"""Word for a held-out PSNR -> from which on."""
+
+
+def describe_quality(figures: Mapping[str, float]) -> str:
+    """A word for how good an avatar is; "" before its first evaluation."""
+    psnr = figures.get("psnr", math.nan)
+    return next((word for word, least in QUALITIES_DB.items() if psnr >= least), "")
+
+
 def describe_figures(figures: Mapping[str, float]) -> list[str]:
     """Figures of any work as short lines for a narrow panel, without those that are not known yet.
 

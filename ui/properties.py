@@ -140,6 +140,9 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
         "Show When Trained", "Show the avatar on the head when training has finished", default=True
     )
     avatar: options.path("Avatar", "Trained avatar file (.npz)")
+    show_figures: options.boolean(
+        "Figures", "Show speed, PSNR of held-out views in dB, loss, number of splats and memory"
+    )
 
 
 class Preferences(bpy.types.AddonPreferences):

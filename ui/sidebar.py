@@ -11,10 +11,10 @@ import numpy as np
 
 from ..operators import monitor
 from ..operators.common import TAB, AtEnd
-from ..stga_addon.format import describe_figures
+from ..stga_addon.format import describe_figures, describe_quality, format_duration
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import KINDS, STORED, Kind
-from ..stga_addon.worker.status import WorkerState
+from ..stga_addon.worker.status import WorkerState, WorkerStatus
 
 LETTER_WIDTH_PX = 7
 """Average, at a resolution scale of 1."""
@@ -84,13 +84,33 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
     elif now.state.is_alive:
         text = now.status.message
     layout.progress(factor=now.status.progress, text=f"{percent:.0f} %  {text}")
-    column = layout.column(align=True)
-    for line in (*describe_figures(now.status.figures), now.status.detail):
-        draw_text(column, context, line)
+    left_s = now.status.figures.get("left_s", 0.0)
+    if left_s > 0:  # not where it is not known
+        draw_text(layout, context, f"About {format_duration(left_s)} left", "TIME")
+    draw_figures(layout, context, now.status)
     if kind in STORED:
         draw_curve(layout, state.run)
     layout.operator("stga.cancel", text="Cancel", icon="CANCEL").request = kind
     return True
+
+
+def draw_figures(layout: Any, context: Any, status: WorkerStatus) -> None:
+    """Draw a word for how good the result is; figures, and what more time brings, unfold."""
+    figures = {name: value for name, value in status.figures.items() if name != "left_s"}
+    lines = describe_figures(figures)
+    word = describe_quality(figures)
+    column = layout.column(align=True)
+    if not lines:
+        draw_text(column, context, status.detail)
+        return
+    is_open = context.scene.stga.show_figures
+    arrow = "DISCLOSURE_TRI_DOWN" if is_open else "DISCLOSURE_TRI_RIGHT"
+    text = f"Quality: {word}" if word else "Figures"
+    row = column.row()
+    row.alignment = "LEFT"
+    row.prop(context.scene.stga, "show_figures", text=text, icon=arrow, emboss=False)
+    for line in (*lines, status.detail) if is_open else ():
+        draw_text(column, context, line)
 
 
 def draw_end(layout: Any, context: Any, state: RequestState) -> Any:

@@ -1,6 +1,7 @@
 """The Train step: settings, progress, and result or failure; refining a region of the trained
 avatar, and extending it by a further take; what the analysis decided about effects, and why."""
 
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -8,7 +9,7 @@ import bpy
 from ..operators import monitor, train
 from ..operators.common import is_head, package
 from ..operators.training_python import has_training_python
-from ..stga_addon.format import describe_figures, format_duration
+from ..stga_addon.format import format_duration
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.vertex_groups import shows_residuals
@@ -21,6 +22,7 @@ from .sidebar import (
     SidebarPanel,
     draw_curve,
     draw_end,
+    draw_figures,
     draw_running,
     draw_text,
     set_options,
@@ -44,8 +46,7 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
                 remedy = "choose its new folder and press Resume"
                 draw_text(box, context, f"{run}: does not exist; {remedy}")
             elif not state.failed:
-                for line in describe_figures(training.snapshot.status.figures)[1:]:
-                    draw_text(box, context, line)
+                draw_figures(box, context, training.snapshot.status)
                 draw_curve(box, run)
                 if training.files.tracking is not None:  # the splats were trained with it
                     head = context.scene.stga.head
@@ -62,17 +63,29 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "minutes")
         row = layout.row(align=True)
         draw_train_button(row, settings)
-        draw_train_button(row, settings, resume=True)
+        is_known = training.subject is not None and training.place == _run_folder(settings)
+        finished = training.snapshot.state == WorkerState.FINISHED
+        is_more = finished if is_known else bool(settings.avatar)
+        draw_train_button(row, settings, goes_on="more" if is_more else "resume")
         draw_missing_python(layout, context)
 
 
-def draw_train_button(layout: Any, settings: Any, resume: bool = False) -> None:
-    """Draw the button that starts, or resumes, training with the panel's settings."""
-    text, icon = ("Resume", "FRAME_NEXT") if resume else ("Train", "MOD_PARTICLES")
-    button = layout.operator("stga.train", text=text, icon=icon)
+def _run_folder(settings: Any) -> Path:
+    return Path(bpy.path.abspath(settings.run_folder))
+
+
+def draw_train_button(layout: Any, settings: Any, goes_on: str = "") -> None:
+    """Draw the button that starts training with the panel's settings, or goes on with it: "resume"
+    or "more"."""
+    more = f"Train {format_duration(60 * settings.minutes)} More"
+    text = {"": "Train", "resume": "Resume", "more": more}[goes_on]
+    button = layout.operator(
+        "stga.train", text=text, icon="FRAME_NEXT" if goes_on else "MOD_PARTICLES"
+    )
     set_options(button, settings, train.TrainOptions)
     button.directory = settings.run_folder
-    button.resume = resume
+    button.resume = goes_on == "resume"
+    button.more = goes_on == "more"
     button.effects = " ".join(train.chosen_effects(settings))
 
 

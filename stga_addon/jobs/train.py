@@ -61,10 +61,11 @@ class Train:
 
 @dataclass(frozen=True)
 class Resume:
-    """Continue a run that was stopped.
+    """Continue a run that was stopped, or train one further.
 
     capture, flame, principal_point   stand in for those that the run was begun with; None: these
     selection       where training has not begun
+    more_s          seconds to train from its checkpoint on; None: what is left of its budget
     """
 
     run: Path
@@ -73,6 +74,7 @@ class Resume:
     principal_point: str | None = setting(None, choices=PRINCIPAL_POINTS)
     device: str = like(Train, "device")
     selection: Selection | None = None
+    more_s: float | None = setting(None, above=0)
 
 
 def resumed(request: "Train | Refine | Extend") -> "Train | Resume | Refine | Extend":
@@ -191,8 +193,10 @@ class Prepared:
     def train_as_asked(self, report: Report) -> Path:
         """Train on the device of the request, or the one chosen for it; the path of the avatar.
         Raises as `training.run.session.train_run`."""
-        from ..training.run.session import train_run, train_run_or_fall_back
+        from ..training.run.session import train_more, train_run, train_run_or_fall_back
 
+        if isinstance(self.request, Resume) and self.request.more_s is not None:
+            return train_more(self.capture, self.request.run, self.run, self.request.more_s, report)
         train = train_run_or_fall_back if self.request.device == "auto" else train_run
         resumes = isinstance(self.request, Resume)
         return train(self.capture, self.request.run, self.run, self.selection, resumes, report)

@@ -31,7 +31,8 @@ def trained(extension, head, tmp_path, monkeypatch):
     jobs.perform.write_request(folder, jobs.train.Train(run, tmp_path / "capture", settings))
     with extension.stga_addon.worker.status.status_writer(folder) as writer:
         monitor.follow(bpy.context.scene, Kind.TRAINING, run, folder)
-        writer.report(Progress(0.5, "Training"))
+        figures = {"psnr": 27.0, "splats": 5.0, "left_s": 70.0}
+        writer.report(Progress(0.5, "Training", figures=lambda: figures))
         (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines()))
         (run / "tracking.npz").write_bytes(b"")
     write_ball_avatar(run / "avatar.npz")
@@ -67,7 +68,8 @@ def draw(extension, name: str = "") -> list[str]:
         if leaf.kind == "prop":
             owner, prop = leaf.arguments[:2]
             assert prop.startswith("[") or hasattr(owner, prop)
-    shown = [leaf for leaf in leaves if not leaf.kind.startswith(("prop", "template_list"))]
+    shown = [leaf for leaf in leaves if leaf.options.get("text") or leaf.kind[:4] != "prop"]
+    shown = [leaf for leaf in shown if leaf.kind != "template_list"]
     return [leaf.text or leaf.kind for leaf in shown]
 
 
@@ -100,6 +102,23 @@ def test_panels(extension, trained, monkeypatch, capsys):
     assert "Monitoring stopped after an unexpected error (ZeroDivisionError" in " ".join(
         draw(extension)
     )
+
+
+def test_a_word_for_the_quality_and_more_training(extension, trained):
+    """Catches figures that only an expert reads, and a finished run that can only be resumed, which
+    trains nothing."""
+    settings = bpy.context.scene.stga
+    settings.run_folder = str(trained)
+    settings.minutes = 3.0
+    texts = draw(extension, "STGA_PT_train")
+    assert "Quality: Usable" in texts
+    assert not any("PSNR" in text for text in texts)
+    assert {"Train", "Train 3 min More"} <= set(texts)
+    settings.show_figures = True
+    assert "PSNR 27.00 dB" in draw(extension, "STGA_PT_train")
+    settings.run_folder = "//another"
+    settings.avatar = ""
+    assert {"Train", "Resume"} <= set(draw(extension, "STGA_PT_train"))
 
 
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])

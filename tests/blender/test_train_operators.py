@@ -4,6 +4,8 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -54,8 +56,6 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
     folder = str(tmp_path / "run")
     bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
     bpy.ops.stga.train(directory=folder, iterations=3, device="cpu")
-    with pytest.raises(RuntimeError, match="already holds a run"):
-        bpy.ops.stga.train(directory=folder, iterations=3)
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     mistakes = (
         (other, "opencv", rf"^Error: .*run: was trained on {one} .*{other}"),
@@ -68,6 +68,25 @@ def test_resume_of_another_capture_is_refused(extension, tmp_path):
         assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
     bpy.ops.stga.import_capture(directory=str(one), principal_point="opencv")
     bpy.ops.stga.train(directory=folder, resume=True)
+
+
+def test_an_occupied_folder_and_more_training(head, tmp_path, monkeypatch, extension):
+    """Catches a run that is overwritten or refused where the next folder is free, a panel that
+    still names the one before, and *More* that asks for the budget of before."""
+    asked = ask_only(monkeypatch, extension)
+    settings = bpy.context.scene.stga
+    run = tmp_path / "run"
+    run.mkdir()
+    monkeypatch.setattr(extension.operators.train, "has_run", run.__eq__)
+    for given, expected in ((run, tmp_path / "run_2"), (tmp_path / "b", tmp_path / "b")):
+        settings.run_folder = str(given)
+        bpy.ops.stga.train(directory=str(given), iterations=3)
+        assert asked.pop().run == Path(settings.run_folder) == expected
+    stored = SimpleNamespace(takes=())
+    monkeypatch.setattr(extension.operators.train, "read_run", lambda _: stored)
+    bpy.ops.stga.train(directory=str(run), minutes=3, more=True)
+    bpy.ops.stga.train(directory=str(run), minutes=3, resume=True)
+    assert [(request.run, request.more_s) for request in asked] == [(run, 180), (run, None)]
 
 
 def test_device_reaches_the_request(head, tmp_path, monkeypatch, extension):

@@ -20,7 +20,7 @@ from stga_addon.training.run import session as run_module
 from stga_addon.training.run.checkpoint import read_checkpoint, read_selection
 from stga_addon.training.run.folder import Run, read_residuals, read_run
 from stga_addon.training.run.metrics_log import read_metrics
-from stga_addon.training.run.session import train_run
+from stga_addon.training.run.session import train_more, train_run
 from stga_addon.training.settings import STRATEGIES
 
 from .toys import assert_same_state, quick_settings, stop_at
@@ -336,6 +336,39 @@ def test_a_budget_in_seconds(toy: Capture, tmp_path: Path, monkeypatch: pytest.M
     assert 0.6 <= end.elapsed_s < 0.615
     assert end.iteration == pytest.approx(60, abs=1)
     assert shares == sorted(shares)
+
+
+def test_more_training(
+    toy: Capture, unbroken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Catches a finished run that trains nothing more, or as if from the beginning, an avatar that
+    gets worse, and a run that cannot be resumed afterwards."""
+    out = tmp_path / "run"
+    shutil.copytree(unbroken, out)
+    shares: list[float] = []
+    left: list[float] = []
+
+    def note(progress: Progress) -> bool:
+        if progress.stage == "Training":
+            shares.append(progress.share)
+            left.append(progress.figures()["left_s"])
+        return False
+
+    before = read_checkpoint(out)
+    ticks = count()  # every step takes 0.01 s
+    monkeypatch.setattr(run_module, "perf_counter", lambda: next(ticks) / 100)
+    train_more(toy, out, make_run(toy), 0.2, note)
+    after = read_checkpoint(out)
+    assert after.elapsed_s - before.elapsed_s == pytest.approx(0.2, abs=0.02)
+    assert after.iteration - before.iteration == pytest.approx(20, abs=1)
+    assert shares == sorted(shares)
+    assert shares[0] >= 0.5
+    assert left == sorted(left, reverse=True)
+    lines = read_metrics(out)
+    assert lines[-1]["iteration"] == after.iteration
+    assert lines[: before.lines] == read_metrics(unbroken)
+    train_run(toy, out, make_run(toy), resume=True)
+    assert read_checkpoint(out).iteration == after.iteration
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)

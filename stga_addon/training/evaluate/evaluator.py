@@ -1,6 +1,5 @@
 """Evaluations of a run while it trains: when they are due, what is kept, and when to stop."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,16 +30,13 @@ RENDERING_COST = 0.5
 
 @dataclass(frozen=True)
 class Spent:
-    """Trained so far: share of the budget (may exceed 1), seconds without evaluations, steps."""
+    """Trained so far: share of the budget (may exceed 1), seconds without evaluations, steps; the
+    seconds of training that are left, at the speed so far, NaN before the first step."""
 
     share: float
     seconds: float
     iterations: int
-
-    @property
-    def left_s(self) -> float:
-        """Seconds of training left, at the speed so far; NaN before the first step."""
-        return max(0.0, self.seconds * (1 / self.share - 1)) if self.share > 0 else math.nan
+    left_s: float
 
 
 @dataclass

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from shutil import copyfile
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from ...render.render import render_avatar
 from ...selection import select_capture
 from ...tracking.folder import is_in_order
 from ..evaluate import lpips, metrics
-from ..evaluate.evaluator import Evaluator, Spent
+from ..evaluate.evaluator import EVALUATIONS, Evaluator, Spent
 from ..evaluate.forecast import UNMATCHED
 from ..evaluate.metrics import RESIDUAL_SCALE, triangle_residuals
 from ..optimize.avatar_tracking import (
@@ -45,7 +46,12 @@ from ..optimize.trainer import Start, Trainer
 from ..schedule import image_scales, view_order
 from . import checkpoint as checkpoints
 from . import folder as folders
-from .continuation import continued_evaluation_views, continued_order, starting_state
+from .continuation import (
+    START_SHARE,
+    continued_evaluation_views,
+    continued_order,
+    starting_state,
+)
 from .folder import AVATAR, CHECKPOINT, TRACKING, Run
 from .metrics_log import METRICS, TRACKING_GAIN, append_metrics, cut_metrics, read_metrics
 
@@ -135,6 +141,30 @@ def train_run(
     return out / AVATAR
 
 
+def train_more(
+    capture: Capture, out: Path, run: Run, seconds: float, report: Report = ignore
+) -> Path:
+    """Train the run in the folder `out` for so many seconds more than it was, whether its budget is
+    spent or not, by the later part of its schedule; the path of the avatar file. Raises as
+    `train_run` does."""
+    lpips.load_network()
+    with folders.locked(out):
+        run = replace(run, identity=folders.check_identity(out, run, capture))
+        session = _resume(capture, out, run, report)
+        session.begin_addition(seconds)
+        session.complete()
+    return out / AVATAR
+
+
+class _Addition(NamedTuple):
+    """Training beyond the budget: its seconds, and the seconds and the share of the schedule at
+    which it begins."""
+
+    seconds: float
+    begun_s: float
+    begun_share: float
+
+
 @dataclass
 class _Session:
     """A run that trains.
@@ -146,6 +176,7 @@ class _Session:
     speed         iterations per second since this process began to train
     tracking_gain TRACKING_GAIN, of which the next evaluation is to tell; NaN: nothing was left out
     interrupts    the first Ctrl-C
+    addition      training beyond the budget, if it was asked for
     """
 
     capture: Capture
@@ -161,6 +192,18 @@ class _Session:
     speed: float = 0.0
     tracking_gain: float | None = None
     interrupts: list[int] = field(default_factory=list)
+    addition: _Addition | None = None
+
+    def begin_addition(self, seconds: float) -> None:
+        """Train so long from here on, whatever budget and goals the run began with."""
+        begun_share = min(self._spent().share, START_SHARE)
+        self.addition = _Addition(seconds, self.elapsed_s, begun_share)
+        evaluator = self.evaluator
+        evaluator.settings = replace(evaluator.settings, target_psnr=None, stop_when_flat=False)
+        evaluator.count = int(begun_share * EVALUATIONS)
+        tracking = self.trainer.tracking
+        if tracking is not None:  # unseen heads are fitted to the later avatar again
+            tracking.rounds = min(tracking.rounds, 1)
 
     def complete(self) -> None:
         """Train until the budget is spent, a goal is reached or the report asks to stop."""
@@ -454,9 +497,18 @@ class _Session:
     def _spent(self) -> Spent:
         settings = self.run.settings
         iterations = self.trainer.iteration
-        if settings.seconds is not None:
-            return Spent(self.elapsed_s / settings.seconds, self.elapsed_s, iterations)
-        return Spent(iterations / (settings.iterations or 1), self.elapsed_s, iterations)
+        begun_share = done_s = 0.0
+        budget_s = settings.seconds
+        if self.addition is not None:
+            budget_s, done_s, begun_share = self.addition
+        if budget_s is not None:
+            done_s = self.elapsed_s - done_s
+            share = begun_share + (1 - begun_share) * done_s / budget_s
+            left_s = max(0.0, budget_s - done_s)
+        else:
+            share = iterations / (settings.iterations or 1)
+            left_s = max(0.0, self.elapsed_s * (1 / share - 1)) if share > 0 else math.nan
+        return Spent(share, self.elapsed_s, iterations, left_s)
 
     def _is_finished(self) -> bool:
         return self.evaluator.is_finished(self._spent())
