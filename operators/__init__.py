@@ -12,6 +12,7 @@ from . import (
     kernels,
     monitor,
     opened_files,
+    pick,
     pose,
     render_video,
     request,
@@ -30,6 +31,7 @@ MODULES = (
     train,
     request,
     training_python,
+    pick,
     pose,
     show,
     render_video,
@@ -37,9 +39,15 @@ MODULES = (
     drive,
     export,
 )
-KEYS = (("Pose", "EMPTY", "stga.turn_jaw", "R"), ("3D View", "VIEW_3D", "stga.stop_live", "ESC"))
-"""Keymap, its space, operator and key: R turns a jaw about its hinge, Esc over a 3D viewport stops
-the live session."""
+PICK = "stga.pick_avatar"
+KEYS = (
+    ("Pose", "EMPTY", "stga.turn_jaw", "R", "PRESS", False),
+    ("3D View", "VIEW_3D", "stga.stop_live", "ESC", "PRESS", False),
+    ("Object Mode", "EMPTY", PICK, "LEFTMOUSE", "CLICK", False),
+    ("Object Mode", "EMPTY", PICK, "LEFTMOUSE", "CLICK", True),
+)
+"""Keymap, its space, operator, key and event, with Shift: R turns a jaw about its hinge, Esc over a
+3D viewport stops the live session, a click selects an avatar."""
 CLASSES = tuple(
     thing
     for module in MODULES
@@ -81,9 +89,12 @@ def register(at_end: AtEnd) -> None:
         menu.append(draw)
         at_end(menu.remove, draw)
     keys = bpy.context.window_manager.keyconfigs.addon
-    for name, space, operator, key in KEYS if keys is not None else ():  # none without a window
+    for name, space, operator, key, event, shift in KEYS if keys is not None else ():
         items = keys.keymaps.new(name=name, space_type=space).keymap_items
-        at_end(items.remove, items.new(operator, key, "PRESS"))
+        item = items.new(operator, key, event, shift=shift)
+        if operator == PICK:
+            item.properties.extend = shift
+        at_end(items.remove, item)
     for part in (kernels, opened_files, monitor, pose, render_video, drive):
         part.register(at_end)
     at_end(close_steps)

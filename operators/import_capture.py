@@ -23,6 +23,7 @@ from ..stga_addon.scene.objects import (
     COLLECTIONS,
     capture_root,
     leave_edit_mode,
+    mover_of,
     show_kind,
     show_progress,
 )
@@ -81,6 +82,7 @@ class HeadImport(Edit):
             thing.select_set(False)
         if objects.get(head.name) is head:
             head.select_set(True)
+            mover_of(head).select_set(True)
             objects.active = head
         cube = objects.get("Cube") if is_first else None  # later on, the user shows it
         if cube is not None and not cube.library and cube.type == "MESH":

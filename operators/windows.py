@@ -12,10 +12,10 @@ from .common import TAB
 MAX_SIDEBAR_ATTEMPTS = 10
 
 
-def push_undo() -> None:
+def push_undo(what: str = "Show Result") -> None:
     """Let undo come back to what is in the file now."""
     if bpy.ops.ed.undo_push.poll():
-        bpy.ops.ed.undo_push(message="Show Result")
+        bpy.ops.ed.undo_push(message=what)
 
 
 def redraw() -> None:

@@ -84,6 +84,8 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
             root.users_collection[0].children.link(collection)
         collection.objects.link(obj)
         obj.parent = root
+        if kind != tags.CAMERA:
+            lock(obj)
     else:
         leave_edit_mode()
         old_data = obj.data
@@ -94,6 +96,19 @@ def place(root: Any, kind: str, name: str, data: Any, existing: Any = None) -> A
         data.name = name
     tags.mark(obj, kind, Path(root[tags.CAPTURE]))
     return obj
+
+
+def mover_of(part: Any) -> Any:
+    """What moves an object of a capture with all that belongs to it: the capture's Empty."""
+    root = part.parent
+    return root if root is not None and root.get(tags.KIND) == tags.ROOT else part
+
+
+def lock(part: Any) -> None:
+    """Let nobody move an object of a capture away from what it belongs to."""
+    for field in ("lock_location", "lock_rotation", "lock_scale"):
+        setattr(part, field, (True, True, True))
+    part.lock_rotation_w = True
 
 
 def reset(obj: Any) -> None:

@@ -17,7 +17,7 @@ from .. import compat, tags
 from ..arrays import has_triangles, mesh_triangles, mesh_vertices, triangle_mesh
 from ..compat import animation_curves, modifier_input, set_modifier_input
 from ..layers import DisplaySettings
-from ..objects import remove
+from ..objects import lock, remove
 from . import splat_attributes as stored
 from . import splat_nodes
 from .frame_nodes import SIGNALS
@@ -73,6 +73,7 @@ def show_avatar(
         splat_object.parent = head.parent
         splat_object.matrix_parent_inverse = head.matrix_parent_inverse
         splat_object.matrix_basis = head.matrix_basis
+        lock(splat_object)
     else:
         _exchange_tree(splat_object, splat_nodes.splat_tree(_tree_options(avatar)))
     splat_object[tags.CONVENTION] = avatar.convention
