@@ -17,7 +17,7 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export.splat_files import READERS
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.avatar_scene import frame_head
+from ..stga_addon.scene.avatar_scene import frame_head, place_beside
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import (
     COLLECTIONS,
@@ -55,10 +55,11 @@ class HeadImport(Edit):
         source: Path,
         flame: str = "",
         principal_point: str = DEFAULT_PRINCIPAL_POINT,
-        set_up_scene: bool = False,
+        set_up_scene: bool | None = False,
         correctives: str = "all",
     ) -> None:
-        """Import what `open_capture` reads, and make it the scene's head. Raises StgaError."""
+        """Import what `open_capture` reads, and make it the scene's head. set_up_scene: None: where
+        it has no other head. Raises StgaError."""
         warn = self.warn
         scene = context.scene
         objects = context.view_layer.objects
@@ -66,17 +67,24 @@ class HeadImport(Edit):
         model = None if has_model else flame_model_path(context, flame)
         capture = open_capture(source, flame=model, principal_point=principal_point)
         show_progress(0.5)
-        is_first = not any(is_head(thing) for thing in scene.objects)
+        heads = [thing for thing in scene.objects if is_head(thing)]
+        others = [each for each in heads if each[tags.CAPTURE] != str(capture.root.resolve())]
+        is_new = len(heads) == len(others)
         head = import_head(capture, warn=warn, correctives=correctives)
+        if others and is_new:
+            place_beside(head, others)
+        if set_up_scene is None:
+            set_up_scene = not others
         show_progress(0.8)
         cameras = import_cameras(capture, capture_root(capture.root), warn=warn)
         head[tags.FLAME_MODEL] = str(capture.flame_file or "")
         head[tags.PRINCIPAL_POINT] = principal_point
         head[tags.TRACKED] = is_tracked(capture.root)
         scene.stga.head = head
-        scene.frame_start = capture.timesteps[0]
-        scene.frame_end = capture.timesteps[-1]
-        scene.frame_set(capture.timesteps[0])
+        if set_up_scene or not others:
+            scene.frame_start = capture.timesteps[0]
+            scene.frame_end = capture.timesteps[-1]
+            scene.frame_set(capture.timesteps[0])
         leave_edit_mode()
         for thing in objects.selected:
             thing.select_set(False)
@@ -84,7 +92,7 @@ class HeadImport(Edit):
             head.select_set(True)
             mover_of(head).select_set(True)
             objects.active = head
-        cube = objects.get("Cube") if is_first else None  # later on, the user shows it
+        cube = None if heads else objects.get("Cube")  # later on, the user shows it
         if cube is not None and not cube.library and cube.type == "MESH":
             # hidden where it is as it came with Blender: 2 m wide, it would enclose the head
             is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
@@ -138,8 +146,10 @@ class ImportCapture(HeadImport, bpy.types.Operator, FileImport):
     set_up_scene: options.boolean(
         "Set Up Scene",
         "Set the scene's resolution, camera and frame rate to those of the capture, "
-        "and its view transform to Standard, which the splats' colors are trained for",
+        "and its view transform to Standard, which the splats' colors are trained for; unless "
+        "asked for, with the scene's first head only",
         default=True,
+        options=ONCE,
     )
     filter_glob: options.file_filter("")
 
@@ -150,7 +160,8 @@ class ImportCapture(HeadImport, bpy.types.Operator, FileImport):
         if folder.is_file():
             raise StgaError(f"{path}: is in no capture; choose a capture's folder, or a file in it")
         point = self.principal_point
-        set_up = self.set_up_scene
+        is_asked = self.properties.is_property_set("set_up_scene")
+        set_up = self.set_up_scene if is_asked else None
         correctives = self.correctives
         self.bring_in(context, folder, self.flame, point, set_up, correctives)
 
@@ -202,7 +213,7 @@ class OpenDemo(HeadImport, bpy.types.Operator):
         except (OSError, shutil.Error) as error:
             problem = getattr(error, "strerror", None) or error
             raise StgaError(f"{own}: cannot be written ({problem})") from error
-        self.bring_in(context, own, set_up_scene=True)
+        self.bring_in(context, own, set_up_scene=None)
         runs = Path.home() / "STGA Demo"
         names = ("run", *(f"run {number}" for number in range(2, 1000)))
         free = next(runs / name for name in names if not has_run(runs / name))

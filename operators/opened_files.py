@@ -17,12 +17,12 @@ from ..stga_addon.scene.display.splat_object import (
     keep_evaluated,
     replace_native_splats,
 )
-from ..stga_addon.scene.objects import layers_with
+from ..stga_addon.scene.objects import layers_with, mover_of
 from ..stga_addon.training.run.folder import has_run
 from . import monitor
 from .common import AtEnd, is_head, register_handlers
 from .results import HEADS, avatar_of
-from .windows import show_panel
+from .windows import redraw, show_panel
 
 
 @persistent
@@ -73,6 +73,7 @@ def _say(sentence: str) -> None:
     if sentence:
         print(f"STGA: {sentence}")
         bpy.context.window_manager.stga_message = sentence
+        bpy.context.window_manager.stga_failed = False
 
 
 @persistent
@@ -122,9 +123,28 @@ def run_of(avatar: str) -> str:
     return folder if has_run(Path(bpy.path.abspath(folder))) else ""
 
 
+_active: dict[int, int] = {}
+"""Session id of a scene -> of the active object that the panel has followed."""
+
+
+def _follow_active(scene: Any) -> None:
+    """Let the panel work on the head of what has become the active object."""
+    active = bpy.context.view_layer.objects.active if bpy.context.scene == scene else None
+    if active is None or _active.get(scene.session_uid) == active.session_uid:
+        return
+    _active[scene.session_uid] = active.session_uid
+    family = (active, *mover_of(active).children)
+    head = next((each for each in family if is_head(each)), scene.stga.head)
+    if head != scene.stga.head:
+        scene.stga.head = head
+        redraw()
+
+
 @persistent
 def _after_update(scene: Any, *_: Any) -> None:
-    """Let the panel work on no head, and no splats, that were deleted: its pointers keep them."""
+    """Let the panel follow the active object, and work on no head, and no splats, that were
+    deleted: its pointers keep them."""
+    _follow_active(scene)
     for name in ("head", "splats", *HEADS.values()):
         thing = getattr(scene.stga, name)
         if thing is not None and thing.name not in scene.objects and not thing.users_collection:

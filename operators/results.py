@@ -1,6 +1,7 @@
 """How the result of each kind of request reaches the scene, and what the scene stores of it."""
 
 import json
+import os
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -19,7 +20,7 @@ from ..stga_addon.scene import tags
 from ..stga_addon.scene.avatar_scene import show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
-from ..stga_addon.scene.objects import Identity
+from ..stga_addon.scene.objects import Identity, mover_of
 from ..stga_addon.scene.vertex_groups import write_selection
 from ..stga_addon.tracking.folder import is_flame
 from ..stga_addon.training.run.folder import AVATAR, TRACKING, read_run
@@ -157,11 +158,28 @@ def avatar_of(splats: Any) -> str:
 
 
 def follow_head(settings: Any) -> None:
-    """Let the panel show the splats of the head that was chosen in it, and name their avatar."""
-    shown = shown_splats(settings.id_data, settings.head)
+    """Let the panel show the splats of the head that was chosen in it, and name their avatar and
+    their run, or a new one beside that of another head."""
+    scene = settings.id_data
+    head = settings.head
+    shown = shown_splats(scene, head)
+    has_others = any(is_head(thing) and thing != head for thing in scene.objects)
     if shown is not None:
         settings.splats = shown
         settings.avatar = avatar_of(shown) or settings.avatar
+    elif head is not None and has_others:
+        settings.splats = None
+        settings.avatar = ""
+    if head is not None and (tags.RUN in head or has_others):
+        before = settings.run_folder.rstrip("/\\")
+        beside = before.removesuffix(os.path.basename(before))
+        settings.run_folder = head.get(tags.RUN) or f"{beside}{mover_of(head).name}_run"
+
+
+def keep_run_folder(settings: Any) -> None:
+    """Store the panel's run folder with its head, for when that is chosen again."""
+    if is_head(settings.head) and settings.head.library is None:
+        settings.head[tags.RUN] = settings.run_folder
 
 
 def _is_immature(state: RequestState) -> bool:

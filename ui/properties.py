@@ -8,7 +8,7 @@ import bpy
 from ..operators import options
 from ..operators.common import AtEnd, package, register_classes
 from ..operators.drive import DriveSettings
-from ..operators.results import follow_head
+from ..operators.results import follow_head, keep_run_folder
 from ..operators.track import TrackOptions
 from ..operators.train import ExtendOptions, RefineOptions, TrainOptions, preset_property
 from ..operators.training_python import has_training_python, test
@@ -126,7 +126,11 @@ class SceneSettings(TrainOptions, bpy.types.PropertyGroup):
     drive: bpy.props.PointerProperty(type=DriveSettings)
     splats: object_property("Splats", "Splats whose display is set here")
     run_folder: options.path(
-        "Run Folder", "Folder for the avatar and its checkpoints", "DIR_PATH", default="//stga_run"
+        "Run Folder",
+        "Folder for the avatar and its checkpoints",
+        "DIR_PATH",
+        default="//stga_run",
+        update=lambda settings, context: keep_run_folder(settings),
     )
     refine: bpy.props.PointerProperty(type=RefineSettings)
     extend: bpy.props.PointerProperty(type=ExtendSettings)
@@ -202,6 +206,8 @@ def register(at_end: AtEnd) -> None:
     register_classes(CLASSES, at_end)
     bpy.types.Scene.stga = bpy.props.PointerProperty(type=SceneSettings)
     at_end(delattr, bpy.types.Scene, "stga")
-    # what the last operator could not do
+    # what the last operator could not do, or there is to know of what it did
     bpy.types.WindowManager.stga_message = bpy.props.StringProperty()
-    at_end(delattr, bpy.types.WindowManager, "stga_message")
+    bpy.types.WindowManager.stga_failed = bpy.props.BoolProperty()
+    for name in ("stga_message", "stga_failed"):
+        at_end(delattr, bpy.types.WindowManager, name)

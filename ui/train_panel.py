@@ -35,6 +35,10 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout = self.layout
         settings = context.scene.stga
+        owner = settings.training_head
+        is_of_another = owner is not None and owner != settings.head
+        if is_of_another:
+            layout.label(text=owner.name, icon="USER")
         if draw_running(layout, context, Kind.TRAINING):
             return
         training = monitor.state_of(context.scene, Kind.TRAINING)
@@ -64,6 +68,7 @@ class TrainPanel(SidebarPanel, bpy.types.Panel):
         row = layout.row(align=True)
         draw_train_button(row, settings)
         is_known = training.subject is not None and training.place == _run_folder(settings)
+        is_known &= not is_of_another
         finished = training.snapshot.state == WorkerState.FINISHED
         is_more = finished if is_known else bool(settings.avatar)
         draw_train_button(row, settings, goes_on="more" if is_more else "resume")

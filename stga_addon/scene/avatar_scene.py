@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from mathutils import Vector
 
 from ..avatar.file import Avatar
@@ -17,11 +18,21 @@ from .arrays import evaluated_vertices
 from .cameras import central, configure_scene, import_cameras
 from .compat import enable_nodes
 from .display.splat_object import hide_in_layers, hide_object, show_avatar, show_world_splats
-from .objects import COLLECTIONS, capture_root, go_to_frame, set_frames_per_second, show_kind
+from .objects import (
+    COLLECTIONS,
+    capture_root,
+    go_to_frame,
+    mover_of,
+    set_frames_per_second,
+    show_kind,
+)
 from .rig.head import import_head
 
 DISTANCE = 2.2
 """From the viewport's eye to the head's center, in radii of the sphere around its bounding box."""
+
+GAP_M = 0.1
+"""Between heads beside each other."""
 
 
 def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
@@ -44,6 +55,19 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_rotation = (camera or head).matrix_world.to_quaternion()
         region.view_location = center
         region.view_distance = DISTANCE * radius
+
+
+def place_beside(head: Any, others: Iterable[Any]) -> None:
+    """Move a head with its capture to the right of others, as +X is in Blender's front view."""
+
+    def sides(thing: Any) -> Any:
+        world = np.array(thing.matrix_world)
+        return evaluated_vertices(thing) @ world[0, :3] + world[0, 3]
+
+    bpy.context.view_layer.update()
+    gap = max(sides(each).max() for each in others) - sides(head).min() + GAP_M
+    mover_of(head).location.x += gap
+    bpy.context.view_layer.update()
 
 
 def open_sidebar(tab: str, screens: Iterable[Any]) -> bool:

@@ -225,3 +225,39 @@ def test_an_npz_is_opened_by_its_content(tmp_path):
     assert [action for action in bpy.data.actions if "smile" in action.name]
     bpy.ops.stga.open_npz(filepath=str(avatar))
     assert bpy.context.scene.stga.splats is not None
+
+
+def test_a_second_head_stands_beside_the_first(extension, head, tmp_path):
+    """Catches a head inside another one, a scene that changes under one's hands, a panel that
+    speaks of the first head still, and a folder that two heads share."""
+    scene = bpy.context.scene
+    settings = scene.stga
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    splats = settings.splats
+    settings.run_folder = str(tmp_path / "first run")
+    kept = ("camera", "frame_start", "frame_end", "frame_current")
+    before = [getattr(scene, name) for name in kept]
+    size = scene.render.resolution_x
+    second = write_mesh_capture(tmp_path / "second", timesteps=(20, 21))
+    bpy.ops.stga.import_capture(directory=str(second))
+    other = settings.head
+    assert other != head
+    right = max((head.matrix_world @ vertex.co).x for vertex in head.data.vertices)
+    left = min((other.matrix_world @ vertex.co).x for vertex in other.data.vertices)
+    assert left - right == pytest.approx(0.1, abs=0.02)
+    assert [getattr(scene, name) for name in kept] == before
+    assert scene.render.resolution_x == size
+    assert (settings.splats, settings.avatar) == (None, "")
+    assert settings.run_folder == str(tmp_path / "second_run")
+    bpy.context.view_layer.objects.active = head.parent
+    bpy.context.view_layer.update()
+    assert (settings.head, settings.splats) == (head, splats)
+    assert settings.run_folder == str(tmp_path / "first run")
+    settings.head = other  # chosen in the panel: it stays, whatever is active
+    bpy.context.view_layer.update()
+    assert settings.head == other
+    place = other.parent.location.copy()
+    bpy.ops.stga.import_capture(directory=str(second), set_up_scene=True)
+    assert scene.frame_start == 20
+    assert other.parent.location == place
