@@ -60,14 +60,18 @@ class Action:
         manager = context.window_manager
         window = context.window
         manager.stga_message = ""
+        manager.stga_failed = False
         if window is not None:
             manager.progress_begin(0, 1)
             window.cursor_modal_set("WAIT")
         try:
             with telling_refusals():
                 return self.run(context) or {"FINISHED"}
-        except (StgaError, Cancelled) as error:
+        except StgaError as error:
             self.tell("ERROR", str(error))
+            return {"CANCELLED"}
+        except Cancelled as error:
+            self.tell("WARNING", str(error) or "Cancelled")
             return {"CANCELLED"}
         finally:
             if window is not None:
@@ -82,13 +86,16 @@ class Action:
 
     def tell(self: Any, kind: str, sentence: str) -> None:
         """Report "ERROR" or "WARNING": as a whole without a window, else briefly, and as a whole in
-        the panel."""
+        the panel, there after the warnings of before."""
         brief = short_sentence(sentence)
         manager = bpy.context.window_manager
         self.report({kind}, sentence if bpy.app.background else brief)
+        is_error = kind == "ERROR"
+        told = [] if is_error or manager.stga_failed else manager.stga_message.splitlines()
         # an operator that was called by another has told it at length
         if brief != short_sentence(manager.stga_message):
-            manager.stga_message = sentence
+            manager.stga_message = "\n".join([*told, sentence])
+        manager.stga_failed = is_error
 
 
 class Edit(Action):

@@ -234,6 +234,7 @@ class LiveSession:
         manager = bpy.context.window_manager
         if manager is not None and self._said:
             manager.stga_message = self._said
+            manager.stga_failed = True
 
     def close(self) -> None:
         """Stop listening, and save what is being recorded; the head stays as it is."""

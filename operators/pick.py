@@ -12,6 +12,7 @@ from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import XYZ, read_attribute
 from ..stga_addon.scene.objects import Identity, mover_of
+from . import options
 from .common import is_head
 from .windows import push_undo
 
@@ -27,7 +28,7 @@ class PickAvatar(bpy.types.Operator):
     bl_label = "Select Avatar"
     bl_options = frozenset({"INTERNAL"})
 
-    extend: bpy.props.BoolProperty()
+    extend: options.boolean("Extend", "Keep what is selected")
 
     @classmethod
     def poll(cls, context: Any) -> bool:

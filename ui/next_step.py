@@ -75,17 +75,20 @@ class NextStepPanel(SidebarPanel, bpy.types.Panel):
 
 
 def _draw_message(layout: Any, context: Any) -> None:
-    """Draw what the last operator could not do, as a whole, with the button that helps."""
+    """Draw what the last operator could not do, or there is to know of what it did, as a whole,
+    with the button that helps."""
     text = context.window_manager.stga_message
+    failed = context.window_manager.stga_failed
     if not text:
         return
     box = layout.box()
     row = box.row()
-    row.label(text="Not Done", icon="ERROR")
+    row.label(text="Not Done" if failed else "Done", icon="ERROR" if failed else "INFO")
     close = row.operator("wm.context_set_string", text="", icon="X", emboss=False)
     close.data_path = "window_manager.stga_message"
     close.value = ""
-    draw_text(box, context, text)
+    for sentence in text.splitlines():
+        draw_text(box, context, sentence)
     if PYTHON_VARIABLE in text:
         draw_missing_python(box, context)
     elif "FLAME model" in text:

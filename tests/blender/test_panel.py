@@ -121,6 +121,24 @@ def test_a_word_for_the_quality_and_more_training(extension, trained):
     assert {"Train", "Resume"} <= set(draw(extension, "STGA_PT_train"))
 
 
+def test_what_is_said_of_an_operator(extension, head):
+    """Catches *Not Done* over what was done, and all warnings but the last forgotten."""
+    operator = SimpleNamespace(report=lambda kind, sentence: None)
+    tell = extension.operators.common.Action.tell
+    manager = bpy.context.window_manager
+    bpy.ops.stga.select(threshold=0.0005)
+    for kind, sentence, expected in (
+        ("WARNING", "One image is missing", ["Done", "One image is missing"]),
+        ("WARNING", "So is one mask", ["Done", "One image is missing", "So is one mask"]),
+        ("ERROR", "The disk is full", ["Not Done", "The disk is full"]),
+    ):
+        tell(operator, kind, sentence)
+        texts = draw(extension, "next_step")
+        assert [text for text in texts if text in {*expected, "Done", "Not Done"}] == expected
+    bpy.ops.stga.select(threshold=0.0005)
+    assert (manager.stga_message, manager.stga_failed) == ("", False)
+
+
 SECONDS = np.array([2.0, 10.0, 20.0, 40.0, 60.0, 80.0])
 PSNR = np.array([20.0, 28.0, 30.5, 32.0, 31.0, 33.2])
 AHEAD = {"seconds": 100.0, "psnr": 34.0, "error": 0.5, "ahead": 20.0, "gain": 0.8}

@@ -127,7 +127,7 @@ def add_rig(
 ) -> Any:
     """Rig and animate `head`, the sequence's neutral mesh with a "Basis" key; returns the armature
     object. The evaluated mesh equals `flame_forward` within 1e-5 m. Vertex offsets that change by
-    frame become a shape key per timestep, which `warn` reports, as it does coefficients beyond ±10.
+    frame become a shape key per timestep; `warn` reports coefficients beyond ±10.
     correctives: "all", or "moving": of joints only that turn in the frames."""
     model = sequence.model
     no_expression = np.zeros(model.n_expression)
@@ -154,10 +154,6 @@ def add_rig(
     _add_correctives(head, rig, model, basis, corrected)
     keyframes.key_motion(head, rig, np.array(sequence.timesteps), frames, warn=warn)
     if has_offsets:
-        warn(
-            f"{head.name}: the capture has a dynamic_offset per frame, which a rig cannot "
-            f"represent; added one shape key per timestep ({len(frames)})"
-        )
         for timestep, frame in zip(sequence.timesteps, frames, strict=True):
             offset = 0 if frame.dynamic_offset is None else frame.dynamic_offset
             _new_shape_key(head, keyframes.offset_key(timestep), basis + offset, 0.0, 1.0)
