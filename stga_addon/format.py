@@ -50,6 +50,14 @@ def describe_quality(figures: Mapping[str, float]) -> str:
     return next((word for word, least in QUALITIES_DB.items() if psnr >= least), "")
 
 
+def describe_left(figures: Mapping[str, float]) -> str:
+    """The time that is left as a sentence; "" where it is not known."""
+    left_s = figures.get("left_s", 0.0)
+    if not left_s > 0:
+        return ""
+    return f"{'More than' if 'longer' in figures else 'About'} {format_duration(left_s)} left"
+
+
 def describe_figures(figures: Mapping[str, float]) -> list[str]:
     """Figures of any work as short lines for a narrow panel, without those that are not known yet.
 

@@ -14,6 +14,7 @@ import numpy as np
 Item = TypeVar("Item")
 
 PACE_SHARE = 0.1  # Share of the work, the last that was done, whose pace says how much time is left
+LONGER = 1.25  # Times what was said to be left, from which on that was too little
 MAX_STEP_SHARE = 0.03  # Of a step; beyond, an interrupted call had done it before
 
 
@@ -77,6 +78,30 @@ class TimeLeft:
             seconds = seconds - first[0]
             done = done - first[1]
         return (1 - share) * seconds / done if done >= PACE_SHARE / 10 else math.nan
+
+
+MAX_SHARE = 0.99
+"""Before the end: 100 % is said of what is done."""
+
+
+class Clock:
+    """How far work is and how long it takes, as people are told: neither ever goes back."""
+
+    def __init__(self) -> None:
+        self.share = 0.0
+        self._left_s = math.inf
+
+    def told(self, progress: Progress) -> dict[str, float]:
+        """The finite figures of some progress; `left_s` is the least so far, and `longer` 1 where
+        it is known to be too little."""
+        self.share = max(self.share, min(progress.share, MAX_SHARE))
+        figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
+        if "left_s" in figures:
+            asked_s = figures["left_s"]
+            self._left_s = min(self._left_s, asked_s)
+            longer = asked_s > LONGER * self._left_s + 1
+            figures |= {"left_s": self._left_s, **({"longer": 1.0} if longer else {})}
+        return figures
 
 
 class Cancelled(Exception):

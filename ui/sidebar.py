@@ -11,7 +11,7 @@ import numpy as np
 
 from ..operators import monitor
 from ..operators.common import TAB, AtEnd
-from ..stga_addon.format import describe_figures, describe_quality, format_duration
+from ..stga_addon.format import describe_figures, describe_left, describe_quality
 from ..stga_addon.jobs.monitor_state import RequestState
 from ..stga_addon.jobs.table import KINDS, STORED, Kind
 from ..stga_addon.worker.status import WorkerState, WorkerStatus
@@ -84,9 +84,7 @@ def draw_running(layout: Any, context: Any, kind: Kind) -> bool:
     elif now.state.is_alive:
         text = now.status.message
     layout.progress(factor=now.status.progress, text=f"{percent:.0f} %  {text}")
-    left_s = now.status.figures.get("left_s", 0.0)
-    if left_s > 0:  # not where it is not known
-        draw_text(layout, context, f"About {format_duration(left_s)} left", "TIME")
+    draw_text(layout, context, describe_left(now.status.figures), "TIME")
     draw_figures(layout, context, now.status)
     if kind in STORED:
         draw_curve(layout, state.run)

@@ -22,7 +22,7 @@ from ..tracking.stages import Stage
 from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
-from .train import Train, resumed, train_and_finish
+from .train import AFTER_S, Train, resumed, train_and_finish
 
 WORLDS = {
     "auto": "the cameras' own where they were exported from a Blender scene, else head",
@@ -302,7 +302,7 @@ def make_avatar(request: MakeAvatar, report: Report, say: Say) -> Written:
         share = TRACKING_SHARE * progress.share
         stage = f"Tracking: {progress.stage}"
         figures = {"left_s": math.nan, **progress.figures()}
-        figures["left_s"] += request.train.settings.seconds or 0.0
+        figures["left_s"] += (request.train.settings.seconds or 0.0) + AFTER_S
         return report(replace(progress, share=share, stage=stage, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:

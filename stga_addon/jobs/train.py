@@ -30,6 +30,9 @@ from ..training.settings import MAX_GROWTH, TrainingSettings, with_budget
 MAX_NAMED_VIEWS = 6  # Views that a warning names
 AFTERWARDS = (StgaError, Cancelled, MemoryError)
 """What may end the work after a training, whose avatar is whole without it."""
+AFTER_S = 20.0
+AFTER_SHARE = 0.05
+"""Of light and of world, about: seconds, and share of the progress."""
 Selection = Mapping[int, np.ndarray]  # timestep -> (F,) bool: triangles to train
 
 
@@ -213,29 +216,40 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
         say(f"warning: {warning}")
     for line in format_table(describe_effects(prepared.run.effect_plan)):
         say(line)
-    on = {decision.effect for decision in prepared.run.effect_plan if decision.on}
+    choices = {decision.effect: decision.on for decision in prepared.run.effect_plan}
+    after = [choices.get(RELIGHT, True), choices.get(WORLD, False)]
     draw = CurveUpdater(folder)
     latest = Progress()
     is_stopped = False
+
+    def tell(progress: Progress, done: float) -> bool:
+        """Report training, or with its figures what comes after it, of which `done` is done."""
+        left = sum(after) - done
+        figures = {**latest.figures()}
+        figures["left_s"] = figures.get("left_s", 0.0) + AFTER_S * left
+        share = latest.share * (1 - AFTER_SHARE * sum(after)) + AFTER_SHARE * done
+        return report(replace(progress, share=share, figures=lambda: figures))
 
     def report_training(progress: Progress) -> bool:
         nonlocal latest, is_stopped
         draw()
         latest = progress
-        is_stopped = report(progress)
+        is_stopped = tell(progress, 0.0)
         return is_stopped
 
-    def report_afterwards(progress: Progress) -> bool:
-        # with the figures of the training
-        return report(replace(latest, stage=progress.stage, preview=None))
+    def report_light(progress: Progress) -> bool:
+        return tell(progress, progress.share)
+
+    def report_world(progress: Progress) -> bool:
+        return tell(progress, after[0] + progress.share)
 
     avatar = prepared.train_as_asked(report_training)
     lines = report_run(folder)
     # whoever stops a training does not wait; `stga relight` finds the light out later
     if not is_stopped:
-        lines += _light_of(prepared, avatar, report_afterwards)
-        if WORLD in on:
-            lines.append(_world_of(prepared, report_afterwards))
+        lines += _light_of(prepared, avatar, report_light)
+        if after[1]:
+            lines.append(_world_of(prepared, report_world))
     lines.append(f"avatar: {avatar}")
     if prepared.run.settings.tracking:
         refined = f"refined meshes: {folder / run_folder.TRACKING}"

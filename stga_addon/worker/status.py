@@ -25,7 +25,7 @@ from typing import Any
 
 from ..errors import StgaError
 from ..files import RENAME_PATIENCE_S, file_size, naming, read_json, write_json, write_npz
-from ..progress import Progress
+from ..progress import Clock, Progress
 from ..schema import from_json, setting
 from .lock import hold_folder, is_locked, lock_owner
 
@@ -201,6 +201,7 @@ class StatusWriter:
         self.folder = folder
         self.cancel_requested = False
         self._status = WorkerStatus(machine=platform.node())
+        self._clock = Clock()
         self._written_s = -math.inf
         self._began_s = self._previewed_s = time.monotonic()
 
@@ -210,10 +211,10 @@ class StatusWriter:
         self.cancel_requested = (self.folder / CANCEL_FILE).exists()
         now = time.monotonic()
         if progress.stage != self._status.message or now - self._written_s >= STATUS_INTERVAL_S:
-            figures = {n: value for n, value in progress.figures().items() if math.isfinite(value)}
+            figures = self._clock.told(progress)
             said = {"message": progress.stage, "detail": progress.detail, "figures": figures}
             self._written_s = now
-            self._write(0.0, progress=min(max(progress.share, 0.0), 1.0), **said)
+            self._write(0.0, progress=self._clock.share, **said)
         if progress.preview is not None and now - self._previewed_s > PREVIEW_INTERVAL_S:
             progress.preview(self.folder / PREVIEW)
             self._previewed_s = time.monotonic()

@@ -19,6 +19,7 @@ from stga_addon.capture.open import open_capture
 from stga_addon.cli.main import main
 from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
+from stga_addon.format import describe_left
 from stga_addon.jobs import perform as jobs
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import perform_in_folder, write_request
@@ -164,6 +165,24 @@ def test_time_left_is_told_by_the_pace_of_what_was_done_last() -> None:
         now += 1
         told = left.after(share)
     assert told == pytest.approx(0.15 * 100)
+
+
+def test_a_clock_never_goes_back(tmp_path: Path) -> None:
+    """Catches 73, 25, 55 and 7 minutes that are left one after another, too little that is said as
+    if it were true, and 100 % before the end."""
+    minutes = (73.0, 64.0, 49.0, 25.0, 39.0, 55.0, 24.0, math.nan, 7.0)
+    shares = (0.0, 0.3, 0.2, 0.4, 0.5, 0.6, 0.9, 1.0, 1.0)
+    told = []
+    with status_writer(tmp_path) as writer:
+        for number, (left, share) in enumerate(zip(minutes, shares, strict=True)):
+            figures = {"left_s": 60 * left}
+            writer.report(Progress(share, f"Stage {number}", figures=lambda f=figures: f))
+            told.append(inspect_worker(tmp_path).status)
+    expected = ["About 73", "About 64", "About 49", "About 25", "More than 25", "More than 25"]
+    expected += ["About 24", "", "About 7"]
+    sentences = [describe_left(status.figures) for status in told]
+    assert sentences == [f"{each} min left" if each else "" for each in expected]
+    assert [status.progress for status in told] == [0.0, 0.3, 0.3, 0.4, 0.5, 0.6, 0.9, 0.99, 0.99]
 
 
 @pytest.mark.slow

@@ -521,7 +521,8 @@ class _Session:
         figures = {
             "iteration": spent.iterations,
             "per_second": self.speed,
-            "left_s": spent.left_s,
+            # and the last evaluation and the residuals
+            "left_s": spent.left_s + 2 * last.get("evaluation_s", 0.0),
             "loss": np.mean(self.losses) if self.losses else None,
             "psnr": last.get("psnr"),
             "psnr_unmatched": last.get(UNMATCHED),
