@@ -44,9 +44,10 @@ def _rebase(old: str, new: str) -> None:
             moved = _rebased(value, old, new)
             if moved != value:
                 setattr(settings, name, moved)
-    for thing in bpy.data.objects:
-        if tags.AVATAR in thing and thing.library is None:
-            thing[tags.AVATAR] = _rebased(thing[tags.AVATAR], old, new)
+    for thing in [thing for thing in bpy.data.objects if thing.library is None]:
+        for tag in (tags.AVATAR, tags.RUN_FOLDER):
+            if tag in thing:
+                thing[tag] = _rebased(thing[tag], old, new)
 
 
 def _rebased(value: str, old: str, new: str) -> str:
@@ -130,9 +131,12 @@ _active: dict[int, int] = {}
 def _follow_active(scene: Any) -> None:
     """Let the panel work on the head of what has become the active object."""
     active = bpy.context.view_layer.objects.active if bpy.context.scene == scene else None
-    if active is None or _active.get(scene.session_uid) == active.session_uid:
+    followed = _active.get(scene.session_uid)
+    if active is None or followed == active.session_uid:
         return
     _active[scene.session_uid] = active.session_uid
+    if followed is None:  # as the file was saved
+        return
     family = (active, *mover_of(active).children)
     head = next((each for each in family if is_head(each)), scene.stga.head)
     if head != scene.stga.head:

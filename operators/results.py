@@ -170,16 +170,16 @@ def follow_head(settings: Any) -> None:
     elif head is not None and has_others:
         settings.splats = None
         settings.avatar = ""
-    if head is not None and (tags.RUN in head or has_others):
+    if head is not None and (tags.RUN_FOLDER in head or has_others):
         before = settings.run_folder.rstrip("/\\")
         beside = before.removesuffix(os.path.basename(before))
-        settings.run_folder = head.get(tags.RUN) or f"{beside}{mover_of(head).name}_run"
+        settings.run_folder = head.get(tags.RUN_FOLDER) or f"{beside}{mover_of(head).name}_run"
 
 
 def keep_run_folder(settings: Any) -> None:
     """Store the panel's run folder with its head, for when that is chosen again."""
     if is_head(settings.head) and settings.head.library is None:
-        settings.head[tags.RUN] = settings.run_folder
+        settings.head[tags.RUN_FOLDER] = settings.run_folder
 
 
 def _is_immature(state: RequestState) -> bool:

@@ -22,6 +22,7 @@ ANTIALIASED = "stga_antialiased"  # on splats that follow a head: `Avatar.antial
 REVISION = "stga_revision"  # on a splat object's mesh: changes whenever splats are written into it
 RELIT_FRAME = "stga_relit_frame"  # on that mesh: the frame in whose light other engines show it
 AVATAR = "stga_avatar"  # on splats that follow a head: the file of their avatar
+RUN_FOLDER = "stga_run_folder"  # on the head: that of the panel while it works on the head
 RUN = "stga_run"  # on splats that preview or show a training run: the run's folder
 WORLD = "stga_world"  # on splats of a run's world: their file
 
