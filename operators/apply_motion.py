@@ -31,6 +31,8 @@ LAST_FRAME = 1_048_574
 """Blender's maximum frame number."""
 PART_OF_SHAPES = {"face": "expression", "jaw": "jaw", "eyes": "eyes", "head": "neck"}
 """Part of a face performance -> that of the head which it moves."""
+FIRST_OPTIONS = ("start", "strength", "neutral", "place")
+"""Of the dialog; the others unfold."""
 NEUTRAL_LABELS = {"none": "As Recorded", "quiet": "Quiet Face", "first": "First Frame"}
 
 
@@ -155,6 +157,24 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         options=ONCE,
     )
     filter_glob: options.file_filter(".npz", *READ_SUFFIXES)
+    is_open: options.boolean(
+        "More", "Parts, timing, and what face performances need", options={*ONCE, "HIDDEN"}
+    )
+
+    def draw(self, context: Any) -> None:
+        column = self.layout.column()
+        column.use_property_split = True
+        names = list(ApplyMotion.__annotations__)
+        others = names[names.index("expression") : names.index("filter_glob")]
+        for name in FIRST_OPTIONS:
+            column.prop(self, name)
+        arrow = "DISCLOSURE_TRI_DOWN" if self.is_open else "DISCLOSURE_TRI_RIGHT"
+        self.layout.prop(self, "is_open", icon=arrow, emboss=False)
+        column = self.layout.column()
+        column.use_property_split = True
+        for name in others if self.is_open else ():
+            if name not in FIRST_OPTIONS:
+                column.prop(self, name)
 
     @classmethod
     def description(cls, context: Any, properties: Any) -> str:

@@ -337,8 +337,11 @@ class FileImport(ImportHelper):
     def invoke(self: Any, context: Any, event: Any) -> set[str]:
         if self.filepath:
             return self.execute(context)
-        if bpy.data.filepath:  # else Blender proposes the .blend file's own name
-            self.filepath = os.path.join(os.path.dirname(bpy.data.filepath), "")
+        beside = bpy.data.filepath
+        if is_head(context.scene.stga.head):
+            beside = context.scene.stga.head[tags.CAPTURE]
+        if beside:  # else Blender proposes the .blend file's own name
+            self.filepath = os.path.join(os.path.dirname(beside), "")
         return super().invoke(context, event)
 
 

@@ -32,7 +32,10 @@ RIGGED = " and ".join(name for name, format in FORMATS.items() if format.has_rig
 
 @dataclass(frozen=True)
 class Export:
-    """Write an avatar in another format, for other viewers (`avatar_source.Posed`)."""
+    """Write an avatar in another format, for other viewers.
+
+    others    as of `avatar_source.Posed`
+    """
 
     source: Path = option("folder of a run, or avatar file", flag="RUN|AVATAR")
     output: Path = option("the file, or the folder of a format of several", flag="--out")

@@ -1,11 +1,13 @@
 """Apply Motion as a script calls it, and what leaves Blender again."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 from capture.factory import ball, flame_parameters, write_flame_capture, write_mesh_capture
+from gui.layouts import Layout
 
 from stga_addon.capture.model import Capture
 from stga_addon.capture.open import open_capture
@@ -17,6 +19,7 @@ from stga_addon.training.run.folder import with_refined_tracking, write_tracking
 
 pytestmark = pytest.mark.usefixtures("extension")
 TOLERANCE = 2e-6
+UNDRAWN = {"filepath", "source", "filter_glob", "is_open"}
 
 
 class Reenacted:
@@ -183,3 +186,16 @@ def test_wrong_sources_change_nothing(scene, tmp_path):
     needed = r"has no FLAME rig.*splats follow whatever moves its mesh"
     with pytest.raises(RuntimeError, match=needed):
         bpy.ops.stga.apply_motion(filepath=str(scene.file))
+
+
+def test_the_dialog_shows_what_people_need(extension):
+    """Catches a dialog of twenty-five options, and one that lacks any of them."""
+    operator = extension.operators.apply_motion.ApplyMotion
+    options = [name for name in operator.__annotations__ if name not in UNDRAWN]
+    for is_open, expected in ((False, 4), (True, len(options))):
+        values = SimpleNamespace(layout=Layout(), is_open=is_open)
+        operator.draw(values, bpy.context)
+        leaves = values.layout.leaves
+        shown = [leaf.arguments[1] for leaf in leaves if leaf.arguments[1] != "is_open"]
+        assert len(shown) == expected
+        assert set(shown) <= set(options)

@@ -129,10 +129,12 @@ def test_problems_are_reported(tmp_path):
 
 
 def test_the_parent_is_called_like_the_capture(tmp_path):
-    """Catches a folder's name that is cut at a dot, as if it were a file's."""
+    """Catches a folder's name that is cut at a dot, as if it were a file's, and heads of all videos
+    with the same name."""
     (tmp_path / "anna.v2").mkdir()
     assert capture_root(tmp_path / "anna.v2").name == "anna.v2"
     assert capture_root(tmp_path / "ben.v2.mp4").name == "ben.v2"
+    assert capture_root(tmp_path / "clip 1 avatar 2/capture").name == "clip 1 2"
 
 
 def test_second_import_replaces_the_first(tmp_path):
