@@ -2,6 +2,7 @@
 panel works on."""
 
 import os
+from math import radians
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from ..stga_addon.scene.display.splat_object import (
     keep_evaluated,
     replace_native_splats,
 )
-from ..stga_addon.scene.objects import layers_with, mover_of
+from ..stga_addon.scene.objects import layers_with, mover_of, remove
+from ..stga_addon.scene.render.viewport_display import is_shown_as_trained
 from ..stga_addon.training.run.folder import has_run
 from . import monitor
 from .common import AtEnd, is_head, register_handlers
@@ -28,12 +30,43 @@ from .windows import redraw, show_panel
 @persistent
 def _before_save(path: str) -> None:
     _rebase(bpy.data.filepath, path)
+    _add_notes()
 
 
 @persistent
 def _after_save(path: str) -> None:
+    _remove_notes()
     if bpy.data.filepath != path:  # a copy was saved
         _rebase(path, bpy.data.filepath)
+
+
+NOTE = (
+    "This avatar is drawn by the extension\nSTGA for Blender, which is not enabled.\n"
+    "Enable it, or choose Camera Quads as\nDisplay of the splats' modifier."
+)
+NOTE_SIZE_M = 0.02
+
+
+def _add_notes() -> None:
+    """Let the file say what is missing where nobody draws its avatars; here it is gone again as
+    soon as the file is written."""
+    for scene in [scene for scene in bpy.data.scenes if scene.library is None]:
+        avatars = [each for each in scene.objects if is_shown_as_trained(each)]
+        for avatar in avatars[:1]:
+            text = bpy.data.curves.new("STGA note", "FONT")
+            text.body = NOTE
+            text.size = NOTE_SIZE_M
+            text.align_x = "CENTER"
+            note = bpy.data.objects.new(text.name, text)
+            note[tags.KIND] = tags.NOTE
+            note.hide_render = True
+            note.rotation_euler = (radians(90), 0, 0)
+            note.location = avatar.matrix_world.translation
+            scene.collection.objects.link(note)
+
+
+def _remove_notes() -> None:
+    remove(each for each in bpy.data.objects if each.get(tags.KIND) == tags.NOTE)
 
 
 def _rebase(old: str, new: str) -> None:
@@ -64,6 +97,7 @@ def _rebased(value: str, old: str, new: str) -> str:
 @persistent
 def _after_load(_: Any) -> None:
     monitor.forget_file()
+    _remove_notes()
     _choose_head()
     _say(replace_native_splats(bpy.data.objects))
     monitor.start_timer()

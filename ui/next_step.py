@@ -10,6 +10,7 @@ from ..operators import monitor
 from ..operators.common import is_head, rig_or_none
 from ..operators.import_capture import OpenDemo
 from ..operators.pose import is_posing
+from ..operators.show import PreviewImages
 from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
@@ -18,7 +19,7 @@ from ..stga_addon.scene.display.splat_object import splat_modifier
 from ..stga_addon.worker.status import WorkerState
 from ..stga_addon.worker.training_python import PYTHON_VARIABLE
 from .select_panel import has_selection
-from .show_panel import draw_input
+from .show_panel import draw_input, left_out_hint
 from .sidebar import SidebarPanel, draw_end, draw_running, draw_text
 from .train_panel import draw_missing_python, draw_preferences, draw_train_button
 
@@ -121,6 +122,11 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
             toggle = {"icon": "RESTRICT_SELECT_OFF", "toggle": True}
             modifier = splat_modifier(settings.splats)
             draw_input(column, modifier, splat_nodes.SHOW_SELECTION, **toggle)
+    hint = left_out_hint(context.scene)
+    if hint:
+        draw_text(column, context, hint, "INFO")
+        if PreviewImages.poll(context):
+            column.operator("stga.preview_images", icon="SHADING_RENDERED")
     if draw_running(column, context, Kind.VIDEO):
         return
     video = monitor.state_of(context.scene, Kind.VIDEO)

@@ -14,6 +14,7 @@ from ..operators.training_python import has_training_python
 from ..stga_addon.errors import StgaError
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.render.client import missing_packages
+from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
@@ -33,8 +34,9 @@ DISPLAY_INPUTS = (
     splat_nodes.SHOW_SELECTION,
     splat_nodes.SELECTED_ONLY,
 )
+SURFACES = ("MESH", "CURVE", "SURFACE", "META", "FONT", "CURVES", "POINTCLOUD", "VOLUME")
 _is_told = False
-"""Whether the render job in progress has said that it does not show the scene's light."""
+"""Whether the render job in progress has said what it does not show."""
 
 
 class ShowPanel(SidebarPanel, bpy.types.Panel):
@@ -146,9 +148,11 @@ def _before_job(*_: Any) -> None:
 
 @persistent
 def _before_image(scene: Any, *_: Any) -> None:
-    """Say once a job that an image does not show the scene's light."""
+    """Say once a job that an image does not show the scene's light, or its other objects."""
     global _is_told
-    hint = light_hint(scene) if shows_nodes(scene) and not _is_told else None
+    if _is_told:
+        return
+    hint = light_hint(scene) if shows_nodes(scene) else left_out_hint(scene)
     if hint:
         _is_told = True
         print(f"STGA: {hint}")
@@ -156,13 +160,29 @@ def _before_image(scene: Any, *_: Any) -> None:
             bpy.app.timers.register(partial(_pop_up, hint))
 
 
+def left_out_hint(scene: Any) -> str | None:
+    """A sentence where the engine STGA Splats leaves out what the scene's images are to show."""
+    if scene.render.engine != ENGINE:
+        return None
+    left_out = ["meshes"] if any(map(_is_other, scene.objects)) else []
+    if scene.camera is not None and getattr(scene.camera.data, "dof", None) is not None:
+        left_out += ["depth of field"] if scene.camera.data.dof.use_dof else []
+    if not left_out:
+        return None
+    names = " and ".join(left_out)
+    remedy = "Preview for EEVEE/Cycles, rendered by one of these, shows all in one image"
+    return f"STGA Splats leaves out {names}; {remedy}"
+
+
+def _is_other(thing: Any) -> bool:
+    return thing.type in SURFACES and not thing.hide_render and tags.KIND not in thing
+
+
 def _pop_up(hint: str) -> None:
     """Show the sentence in the window that was opened last: that of the image, where it has one."""
     manager = bpy.context.window_manager
     with bpy.context.temp_override(window=manager.windows[-1]):
-        manager.popup_menu(
-            lambda menu, _: menu.layout.label(text=hint), title="STGA Lighting", icon="ERROR"
-        )
+        manager.popup_menu(lambda menu, _: menu.layout.label(text=hint), title="STGA", icon="ERROR")
 
 
 class RenderPanel(bpy.types.Panel):

@@ -34,6 +34,7 @@ HEAD = "head"
 RIG = "rig"
 CAMERA = "camera"
 SPLATS = "splats"
+NOTE = "note"  # in files: what is missing where the extension is not enabled
 
 # Boolean face attributes of the head mesh, one per region.
 REGION_PREFIX = "stga_region_"

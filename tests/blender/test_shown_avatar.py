@@ -302,3 +302,40 @@ def test_heads_of_files_from_before_are_hidden_as_well(extension, head, tmp_path
     bring(file, "append")
     drawn = [each for each in bpy.context.visible_objects if each.type == "MESH"]
     assert [tags.CONVENTION in each for each in drawn] == [True]
+
+
+def test_a_file_says_what_is_missing_without_the_extension(extension, head, tmp_path):
+    """Catches a file that shows nothing where the avatar was, and a note where it is drawn."""
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    names = set(bpy.data.objects.keys())
+    file = str(tmp_path / "head.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=file, copy=True)
+    assert set(bpy.data.objects.keys()) == names
+    with bpy.data.libraries.load(file) as (stored, taken):
+        (note,) = set(stored.objects) - names
+        taken.objects = [note]
+    (text,) = taken.objects
+    assert "STGA" in text.data.body
+    assert text.hide_render
+    bpy.ops.wm.open_mainfile(filepath=file)
+    assert set(bpy.data.objects.keys()) == names
+    assert not [each for each in bpy.data.curves if "STGA" in each.name]
+
+
+def test_what_the_engine_leaves_out_is_said(extension, head, tmp_path):
+    """Catches F12 by the engine that drops meshes and depth of field without a word."""
+    write_ball_avatar(tmp_path / "avatar.npz")
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    scene = bpy.context.scene
+    hint = extension.ui.show_panel.left_out_hint
+    scene.render.engine = extension.ui.show_panel.ENGINE
+    assert hint(scene) is None
+    bpy.ops.mesh.primitive_cube_add()
+    assert "leaves out meshes;" in hint(scene)
+    scene.camera.data.dof.use_dof = True
+    assert "meshes and depth of field" in hint(scene)
+    bpy.context.object.hide_render = True
+    assert "leaves out depth of field;" in hint(scene)
+    scene.render.engine = "CYCLES"
+    assert hint(scene) is None
