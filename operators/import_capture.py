@@ -17,13 +17,14 @@ from ..stga_addon.errors import StgaError
 from ..stga_addon.export.splat_files import READERS
 from ..stga_addon.flame.sequence import FIELD_ALIASES, FRAME_FIELDS
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.avatar_scene import frame_head, place_beside
+from ..stga_addon.scene.avatar_scene import frame_head, hide_default_cube, place_beside
 from ..stga_addon.scene.cameras import central, configure_scene, import_cameras
 from ..stga_addon.scene.objects import (
     COLLECTIONS,
     capture_root,
     leave_edit_mode,
     mover_of,
+    remove,
     show_kind,
     show_progress,
 )
@@ -92,14 +93,9 @@ class HeadImport(Edit):
             head.select_set(True)
             mover_of(head).select_set(True)
             objects.active = head
-        cube = None if heads else objects.get("Cube")  # later on, the user shows it
-        if cube is not None and not cube.library and cube.type == "MESH":
-            # hidden where it is as it came with Blender: 2 m wide, it would enclose the head
-            is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
-            is_whole = len(cube.data.vertices) == 8 and tuple(cube.dimensions) == (2.0, 2.0, 2.0)
-            if is_whole and not is_moved:
-                cube.hide_set(True)
-                cube.hide_render = True
+        if not heads:  # later on, the user shows it
+            hide_default_cube(scene)
+        remove(tags.find(tags.TRACKED_HEAD, capture.root))
         middle = central(cameras)
         for kind in COLLECTIONS:
             show_kind(head.parent, kind, context.view_layer, False)

@@ -32,6 +32,7 @@ from ..stga_addon.worker.status import PICTURE, PREVIEW
 from . import timers
 from .common import AtEnd, describe
 from .results import (
+    CAPTURES,
     PLACES,
     SHOW,
     changed_object,
@@ -39,6 +40,7 @@ from .results import (
     load_avatar,
     panel_head,
     record_head,
+    show_tracked,
     stop_loading,
     store_avatar,
     store_head,
@@ -264,6 +266,8 @@ def _carry_out(scene: Any, state: RequestState, effect: states.Effect) -> states
                 return states.Failed(f"Unexpected {describe(error)}")
         case states.ReadCurve(run):
             curves[run] = _read_curve(run, state.folder)
+            if state.kind in CAPTURES and state.folder is not None:
+                show_tracked(scene, CAPTURES[state.kind](state), state.folder / PICTURE)
         case states.StopWorker(folder):
             status.request_cancel(folder)
         case states.KillWorker(folder):

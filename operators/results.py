@@ -12,12 +12,14 @@ import bpy
 
 from ..stga_addon.avatar.file import Avatar, read_avatar
 from ..stga_addon.errors import StgaError
+from ..stga_addon.files import read_npz
 from ..stga_addon.jobs.monitor_state import RequestState, Shown, SliceBuilt
 from ..stga_addon.jobs.perform import read_request, read_result
 from ..stga_addon.jobs.table import TRAINS, Kind
 from ..stga_addon.jobs.track import CAPTURE_FOLDER, RUN_FOLDER
 from ..stga_addon.scene import tags
-from ..stga_addon.scene.avatar_scene import show_world
+from ..stga_addon.scene.arrays import triangle_mesh
+from ..stga_addon.scene.avatar_scene import place_tracked, show_world
 from ..stga_addon.scene.display import splat_nodes, splat_object
 from ..stga_addon.scene.display.splat_attributes import SplatAttributes, avatar_attributes
 from ..stga_addon.scene.objects import Identity, mover_of
@@ -111,6 +113,7 @@ def forget_heads() -> None:
 # Avatars
 
 
+TRACKED_NAME = "Head, being tracked"
 MIN_ITERATIONS = 300
 """Below, new splats look like gray fog: neither previews nor a run that was cancelled replace
 another avatar."""
@@ -307,6 +310,27 @@ def _import(scene: Any, state: RequestState) -> Shown:
     model = getattr(getattr(request, "track", request), "model", None)
     flame = str(model) if model is not None and is_flame(capture) else ""
     return _operate(scene, bpy.ops.stga.import_capture, directory=str(capture), flame=flame)
+
+
+CAPTURES = {
+    Kind.TRACKING: lambda state: state.place,
+    Kind.AVATAR: lambda state: state.place / CAPTURE_FOLDER,
+}
+"""Where the request of a kind tracks a head."""
+
+
+def show_tracked(scene: Any, capture: Path, picture: Path) -> None:
+    """Show the mesh of a head that is being tracked, until its capture is imported."""
+    arrays = {}
+    with suppress(StgaError):  # none yet
+        arrays = read_npz(picture, ("vertices", "faces"))
+    busy = bpy.app.is_job_running("RENDER") or _head_of_capture(scene, capture) is not None
+    if len(arrays) == 2 and not busy:
+        before = tags.find(tags.TRACKED_HEAD, capture)
+        if before and before[0].mode == "EDIT":
+            return
+        mesh = triangle_mesh(TRACKED_NAME, arrays["vertices"], arrays["faces"])
+        place_tracked(scene, capture, mesh, next(iter(before), None))
 
 
 def _fill_effects(scene: Any, state: RequestState) -> Answer:

@@ -26,8 +26,8 @@ class Progress:
     stage     what is being done; detail: more about it
     figures   gives named numbers that depend on the kind of work, NaN where one is not known yet
     preview   writes the result so far into a file; None before there is one
-    picture   draws the result so far, (H, W, 3) uint8, or nothing; None where nothing new is to be
-              seen
+    picture   draws the result so far: `rgb` (H, W, 3) uint8, of a head `vertices` (V, 3) and
+              `faces` (F, 3) too; or nothing. None where nothing new is to be seen
     """
 
     share: float = 0.0
@@ -35,7 +35,7 @@ class Progress:
     detail: str = ""
     figures: Callable[[], Mapping[str, float]] = dict
     preview: Callable[[Path], None] | None = None
-    picture: Callable[[], np.ndarray | None] | None = None
+    picture: Callable[[], Mapping[str, np.ndarray] | None] | None = None
 
 
 Report = Callable[[Progress], bool]

@@ -122,9 +122,9 @@ def _draw_what_to_try(layout: Any, context: Any, settings: Any) -> None:
             toggle = {"icon": "RESTRICT_SELECT_OFF", "toggle": True}
             modifier = splat_modifier(settings.splats)
             draw_input(column, modifier, splat_nodes.SHOW_SELECTION, **toggle)
-    hint = left_out_hint(context.scene)
-    if hint:
-        draw_text(column, context, hint, "INFO")
+    left_out = left_out_hint(context.scene)
+    if left_out:
+        draw_text(column, context, left_out, "INFO")
         if PreviewImages.poll(context):
             column.operator("stga.preview_images", icon="SHADING_RENDERED")
     if draw_running(column, context, Kind.VIDEO):

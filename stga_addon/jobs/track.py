@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..options import option, usable_path
 from ..progress import Cancelled, Progress, Report, Say, TimeLeft, Written
 from ..report import CURVE
 from ..tracking.folder import KEPT_FOLDER, LOCK_FILE, REPORT_FILE, SHEET_FILE, is_flame, is_written
-from ..tracking.stages import Stage
+from ..tracking.stages import Draw, Stage
 from ..training.run.folder import AVATAR
 from ..worker.helpers import Helpers
 from ..worker.lock import hold_folder
@@ -285,7 +285,7 @@ class _Steps:
         if self._report(self._now):
             raise Cancelled
 
-    def show(self, draw: Callable[[], np.ndarray | None], quality: Mapping[str, float]) -> None:
+    def show(self, draw: Draw, quality: Mapping[str, float]) -> None:
         self._quality = dict(quality)
         self._report(replace(self._now, picture=draw))
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from contextlib import suppress
+from math import radians
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,35 @@ def frame_head(head: Any, camera: Any, screens: Iterable[Any]) -> None:
         region.view_rotation = (camera or head).matrix_world.to_quaternion()
         region.view_location = center
         region.view_distance = DISTANCE * radius
+
+
+def place_tracked(scene: Any, capture: Path, mesh: Any, before: Any) -> None:
+    """Show the mesh of a head that is being tracked, in place of the one before; viewports look at
+    the first one."""
+    if before is not None:
+        old = before.data
+        before.data = mesh
+        bpy.data.meshes.remove(old)
+        return
+    head = bpy.data.objects.new(mesh.name, mesh)
+    tags.mark(head, tags.TRACKED_HEAD, capture)
+    head.rotation_euler = (radians(90), 0, 0)
+    scene.collection.objects.link(head)
+    hide_default_cube(scene)
+    windows = bpy.context.window_manager.windows
+    frame_head(head, None, [each.screen for each in windows if each.scene == scene])
+
+
+def hide_default_cube(scene: Any) -> None:
+    """Hide the cube where it is as it came with Blender: 2 m wide, it would enclose a head."""
+    cube = scene.objects.get("Cube")
+    if cube is None or cube.library or cube.type != "MESH":
+        return
+    is_moved = cube.modifiers or cube.animation_data or not cube.matrix_world.is_identity
+    is_whole = len(cube.data.vertices) == 8 and tuple(cube.dimensions) == (2.0, 2.0, 2.0)
+    if is_whole and not is_moved:
+        hide_in_layers(cube, scene)
+        cube.hide_render = True
 
 
 def place_beside(head: Any, others: Iterable[Any]) -> None:

@@ -34,6 +34,7 @@ HEAD = "head"
 RIG = "rig"
 CAMERA = "camera"
 SPLATS = "splats"
+TRACKED_HEAD = "tracked head"  # a mesh without rig, until its capture is imported
 NOTE = "note"  # in files: what is missing where the extension is not enabled
 
 # Boolean face attributes of the head mesh, one per region.

@@ -67,7 +67,7 @@ class PosedHead:
 
 def picture_of_first_frame(
     head: HeadModel, footage: Footage, detector: FaceNetworks, take: RecordedTake
-) -> np.ndarray | None:
+) -> dict[str, np.ndarray] | None:
     """The head on the first frame, within seconds; None where no face, or several, are seen. take:
     of which landmarks are not known yet."""
     timestep = footage.timesteps[0]
@@ -88,8 +88,9 @@ def picture_of_first_frame(
     return None
 
 
-def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
-    """The head on a few of the frames that it was fitted to; black beyond an image."""
+def picture_of_fit(fit: HeadFit, footage: Footage) -> dict[str, np.ndarray]:
+    """The head on a few of the frames that it was fitted to, black beyond an image, and its mesh in
+    the first of them: `rgb`, `vertices` and `faces`."""
     timesteps = evenly_spread(sorted(fit.parameters), SHOWN_FRAMES)
     columns = 2 if len(timesteps) == SHOWN_FRAMES else 1
     side = SIZE // columns
@@ -112,7 +113,8 @@ def picture_of_fit(fit: HeadFit, footage: Footage) -> np.ndarray:
         column = side * (number % columns)
         square = np.asarray(Image.fromarray(drawn).resize((side, side)))
         picture[row : row + side, column : column + side] = square
-    return picture
+    vertices = posed_mesh(fit, fit.parameters[timesteps[0]])
+    return {"rgb": picture, "vertices": vertices, "faces": faces}
 
 
 def write_contact_sheet(

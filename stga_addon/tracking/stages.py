@@ -44,16 +44,17 @@ class Stage(Enum):
 ReportStage = Callable[[Stage, int, int], None]
 """Stage, steps done and steps in all. May raise to cancel: whole cameras stay on disk, and are not
 detected again."""
-Show = Callable[[Callable[[], np.ndarray | None], Mapping[str, float]], None]
-"""Called with what draws a picture (H, W, 3) uint8 for those who watch, None: there is nothing to
-see; and with figures of how well the head fits (`format.describe_figures`)."""
+Draw = Callable[[], Mapping[str, np.ndarray] | None]
+Show = Callable[[Draw, Mapping[str, float]], None]
+"""Called with what draws a picture (`Progress.picture`) for those who watch, None: there is nothing
+to see; and with figures of how well the head fits (`format.describe_figures`)."""
 
 
 def unreported(stage: Stage, done: int, total: int) -> None:
     """The `ReportStage` that nobody reads."""
 
 
-def unseen(draw: Callable[[], np.ndarray | None], figures: Mapping[str, float]) -> None:
+def unseen(draw: Draw, figures: Mapping[str, float]) -> None:
     """The `Show` that nobody watches."""
 
 

@@ -2,7 +2,7 @@
 
 status.json   the worker's latest status, replaced atomically
 preview.npz   of a training: the avatar of a few seconds ago
-picture.npz   of a tracking: the head over the footage, `rgb` (H, W, 3) uint8
+picture.npz   of a tracking: the head over the footage and its mesh, `Progress.picture`
 worker.log    its standard output and error
 worker.lock   locked while the worker lives
 cancel        exists once the worker was asked to stop
@@ -221,7 +221,7 @@ class StatusWriter:
         picture = None if progress.picture is None else progress.picture()
         if picture is not None:
             with suppress(StgaError):  # a full disk, which the work reports itself
-                write_npz(self.folder / PICTURE, {"rgb": picture})
+                write_npz(self.folder / PICTURE, dict(picture))
         return self.cancel_requested
 
     def finish(self, state: WorkerState, error: str = "", trace: str = "") -> None:

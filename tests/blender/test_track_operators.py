@@ -6,7 +6,7 @@ from math import radians
 import bpy
 import numpy as np
 import pytest
-from capture.factory import write_flame_capture
+from capture.factory import ball, write_flame_capture, write_mesh_capture
 from flame.small_head import small_head
 from mathutils import Quaternion
 from tracking.test_head_model import blender_head
@@ -142,3 +142,29 @@ def test_what_was_tracked_meanwhile_is_imported(extension, take, tmp_path, monke
     extension.operators.monitor.tick()
     assert list(bpy.context.scene.stga.head[tags.TIMESTEPS]) == [0, 1, 2, 3, 4]
     assert bpy.context.scene.stga.tracking_shown
+
+
+def test_the_head_is_shown_while_it_is_tracked(extension, tmp_path):
+    """Catches a default cube where the head is known already, a head for each picture, and one that
+    stays inside the imported one."""
+    bpy.ops.wm.read_homefile(use_empty=False, use_factory_startup=True)
+    scene = bpy.context.scene
+    capture = write_mesh_capture(tmp_path / "capture")
+    vertices, faces = ball()
+    show = extension.operators.results.show_tracked
+    show(scene, capture, tmp_path / "picture.npz")
+    assert not scene.objects["Cube"].hide_render
+    before = set(bpy.data.objects)
+    for size in (1.0, 2.0):
+        np.savez(tmp_path / "picture.npz", vertices=size * vertices, faces=faces)
+        show(scene, capture, tmp_path / "picture.npz")
+        (head,) = set(bpy.data.objects) - before
+        found = np.array([head.matrix_world @ vertex.co for vertex in head.data.vertices])
+        expected = size * vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert scene.objects["Cube"].hide_render
+    name = head.name
+    bpy.ops.stga.import_capture(directory=str(capture))
+    assert name not in bpy.data.objects
+    show(scene, capture, tmp_path / "picture.npz")  # the last picture, read late
+    assert name not in bpy.data.objects

@@ -146,7 +146,7 @@ def test_first_frame_shows_the_head_where_it_is(tmp_path, monkeypatch):
     for with_mesh in (draw, lambda picture, *_: picture):
         monkeypatch.setattr(pictures, "with_mesh", with_mesh)
         footage = open_footage(tmp_path / "head.mp4")
-        shown.append(pictures.picture_of_first_frame(head, footage, networks, take))
+        shown.append(pictures.picture_of_first_frame(head, footage, networks, take)["rgb"])
     over, plain = (picture.astype(int) for picture in shown)
     assert over.shape == (pictures.SIZE, pictures.SIZE, 3)
     drawn = np.abs(over - plain).max(2) > 8
