@@ -35,7 +35,9 @@ REQUESTS: tuple[Request, ...] = (
         device="gpu:Name",
         selection={0: np.ones(4, bool)},
     ),
-    Resume(Path("r"), HEAD, Path("flame.pkl"), "opencv", selection={7: np.zeros(4, bool)}),
+    Resume(
+        Path("r"), HEAD, Path("flame.pkl"), "opencv", selection={7: np.zeros(4, bool)}, more_s=9.0
+    ),
     Refine(Path("r_2"), Path("r"), "mouth", frames=(3, 5), growth=0.5, seconds=20.0),
     Refine(
         Path("r_2"), Path("r"), weights=np.arange(4, dtype=np.float32) / 4, iterations=3, seed=2
