@@ -169,7 +169,9 @@ class ApplyMotion(Edit, bpy.types.Operator, FileImport):
         for name in FIRST_OPTIONS:
             column.prop(self, name)
         arrow = "DISCLOSURE_TRI_DOWN" if self.is_open else "DISCLOSURE_TRI_RIGHT"
-        self.layout.prop(self, "is_open", icon=arrow, emboss=False)
+        row = self.layout.row()
+        row.alignment = "LEFT"
+        row.prop(self, "is_open", icon=arrow, emboss=False)
         column = self.layout.column()
         column.use_property_split = True
         for name in others if self.is_open else ():
