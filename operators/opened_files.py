@@ -30,7 +30,8 @@ from .windows import redraw, show_panel
 @persistent
 def _before_save(path: str) -> None:
     _rebase(bpy.data.filepath, path)
-    _add_notes()
+    if not bpy.app.is_job_running("RENDER"):
+        _add_notes()
 
 
 @persistent

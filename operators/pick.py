@@ -1,5 +1,6 @@
 """A click on an avatar: selects what G then moves, of which Blender itself draws nothing there."""
 
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -7,6 +8,7 @@ import bpy
 import numpy as np
 from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
 
+from ..stga_addon.errors import StgaError
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.arrays import evaluated_vertices
 from ..stga_addon.scene.display import splat_nodes, splat_object
@@ -68,7 +70,10 @@ def _distance(context: Any, part: Any, at: np.ndarray, origin: Any) -> float | N
     """From the eye to a head or splats at a point of the region; None where they are not there."""
     shape = part
     if tags.CONVENTION in part:
-        shape = splat_object.get_input(part, splat_nodes.HEAD)
+        with suppress(StgaError):  # they have lost their modifier
+            shape = splat_object.get_input(part, splat_nodes.HEAD)
+        if shape in (None, part):
+            return None
     is_world = shape.get(tags.KIND) == tags.SPLATS
     vertices = read_attribute(shape.data, XYZ) if is_world else evaluated_vertices(shape)
     world = np.array(shape.matrix_world)

@@ -57,6 +57,9 @@ def test_a_click_finds_what_moves_the_avatar(extension, head, view):
     context.view_layer.update()
     assert pick.avatar_at(context, middle) is None
     splats = bpy.context.scene.stga.splats
+    bpy.context.object.hide_set(True)
+    splats.modifiers.clear()  # and no traceback
+    assert pick.avatar_at(context, middle) is None
     for part in (head, splats):
         assert all((*part.lock_location, *part.lock_rotation, *part.lock_scale))
     assert not any(head.parent.lock_location)
