@@ -1,5 +1,6 @@
 """Training: a new run, one that is resumed, and one that refines or extends a finished run."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
@@ -224,9 +225,9 @@ def train_and_finish(request: Training, report: Report, say: Say) -> Written:
 
     def tell(progress: Progress, done: float) -> bool:
         """Report training, or with its figures what comes after it, of which `done` is done."""
-        left = sum(after) - done
-        figures = {**latest.figures()}
-        figures["left_s"] = figures.get("left_s", 0.0) + AFTER_S * left
+        figures = {"left_s": math.nan, **latest.figures()}
+        training_s = figures["left_s"] if progress is latest else 0.0
+        figures["left_s"] = training_s + AFTER_S * (sum(after) - done)
         share = latest.share * (1 - AFTER_SHARE * sum(after)) + AFTER_SHARE * done
         return report(replace(progress, share=share, figures=lambda: figures))
 

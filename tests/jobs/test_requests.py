@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import av
@@ -21,6 +22,7 @@ from stga_addon.errors import StgaError
 from stga_addon.files import read_npz
 from stga_addon.format import describe_left
 from stga_addon.jobs import perform as jobs
+from stga_addon.jobs import train
 from stga_addon.jobs.export import Export
 from stga_addon.jobs.perform import perform_in_folder, write_request
 from stga_addon.jobs.render import Render
@@ -28,6 +30,7 @@ from stga_addon.jobs.table import JOBS, Result
 from stga_addon.jobs.track import SolveAgain, Track
 from stga_addon.jobs.train import Refine, Resume, Train
 from stga_addon.progress import Progress, TimeLeft, Written
+from stga_addon.training.effect_catalog import RELIGHT, WORLD, EffectDecision
 from stga_addon.training.run.folder import Run, write_run
 from stga_addon.training.settings import make_settings
 from stga_addon.worker.launch import start_worker
@@ -183,6 +186,45 @@ def test_a_clock_never_goes_back(tmp_path: Path) -> None:
     sentences = [describe_left(status.figures) for status in told]
     assert sentences == [f"{each} min left" if each else "" for each in expected]
     assert [status.progress for status in told] == [0.0, 0.3, 0.3, 0.4, 0.5, 0.6, 0.9, 0.99, 0.99]
+
+
+def test_what_follows_training_is_told_ahead(tmp_path: Path, monkeypatch: Any) -> None:
+    """Catches 100 % for minutes of light and world, and a time that is too short before training
+    knows its own."""
+
+    plan = [EffectDecision(name, "auto", True, "", "") for name in (RELIGHT, WORLD)]
+
+    class Prepared:
+        capture = SimpleNamespace(warnings=())
+        request = Train(tmp_path, tmp_path, make_settings(iterations=1))
+        run = SimpleNamespace(effect_plan=plan, settings=SimpleNamespace(tracking=False))
+
+        def train_as_asked(self, report: Any) -> Path:
+            report(Progress(0.0, "Placing splats"))
+            report(Progress(0.5, "Training", figures=lambda: {"left_s": 30.0}))
+            report(Progress(1.0, "Finished", figures=lambda: {"left_s": 1.0}))
+            return tmp_path / "avatar.npz"
+
+    def half(prepared: Any, *others: Any) -> Any:
+        others[-1](Progress(0.5, "Halfway"))
+        return ("done",) if len(others) == 2 else "done"
+
+    monkeypatch.setattr(train, "prepare", lambda *_: Prepared())
+    monkeypatch.setattr(train, "report_run", lambda _: [])
+    monkeypatch.setattr(train, "CurveUpdater", lambda _: lambda: None)
+    for name in ("_light_of", "_world_of"):
+        monkeypatch.setattr(train, name, half)
+    told: list[tuple[float, float]] = []
+
+    def report(progress: Progress) -> bool:
+        told.append((progress.share, progress.figures()["left_s"]))
+        return False
+
+    train.train_and_finish(Prepared.request, report, print)
+    shares, left = zip(*told, strict=True)
+    assert shares == pytest.approx([0.0, 0.45, 0.9, 0.925, 0.975])
+    assert math.isnan(left[0])
+    assert left[1:] == pytest.approx([70.0, 41.0, 30.0, 10.0])
 
 
 @pytest.mark.slow
