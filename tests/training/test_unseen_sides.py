@@ -9,8 +9,9 @@ from PIL import Image
 
 from stga_addon.capture.camera import look_at
 from stga_addon.capture.images import read_image
-from stga_addon.capture.mesh_geometry import rasterize
+from stga_addon.capture.mesh_geometry import connected_parts, rasterize
 from stga_addon.capture.model import Capture, View
+from stga_addon.flame.model import faces_within
 from stga_addon.flame.parts import flame_model, key_regions
 from stga_addon.training.optimize.change import Turn
 from stga_addon.training.optimize.frames import FrameStore
@@ -18,6 +19,7 @@ from stga_addon.training.optimize.trainer import Trainer
 from stga_addon.training.optimize.unseen_sides import (
     UnseenSideColors,
     UnseenSides,
+    outside,
     unseen_sides,
 )
 
@@ -141,7 +143,7 @@ CLOTH = np.array([30, 60, 160], np.uint8)
 
 def test_hair_goes_round_the_head(from_one_side, tmp_path):
     """Catches a back of the head in the color of skin, a neck with hair or in the color of clothes,
-    and clothes that end where the camera does."""
+    clothes that end where the camera does, and a closed mouth that is skin inside."""
     model = flame_model(None)
     neutral = model.v_template
     centers = neutral[model.faces].mean(1)
@@ -150,6 +152,7 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
         faces=model.faces,
         neutral=neutral,
         mesh=lambda _: neutral,
+        flame=replace(from_one_side.flame, model=model),
         regions=key_regions(model),
     )
     level = (centers[:, 1] - 0.04) / 0.07  # over the eyes, in their distance from the mouth
@@ -179,3 +182,12 @@ def test_hair_goes_round_the_head(from_one_side, tmp_path):
         assert rows.sum() > 8, part
         off = np.abs(255 * sides.color[rows] - expected).max(1)
         assert (off < 25).mean() > 0.9, (part, np.median(255 * sides.color[rows], 0))
+    teeth = faces_within(model.faces, model.masks["teeth"])
+    assert sides.triangles[teeth].all()
+    assert (sides.color[teeth].min(1) > 0.6).all()
+    part = connected_parts(len(neutral), model.faces)[model.faces[:, 0]]
+    mouth = centers[key_regions(model)["mouth"]].mean(0)
+    throat = sides.triangles & (part == part[0]) & ~outside(bare)
+    throat &= np.linalg.norm(centers - mouth, axis=1) < 0.04
+    assert throat.sum() > 20
+    assert (sides.color[throat].max(1) < 0.3).all()

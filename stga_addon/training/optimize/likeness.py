@@ -163,7 +163,7 @@ def inside_colors(
     centers = np.asarray(capture.neutral)[faces].mean(1)
     skin = skin_of(capture)
     known = np.flatnonzero(shown & skin)
-    if not len(known):
+    if not len(known) or not inside.any():
         return np.asarray(color[inside])
     near = cKDTree(centers[known]).query(centers[inside], min(SMOOTHED, len(known)))[1]
     found = np.median(color[known[near.reshape(int(inside.sum()), -1)]], axis=1)
