@@ -64,6 +64,7 @@ IMPORTS = (
 )
 EXPORTS = (
     ("stga.export_avatar", "Gaussian Head Avatar (STGA)"),
+    ("stga.export_splats", "Gaussian Splats (.ply, .spz, .glb, .usdc)"),
     ("stga.export_performance", "ARKit Curves (STGA)"),
     ("stga.export_cameras", "Cameras for Tracking (STGA)"),
     ("stga.export_head_model", "Head Model for Tracking (STGA)"),

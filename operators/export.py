@@ -1,7 +1,7 @@
 """Exports an avatar to the files of other viewers and tools; what the head plays, the cameras and a
 head model for tracking."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -16,19 +17,20 @@ import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..stga_addon.avatar.file import read_avatar
+from ..stga_addon.avatar.splats import Splats
 from ..stga_addon.capture.camera import Camera, camera_from_gl
 from ..stga_addon.driving.head_map import page_controls
 from ..stga_addon.driving.inverse import captured_performance, write_performance
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export import formats
-from ..stga_addon.export.formats import FORMATS, Meshes
+from ..stga_addon.export.formats import FORMATS, SPLAT_FORMATS, Content, Meshes, WorldContent
 from ..stga_addon.export.playback import Playback
 from ..stga_addon.files import confirming
 from ..stga_addon.flame.sequence import FlameSequence
 from ..stga_addon.format import format_bytes
 from ..stga_addon.jobs.export import Export
 from ..stga_addon.progress import Cancelled
-from ..stga_addon.scene.arrays import evaluated_vertices
+from ..stga_addon.scene.arrays import Z_UP_TO_Y_UP, evaluated_vertices
 from ..stga_addon.scene.cameras import export_cameras, scene_camera
 from ..stga_addon.scene.display.splat_object import check_head
 from ..stga_addon.scene.objects import (
@@ -38,6 +40,7 @@ from ..stga_addon.scene.objects import (
     frames_per_second,
     iterate_frames,
 )
+from ..stga_addon.scene.render.scene_splats import SplatCache, evaluated_splats
 from ..stga_addon.scene.rig.head import has_shape_keys, shape_key_model
 from ..stga_addon.scene.rig.motion import sample_motion
 from ..stga_addon.scene.vertex_groups import training_selection
@@ -56,12 +59,104 @@ from .common import (
 )
 from .options import ONCE
 
+Read = Callable[[], Any]
+"""What is exported of the open scene at its frame."""
+Write = Callable[[Iterable[tuple[int, Any]]], Any]
 STEP_INTERVAL_S = 0.005
-MAX_WAITING_MESHES = 2
+MAX_WAITING_FRAMES = 2
 SUFFIXES = tuple(suffix for format in FORMATS.values() for suffix in format.suffixes)
 
 
-class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
+class SplatExport(Stepwise, ExportHelper):
+    """Mixin of operators that export splats frame by frame, in one of the formats that they
+    offer."""
+
+    filter_glob: options.file_filter(*SUFFIXES)
+    _is_invoked = False
+
+    @property
+    def filename_ext(self: Any) -> str:
+        """What ExportHelper appends to the path."""
+        return next(iter(FORMATS[self.format].suffixes), "")
+
+    def check(self: Any, context: Any) -> bool:
+        """Keep the path's extension in step with the format; whether it changed."""
+        path = self.filepath
+        if not path.lower().endswith(FORMATS[self.format].suffixes or ("/",)):
+            for suffix in SUFFIXES:
+                path = path.removesuffix(suffix)
+            path += self.filename_ext
+        changed = path != self.filepath
+        self.filepath = path
+        return bool(changed)
+
+    def invoke(self, context: Any, event: Any) -> set[str]:
+        self._is_invoked = True
+        return super().invoke(context, event)
+
+    def target(self: Any) -> Path:
+        """The path that was chosen. Raises StgaError where it is not one of the format."""
+        path = file_path(self.filepath, "export")
+        if self.filename_ext and not path.suffix:
+            path = path.with_suffix(self.filename_ext)
+        formats.check_suffix(path, self.format)
+        return path
+
+    def write_frames(self: Any, context: Any, path: Path, read: Read, write: Write) -> Any:
+        """Let `write` take what `read` finds in each frame that the format holds, with its number:
+        in steps where a dialog has been shown."""
+        scene = context.scene
+        frames = scene_frames(scene)
+        if FORMATS[self.format].source != "range":
+            frames = range(scene.frame_current, scene.frame_current + 1)
+        if self._is_invoked:
+            steps = self.export(SceneView(context), read, path, frames, write)
+            return self.begin(context, steps, STEP_INTERVAL_S)
+        write((frame, read()) for frame in iterate_frames(frames))
+        self.inform(f"Exported to {path}")
+        return None
+
+    def export(
+        self: Any, view: SceneView, read: Read, path: Path, frames: range, write: Write
+    ) -> StepGenerator:
+        """Read the scene, a frame a step, for `write`, which takes it in a thread; restore the
+        scene's frame at the end, and say what has become of the export. Raises Cancelled, and
+        StgaError as `read`."""
+        writer = _Writer(write)
+        done = 0
+        was_named = False
+        with ExitStack() as ends:
+            ends.callback(_show_status, None)
+            ends.callback(writer.stop)  # also where reading fails, or Blender closes the file
+            posing = ends.enter_context(closing(iterate_frames(frames)))
+            try:
+                while not writer.has_ended:
+                    if writer.takes_frames:
+                        with view.shown():
+                            frame = next(posing, None)
+                            found = None if frame is None else read()
+                        writer.give(frame, found)
+                        done += frame is not None
+                    posed = f" frame {done} of {len(frames)}" if len(frames) > 1 else ""
+                    _show_status(f"Exporting{posed}   Esc: Cancel")
+                    yield
+            except Cancelled:
+                was_named = not writer.stop()
+                posing.close()
+                self.others = "PASS_THROUGH"
+                while not writer.has_ended:
+                    _show_status("Finishing the export" if was_named else "Cancelling the export")
+                    yield
+            try:
+                writer.result()
+            except Cancelled as error:
+                sentence = f"Export cancelled after {done} of {len(frames)} frames"
+                raise Cancelled(sentence) from error
+        late = "; it was complete when Esc was pressed" if was_named else ""
+        self.inform(f"Exported to {path}{late}")
+
+
+class ExportAvatar(SplatExport, bpy.types.Operator):
     """Export a trained avatar, posed as the head in the scene, for other viewers of Gaussian
     splats"""
 
@@ -78,25 +173,7 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
         "File format",
         *((name, format.label, format.description) for name, format in FORMATS.items()),
     )
-    filter_glob: options.file_filter(*SUFFIXES)
     motion_only: options.field(Export, "motion_only")
-    _is_invoked = False
-
-    @property
-    def filename_ext(self) -> str:
-        """What ExportHelper appends to the path."""
-        return next(iter(FORMATS[self.format].suffixes), "")
-
-    def check(self, context: Any) -> bool:
-        """Keep the path's extension in step with the format; whether it changed."""
-        path = self.filepath
-        if not path.lower().endswith(FORMATS[self.format].suffixes or ("/",)):
-            for suffix in SUFFIXES:
-                path = path.removesuffix(suffix)
-            path += self.filename_ext
-        changed = path != self.filepath
-        self.filepath = path
-        return changed
 
     def draw(self, context: Any) -> None:
         self.layout.use_property_split = True
@@ -118,20 +195,13 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
     def _source(self, context: Any) -> Path:
         return file_path(self.avatar or context.scene.stga.avatar, "avatar")
 
-    def invoke(self, context: Any, event: Any) -> set[str]:
-        self._is_invoked = True
-        return super().invoke(context, event)
-
     def run(self, context: Any) -> set[str] | None:
         head = head_of(context)
         scene = context.scene
-        path = file_path(self.filepath, "export")
+        path = self.target()
         format = FORMATS[self.format]
         frames = scene_frames(scene)
         fps = frames_per_second(scene)
-        if format.suffixes and not path.suffix:
-            path = path.with_suffix(self.filename_ext)
-        formats.check_suffix(path, self.format)
         avatar = read_avatar(self._source(context))
         check_head(avatar, head)
         motion = None
@@ -141,72 +211,75 @@ class ExportAvatar(Stepwise, bpy.types.Operator, ExportHelper):
             playback = scene_playback(context, head, frames, self.motion_only)
             playback = replace(playback, controls=page_controls(motion))
         if format.source == "range":
-            formats.check_free_space(path, format.size(avatar, len(frames)))
+            formats.check_free_space(path, format.size(Content(avatar), len(frames)))
         elif format.source == "motion":
             motion = sample_motion(head, own_motion(head), frames, self.warn)
 
         def write(meshes: Meshes) -> None:
             formats.export_avatar(path, avatar, self.format, meshes, motion, playback)
 
-        if format.source != "range":
-            frames = range(scene.frame_current, scene.frame_current + 1)
-        if self._is_invoked:
-            steps = self.export(SceneView(context), Identity(head), path, frames, write)
-            return self.begin(context, steps, STEP_INTERVAL_S)
-        write((frame, evaluated_vertices(head)) for frame in iterate_frames(frames))
-        self.inform(f"Exported to {path}")
-        return None
+        owner = Identity(head)
+        return self.write_frames(context, path, lambda: evaluated_vertices(owner.get()), write)
 
-    def export(
-        self,
-        view: SceneView,
-        head: Identity,
-        path: Path,
-        frames: range,
-        write: Callable[[Meshes], Any],
-    ) -> StepGenerator:
-        """Pose the head, a frame a step, for `write`, which takes the numbered meshes in a thread;
-        restore the scene's frame at the end, and say what has become of the export. Raises
-        Cancelled, and StgaError as where the head is gone."""
-        writer = _Writer(write)
-        done = 0
-        was_named = False
-        with ExitStack() as ends:
-            ends.callback(_show_status, None)
-            ends.callback(writer.stop)  # also where posing fails, or Blender closes the file
-            posing = ends.enter_context(closing(iterate_frames(frames)))
-            try:
-                while not writer.has_ended:
-                    if writer.takes_meshes:
-                        with view.shown():
-                            frame = next(posing, None)
-                            mesh = None if frame is None else evaluated_vertices(head.get())
-                        writer.give(frame, mesh)
-                        done += frame is not None
-                    posed = f" frame {done} of {len(frames)}" if len(frames) > 1 else ""
-                    _show_status(f"Exporting{posed}   Esc: Cancel")
-                    yield
-            except Cancelled:
-                was_named = not writer.stop()
-                posing.close()
-                self.others = "PASS_THROUGH"
-                while not writer.has_ended:
-                    _show_status("Finishing the export" if was_named else "Cancelling the export")
-                    yield
-            try:
-                writer.result()
-            except Cancelled as error:
-                sentence = f"Export cancelled after {done} of {len(frames)} frames"
-                raise Cancelled(sentence) from error
-        late = "; it was complete when Esc was pressed" if was_named else ""
-        self.inform(f"Exported to {path}{late}")
+
+class ExportSplats(SplatExport, bpy.types.Operator):
+    """Export all splats that the scene shows: avatars, and native splats of Blender, also of
+    others, instanced or deformed"""
+
+    bl_label = "Export Gaussian Splats"
+
+    filepath: options.path(
+        "File or Folder", "A folder for PLY Sequence, a file for the other formats", options=ONCE
+    )
+    format: options.choice(
+        "Format",
+        "File format",
+        *((name, format.label, format.description) for name, format in SPLAT_FORMATS.items()),
+    )
+    up: options.choice(
+        "Up",
+        "Axis that points up in PLY files; the other formats have their own",
+        ("Z", "Z", "As in Blender, whose import of PLY does not turn"),
+        ("Y", "Y", "As most viewers, and this add-on's import"),
+    )
+
+    def draw(self, context: Any) -> None:
+        self.layout.use_property_split = True
+        self.layout.prop(self, "format")
+        if self._is_ply:
+            self.layout.prop(self, "up")
+
+    @property
+    def _is_ply(self) -> bool:
+        return bool(self.format.startswith("ply"))
+
+    def run(self, context: Any) -> set[str] | None:
+        path = self.target()
+        is_turned = self.up == "Y" or not self._is_ply
+        to_file = Z_UP_TO_Y_UP if is_turned else np.eye(4)
+        playback = Playback(fps=frames_per_second(context.scene))
+        format = SPLAT_FORMATS[self.format]
+        count = len(scene_frames(context.scene))
+
+        def read() -> Splats:
+            depsgraph = bpy.context.evaluated_depsgraph_get()
+            return evaluated_splats(depsgraph, SplatCache(), to_file)
+
+        if format.source == "range":
+            content = SimpleNamespace(splats=read(), moving_color=False)
+            formats.check_free_space(path, format.size(content, count))
+
+        def write(frames: Iterable[tuple[int, Splats]]) -> None:
+            formats.write_content(path, self.format, WorldContent(frames, playback))
+
+        return self.write_frames(context, path, read, write)
 
 
 class _Writer:
-    """A thread that writes a file of meshes, which it is given one by one. Once stopped, it ends by
+    """A thread that writes a file of frames, which it is given one by one. Once stopped, it ends by
     itself and leaves nothing."""
 
-    def __init__(self, write: Callable[[Meshes], Any]) -> None:
+    def __init__(self, write: Write) -> None:
         self._waiting: SimpleQueue[Any] = SimpleQueue()
         self._lock = Lock()
         self._has_all = self._is_stopped = self._is_named = False
@@ -219,13 +292,13 @@ class _Writer:
         return self._written.done()
 
     @property
-    def takes_meshes(self) -> bool:
-        return not self._has_all and self._waiting.qsize() < MAX_WAITING_MESHES
+    def takes_frames(self) -> bool:
+        return not self._has_all and self._waiting.qsize() < MAX_WAITING_FRAMES
 
-    def give(self, frame: int | None, mesh: np.ndarray | None) -> None:
-        """The next mesh and its number; None: there are no more."""
+    def give(self, frame: int | None, found: Any) -> None:
+        """The next frame and its number; None: there are no more."""
         self._has_all = frame is None
-        self._waiting.put(None if frame is None else (frame, mesh))
+        self._waiting.put(None if frame is None else (frame, found))
 
     def stop(self) -> bool:
         """Let the thread end without a file; False where the file has its name already."""
@@ -238,9 +311,9 @@ class _Writer:
         """Raises what `write` raised, and Cancelled where it was stopped."""
         self._written.result()
 
-    def _write(self, write: Callable[[Meshes], Any]) -> None:
+    def _write(self, write: Write) -> None:
         with confirming(self._confirm):
-            write(self._meshes())
+            write(self._frames())
 
     def _confirm(self) -> None:
         with self._lock:
@@ -248,7 +321,7 @@ class _Writer:
                 raise Cancelled
             self._is_named = True
 
-    def _meshes(self) -> Meshes:
+    def _frames(self) -> Iterator[tuple[int, Any]]:
         while True:
             item = self._waiting.get()
             if self._is_stopped:
@@ -268,7 +341,7 @@ def _show_status(text: str | None) -> None:
 @lru_cache(maxsize=8)
 def _size(avatar: Path, modified: float, format: str, frames: int) -> int:
     """`Format.size` of an avatar file last modified at this time. Raises StgaError."""
-    return FORMATS[format].size(read_avatar(avatar), frames)
+    return FORMATS[format].size(Content(read_avatar(avatar)), frames)
 
 
 # What of the scene plays in a web page

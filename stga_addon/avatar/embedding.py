@@ -7,12 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..flame.quaternions import from_matrices, multiply, normalized
-from .splats import SH_C0, Splats
+from ..flame.quaternions import from_matrices, multiply, normalized, to_matrices
+from .splats import SH_C0, Splats, turned_harmonics
 from .strain import StrainBasis, gram_deformation
 
 CONVENTIONS = ("stga", "gaussian_avatars")
 MIN_DIVISOR = 1e-30
+MAX_UNEVENNESS = 1e-6
+"""Relative difference between a matrix's scales that is float32's rounding."""
 MIN_AREA_RATIO = 1e-4
 """A triangle whose area is below this share of its longest edge's square counts as a line: vertices
 on a line, rounded to float32, have ratios of 1e-6 to 1e-5, and their normal and area are those of
@@ -172,6 +174,33 @@ def to_world(splats: Splats, frames: FaceFrames) -> Splats:
         log_scale=log_scale.astype(np.float32),
         sh=colored_sh(splats, frames),
         face=np.zeros_like(face),
+    )
+
+
+def placed(world: Splats, matrix: np.ndarray) -> Splats:
+    """World-space splats in a space that `matrix` (4, 4) leads to: it may turn, scale, mirror and
+    shear. Harmonics turn along, of a matrix that shears by the rotation nearest to it."""
+    linear = np.asarray(matrix, np.float64)[:3, :3]
+    left, stretches, right = np.linalg.svd(linear)
+    turn = left @ right
+    rotation = normalized(world.rotation)
+    log_scale = world.log_scale.astype(np.float64)
+    if np.ptp(stretches) <= MAX_UNEVENNESS * stretches[0]:
+        # an ellipsoid is its own mirror image
+        rotation = multiply(from_matrices(turn * np.linalg.det(turn)), rotation)
+        log_scale = log_scale + np.log(max(stretches[0], MIN_DIVISOR))
+    else:
+        axes = linear @ (to_matrices(rotation) * np.exp(log_scale)[:, None])
+        axes, lengths, _ = np.linalg.svd(axes)
+        rotation = from_matrices(axes * np.linalg.det(axes)[:, None, None])
+        log_scale = np.log(np.maximum(lengths, MIN_DIVISOR))
+    is_turned = not np.array_equal(turn, np.eye(3)) and world.sh_degree > 0
+    return replace(
+        world,
+        xyz=(world.xyz @ linear.T + matrix[:3, 3]).astype(np.float32),
+        rotation=rotation.astype(np.float32),
+        log_scale=log_scale.astype(np.float32),
+        sh=turned_harmonics(world.sh, turn) if is_turned else world.sh,
     )
 
 

@@ -116,6 +116,14 @@ ARRAYS = {
 """The fields of `Splats`, by which files and checkpoints are read."""
 
 
+def at_degree(splats: Splats, degree: int) -> Splats:
+    """The splats with harmonics of this degree: higher ones are left out, missing ones 0."""
+    sh = np.zeros((len(splats), (degree + 1) ** 2, 3), np.float32)
+    kept = min(sh.shape[1], splats.sh.shape[1])
+    sh[:, :kept] = splats.sh[:, :kept]
+    return replace(splats, sh=sh)
+
+
 def joined(parts: Sequence[Splats]) -> Splats:
     """All splats of sets with coefficients of the same kinds, in order."""
     names = [field.name for field in fields(Splats)]
@@ -158,6 +166,21 @@ def harmonics_text() -> list[str]:
     returned = next(node for node in nodes if isinstance(node, ast.Return))
     assert isinstance(returned.value, ast.Tuple)
     return [ast.unparse(term) for term in returned.value.elts]
+
+
+def turned_harmonics(sh: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """(N, K, 3) of the same colors where turn (3, 3), a rotation that may mirror, has turned all
+    directions."""
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    new, old = (_basis(each, sh.shape[1]) for each in (directions, directions @ turn))
+    matrix = np.linalg.lstsq(new, old, rcond=None)[0]
+    return np.asarray(np.einsum("kj,njc->nkc", matrix, sh), np.float32)
+
+
+def _basis(directions: np.ndarray, count: int) -> np.ndarray:
+    terms = harmonics(*directions.T)[:count]
+    return np.stack([np.broadcast_to(term, len(directions)) for term in terms], 1)
 
 
 def sh_color(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:

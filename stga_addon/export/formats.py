@@ -4,13 +4,14 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..avatar.embedding import to_world
 from ..avatar.file import Avatar
 from ..avatar.offsets import COLOR, OFFSETS
-from ..avatar.splats import Splats
+from ..avatar.splats import Splats, at_degree
 from ..errors import StgaError
 from ..flame.sequence import FlameSequence
 from ..format import format_bytes
@@ -50,6 +51,19 @@ class Content:
         """The splats in world space on the first mesh. Raises StgaError as `frames`."""
         return next(self.frames(path))[1]
 
+    @property
+    def splats(self) -> Splats:
+        return self.avatar.splats
+
+    @property
+    def antialiased(self) -> bool:
+        return self.avatar.antialiased
+
+    @property
+    def moving_color(self) -> bool:
+        """Whether the harmonics differ between frames by little."""
+        return any(OFFSETS[name].target == COLOR for name in self.avatar.driven_offsets)
+
     def rigged(self, path: Path) -> RiggedAvatar:
         """The avatar with what moves it. Raises StgaError naming `path` where there is no pose."""
         motion_only = self.playback.motion_only
@@ -61,6 +75,28 @@ class Content:
 
 
 @dataclass(frozen=True)
+class WorldContent:
+    """Any splats to be exported, in world space: numbered frames of them, whose number, order and
+    values may differ, and how they play. Harmonics are of the degree of the first frame."""
+
+    numbered: Iterable[tuple[int, Splats]]
+    playback: Playback
+    antialiased: bool = False
+    moving_color: bool = False
+
+    def frames(self, path: Path) -> Iterator[tuple[int, Splats]]:
+        """Pairs as of `numbered`."""
+        degree = None
+        for number, splats in self.numbered:
+            degree = splats.sh_degree if degree is None else degree
+            yield number, at_degree(splats, degree)
+
+    def first_frame(self, path: Path) -> Splats:
+        """The splats of the first frame."""
+        return next(self.frames(path))[1]
+
+
+@dataclass(frozen=True)
 class Format:
     """A row of FORMATS: what menus and the command line need to know of a format, and its writer.
 
@@ -68,8 +104,9 @@ class Format:
     suffixes  of the file, the usual one first; none: a folder
     source    "frame": the avatar on one posed mesh; "range": on several; "motion": the avatar and
               its FLAME parameters
-    write     writes `content` to a path: returns the files, None where that is the path alone
-    size      bytes that `frames` of an avatar take, about; of a "range"
+    write     writes a `Content`, of splats without a rig also a `WorldContent`, to a path: returns
+              the files, None where that is the path alone
+    size      bytes that a number of frames of it take, about; of a "range"
     has_rate  whether it records how many frames play in a second
     has_rig   whether it takes the avatar with its rig (`Content.rigged`), and what else `Playback`
               holds; the source is a "range"
@@ -79,17 +116,13 @@ class Format:
     description: str
     suffixes: tuple[str, ...]
     source: str
-    write: Callable[[Path, Content], list[Path] | None]
-    size: Callable[[Avatar, int], int] = lambda avatar, frames: frames * ply_bytes(avatar.splats)
+    write: Callable[[Path, Any], list[Path] | None]
+    size: Callable[[Any, int], int] = lambda item, frames: frames * ply_bytes(item.splats)
     has_rate: bool = False
     has_rig: bool = False
 
 
-def _moving_color(avatar: Avatar) -> bool:
-    return any(OFFSETS[name].target == COLOR for name in avatar.driven_offsets)
-
-
-FORMATS = {
+FORMATS: dict[str, Format] = {
     "ply": Format(
         "PLY",
         "The current frame in world space, for any 3D Gaussian Splatting viewer",
@@ -116,10 +149,8 @@ FORMATS = {
         "The frames of the scene as an animated particle field",
         (".usdc", ".usdz"),
         "range",
-        lambda path, item: write_usd(
-            path, item.frames(path), item.playback.fps, _moving_color(item.avatar)
-        ),
-        lambda avatar, frames: usd_bytes(avatar.splats, frames, _moving_color(avatar)),
+        lambda path, item: write_usd(path, item.frames(path), item.playback.fps, item.moving_color),
+        lambda item, frames: usd_bytes(item.splats, frames, item.moving_color),
         has_rate=True,
     ),
     "web": Format(
@@ -128,7 +159,7 @@ FORMATS = {
         (".html", ".stga"),
         "range",
         lambda path, item: write_web(path, item.rigged(path), item.playback),
-        lambda avatar, frames: web_bytes(avatar),
+        lambda item, frames: web_bytes(item.avatar),
         has_rate=True,
         has_rig=True,
     ),
@@ -144,9 +175,17 @@ FORMATS = {
         "The current frame compressed, a tenth of a PLY's size",
         (".spz",),
         "frame",
-        lambda path, item: write_spz(path, item.first_frame(path), item.avatar.antialiased),
+        lambda path, item: write_spz(path, item.first_frame(path), item.antialiased),
     ),
 }
+
+
+SPLAT_FORMATS = {
+    name: format
+    for name, format in FORMATS.items()
+    if format.source in ("frame", "range") and not format.has_rig
+}
+"""Those that hold splats alone."""
 
 
 def export_avatar(
@@ -168,11 +207,16 @@ def export_avatar(
     Raises StgaError where the suffix is another, the format needs what is not given or has no such
     frame rate, or a file cannot be written.
     """
-    check_suffix(path, format)
     playback = playback or Playback()
+    return write_content(path, format, Content(avatar, meshes, sequence, playback))
+
+
+def write_content(path: Path, format: str, content: Content | WorldContent) -> list[Path]:
+    """What `export_avatar` does, of what is not an avatar too: in one of SPLAT_FORMATS."""
+    check_suffix(path, format)
     if FORMATS[format].has_rate:
-        check_rate(path, playback.fps)
-    return FORMATS[format].write(path, Content(avatar, meshes, sequence, playback)) or [path]
+        check_rate(path, content.playback.fps)
+    return FORMATS[format].write(path, content) or [path]
 
 
 def check_suffix(path: Path, format: str) -> None:

@@ -29,10 +29,10 @@ def write_usd(
     fps           time codes per second
     moving_color  whether the spherical harmonics differ between frames: written for each of them,
                   in half precision
-    Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. Splats and
-    opacities stay the same. A frame is in the file before the next is taken, so memory does not
-    grow with their number. Raises StgaError where USD is not installed, or a file cannot be
-    written.
+    Meters, y up; rotations unit quaternions, standard deviations linear, opacity 0 to 1. What stays
+    the same is written once; splats may come and go. A frame is in the file before the next is
+    taken, so memory does not grow with their number. Raises StgaError where USD is not installed,
+    or a file cannot be written.
     """
     try:
         import pxr as usd
@@ -82,32 +82,67 @@ def _write_layer(
     stage.SetFramesPerSecond(fps)
     types = usd.Sdf.ValueTypeNames
     vt = usd.Vt
-    prim = None
+    samples = None
     for number, world in frames:
-        if prim is None:
-            prim = _define(usd, stage, world, moving_color)
+        if samples is None:
+            samples = _Samples(_define(usd, stage, world))
             stage.SetStartTimeCode(number)
+        samples.begin_frame(number)
         scales = world.scales()
         reach = EXTENT_DEVIATIONS * scales.max(axis=1, keepdims=True)
         extent = np.stack([(world.xyz - reach).min(axis=0), (world.xyz + reach).max(axis=0)])
         xyzw = _rows(world.unit_rotations()[:, [1, 2, 3, 0]])  # as FromNumpy takes them
-        values = [
-            ("extent", types.Float3Array, vt.Vec3fArray.FromNumpy(extent)),
-            ("positions", types.Point3fArray, vt.Vec3fArray.FromNumpy(_rows(world.xyz))),
-            ("scales", types.Float3Array, vt.Vec3fArray.FromNumpy(_rows(scales))),
-            ("orientations", types.QuatfArray, vt.QuatfArray.FromNumpy(xyzw)),
-        ]
+        vectors = vt.Vec3fArray
+        samples.put("extent", types.Float3Array, vectors, extent)
+        samples.put("positions", types.Point3fArray, vectors, _rows(world.xyz))
+        samples.put("scales", types.Float3Array, vectors, _rows(scales))
+        samples.put("orientations", types.QuatfArray, vt.QuatfArray, xyzw)
+        samples.put("opacities", types.FloatArray, vt.FloatArray, world.opacities(), True)
+        sh = _rows(world.sh)
         if moving_color:
-            half = vt.Vec3hArray.FromNumpy(_rows(world.sh).astype(np.float16))
-            values.append((f"{COEFFICIENTS}h", types.Half3Array, half))
-        for name, kind, value in values:
-            prim.CreateAttribute(name, kind, False).Set(value, number)
+            half = sh.astype(np.float16)
+            samples.put(f"{COEFFICIENTS}h", types.Half3Array, vt.Vec3hArray, half)
+        else:
+            samples.put(COEFFICIENTS, types.Float3Array, vectors, sh, True)
         stage.SetEndTimeCode(number)
         layer.Save()
 
 
-def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
-    """The prim with what does not change. By names, not by USD's class of it, which older versions
+class _Samples:
+    """Attributes of a prim over time, with a time sample where they change. One at the frame before
+    keeps what was there from being interpolated."""
+
+    def __init__(self, prim: Any) -> None:
+        self._prim = prim
+        self._values: dict[str, tuple[np.ndarray, int | None]] = {}
+        self._before: int | None = None
+        self._number: int | None = None
+
+    def begin_frame(self, number: int) -> None:
+        self._before = self._number
+        self._number = number
+
+    def put(
+        self, name: str, kind: Any, array: Any, values: np.ndarray, is_default: bool = False
+    ) -> None:
+        """The values of this frame. array: USD's kind of it; is_default: the first ones are the
+        default, which holds at all times."""
+        before, sampled = self._values.get(name, (None, None))
+        if before is not None and np.array_equal(before, values):
+            return
+        attribute = self._prim.CreateAttribute(name, kind, False)
+        if before is not None and sampled != self._before:
+            attribute.Set(array.FromNumpy(before), self._before)
+        if before is None and is_default:
+            attribute.Set(array.FromNumpy(values))
+            self._values[name] = values, None
+        else:
+            attribute.Set(array.FromNumpy(values), self._number)
+            self._values[name] = values, self._number
+
+
+def _define(usd: Any, stage: Any, first: Splats) -> Any:
+    """The prim with what never changes. By names, not by USD's class of it, which older versions
     lack."""
     types = usd.Sdf.ValueTypeNames
     uniform = usd.Sdf.VariabilityUniform
@@ -120,11 +155,6 @@ def _define(usd: Any, stage: Any, first: Splats, moving_color: bool) -> Any:
         ("radiance:sphericalHarmonicsDegree", types.Int, first.sh_degree),
     ):
         prim.CreateAttribute(name, kind, False, uniform).Set(value)
-    opacities = usd.Vt.FloatArray.FromNumpy(first.opacities())
-    prim.CreateAttribute("opacities", types.FloatArray, False).Set(opacities)
-    if not moving_color:
-        coefficients = usd.Vt.Vec3fArray.FromNumpy(_rows(first.sh))
-        prim.CreateAttribute(COEFFICIENTS, types.Float3Array, False).Set(coefficients)
     return prim
 
 

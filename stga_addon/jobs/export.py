@@ -12,7 +12,14 @@ from ..capture.model import Capture
 from ..driving.head_map import page_controls
 from ..driving.open_motion import MotionOptions
 from ..errors import StgaError
-from ..export.formats import FORMATS, Meshes, check_free_space, check_suffix, export_avatar
+from ..export.formats import (
+    FORMATS,
+    Content,
+    Meshes,
+    check_free_space,
+    check_suffix,
+    export_avatar,
+)
 from ..export.playback import DEFAULT_FPS, MAX_VIEWS, Playback, playback_fps
 from ..export.rig import flame_notice
 from ..flame.sequence import FlameSequence
@@ -128,7 +135,7 @@ def export(request: Export, report: Report, say: Say) -> Written:
 
 def _say_size(request: Export, avatar: Avatar, frames: int, say: Say) -> None:
     """Say how large the file will be. Raises StgaError where the disk has too little free space."""
-    size = FORMATS[request.file_format].size(avatar, frames)
+    size = FORMATS[request.file_format].size(Content(avatar), frames)
     check_free_space(request.output, size)
     count = f"{frames} frame{'' if frames == 1 else 's'}"
     say(f"{count} of {len(avatar.splats)} splats: about {format_bytes(size)}")

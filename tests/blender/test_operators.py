@@ -226,7 +226,11 @@ class RangeExport:
         self.dialog = SimpleNamespace(others="", inform=self.said.append)
         self.dialog.report = self.dialog.tell = lambda kind, text: self.said.append(text)
         self._modal = operator.modal
-        steps = operator.export(self.dialog, view, head, Path(), frames, write)
+
+        def read() -> np.ndarray:
+            return extension.operators.export.evaluated_vertices(head.get())
+
+        steps = operator.export(self.dialog, view, read, Path(), frames, write)
         self.dialog._steps = extension.operators.common.Steps(steps, 1.0)
 
     def event(self, kind: str = "TIMER") -> str:

@@ -14,7 +14,7 @@ from stga_addon.avatar.embedding import to_world
 from stga_addon.avatar.file import Avatar
 from stga_addon.avatar.splats import Splats
 from stga_addon.errors import StgaError
-from stga_addon.export.formats import FORMATS, export_avatar
+from stga_addon.export.formats import FORMATS, Content, export_avatar
 from stga_addon.export.playback import Playback
 
 PLAYBACK = Playback(fps=30.0)
@@ -116,7 +116,7 @@ def test_size_is_known_before(avatar, tmp_path):
     for item in (avatar, colored(avatar)):
         export_avatar(tmp_path / "a.usdc", item, "usd", moved(item, (0, 1, 2, 3)))
         size = (tmp_path / "a.usdc").stat().st_size
-        assert FORMATS["usd"].size(item, 4) == pytest.approx(size, rel=0.02)
+        assert FORMATS["usd"].size(Content(item), 4) == pytest.approx(size, rel=0.02)
 
 
 def test_without_usd_the_package_is_named(avatar, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import numpy as np
 from ...avatar.embedding import face_areas
 from ...avatar.file import Avatar, AvatarLight
 from ...avatar.offsets import OFFSETS
-from ...avatar.splats import SH_C0, Splats
+from ...avatar.splats import SH_C0, Splats, in_world
 from ...avatar.strain import STRAIN_COMPONENTS, strain_basis
 from ...capture.color import srgb_to_linear
 from ...flame.quaternions import normalized
@@ -32,6 +32,19 @@ NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with d
 WORLD_ROTATION = "rotation"
 WORLD_SCALE = "scale"
 """As posed by the nodes, by the names that Blender's native splats have."""
+# What else those are drawn from.
+RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
+RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
+MIN_OPACITY = 1e-6  # and at most 1 less that, of what becomes a logit
+_FIELDS = {
+    "FLOAT": ("value", 1),
+    "INT": ("value", 1),
+    "FLOAT_VECTOR": ("vector", 3),
+    "QUATERNION": ("value", 4),
+    "FLOAT4": ("vector", 4),
+    "FLOAT_COLOR": ("color", 4),
+}
+"""Data type of an attribute -> name and width of its element's field."""
 
 # On the faces of the neutral mesh, from `StrainBasis`. A symmetric tensor is two vectors: xx yy zz
 # and xy yz zx.
@@ -152,6 +165,33 @@ def read_splats(mesh: Any) -> Splats:
         )
 
 
+def read_native_splats(cloud: Any) -> Splats | None:
+    """The splats of a point cloud, in its object's space; None where Blender draws no splats of
+    it. What it lacks is as Blender draws it: no turn, gray, opaque."""
+    names = set(cloud.attributes.keys())
+    count = len(cloud.points)
+    if getattr(cloud, "type", "") != "GAUSSIAN_SPLAT" or WORLD_SCALE not in names or not count:
+        return None
+    base = np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1))
+    rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
+    if RADIANCE in names:
+        base = read_attribute(cloud, RADIANCE)
+    if WORLD_ROTATION in names:
+        rotation = read_attribute(cloud, WORLD_ROTATION)
+    degree = next(n for n in (3, 2, 1, 0) if n == 0 or RADIANCE_SH.format(n * (n + 2) - 1) in names)
+    rest = [read_attribute(cloud, RADIANCE_SH.format(n)) for n in range(degree * (degree + 2))]
+    opacity = np.clip(base[:, 3].astype(np.float64), MIN_OPACITY, 1 - MIN_OPACITY)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_scale = np.log(np.abs(read_attribute(cloud, WORLD_SCALE)))
+    return in_world(
+        read_attribute(cloud, "position"),
+        rotation,
+        log_scale,
+        np.log(opacity / (1 - opacity)),
+        np.stack([base[:, :3], *rest], 1),
+    )
+
+
 def read_driven_offsets(neutral: Any) -> dict[str, np.ndarray]:
     """`Avatar.driven_offsets` as stored in a neutral mesh."""
     stored = {name: read_vectors(neutral, _offset_names(name)) for name in OFFSETS}
@@ -169,14 +209,13 @@ def _offset_names(offset: str) -> list[str]:
 
 
 def read_attribute(mesh: Any, name: str) -> np.ndarray:
-    """(N,) of an attribute of numbers, (N, 3) of one of vectors, (N, 4) of one of rotations."""
+    """(N,) of an attribute of numbers, (N, 3) of one of vectors, (N, 4) of one of rotations or
+    colors."""
     attribute = mesh.attributes[name]
-    if attribute.data_type in ("FLOAT", "INT"):
-        dtype = np.int32 if attribute.data_type == "INT" else np.float32
-        return read_values(attribute.data, "value", 1, dtype)[:, 0]
-    if attribute.data_type == "QUATERNION":
-        return read_values(attribute.data, "value", 4)
-    return read_values(attribute.data, "vector", 3)
+    field, width = _FIELDS[attribute.data_type]
+    dtype = np.int32 if attribute.data_type == "INT" else np.float32
+    values = read_values(attribute.data, field, width, dtype)
+    return values[:, 0] if width == 1 else values
 
 
 def read_vectors(mesh: Any, names: Sequence[str]) -> np.ndarray | None:

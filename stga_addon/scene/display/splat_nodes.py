@@ -167,10 +167,6 @@ def _emission(nodes: Nodes, attribute_type: str, density: Any) -> Any:
     return nodes.out("ShaderNodeMixShader", {"Fac": alpha, "Shader": shaders})
 
 
-# Attributes that Blender's native splats use, beside WORLD_ROTATION and WORLD_SCALE.
-RADIANCE = "radiance:base"  # coefficient of degree 0, and opacity
-RADIANCE_SH = "radiance:sh_{}"  # coefficients of degrees 1 to 3
-
 AS_TRAINED = "As Trained"
 POINTS = "Points"
 QUADS = "Camera Quads"
@@ -274,13 +270,13 @@ def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
     base = {"Red": red, "Green": green, "Blue": blue, "Alpha": opacity}
     # A color, which 5.3 draws as four floats; of FLOAT4, this node of 5.2 stores three.
     radiance = nodes.out("FunctionNodeCombineColor", base)
-    splats = nodes.store(given.splats, RADIANCE, radiance, "FLOAT_COLOR")
+    splats = nodes.store(given.splats, stored.RADIANCE, radiance, "FLOAT_COLOR")
     scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), given.size)
     splats = nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
     factor = nodes.logic("NIMPLY", given.view_dependent, flat)
     for index in range((degree + 1) ** 2 - 1):
         coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
-        splats = nodes.store(splats, RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
+        splats = nodes.store(splats, stored.RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
     points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": given.visible})
     return compat.native_splats(nodes.tree, points)
 

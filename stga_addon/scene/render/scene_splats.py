@@ -8,16 +8,24 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...avatar.embedding import WORLD, FaceFrames
+from ...avatar.embedding import WORLD, FaceFrames, placed, to_world
 from ...avatar.file import Avatar
-from ...avatar.splats import Splats
+from ...avatar.splats import Splats, at_degree, joined
 from ...errors import StgaError
-from .. import tags
+from .. import compat, tags
 from ..arrays import flat_floats, mesh_vertices
 from ..display import splat_nodes
 from ..display.node_builder import VERSION
-from ..display.splat_attributes import RELIT_COLOR, read_splats, with_alpha, write_attributes
+from ..display.splat_attributes import (
+    RELIT_COLOR,
+    read_native_splats,
+    read_splats,
+    with_alpha,
+    write_attributes,
+)
+from ..display.splat_nodes import NATIVE
 from ..display.splat_object import (
+    display_mode,
     display_settings,
     get_input,
     splat_modifier,
@@ -27,6 +35,9 @@ from ..display.splat_object import (
 from ..layers import SceneLayer
 from ..light import PosedAvatar, SceneLight, lighting_settings
 from ..vertex_groups import frame_group, frame_selection
+
+VIEWER = np.array((0.0, -1.0, 0.0))
+"""Meters from relit splats to who sees their highlights, where the scene has no camera."""
 
 
 class SplatCache:
@@ -38,14 +49,18 @@ class SplatCache:
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
         self._frames: dict[tuple[Any, ...], tuple[np.ndarray, FaceFrames]] = {}
         self._selections: dict[tuple[int, int, int], np.ndarray | None] = {}
+        self._native: dict[tuple[int, ...], Splats | None] = {}
         self.light = SceneLight()
 
     def scene_changed(self, depsgraph: Any) -> None:
         """Forget meshes that were edited, the selections painted on them, and what throws
         shadows."""
         self.light.forget_casters()
-        changed = [update.id.original for update in depsgraph.updates]
+        updates = depsgraph.updates
+        changed = [update.id.original for update in updates]
         uids = {each.session_uid for each in changed if isinstance(each, bpy.types.Mesh)}
+        moved = {each.id.original.session_uid for each in updates if each.is_updated_geometry}
+        self._native = {key: read for key, read in self._native.items() if key[0] not in moved}
         if uids:
             self._keep(lambda key: key[0] not in uids)
         # where a group was removed, the scene's relations are built anew
@@ -71,6 +86,13 @@ class SplatCache:
             mesh = splat_object.data
             self._stored[key] = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
         return self._stored[key]
+
+    def native(self, shown: Any) -> Splats | None:
+        """`read_native_splats` of an evaluated object, by that and where its data are."""
+        key = shown.original.session_uid, shown.data.as_pointer(), len(shown.data.points)
+        if key not in self._native:
+            self._native[key] = read_native_splats(shown.data)
+        return self._native[key]
 
     def frames(
         self, splat_object: Any, avatar: Avatar, vertices: np.ndarray
@@ -145,6 +167,71 @@ def visible_layers(
             )
         )
     return layers
+
+
+def native_layers(
+    depsgraph: Any,
+    cache: SplatCache,
+    view: Any = None,
+    is_wanted: Callable[[Any, Any], bool] = lambda owner, shown: not _is_own(owner, shown),
+) -> list[SceneLayer]:
+    """The native splats that Blender itself draws at the depsgraph's frame, also of others and in
+    instances; none before Blender 5.3. view: as of `visible_layers`. is_wanted: of the object that
+    makes an instance, or itself, and the object whose splats they are."""
+    layers = []
+    for instance in depsgraph.object_instances if compat.NATIVE_SPLATS else ():
+        shown = instance.object
+        owner = instance.parent if instance.is_instance else shown
+        # the data are there until the next instance only
+        if shown.type != "POINTCLOUD" or not is_wanted(owner.original, shown.original):
+            continue
+        is_hidden = owner.hide_render or not (owner.visible_camera and shown.visible_camera)
+        if view is None and is_hidden:
+            continue
+        splats = cache.native(shown)
+        if splats is not None:
+            to_world = np.array(instance.matrix_world, np.float64)
+            holdout = view is None and (owner.is_holdout or shown.is_holdout)
+            layers.append(SceneLayer(splats, WORLD, to_world, holdout=holdout))
+    return layers
+
+
+def _is_own(owner: Any, shown: Any) -> bool:
+    """Whether `visible_layers` has these splats."""
+    is_known = owner == shown or owner.instance_type == "COLLECTION"
+    return is_known and shown.get(tags.KIND) == tags.SPLATS
+
+
+def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[SceneLayer]:
+    """`visible_layers`, and native splats of others."""
+    return visible_layers(depsgraph, cache, view) + native_layers(depsgraph, cache, view)
+
+
+def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> Splats:
+    """All splats that images of the scene show at the depsgraph's frame, with harmonics of the
+    highest degree among them, by a matrix (4, 4) from Blender's axes: native ones as Blender
+    evaluates them, others as they are displayed. Raises StgaError as `visible_layers`, and where
+    there are none."""
+
+    def is_native(owner: Any, shown: Any) -> bool:
+        return not _is_own(owner, shown) or display_mode(shown) == NATIVE
+
+    layers = visible_layers(depsgraph, cache, None, lambda shown: display_mode(shown) != NATIVE)
+    layers += native_layers(depsgraph, cache, None, is_native)
+    camera = depsgraph.scene.camera
+    eye = None if camera is None else np.array(camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
+    parts = []
+    for layer in layers:
+        if layer.holdout:
+            continue
+        posed = layer.posed(layer.to_world[:3, 3] + VIEWER if eye is None else eye)
+        world = to_world(posed.splats, posed.frames)
+        parts.append(placed(world, to_file @ posed.to_world))
+    if not sum(map(len, parts)):
+        scene = depsgraph.scene
+        raise StgaError(f"{scene.name}: shows no splats in frame {scene.frame_current}")
+    degree = max(part.sh_degree for part in parts)
+    return joined([at_degree(part, degree) for part in parts])
 
 
 def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: Any) -> np.ndarray:

@@ -1,0 +1,255 @@
+"""Export of all that shows splats in a scene, read back by Blender 5.3 and by others."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import bpy
+import numpy as np
+import pytest
+import trimesh
+from avatar.conftest import random_splats, world_splats
+from mathutils import Matrix
+from scipy.spatial.transform import Rotation
+
+from stga_addon.avatar.file import write_avatar
+from stga_addon.avatar.splats import Splats, harmonics
+from stga_addon.capture.open import open_capture
+from stga_addon.export.ply import read_ply, write_ply
+from stga_addon.scene import compat
+from stga_addon.scene.display.node_builder import Nodes, new_socket, new_tree
+
+from .test_operators import expected_world, write_ball_avatar
+
+needs_native = pytest.mark.skipif(
+    not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats"
+)
+TURN = Rotation.from_euler("xyz", (0.4, -1.1, 2.0)).as_matrix()
+PLACES = {
+    "plain": np.eye(3),
+    "scaled": 2 * TURN,
+    "mirrored": 0.5 * TURN @ np.diag([1, 1, -1]),
+    "sheared": TURN @ [[1, 0.5, 0], [0, 2, 0], [0, 0, 0.5]],
+}
+IMPORTS: dict[str, tuple[str, Callable[[], Any]]] = {
+    "a.ply": ("ply", lambda: bpy.ops.wm.ply_import),
+    "a.spz": ("spz", lambda: bpy.ops.wm.spz_import),
+    "a.glb": ("gltf", lambda: bpy.ops.import_scene.gltf),
+    "a.usdc": ("usd", lambda: bpy.ops.wm.usd_import),
+}
+DIRECTIONS = np.random.default_rng(5).normal(size=(20, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+
+
+class Seen(NamedTuple):
+    """Of splats where their object stands: position (N, 3), covariance (N, 3, 3), color in
+    DIRECTIONS (N, 20, 3), opacity (N,)."""
+
+    xyz: np.ndarray
+    covariance: np.ndarray
+    color: np.ndarray
+    opacity: np.ndarray
+
+    def check(self, expected: "Seen", is_coarse: bool = False) -> None:
+        """Whether they are those expected, in float32, or in SPZ's bits."""
+        within = 0.07 if is_coarse else 0
+        np.testing.assert_allclose(self.xyz, expected.xyz, atol=2e-6 + within / 1000)
+        size = np.abs(expected.covariance).max((1, 2), keepdims=True)
+        relative = [each.covariance / size for each in (self, expected)]
+        np.testing.assert_allclose(*relative, atol=1e-5 + 2 * within)
+        np.testing.assert_allclose(self.color, expected.color, atol=1e-5 + within)
+        np.testing.assert_allclose(self.opacity, expected.opacity, atol=2e-6 + within / 20)
+
+
+def seen(splats: Splats, linear: np.ndarray, move: Any = (0, 0, 0)) -> Seen:
+    turn = Rotation.from_quat(splats.rotation[:, [1, 2, 3, 0]]).as_matrix()
+    axes = linear @ (turn * np.exp(splats.log_scale)[:, None])
+    left, _, right = np.linalg.svd(linear)
+    terms = harmonics(*(DIRECTIONS @ (left @ right)).T)[: splats.sh.shape[1]]
+    basis = np.stack([np.broadcast_to(term, 20) for term in terms])
+    return Seen(
+        splats.xyz @ linear.T + move,
+        axes @ axes.transpose(0, 2, 1),
+        np.einsum("kd,nkc->ndc", basis, splats.sh),
+        1 / (1 + np.exp(-splats.opacity)),
+    )
+
+
+def values(cloud: Any, name: str, field: str, width: int) -> np.ndarray:
+    found = np.empty(len(cloud.points) * width, np.float32)
+    cloud.attributes[name].data.foreach_get(field, found)
+    return found.reshape(-1, width)
+
+
+def imported() -> Seen:
+    """What the only native splats in the scene are, as Blender evaluates them."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    found = []
+    for instance in depsgraph.object_instances:
+        if instance.object.type == "POINTCLOUD":
+            cloud = instance.object.data
+            assert cloud.type == "GAUSSIAN_SPLAT"
+            base = values(cloud, "radiance:base", "vector", 4)
+            rest = [values(cloud, f"radiance:sh_{n}", "vector", 3) for n in range(15)]
+            splats = world_splats(
+                values(cloud, "position", "vector", 3),
+                values(cloud, "rotation", "value", 4),
+                np.log(values(cloud, "scale", "vector", 3)),
+                base[:, 3].astype(np.float64),
+                np.stack([base[:, :3], *rest], 1),
+            )
+            matrix = np.array(instance.matrix_world)
+            found.append(seen(splats, matrix[:3, :3], matrix[:3, 3]))
+    (only,) = found
+    return only
+
+
+def some_splats(degree: int = 3) -> Splats:
+    """Within what SPZ keeps: sizes of centimeters, coefficients below 1 however they turn."""
+    rng = np.random.default_rng(3)
+    splats = random_splats(1, 300, 1)
+    size = rng.normal(-3, 0.5, (300, 3))
+    sh = rng.uniform(-0.35, 0.35, (300, (degree + 1) ** 2, 3))
+    return world_splats(splats.xyz, splats.rotation, size, splats.opacities(), sh)
+
+
+def place(thing: Any, linear: np.ndarray) -> None:
+    """By a parent, without which nothing shears."""
+    thing.parent = bpy.data.objects.new("parent", None)
+    bpy.context.scene.collection.objects.link(thing.parent)
+    thing.matrix_parent_inverse = Matrix(linear.tolist()).to_4x4()
+
+
+def native_cloud(folder: Path, splats: Splats) -> Any:
+    write_ply(folder / "given.ply", splats)
+    bpy.ops.wm.ply_import(filepath=str(folder / "given.ply"))
+    return bpy.context.object
+
+
+def instanced(collection: Any) -> Any:
+    empty = bpy.data.objects.new("instance", None)
+    empty.instance_type = "COLLECTION"
+    empty.instance_collection = collection
+    bpy.context.scene.collection.objects.link(empty)
+    return empty
+
+
+def instanced_by_nodes(thing: Any, place: tuple[float, float, float]) -> None:
+    mesh = bpy.data.meshes.new("points")
+    mesh.from_pydata([place], [], [])
+    points = bpy.data.objects.new("points", mesh)
+    bpy.context.scene.collection.objects.link(points)
+    tree = points.modifiers.new("points", "NODES").node_group = new_tree("points")
+    new_socket(tree, "Geometry", "INPUT", "Geometry")
+    new_socket(tree, "Geometry", "OUTPUT", "Geometry")
+    nodes = Nodes(tree)
+    instance = nodes.object_info(thing, "ORIGINAL")
+    instance.inputs["As Instance"].default_value = True
+    given = nodes.add("NodeGroupInput").outputs["Geometry"]
+    inputs = {"Points": given, "Instance": instance.outputs["Geometry"]}
+    made = nodes.out("GeometryNodeInstanceOnPoints", inputs)
+    nodes.finish("NodeGroupOutput", {"Geometry": made})
+
+
+@needs_native
+@pytest.mark.parametrize("standing", PLACES)
+@pytest.mark.parametrize("name", IMPORTS)
+def test_blender_reads_what_it_exports(extension, tmp_path, name, standing) -> None:
+    """Catches other axes than the importer's, splats and colors that do not turn, scale, shear or
+    mirror with their object, and activations that are not those of the format."""
+    splats = some_splats()
+    linear = PLACES[standing]
+    place(native_cloud(tmp_path, splats), linear)
+    format, importer = IMPORTS[name]
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / name), format=format)
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    importer()(filepath=str(tmp_path / name))
+    if standing == "sheared" and name == "a.spz":  # whose scales have steps of 6 %
+        np.testing.assert_allclose(imported().xyz, seen(splats, linear).xyz, atol=1e-4)
+    else:
+        imported().check(seen(splats, linear), is_coarse=name == "a.spz")
+    if name in ("a.ply", "a.glb"):
+        (read,) = trimesh.load_scene(tmp_path / name).geometry.values()
+        turned = read.vertices if name == "a.ply" else read.vertices[:, [0, 2, 1]] * [1, -1, 1]
+        np.testing.assert_allclose(turned, seen(splats, linear).xyz, atol=2e-6)
+
+
+@needs_native
+def test_instances_and_frames_of_others_are_exported(extension, tmp_path) -> None:
+    """Catches splats of instanced collections and of geometry nodes that are left out, hidden ones
+    that are not, degrees of harmonics mixed up, the axes of a PLY, and an animation that is
+    exported as it is now."""
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    first = native_cloud(tmp_path, some_splats(0))
+    hidden = native_cloud(tmp_path, some_splats(1))
+    hidden.hide_render = True
+    prop = native_cloud(tmp_path, some_splats(2))
+    collection = bpy.data.collections.new("props")
+    collection.objects.link(prop)
+    bpy.context.scene.collection.objects.unlink(prop)
+    place(instanced(collection), PLACES["mirrored"])
+    instanced_by_nodes(prop, (0, 0, 7))
+    scene = bpy.context.scene
+    scene.frame_start = 2
+    scene.frame_end = 5
+    for frame, x in ((3, 0.0), (5, 2.0)):
+        first.location.x = x
+        first.keyframe_insert("location", frame=frame)
+    scene.frame_set(4)
+    many = tmp_path / "many"
+    bpy.ops.stga.export_splats(filepath=str(many), format="ply-sequence", up="Y")
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "one.ply"), format="ply")
+    assert scene.frame_current == 4
+    files = sorted(path.name for path in many.glob("*.ply"))
+    assert files == [f"{frame:05d}.ply" for frame in (2, 3, 4, 5)]
+    one = read_ply(tmp_path / "one.ply")
+    assert (len(one), one.sh_degree) == (900, 3)
+    turned = read_ply(many / "00004.ply")
+    np.testing.assert_array_equal(turned.xyz, one.xyz[:, [0, 2, 1]] * [1, 1, -1])
+    expected = (
+        seen(some_splats(0), np.eye(3), first.matrix_world.translation),
+        seen(some_splats(2), PLACES["mirrored"]),
+        seen(some_splats(2), np.eye(3), (0, 0, 7)),
+    )
+    for index, part in enumerate(expected):
+        found = one.rows(np.arange(300 * index, 300 * index + 300))
+        seen(found, np.eye(3)).check(part)
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.usdc"), format="usd")
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    prim = stage.GetPrimAtPath("/Avatar/Splats")
+    positions = prim.GetAttribute("positions")
+    assert positions.GetTimeSamples() == [2, 3, 4, 5]
+    for frame in (2, 3, 4, 5):
+        expected = read_ply(many / f"{frame:05d}.ply").xyz
+        np.testing.assert_array_equal(positions.Get(frame), expected)
+    assert prim.GetAttribute("scales").GetTimeSamples() == [2]
+
+
+@pytest.mark.parametrize("display", ["As Trained", "Points", "Native Splats"])
+def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, display) -> None:
+    """Catches an export without what only this add-on shows, twice what Blender shows too, and
+    another frame, size or place."""
+    if display == "Native Splats" and not compat.NATIVE_SPLATS:
+        pytest.skip("Blender before 5.3 has no native splats")
+    avatar = write_ball_avatar(tmp_path / "avatar.npz")
+    sh = np.random.default_rng(0).normal(0, 0.3, avatar.splats.sh.shape).astype(np.float32)
+    avatar = replace(avatar, splats=replace(avatar.splats, sh=sh))
+    write_avatar(tmp_path / "avatar.npz", avatar)
+    bpy.ops.stga.show_avatar(filepath=str(tmp_path / "avatar.npz"))
+    capture = open_capture(tmp_path / "capture")
+    bpy.context.scene.frame_set(3)
+    splats = bpy.context.scene.stga.splats
+    bpy.ops.stga.choose_display(display=display)
+    extension.stga_addon.scene.display.splat_object.set_input(splats, "Size", 1.5)
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.ply"), format="ply", up="Y")
+    expected = expected_world(avatar, capture.mesh(3))
+    found = read_ply(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.xyz, expected.xyz, atol=1e-5)
+    np.testing.assert_allclose(found.log_scale, expected.log_scale + np.log(1.5), atol=1e-3)
+    np.testing.assert_allclose(found.sh[:, : expected.sh.shape[1]], expected.sh, atol=1e-4)
+    np.testing.assert_allclose(found.opacity, expected.opacity, atol=1e-3)
+    splats.hide_render = True
+    with pytest.raises(RuntimeError, match="shows no splats in frame 3"):
+        bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply")
+    assert not (tmp_path / "b.ply").exists()
