@@ -13,17 +13,19 @@ from stga_addon.avatar.splats import SH_C0
 from stga_addon.capture.camera import Camera
 from stga_addon.capture.color import linear_to_srgb
 from stga_addon.errors import DeviceError, StgaError
+from stga_addon.export.ply import write_ply
 from stga_addon.light.harmonics import uniform
 from stga_addon.light.relight import Relighter
 from stga_addon.light.surface import transfer_of
 from stga_addon.light.values import Light, Lighting
 from stga_addon.render.render import render_avatar
+from stga_addon.scene import compat
 from stga_addon.scene.arrays import evaluated_vertices
 from stga_addon.scene.compat import enable_nodes
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_object import set_input, show_avatar, show_world_splats
 from stga_addon.scene.render import engine
-from stga_addon.scene.render.scene_splats import SplatCache, visible_layers
+from stga_addon.scene.render.scene_splats import SplatCache, native_layers, visible_layers
 
 from .exr import read_exr
 from .test_splat_object import (
@@ -433,7 +435,7 @@ def test_what_cannot_be_rendered_is_named():
         bpy.ops.render.render()
 
 
-@pytest.mark.parametrize("stage", ["visible_layers", "combined"])
+@pytest.mark.parametrize("stage", ["all_layers", "combined"])
 @pytest.mark.parametrize("raised", [StgaError("head: is broken"), MemoryError("of pixels")])
 def test_failed_render_is_an_error_and_an_empty_image(stage, raised, tmp_path, monkeypatch):
     """Catches an image without passes, and a failure saved as an image."""
@@ -566,3 +568,36 @@ def test_collections_of_holdouts_and_of_indirect_light(tmp_path, transparent):
     np.testing.assert_array_equal(render(tmp_path)["A"], behind["A"])
     front.visible_camera = True
     np.testing.assert_array_equal(render(tmp_path)["A"], both["A"])
+
+
+@pytest.mark.skipif(not compat.NATIVE_SPLATS, reason="Blender before 5.3 has no native splats")
+def test_native_splats_of_others_are_sorted_among_ours(tmp_path):
+    """Catches a room or a prop that the image lacks, stands elsewhere, hides what is before it, or
+    stays as it was once it is edited."""
+    splats = random_splats(1, 60, degree=1, extent=0.15)
+    splats = replace(splats, log_scale=splats.log_scale + 3.5, opacity=splats.opacity + 1)
+    whole = show_world_splats(splats, "all")
+    active_camera((0, -1, 0)).rotation_euler = (np.pi / 2, 0, 0)
+    expected = render(tmp_path)
+    assert expected["A"].max() > 0.8
+    bpy.data.objects.remove(whole)
+    write_ply(tmp_path / "others.ply", splats.rows(np.arange(0, 60, 2)))
+    bpy.ops.wm.ply_import(filepath=str(tmp_path / "others.ply"))
+    others = bpy.context.object
+    assert render(tmp_path)["A"].max() > 0.5
+    show_world_splats(splats.rows(np.arange(1, 60, 2)), "ours")
+    both = render(tmp_path)
+    for name, values in both.items():
+        np.testing.assert_allclose(values, expected[name], rtol=1e-4, atol=1e-4)
+    cache = SplatCache()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    bpy.app.handlers.depsgraph_update_post.append(lambda _, graph: cache.scene_changed(graph))
+    (before,) = native_layers(depsgraph, cache)
+    (again,) = native_layers(depsgraph, cache)
+    assert again.splats is before.splats
+    others.data.points[0].co.x += 1
+    others.data.update_tag()
+    bpy.context.view_layer.update()
+    bpy.app.handlers.depsgraph_update_post.pop()
+    (after,) = native_layers(depsgraph, cache)
+    assert after.splats.xyz[0, 0] == pytest.approx(before.splats.xyz[0, 0] + 1)

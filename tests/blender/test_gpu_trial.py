@@ -93,7 +93,7 @@ def test_viewports_fall_back_to_points(monkeypatch, capsys, is_engine):
     monkeypatch.setattr(display, "_draw_region", lambda context: SplatRenderer(COMPACT, True))
     monkeypatch.setattr(engine, "is_drawn_by_engine", lambda context: True)
     monkeypatch.setattr(engine, "settings_values", lambda scene: ())
-    monkeypatch.setattr(engine, "visible_layers", lambda *_: [trial._layer(0)])
+    monkeypatch.setattr(engine, "all_layers", lambda *_: [trial._layer(0)])
     viewport = engine.EngineViewport()
 
     def draw() -> None:

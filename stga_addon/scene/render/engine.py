@@ -23,7 +23,7 @@ from ..gpu.renderer import CompositeTarget, SplatRenderer
 from ..layers import SceneLayer
 from ..light import settings_values
 from ..objects import Warn, log_warning
-from .scene_splats import SplatCache, visible_layers
+from .scene_splats import SplatCache, all_layers
 from .view_transform import combined, inverse_view, measure, needs_inverse, scene_background, srgb
 from .viewport_display import ENGINE, display, is_drawn_by_engine, region_view
 
@@ -66,7 +66,7 @@ class EngineViewport:
         if self._layers is None or lighting != self._lighting:
             self._lighting = lighting
             self._layers = None
-            self._layers = visible_layers(depsgraph, self._cache, context.space_data)
+            self._layers = all_layers(depsgraph, self._cache, context.space_data)
         self.error = ""
         if self._layers:
             self._renderer = self._renderer or SplatRenderer()
@@ -136,7 +136,7 @@ class SplatsEngine(bpy.types.RenderEngine):  # type: ignore[misc]
         empty."""
         scene = depsgraph.scene
         camera = self._camera(depsgraph, border, view_name)
-        layers = visible_layers(depsgraph, SplatCache())
+        layers = all_layers(depsgraph, SplatCache())
         self.update_stats("", f"{sum(len(layer.splats) for layer in layers)} splats")
         held_out = any(layer.holdout for layer in layers)
         shown = [layer.painted(0.0) if layer.holdout else layer for layer in layers]

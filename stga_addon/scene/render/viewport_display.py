@@ -22,7 +22,7 @@ from ..gpu.front_bones import NO_BONES, front_bones
 from ..gpu.packing import NEAR_M, View
 from ..gpu.renderer import COMPACT, CompositeTarget, SplatRenderer
 from ..gpu.trial import WrongPicture
-from .scene_splats import SplatCache, visible_layers
+from .scene_splats import SplatCache, native_layers, visible_layers
 from .view_transform import keeps_colors, srgb, world_color
 
 ENGINE = "STGA_SPLATS"  # the render engine, which draws all splats in *Rendered* mode
@@ -103,6 +103,8 @@ class GpuDisplay:
             space,
             lambda shown: everything or display_mode(shown) == AS_TRAINED,
         )
+        if everything:  # else Blender draws native splats
+            layers += native_layers(context.evaluated_depsgraph_get(), self.cache, space)
         if not layers:
             if self._renderer is not None and not any(
                 is_shown_as_trained(candidate) for candidate in bpy.data.objects
