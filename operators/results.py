@@ -58,7 +58,7 @@ def panel_head(scene: Any, kind: Kind) -> Any:
     head = scene.stga.head
     if kind == Kind.AVATAR:
         return None
-    if kind == Kind.LIGHT and splats is not None:
+    if kind in ADDS and splats is not None:
         head = splat_object.get_input(splats, splat_nodes.HEAD)
     return head if is_head(head) else None
 
@@ -290,11 +290,11 @@ def _in_panel(scene: Any, head: Any) -> Iterator[None]:
             settings.head = before
 
 
-def _store_light(scene: Any, state: RequestState) -> Answer:
-    """Give the scene's splats the light that is now in the avatar of the run."""
+def _store_added(scene: Any, state: RequestState) -> Answer:
+    """Give the scene's splats what is now in the avatar of the run."""
     shown = shown_splats(scene, request_head(scene, state))
     path = state.subject_path / AVATAR
-    if shown is None or not splat_object.store_light(shown, read_avatar(path)):
+    if shown is None or not ADDS[state.kind](shown, read_avatar(path)):
         problem = "its avatar is not the one that the scene shows; show it again"
         raise StgaError(f"{state.subject}: {problem}")
     return Shown(undoable=True)
@@ -367,6 +367,8 @@ def _apply_performance(scene: Any, state: RequestState) -> Answer:
     return _operate(scene, bpy.ops.stga.apply_motion, filepath=path, start=first)
 
 
+ADDS = {Kind.LIGHT: splat_object.store_light, Kind.EXACT: splat_object.store_linear_base}
+"""What requests add to a run's avatar, stored in the object that shows it."""
 SHOW = {
     Kind.TRAINING: _show_avatar,
     Kind.TRACKING: _import,
@@ -374,7 +376,7 @@ SHOW = {
     Kind.ANALYSIS: _fill_effects,
     Kind.SELECTION: _select_for_take,
     Kind.PERFORMANCE: _apply_performance,
-    Kind.LIGHT: _store_light,
+    **dict.fromkeys(ADDS, _store_added),
 }
 """Puts the result of a kind of request into the scene. Raises StgaError or RuntimeError."""
 

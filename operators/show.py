@@ -9,6 +9,7 @@ import bpy
 from ..stga_addon.avatar.file import read_avatar
 from ..stga_addon.errors import StgaError
 from ..stga_addon.export.splat_files import READERS, read_splats
+from ..stga_addon.jobs.finished_run import MakeExact as MakeExactRequest
 from ..stga_addon.jobs.finished_run import Relight
 from ..stga_addon.jobs.table import Kind
 from ..stga_addon.scene import compat, tags
@@ -127,8 +128,8 @@ def _own_as_trained(context: Any) -> list[Any]:
 
 
 class PreviewImages(Edit, bpy.types.Operator):
-    """Show all splats as images by EEVEE and Cycles show them: through the scene's camera as quads
-    that face it, without one as points"""
+    """Show all splats as images by EEVEE and Cycles show them: as Blender's own from 5.3 on, before
+    through the scene's camera as quads that face it, without one as points"""
 
     bl_label = "Preview for EEVEE/Cycles"
     needs = (need(_own_as_trained, "No splats are displayed as trained"),)
@@ -137,13 +138,14 @@ class PreviewImages(Edit, bpy.types.Operator):
         scene = context.scene
         space = context.space_data
         mode = QUADS if scene.camera is not None else POINTS
+        mode = NATIVE if compat.NATIVE_SPLATS else mode
         for thing in _own_as_trained(context):
-            splat_object.set_input(thing, splat_nodes.DISPLAY, mode)
+            splat_object.choose_display(thing, mode)
         splat_object.use_transparent_bounces(scene)
         if getattr(space, "type", "") == "VIEW_3D":  # none where a script calls it
             # Material Preview is EEVEE, whatever the scene's engine is.
             space.shading.type = "RENDERED" if splat_object.shows_nodes(scene) else "MATERIAL"
-            if scene.camera is not None:
+            if mode == QUADS:
                 space.region_3d.view_perspective = "CAMERA"
         if hint := splat_object.view_transform_hint(scene):
             self.warn(hint)
@@ -173,18 +175,32 @@ def _needs_splats(operator: Any, context: Any) -> bool:
     return common.polled(operator, head is not None, "Show an avatar first")
 
 
-class EstimateLight(Action, bpy.types.Operator):
-    """Find out the light of the capture that the avatar was trained on, so that the scene can light
-    the avatar"""
+class RunAddition(Action):
+    """Mixin of operators that start a request about the shown avatar's run."""
 
-    needs = (idle(Kind.LIGHT), _needs_splats)
-
+    request: type[Any]
     directory: options.path("Run Folder", "Folder of the avatar's run", "DIR_PATH")
 
     def run(self, context: Any) -> None:
         run = file_path(self.directory or context.scene.stga.run_folder, "run folder")
-        request = Relight(run, flame=common.flame_model_path(context))
+        request = self.request(run, flame=common.flame_model_path(context))
         start(context.scene, request, training_python(context))
+
+
+class EstimateLight(RunAddition, bpy.types.Operator):
+    """Find out the light of the capture that the avatar was trained on, so that the scene can light
+    the avatar"""
+
+    request = Relight
+    needs = (idle(Kind.LIGHT), _needs_splats)
+
+
+class MakeExact(RunAddition, bpy.types.Operator):
+    """Fit the avatar's colors to EEVEE and Cycles, which blend splats in linear light: takes
+    seconds; as trained, it stays the same"""
+
+    request = MakeExactRequest
+    needs = (idle(Kind.EXACT), _needs_splats)
 
 
 class RelightFrame(Edit, bpy.types.Operator):

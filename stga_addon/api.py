@@ -32,7 +32,7 @@ from .export.splat_files import read_splats
 from .jobs.analyze import Analyze, Select
 from .jobs.convert_motion import ConvertMotion
 from .jobs.export import Export
-from .jobs.finished_run import Evaluate, Relight
+from .jobs.finished_run import Evaluate, MakeExact, Relight
 from .jobs.perform import perform
 from .jobs.render import Render
 from .jobs.track import MakeAvatar, Track
@@ -55,6 +55,7 @@ __all__ = [
     "Export",
     "Extend",
     "MakeAvatar",
+    "MakeExact",
     "Progress",
     "Refine",
     "Relight",

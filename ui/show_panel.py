@@ -17,7 +17,7 @@ from ..stga_addon.render.client import missing_packages
 from ..stga_addon.scene import tags
 from ..stga_addon.scene.compat import modifier_input_owner
 from ..stga_addon.scene.display import splat_nodes, splat_object
-from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS
+from ..stga_addon.scene.display.splat_nodes import AS_TRAINED, LIMITS, NATIVE
 from ..stga_addon.scene.display.splat_object import shows_nodes
 from ..stga_addon.scene.gpu.context import has_gpu_context
 from ..stga_addon.scene.light import MODE_CHANGED, lighting_settings, world_light
@@ -69,6 +69,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if viewport_display.is_engine_view(context):  # shows every display as trained
             return
         draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
+        if mode == NATIVE and not draw_running(layout, context, Kind.EXACT):
+            layout.operator("stga.make_exact").directory = settings.run_folder
         if context.space_data.shading.type in GRAY:
             choose = "stga.choose_display"
             show = layout.operator(choose, text="Show Colors", icon="SHADING_TEXTURE")

@@ -95,6 +95,9 @@ class Avatar:
     driven_offsets  name -> (F, 3, 3) float32 of `offsets.OFFSETS`: change of a triangle's splats by
                     each of three components of a signal
     light       what relighting needs, None where it was not estimated
+    linear_base  (N, 4) float32: constant coefficients and logit of each splat with which renderers
+                 that blend in linear light come nearest to it (`render.linear_fit`); None: those
+                 of `splats`
     """
 
     splats: Splats
@@ -109,6 +112,17 @@ class Avatar:
     strain_range: np.ndarray | None = None
     driven_offsets: Mapping[str, np.ndarray] = field(default_factory=dict)
     light: AvatarLight | None = None
+    linear_base: np.ndarray | None = None
+
+    @property
+    def for_linear_light(self) -> "Avatar":
+        """With the splats for renderers that blend in linear light."""
+        if self.linear_base is None:
+            return self
+        sh = self.splats.sh.copy()
+        sh[:, 0] = self.linear_base[:, :3]
+        splats = replace(self.splats, sh=sh, opacity=self.linear_base[:, 3].copy())
+        return replace(self, splats=splats, linear_base=None)
 
     @property
     def follows_strain(self) -> bool:
@@ -179,6 +193,8 @@ def write_avatar(path: Path, avatar: Avatar) -> None:
     arrays |= {"neutral": avatar.neutral, "faces": avatar.faces, "region_faces": masks}
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
+    if avatar.linear_base is not None:
+        arrays["linear_base"] = avatar.linear_base
     arrays.update(avatar.driven_offsets)
     if avatar.light is not None:
         # by vertex in half precision: 30 bytes a vertex
@@ -204,7 +220,7 @@ def read_avatar(path: Path) -> Avatar:
     _check_shapes(path, _avatar_of(path, header, outlines))
     if "light" in header:
         _check_light_shapes(path, outlines)
-    optional = ("strain_range", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
+    optional = ("strain_range", "linear_base", *OFFSETS, *(_PREFIX + n for n in _LIGHT_ARRAYS))
     arrays = read_npz(path, (*needed, *optional))
     avatar = _avatar_of(path, header, arrays)
     _check(path, avatar)
@@ -229,6 +245,7 @@ def _avatar_of(path: Path, header: dict[str, Any], arrays: Mapping[str, np.ndarr
         **values,
         strain_range=arrays.get("strain_range"),
         driven_offsets={name: arrays[name] for name in OFFSETS if name in arrays},
+        linear_base=arrays.get("linear_base"),
     )
 
 
@@ -257,6 +274,8 @@ def _check(path: Path, avatar: Avatar) -> None:
     arrays |= {"neutral": avatar.neutral, **avatar.driven_offsets}
     if avatar.strain_range is not None:
         arrays["strain_range"] = avatar.strain_range
+    if avatar.linear_base is not None:
+        arrays["linear_base"] = avatar.linear_base
     for name, array in arrays.items():
         _check_finite(path, name, array)
     _check_index(path, "faces", avatar.faces, len(avatar.neutral), "vertices")
@@ -284,6 +303,8 @@ def _check_shapes(path: Path, avatar: Avatar) -> None:
     color = avatar.background
     if limits is not None:
         _check_shape(path, "strain_range", limits, "float32", (faces, *TRAINED_RANGE.shape))
+    if avatar.linear_base is not None:
+        _check_shape(path, "linear_base", avatar.linear_base, "float32", (count, 4))
     for name, coefficients in avatar.driven_offsets.items():
         _check_shape(path, name, coefficients, "float32", (faces, STRAIN_COMPONENTS, 3))
     for name, mask in avatar.regions.items():

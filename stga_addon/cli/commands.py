@@ -25,7 +25,7 @@ from ..jobs.analyze import Analyze, Select, TimePresets
 from ..jobs.avatar_source import OpenHead, avatar_path
 from ..jobs.convert_motion import ConvertMotion
 from ..jobs.export import Export
-from ..jobs.finished_run import Evaluate, Relight
+from ..jobs.finished_run import Evaluate, MakeExact, Relight
 from ..jobs.render import Render
 from ..jobs.table import Request, Result
 from ..jobs.track import CAPTURE_FOLDER, RUN_FOLDER, MakeAvatar, Track, read_inputs
@@ -436,6 +436,7 @@ COMMANDS = {
         ),
     ),
     "relight": _asking(Relight),
+    "exact": _asking(MakeExact),
     "perform": Command(
         "Carry out the request that a folder holds, as a worker of Blender's panel or of a render "
         "farm does. The folder holds request.json; status, previews and result are written beside "

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,10 @@ class Content:
         return next(self.frames(path))[1]
 
     @property
+    def for_linear_light(self) -> "Content":
+        return replace(self, avatar=self.avatar.for_linear_light)
+
+    @property
     def splats(self) -> Splats:
         return self.avatar.splats
 
@@ -94,6 +98,10 @@ class WorldContent:
     def first_frame(self, path: Path) -> Splats:
         """The splats of the first frame."""
         return next(self.frames(path))[1]
+
+    @property
+    def for_linear_light(self) -> "WorldContent":
+        return self
 
 
 @dataclass(frozen=True)
@@ -149,7 +157,9 @@ FORMATS: dict[str, Format] = {
         "The frames of the scene as an animated particle field",
         (".usdc", ".usdz"),
         "range",
-        lambda path, item: write_usd(path, item.frames(path), item.playback.fps, item.moving_color),
+        lambda path, item: write_usd(
+            path, item.for_linear_light.frames(path), item.playback.fps, item.moving_color
+        ),
         lambda item, frames: usd_bytes(item.splats, frames, item.moving_color),
         has_rate=True,
     ),

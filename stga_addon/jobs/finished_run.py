@@ -1,4 +1,5 @@
-"""The light of a finished run's capture, kept in its avatar, and its quality on a split."""
+"""What is added to the avatar of a finished run, light and colors for other renderers, and its
+quality on a split."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,6 +87,29 @@ def add_light(
         light = estimate_light(capture, replace(known or Known(), exposure=exposure), report)
         write_avatar(avatar_file, replace(avatar, light=light))
     return describe_light(light)
+
+
+@dataclass(frozen=True)
+class MakeExact:
+    """Fit a run's avatar to renderers that blend in linear light: its native splats in Cycles and
+    EEVEE, and USD; seconds."""
+
+    run: Path = like(Relight, "run")
+    flame: Path | None = like(Relight, "flame")
+    capture: Path | None = like(Relight, "capture")
+
+
+def make_exact(request: MakeExact, report: Report, say: Say) -> Written:
+    """Write what was fitted into the run's avatar file, beside what was trained. Raises StgaError,
+    also while another process works on the run."""
+    from ..render.linear_fit import fit_linear
+
+    path = request.run / AVATAR
+    capture = run_folder.open_refined(request.run, request.capture, request.flame)
+    with run_folder.locked(request.run):
+        avatar = read_avatar(path)
+        write_avatar(path, replace(avatar, linear_base=fit_linear(avatar, capture, report)))
+    return Written(path)
 
 
 def describe_light(light: AvatarLight) -> tuple[str, ...]:

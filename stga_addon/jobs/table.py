@@ -18,7 +18,7 @@ from .blender import (
 )
 from .convert_motion import ConvertMotion, convert_motion
 from .export import Export, export
-from .finished_run import Evaluate, Relight, evaluate, relight
+from .finished_run import Evaluate, MakeExact, Relight, evaluate, make_exact, relight
 from .render import Render, render
 from .track import (
     MakeAvatar,
@@ -66,6 +66,7 @@ Request = (
     | TimePresets
     | Evaluate
     | Relight
+    | MakeExact
 )
 Result = Written | Selected | Analyzed
 Work = Callable[..., Result]
@@ -82,6 +83,7 @@ class Kind(StrEnum):
     SELECTION = "selection"
     PERFORMANCE = "performance"
     LIGHT = "light"
+    EXACT = "exact"
     VIDEO = "video"
 
 
@@ -134,6 +136,7 @@ JOBS: dict[type[Any], Job] = {
     Select: Job(select),
     Evaluate: Job(evaluate),
     Relight: Job(relight, Kind.LIGHT, "run"),
+    MakeExact: Job(make_exact, Kind.EXACT, "run"),
     Render: Job(render, output="output"),
     RenderRecording: Job(
         render_recording, Kind.VIDEO, "output", check=check_recording, output="output"
@@ -211,6 +214,9 @@ KINDS = {
     ),
     Kind.LIGHT: RequestKind(
         "The estimate of light", "Stop; the avatar stays as it is", is_transient=True
+    ),
+    Kind.EXACT: RequestKind(
+        "Fitting colors for linear light", "Stop; the avatar stays as it is", is_transient=True
     ),
     Kind.VIDEO: RequestKind(
         "The video",

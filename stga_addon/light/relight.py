@@ -275,4 +275,4 @@ def albedo_avatar(avatar: Avatar) -> Avatar:
     sh = ((color[:, None] - 0.5) / SH_C0).astype(np.float32)
     moving = {n: each for n, each in avatar.driven_offsets.items() if OFFSETS[n].target != COLOR}
     splats = replace(avatar.splats, sh=sh)
-    return replace(avatar, splats=splats, driven_offsets=moving, light=None)
+    return replace(avatar, splats=splats, driven_offsets=moving, light=None, linear_base=None)

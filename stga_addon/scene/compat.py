@@ -136,14 +136,18 @@ def shader_nodes(owner: Any) -> Any:
     return owner.node_tree if bpy.app.version >= always_since or owner.use_nodes else None
 
 
-def native_splats(tree: Any, points: Any) -> Any:
-    """Add a node that makes points native splats; its output, still points in a version that names
-    them in another way."""
+def native_splats(tree: Any, points: Any, left_out: str) -> Any:
+    """Add nodes that make points native splats, without attributes of these names; their output,
+    still points in a version that names them in another way."""
     node = tree.nodes.new("GeometryNodePointsSetType")
     with suppress(TypeError):  # there is no such item
         node.inputs["Type"].default_value = "3D Gaussian Splat"
     tree.links.new(points, node.inputs["Points"])
-    return node.outputs["Points"]
+    removal = tree.nodes.new("GeometryNodeRemoveAttribute")
+    removal.inputs["Pattern Mode"].default_value = "Wildcard"
+    removal.inputs["Name"].default_value = left_out
+    tree.links.new(node.outputs["Points"], removal.inputs["Geometry"])
+    return removal.outputs["Geometry"]
 
 
 def allow_depth_write(shader: Any) -> None:

@@ -6,6 +6,7 @@ drawn from.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,12 @@ from stga_addon.scene import compat, tags
 
 if not compat.NATIVE_SPLATS:
     compat.NATIVE_SPLATS = True
-    compat.native_splats = lambda tree, points: points
+    compat.native_splats = lambda tree, points, left_out: points
 
 from stga_addon.scene.display import splat_nodes
 from stga_addon.scene.display.splat_attributes import RELIT_COLOR
 from stga_addon.scene.display.splat_nodes import NATIVE
-from stga_addon.scene.display.splat_object import set_input, show_avatar
+from stga_addon.scene.display.splat_object import set_input, show_avatar, store_linear_base
 
 AVATAR, HEAD, OUT = sys.argv[sys.argv.index("--") + 1 :]
 FIELDS = {
@@ -67,6 +68,9 @@ set_input(shown, splat_nodes.VIEW_DEPENDENT, True)
 set_input(shown, splat_nodes.SHOW_SELECTION, True)
 read("gray")
 set_input(shown, splat_nodes.SHOW_SELECTION, False)
+base = np.random.default_rng(1).uniform(-1, 1, (len(avatar.splats), 4)).astype(np.float32)
+store_linear_base(shown, replace(avatar, linear_base=base))
+read("fitted")
 relit = np.random.default_rng(0).uniform(0, 2, (len(avatar.splats), 4)).astype(np.float32)
 shown.data.attributes.new(RELIT_COLOR, "FLOAT_COLOR", "POINT").data.foreach_set(
     "color", relit.ravel()

@@ -9,9 +9,9 @@ from PIL import Image
 
 from stga_addon.development.demo.capture import unpack_capture
 from stga_addon.export.ply import write_ply
-from stga_addon.scene import tags
+from stga_addon.scene import compat, tags
 from stga_addon.scene.avatar_scene import frame_head
-from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, POINTS, QUADS
+from stga_addon.scene.display.splat_nodes import AS_TRAINED, DISPLAY, LIMITS, NATIVE, POINTS, QUADS
 from stga_addon.scene.display.splat_object import display_mode, set_input, splat_modifier
 from stga_addon.scene.objects import layers_of
 
@@ -134,13 +134,14 @@ def test_images_by_other_engines(extension, tmp_path):
     cycles.transparent_max_bounces = 8
     set_input(shown, DISPLAY, AS_TRAINED)
     bpy.ops.stga.preview_images()
-    assert (display_mode(shown), cycles.transparent_max_bounces) == (QUADS, 64)
+    best = NATIVE if compat.NATIVE_SPLATS else QUADS
+    assert (display_mode(shown), cycles.transparent_max_bounces) == (best, 64)
     with pytest.raises(RuntimeError, match="displayed as trained"):
         bpy.ops.stga.preview_images()
     set_input(shown, DISPLAY, AS_TRAINED)
     scene.camera = None
     bpy.ops.stga.preview_images()
-    assert display_mode(shown) == POINTS
+    assert display_mode(shown) == (NATIVE if compat.NATIVE_SPLATS else POINTS)
     tree = splat_modifier(shown).node_group
     menu = next(node for node in tree.nodes if node.bl_idname == "GeometryNodeMenuSwitch")
     described = {item.name: item.description for item in menu.enum_definition.enum_items}

@@ -14,6 +14,7 @@ from stga_addon.capture.mesh_geometry import vertex_normals
 from stga_addon.light.lamps import LIFT_M, Lamps
 from stga_addon.scene.arrays import read_values, triangle_mesh
 from stga_addon.scene.compat import enable_nodes
+from stga_addon.scene.display.splat_attributes import LINEAR_SH, read_attribute
 from stga_addon.scene.display.splat_nodes import PERCENTAGE
 from stga_addon.scene.display.splat_object import hide_object, set_input, show_avatar, stored_avatar
 from stga_addon.scene.layers import Relit
@@ -307,10 +308,20 @@ def test_estimate_light(extension, tmp_path):
         )
     assert found.source == "estimated"
     assert read_avatar(run / "avatar.npz").light.source == "estimated"
+
+    bpy.ops.stga.make_exact()
+    fitted = read_avatar(run / "avatar.npz")
+    assert fitted.light is not None
+    np.testing.assert_array_equal(fitted.splats.sh, trained.splats.sh)
+    kept = read_attribute(shown.data, LINEAR_SH)
+    np.testing.assert_array_equal(kept, fitted.linear_base[:, :3])
+    assert np.abs(kept - trained.splats.sh[:, 0]).max() > 0.01
     assert [light.kind for light in relit().lighting.lights] == ["sun"]
 
     write_avatar(tmp_path / "other.npz", replace(trained, splats=trained.splats.rows(np.arange(9))))
     bpy.ops.stga.show_avatar(filepath=str(tmp_path / "other.npz"))
     scene.stga.run_folder = str(run)
-    with pytest.raises(RuntimeError, match="is not the one that the scene shows"):
-        bpy.ops.stga.estimate_light()
+    assert LINEAR_SH not in scene.stga.splats.data.attributes
+    for add in (bpy.ops.stga.estimate_light, bpy.ops.stga.make_exact):
+        with pytest.raises(RuntimeError, match="is not the one that the scene shows"):
+            add()

@@ -37,7 +37,7 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     """Catches an attribute that is missing, or named or activated in another way than Blender reads
     it: sizes as logarithms or without their factor, opacities as logits or dropped, splats that do
     not move with the mesh, harmonics in another order or turned with triangles, and colors without
-    deformation, selection or new light."""
+    deformation, selection or new light, or that are not those fitted for linear light."""
     avatar = driven_avatar("stga", count=400)
     rng = np.random.default_rng(4)
     splats = replace(avatar.splats, sh=rng.normal(0, 0.4, (400, 16, 3)).astype(np.float32))
@@ -50,22 +50,32 @@ def test_native_splats_are_those_of_the_posed_avatar(command: list[str], tmp_pat
     output_of([*command, SCRIPT, "--", *files])
     found = np.load(tmp_path / "found.npz")
     assert found["recorded/type"] in ("", "GAUSSIAN_SPLAT")
+    left = {name for name in found if name.startswith("recorded/stga")}
+    assert not left or found["recorded/type"] == ""
     wanted = to_world(splats, avatar.frames(posed))
     np.testing.assert_allclose(found["recorded/position"], wanted.xyz, atol=1e-5)
     assert same_rotation(found["recorded/rotation"], wanted.rotation) < 1e-3
     np.testing.assert_allclose(found["recorded/scale"], 1.5 * np.exp(wanted.log_scale), rtol=1e-3)
-    opacity = 1 / (1 + np.exp(-splats.opacity.astype(np.float64)))
+    fitted = np.random.default_rng(1).uniform(-1, 1, (400, 4))
+    opacity = 1 / (1 + np.exp(-np.stack([splats.opacity.astype(np.float64), fitted[:, 3]])))
+    driven = wanted.sh[:, 0] - splats.sh[:, 0]  # by the deformation
+    bases = dict.fromkeys(("recorded", "constant"), wanted.sh[:, 0])
+    bases["fitted"] = fitted[:, :3] + driven
     relit = np.random.default_rng(0).uniform(0, 2, (400, 4))[:, :3]
     flat = {"gray": np.array(FROZEN_COLOR[:3]), "relit": relit}
-    for case in ("recorded", "constant", *flat):
-        base = (linear_to_srgb(flat[case]) - 0.5) / SH_C0 if case in flat else wanted.sh[:, 0]
-        expected = np.broadcast_to(base, (400, 3))
+    bases |= {case: (linear_to_srgb(color) - 0.5) / SH_C0 for case, color in flat.items()}
+    for case, base in bases.items():
+        # from black to a little above white
+        expected = np.clip(np.broadcast_to(base, (400, 3)), -0.5 / SH_C0, 0.62 / SH_C0)
         np.testing.assert_allclose(found[f"{case}/radiance:base"][:, :3], expected, atol=5e-5)
-        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, 3], opacity, atol=1e-6)
+        alpha = opacity[int(case in ("fitted", "relit"))]  # which comes after it
+        np.testing.assert_allclose(found[f"{case}/radiance:base"][:, 3], alpha, atol=1e-6)
         names = [name for name in found if name.startswith(f"{case}/radiance:sh_")]
         assert sorted(names) == sorted(f"{case}/radiance:sh_{index}" for index in range(15))
         for index in range(15):
-            coefficient = wanted.sh[:, index + 1] if case == "recorded" else 0 * wanted.sh[:, 0]
+            coefficient = (
+                wanted.sh[:, index + 1] if case in ("recorded", "fitted") else 0 * wanted.sh[:, 0]
+            )
             np.testing.assert_allclose(found[f"{case}/radiance:sh_{index}"], coefficient, atol=1e-6)
 
 
@@ -78,7 +88,7 @@ def pretend(extension: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Callable[
     def change(is_native: bool) -> None:
         monkeypatch.setattr(known, "NATIVE_SPLATS", is_native)
         if not compat.NATIVE_SPLATS:
-            monkeypatch.setattr(known, "native_splats", lambda tree, points: points)
+            monkeypatch.setattr(known, "native_splats", lambda tree, points, left_out: points)
 
     return change
 

@@ -191,6 +191,7 @@ COMMANDS: dict[str, tuple[float, list[Any]]] = {
         "@splats run", [[TAKE], [TAKE], [TAKE], [TAKE, TAKE], []],
         [[(1, "--select-only", "@new.npz")], CONTINUE, CONTINUE],
     ]),
+    "exact": (0.5, ["@splats run"]),
     "relight": (0.5, [
         "@splats run", (0.3, "--light", "@mesh motion.npz"),
         (0.3, "--gray-card", "0.5,0.5,0.4", *TEXTS),

@@ -127,6 +127,7 @@ def requests_about(case: Path) -> dict[str, ask.Request]:
         ask.Select(capture),
         ask.TimePresets(capture),
         ask.Relight(case / "run", flame=None),
+        ask.MakeExact(case / "run"),
         ask.RenderBlend(case / "take.blend", case / "asked", (1, 2)),
         Benchmark(case / "asked", capture, 1.0, only=("draft",)),
     )

@@ -12,7 +12,7 @@ from stga_addon.jobs.avatar_source import Played
 from stga_addon.jobs.blender import RenderBlend, RenderRecording
 from stga_addon.jobs.convert_motion import ConvertMotion
 from stga_addon.jobs.export import Export
-from stga_addon.jobs.finished_run import Evaluate, Relight
+from stga_addon.jobs.finished_run import Evaluate, MakeExact, Relight
 from stga_addon.jobs.render import Render
 from stga_addon.jobs.table import Request, Result
 from stga_addon.jobs.track import MakeAvatar, SolveAgain, Track
@@ -86,6 +86,7 @@ REQUESTS: tuple[Request, ...] = (
     Analyze(HEAD, effects={"jaw": "off"}, timed=True),
     Evaluate(Path("r"), "test", capture=HEAD),
     Relight(Path("r"), card=(0.5, 0.4, 0.5), capture=HEAD),
+    MakeExact(Path("r"), capture=HEAD),
     Render(Path("r"), Path("v.mp4"), True, light=Path("sunset.hdr"), light_turn=360.0),
     ConvertMotion(
         Path("take.csv"),

@@ -16,7 +16,7 @@ JOB = RUN / "job"
 PREVIEW = JOB / "preview.npz"
 AVATAR = RUN / "avatar.npz"
 START = states.Started(RUN, JOB)
-TRANSIENT = Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT
+TRANSIENT = Kind.ANALYSIS, Kind.SELECTION, Kind.PERFORMANCE, Kind.LIGHT, Kind.EXACT
 """What leaves nothing but its result in the scene."""
 ENDS = (WorkerState.FINISHED, WorkerState.CANCELLED, WorkerState.FAILED, WorkerState.LOST)
 TRAINING = RequestState(Kind.TRAINING)

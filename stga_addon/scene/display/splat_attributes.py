@@ -26,6 +26,8 @@ OPACITY = "stga_opacity"  # 0 to 1
 COLOR = "stga_color"  # constant part, scene-linear
 RELIT_COLOR = "stga_relit_color"  # scene-linear, of one frame: where it is there, it counts
 SH = "stga_sh_{}"  # sRGB coefficients, by index
+LINEAR_SH = "stga_linear_sh"  # the first of these, and opacity, for linear light (`linear_base`)
+LINEAR_OPACITY = "stga_linear_opacity"
 FACE = "stga_face"
 NEUTRAL_AREA = "stga_neutral_area"  # of its triangle, m²; also on faces with driven offsets
 
@@ -77,6 +79,7 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
     splats = splat_attributes(avatar.splats)
     splats[FACE] = "INT", "value", np.ascontiguousarray(avatar.splats.face, np.int32)
     splats[NEUTRAL_AREA] = _number(areas[avatar.splats.face])
+    splats |= linear_attributes(avatar)
     neutral: Attributes = {}  # what nodes need to have splats follow the deformation
     if avatar.follows_strain:
         basis = strain_basis(avatar.neutral, avatar.faces, avatar.strain_range)
@@ -94,6 +97,15 @@ def avatar_attributes(avatar: Avatar) -> SplatAttributes:
             for index, name in enumerate(_offset_names(offset)):
                 neutral[name] = _vector(coefficients[:, index])
     return SplatAttributes(splats, neutral, avatar.light)
+
+
+def linear_attributes(avatar: Avatar) -> Attributes:
+    """Of vertices of a splat object: what the native display draws in place of the trained ones;
+    none where the avatar has none."""
+    if avatar.linear_base is None:
+        return {}
+    opacity = _number(avatar.for_linear_light.splats.opacities())
+    return {LINEAR_SH: _vector(avatar.linear_base[:, :3]), LINEAR_OPACITY: opacity}
 
 
 def _vector(values: np.ndarray) -> tuple[str, str, np.ndarray]:
@@ -133,6 +145,9 @@ def write_splats(mesh: Any, attributes: Attributes) -> None:
         mesh.vertices.add(len(positions) // 3)
     # Through the attribute, which takes all values at once; `MeshVertex.co` takes them one by one.
     write_attributes(mesh, attributes | {"position": attributes[XYZ]}, "POINT")
+    for name in {LINEAR_SH, LINEAR_OPACITY} - attributes.keys():  # of splats before
+        if name in mesh.attributes:
+            mesh.attributes.remove(mesh.attributes[name])
     mesh[tags.REVISION] = uuid4().hex
     mesh.update()
 

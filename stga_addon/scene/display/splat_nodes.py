@@ -176,7 +176,8 @@ LIMITS = {
     "EEVEE and Cycles render camera quads",
     POINTS: "Fast: a dot for each splat, in one color; for Material Preview",
     QUADS: "For EEVEE and Cycles; right through the scene's camera only",
-    NATIVE: "Blender's own splats, for Workbench, EEVEE and Cycles; edges are lighter than trained",
+    NATIVE: "Blender's own splats, for EEVEE and Cycles through any camera; "
+    "edges are lighter than trained until Make Exact fits the colors",
 }
 """What each display is for and what it is not, in its tooltip and in the panel."""
 
@@ -244,32 +245,53 @@ def _quads(nodes: Nodes, splats: Any, visible: Any, size: Any) -> bpy.types.Node
     return nodes.out("GeometryNodeSetInstanceTransform", placed)
 
 
+MIN_BASE = (-0.5 / SH_C0,) * 3
+MAX_BASE = (0.62 / SH_C0,) * 3
+"""Constant coefficients from black to a little brighter than white: EEVEE keeps 8 bits over the
+range of all splats, which one of them may make wide."""
+
+
 class _NativeInputs(NamedTuple):
-    """Sockets of NATIVE_GROUPS. color: constant part, sRGB; view_dependent: whether harmonics are
-    added; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
+    """Sockets of NATIVE_GROUPS. added: as of `constant_color`; view_dependent: whether harmonics
+    are added; gray: splats in one color, DISPLAY_COLOR, as those that are relit."""
 
     splats: Any
     visible: Any
     size: Any
-    color: Any
+    added: Any
     view_dependent: Any
     gray: Any
 
 
+def _radiance(nodes: Nodes, added: Any, flat: Any) -> bpy.types.NodeSocket:
+    """Field: constant coefficient and opacity of native splats, those fitted for linear light
+    where there are any; flat: of DISPLAY_COLOR. As a color, which 5.3 draws as four floats; of
+    FLOAT4, the node that stores it in 5.2 takes three."""
+    fitted, is_fitted = nodes.attribute_if_any(stored.LINEAR_SH, "FLOAT_VECTOR")
+    base = nodes.switch("VECTOR", is_fitted, nodes.attribute(stored.SH.format(0)), fitted)
+    base = nodes.vector("MULTIPLY_ADD", added, (1 / SH_C0,) * 3, base)
+    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
+    shown = nodes.scale(nodes.vector("SUBTRACT", shown, (0.5, 0.5, 0.5)), 1 / SH_C0)
+    base = nodes.switch("VECTOR", flat, base, shown)
+    clamped = nodes.vector("MINIMUM", nodes.vector("MAXIMUM", base, MIN_BASE), MAX_BASE)
+    red, green, blue = nodes.components(clamped)
+    trained = nodes.attribute(stored.OPACITY, "FLOAT")
+    fitted = nodes.attribute(stored.LINEAR_OPACITY, "FLOAT")
+    alpha = nodes.switch("FLOAT", is_fitted, trained, fitted)
+    parts = {"Red": red, "Green": green, "Blue": blue, "Alpha": alpha}
+    return nodes.out("FunctionNodeCombineColor", parts)
+
+
+_RADIANCE = NodeGroup("STGA Radiance", {"Added": "Vector", "Flat": "Bool"}, "Color", _radiance)
+
+
 def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
-    """Native splats with what they are drawn from, harmonics in the object's axes; sockets: as
-    _NativeInputs."""
+    """Native splats with what they are drawn from alone, harmonics in the object's axes; sockets:
+    as _NativeInputs."""
     given = _NativeInputs(*sockets)
     _, is_relit = nodes.attribute_if_any(stored.RELIT_COLOR, "FLOAT_COLOR")
     flat = nodes.logic("OR", given.gray, is_relit)
-    shown = nodes.group(LINEAR_TO_SRGB, nodes.attribute(DISPLAY_COLOR, "FLOAT_COLOR"))
-    color = nodes.switch("VECTOR", flat, given.color, shown)
-    color = nodes.vector("SUBTRACT", color, (0.5, 0.5, 0.5))
-    red, green, blue = nodes.components(nodes.scale(color, 1 / SH_C0))
-    opacity = nodes.attribute(stored.OPACITY, "FLOAT")
-    base = {"Red": red, "Green": green, "Blue": blue, "Alpha": opacity}
-    # A color, which 5.3 draws as four floats; of FLOAT4, this node of 5.2 stores three.
-    radiance = nodes.out("FunctionNodeCombineColor", base)
+    radiance = nodes.group(_RADIANCE, given.added, flat)
     splats = nodes.store(given.splats, stored.RADIANCE, radiance, "FLOAT_COLOR")
     scale = nodes.scale(nodes.attribute(stored.WORLD_SCALE), given.size)
     splats = nodes.store(splats, stored.WORLD_SCALE, scale, "FLOAT_VECTOR")
@@ -278,7 +300,7 @@ def _native(degree: int, nodes: Nodes, *sockets: Any) -> bpy.types.NodeSocket:
         coefficient = nodes.scale(nodes.attribute(stored.SH.format(index + 1)), factor)
         splats = nodes.store(splats, stored.RADIANCE_SH.format(index), coefficient, "FLOAT_VECTOR")
     points = nodes.out("GeometryNodeMeshToPoints", {"Mesh": splats, "Selection": given.visible})
-    return compat.native_splats(nodes.tree, points)
+    return compat.native_splats(nodes.tree, points, "stga_*")
 
 
 _INPUTS = {"Splats": "Geometry", "Visible": "Bool", "Size": "Float"}
@@ -286,7 +308,7 @@ MODES = {
     POINTS: NodeGroup("STGA Points", _INPUTS, "Geometry", _points),
     QUADS: NodeGroup("STGA Camera Quads", _INPUTS, "Geometry", _quads),
 }
-_NATIVE_INPUTS = _INPUTS | {"Color": "Vector", "View-Dependent": "Bool", "Gray": "Bool"}
+_NATIVE_INPUTS = _INPUTS | {"Added": "Vector", "View-Dependent": "Bool", "Gray": "Bool"}
 NATIVE_GROUPS = tuple(
     NodeGroup(f"STGA Native Splats {n}", _NATIVE_INPUTS, "Geometry", partial(_native, n))
     for n in range(4)
@@ -351,7 +373,7 @@ def build_next_node_group(options: TreeOptions) -> bool:
         groups += [driven(name, convention) for name in offsets]
     if degree > 0 or options.is_colored:
         groups.append(SRGB_TO_LINEAR)
-    groups += [LINEAR_TO_SRGB, NATIVE_GROUPS[degree]] if compat.NATIVE_SPLATS else []
+    groups += [LINEAR_TO_SRGB, _RADIANCE, NATIVE_GROUPS[degree]] if compat.NATIVE_SPLATS else []
     missing = next((group for group in groups if find_tree(f".{group.name}") is None), None)
     if missing is None:
         splat_tree(options)
@@ -424,7 +446,7 @@ def _build(nodes: Nodes, options: TreeOptions) -> None:
     native = None
     if compat.NATIVE_SPLATS:
         view_dependent = inputs[VIEW_DEPENDENT] if options.degree > 0 else False
-        fields = inputs[SIZE], constant_color(nodes, added), view_dependent, gray
+        fields = inputs[SIZE], (0, 0, 0) if added is None else added, view_dependent, gray
         native = nodes.group(NATIVE_GROUPS[options.degree], splats, visible, *fields)
     shown = displayed(nodes, inputs[DISPLAY], splats, visible, inputs[SIZE], native)
     nodes.finish("NodeGroupOutput", {"Geometry": shown})

@@ -181,6 +181,18 @@ def store_light(splat_object: Any, avatar: Avatar) -> bool:
     return True
 
 
+def store_linear_base(splat_object: Any, avatar: Avatar) -> bool:
+    """Give the object the colors for linear light of the same avatar; False where it shows
+    another one."""
+    shown = stored_avatar(splat_object).splats
+    known = avatar.splats
+    if len(shown) != len(known) or not np.array_equal(shown.sh[:, 0], known.sh[:, 0]):
+        return False
+    stored.write_attributes(splat_object.data, stored.linear_attributes(avatar), "POINT")
+    splat_object.data.update()
+    return True
+
+
 def stored_light(splat_object: Any) -> AvatarLight | None:
     """The light of the object's avatar; None without one, or without a modifier."""
     neutral = _stored_neutral(splat_object)
