@@ -263,7 +263,7 @@ class ExportSplats(SplatExport, bpy.types.Operator):
 
         def read() -> Splats:
             depsgraph = bpy.context.evaluated_depsgraph_get()
-            return evaluated_splats(depsgraph, SplatCache(), to_file)
+            return evaluated_splats(depsgraph, SplatCache(self.format == "usd"), to_file)
 
         if format.source == "range":
             content = SimpleNamespace(splats=read(), moving_color=False)

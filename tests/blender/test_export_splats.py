@@ -228,8 +228,8 @@ def test_instances_and_frames_of_others_are_exported(extension, tmp_path) -> Non
 
 @pytest.mark.parametrize("display", ["As Trained", "Points", "Native Splats"])
 def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, display) -> None:
-    """Catches an export without what only this add-on shows, twice what Blender shows too, and
-    another frame, size or place."""
+    """Catches an export without what only this add-on shows, twice what Blender shows too,
+    another frame, size or place, and colors for linear light in another file than USD's."""
     if display == "Native Splats" and not compat.NATIVE_SPLATS:
         pytest.skip("Blender before 5.3 has no native splats")
     avatar = write_ball_avatar(tmp_path / "avatar.npz")
@@ -249,7 +249,19 @@ def test_avatars_are_exported_as_they_are_posed(extension, head, tmp_path, displ
     np.testing.assert_allclose(found.log_scale, expected.log_scale + np.log(1.5), atol=1e-3)
     np.testing.assert_allclose(found.sh[:, : expected.sh.shape[1]], expected.sh, atol=1e-4)
     np.testing.assert_allclose(found.opacity, expected.opacity, atol=1e-3)
+    base = np.column_stack([avatar.splats.sh[:, 0] * 0.5, avatar.splats.opacity - 1])
+    fitted = replace(avatar, linear_base=base.astype(np.float32))
+    extension.stga_addon.scene.display.splat_object.store_linear_base(splats, fitted)
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply", up="Y")
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").sh, found.sh)
     splats.hide_render = True
     with pytest.raises(RuntimeError, match="shows no splats in frame 3"):
-        bpy.ops.stga.export_splats(filepath=str(tmp_path / "b.ply"), format="ply")
-    assert not (tmp_path / "b.ply").exists()
+        bpy.ops.stga.export_splats(filepath=str(tmp_path / "c.ply"), format="ply")
+    assert not (tmp_path / "c.ply").exists()
+    usd = pytest.importorskip("pxr.Usd", reason="the package usd-core is not installed")
+    splats.hide_render = False
+    bpy.context.scene.frame_start = bpy.context.scene.frame_end = 3
+    bpy.ops.stga.export_splats(filepath=str(tmp_path / "a.usdc"), format="usd")
+    stage = usd.Stage.Open(str(tmp_path / "a.usdc"))
+    opacity = stage.GetPrimAtPath("/Avatar/Splats").GetAttribute("opacities").Get(3)
+    np.testing.assert_allclose(opacity, 1 / (1 + np.exp(1 - expected.opacity)), atol=1e-5)

@@ -165,19 +165,32 @@ def read_splats(mesh: Any) -> Splats:
     sh = list[np.ndarray]()
     while (name := SH.format(len(sh))) in mesh.attributes:
         sh.append(read_attribute(mesh, name))
-    opacity = read_attribute(mesh, OPACITY).astype(np.float64)
     face = FACE in mesh.attributes
-    # opacities of 0 and 1 are logits of −∞ and ∞, which the kernels accept
     with np.errstate(divide="ignore"):
         return Splats(
             xyz=read_attribute(mesh, XYZ),
             rotation=read_attribute(mesh, ROTATION),
             log_scale=np.log(read_attribute(mesh, SCALE).astype(np.float64)).astype(np.float32),
-            opacity=np.log(opacity / (1 - opacity)).astype(np.float32),
+            opacity=_logit(read_attribute(mesh, OPACITY)),
             sh=np.stack(sh, 1),
             face=read_attribute(mesh, FACE) if face else np.zeros(count, np.int32),
             unbound=np.zeros(count, bool),
         )
+
+
+def _logit(opacity: np.ndarray) -> np.ndarray:
+    """float32; of 0 and 1 −∞ and ∞, which the kernels accept."""
+    share = opacity.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(share / (1 - share)), np.float32)
+
+
+def read_linear_base(mesh: Any) -> np.ndarray | None:
+    """`Avatar.linear_base` as stored in a splat object's mesh."""
+    if LINEAR_SH not in mesh.attributes:
+        return None
+    opacity = _logit(read_attribute(mesh, LINEAR_OPACITY))
+    return np.column_stack([read_attribute(mesh, LINEAR_SH), opacity])
 
 
 def read_native_splats(cloud: Any) -> Splats | None:
@@ -195,14 +208,14 @@ def read_native_splats(cloud: Any) -> Splats | None:
         rotation = read_attribute(cloud, WORLD_ROTATION)
     degree = next(n for n in (3, 2, 1, 0) if n == 0 or RADIANCE_SH.format(n * (n + 2) - 1) in names)
     rest = [read_attribute(cloud, RADIANCE_SH.format(n)) for n in range(degree * (degree + 2))]
-    opacity = np.clip(base[:, 3].astype(np.float64), MIN_OPACITY, 1 - MIN_OPACITY)
+    opacity = np.clip(base[:, 3], MIN_OPACITY, 1 - MIN_OPACITY)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scale = np.log(np.abs(read_attribute(cloud, WORLD_SCALE)))
     return in_world(
         read_attribute(cloud, "position"),
         rotation,
         log_scale,
-        np.log(opacity / (1 - opacity)),
+        _logit(opacity),
         np.stack([base[:, :3], *rest], 1),
     )
 

@@ -355,6 +355,7 @@ def stored_avatar(splat_object: Any) -> Avatar:
         strain_range=stored.read_strain_range(neutral),
         driven_offsets=stored.read_driven_offsets(neutral),
         light=stored.read_light(neutral),
+        linear_base=stored.read_linear_base(splat_object.data),
     )
 
 

@@ -23,9 +23,7 @@ from ..display.splat_attributes import (
     with_alpha,
     write_attributes,
 )
-from ..display.splat_nodes import NATIVE
 from ..display.splat_object import (
-    display_mode,
     display_settings,
     get_input,
     splat_modifier,
@@ -43,9 +41,11 @@ VIEWER = np.array((0.0, -1.0, 0.0))
 class SplatCache:
     """Avatars and world splats as last read from meshes, frames of heads' last shapes, and the
     scene's light: reading takes longer than posing. A mesh written anew has a new revision, so that
-    neither undo nor a loaded file brings up another state."""
+    neither undo nor a loaded file brings up another state. for_linear_light: avatars are those for
+    renderers that blend so."""
 
-    def __init__(self) -> None:
+    def __init__(self, for_linear_light: bool = False) -> None:
+        self._for_linear_light = for_linear_light
         self._stored: dict[tuple[Any, ...], Avatar | Splats] = {}
         self._frames: dict[tuple[Any, ...], tuple[np.ndarray, FaceFrames]] = {}
         self._selections: dict[tuple[int, int, int], np.ndarray | None] = {}
@@ -84,7 +84,10 @@ class SplatCache:
             self._keep(lambda known: known in current)
             is_avatar = tags.CONVENTION in splat_object
             mesh = splat_object.data
-            self._stored[key] = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
+            read = stored_avatar(splat_object) if is_avatar else read_splats(mesh)
+            if isinstance(read, Avatar) and self._for_linear_light:
+                read = read.for_linear_light
+            self._stored[key] = read
         return self._stored[key]
 
     def native(self, shown: Any) -> Splats | None:
@@ -173,17 +176,15 @@ def native_layers(
     depsgraph: Any,
     cache: SplatCache,
     view: Any = None,
-    is_wanted: Callable[[Any, Any], bool] = lambda owner, shown: not _is_own(owner, shown),
 ) -> list[SceneLayer]:
-    """The native splats that Blender itself draws at the depsgraph's frame, also of others and in
-    instances; none before Blender 5.3. view: as of `visible_layers`. is_wanted: of the object that
-    makes an instance, or itself, and the object whose splats they are."""
+    """The native splats at the depsgraph's frame that `visible_layers` has not: of others, and in
+    instances by nodes; none before Blender 5.3. view: as of `visible_layers`."""
     layers = []
     for instance in depsgraph.object_instances if compat.NATIVE_SPLATS else ():
         shown = instance.object
         owner = instance.parent if instance.is_instance else shown
         # the data are there until the next instance only
-        if shown.type != "POINTCLOUD" or not is_wanted(owner.original, shown.original):
+        if shown.type != "POINTCLOUD" or _is_own(owner.original, shown.original):
             continue
         is_hidden = owner.hide_render or not (owner.visible_camera and shown.visible_camera)
         if view is None and is_hidden:
@@ -209,15 +210,9 @@ def all_layers(depsgraph: Any, cache: SplatCache, view: Any = None) -> list[Scen
 
 def evaluated_splats(depsgraph: Any, cache: SplatCache, to_file: np.ndarray) -> Splats:
     """All splats that images of the scene show at the depsgraph's frame, with harmonics of the
-    highest degree among them, by a matrix (4, 4) from Blender's axes: native ones as Blender
-    evaluates them, others as they are displayed. Raises StgaError as `visible_layers`, and where
-    there are none."""
-
-    def is_native(owner: Any, shown: Any) -> bool:
-        return not _is_own(owner, shown) or display_mode(shown) == NATIVE
-
-    layers = visible_layers(depsgraph, cache, None, lambda shown: display_mode(shown) != NATIVE)
-    layers += native_layers(depsgraph, cache, None, is_native)
+    highest degree among them, by a matrix (4, 4) from Blender's axes. Raises StgaError as
+    `visible_layers`, and where there are none."""
+    layers = all_layers(depsgraph, cache)
     camera = depsgraph.scene.camera
     eye = None if camera is None else np.array(camera.evaluated_get(depsgraph).matrix_world)[:3, 3]
     parts = []
