@@ -18,12 +18,15 @@ from ..raster.cpu.layout import CameraFrames, Parameters
 from ..raster.cpu.rasterize import BufferPool, frames_in_camera, render_backward, render_forward
 from .render import render
 
-STEPS = 150
+STEPS = 120
 MAX_VIEWS = 24
 MAX_SIDE_PX = 240
 RATES = np.array((0.01, 0.01, 0.01, 0.04), np.float32)
 """Adam's first, of colors in sRGB and of logits; they fall to 0."""
 BETAS = 0.9, 0.999
+FINENESS = 2
+"""Parts of a pixel, in each direction, that are averaged in linear light: other renderers average
+samples, and do not blur what is thinner than a pixel, as ours does."""
 BEHIND = 0.0, 1.0
 """Grays behind one half of the views and the other: what is behind an avatar is not known."""
 MAX_SRGB = 1.12  # of what is shown natively (`scene.display.splat_nodes`)
@@ -77,9 +80,8 @@ def _seen(avatar: Avatar, mesh: np.ndarray, camera: Camera, behind: float) -> _S
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     picture = render(avatar.splats, camera, (behind,) * 3, frames, avatar.antialiased)
     colorless = replace(frames, color=NO_COLUMNS)
-    return _Seen(
-        frames_in_camera(colorless, camera), sh_color(world.sh, direction), behind, picture
-    )
+    fine = frames_in_camera(colorless, camera.scaled(FINENESS))
+    return _Seen(fine, sh_color(world.sh, direction), behind, picture)
 
 
 def _gradient(avatar: Avatar, change: np.ndarray, seen: _Seen, buffers: BufferPool) -> np.ndarray:
@@ -101,8 +103,11 @@ def _gradient(avatar: Avatar, change: np.ndarray, seen: _Seen, buffers: BufferPo
         antialiased=avatar.antialiased,
         buffers=buffers,
     )
-    difference = (output.image - srgb_to_linear(seen.picture)) / _slope(seen.picture) ** 2
-    by_image = (difference / difference.size).astype(np.float32)
+    channels, height, width = seen.picture.shape
+    fine = output.image.reshape(channels, height, FINENESS, width, FINENESS)
+    difference = fine.mean((2, 4)) - srgb_to_linear(seen.picture)
+    difference /= _slope(seen.picture) ** 2 * difference.size * FINENESS**2
+    by_image = difference.repeat(FINENESS, 1).repeat(FINENESS, 2).astype(np.float32)
     by = Parameters(*(np.zeros_like(each) for each in parameters))
     render_backward(output, parameters, splats.face, seen.frames, by_image, by, buffers=buffers)
     by_color = by.sh[:, 0] / SH_C0 * _slope(srgb)
