@@ -69,7 +69,8 @@ class ShowPanel(SidebarPanel, bpy.types.Panel):
         if viewport_display.is_engine_view(context):  # shows every display as trained
             return
         draw_text(layout, context, LIMITS.get(mode, ""), "INFO")
-        if mode == NATIVE and not draw_running(layout, context, Kind.EXACT):
+        is_avatar = tags.CONVENTION in settings.splats
+        if mode == NATIVE and is_avatar and not draw_running(layout, context, Kind.EXACT):
             layout.operator("stga.make_exact").directory = settings.run_folder
         if context.space_data.shading.type in GRAY:
             choose = "stga.choose_display"

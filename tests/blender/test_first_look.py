@@ -16,6 +16,7 @@ from stga_addon.scene.display.splat_object import display_mode, set_input, splat
 from stga_addon.scene.objects import layers_of
 
 from .test_operators import write_ball_avatar
+from .test_panel import draw
 
 
 @pytest.fixture
@@ -136,6 +137,7 @@ def test_images_by_other_engines(extension, tmp_path):
     bpy.ops.stga.preview_images()
     best = NATIVE if compat.NATIVE_SPLATS else QUADS
     assert (display_mode(shown), cycles.transparent_max_bounces) == (best, 64)
+    assert ("Make Exact" in draw(extension, "show")) == compat.NATIVE_SPLATS
     with pytest.raises(RuntimeError, match="displayed as trained"):
         bpy.ops.stga.preview_images()
     set_input(shown, DISPLAY, AS_TRAINED)
