@@ -11,9 +11,11 @@ from stga_addon.avatar.embedding import (
     face_areas,
     face_frames,
     frame_backward,
+    placed,
     to_local,
     to_world,
 )
+from stga_addon.avatar.splats import sh_color
 
 from .conftest import random_mesh, random_splats
 
@@ -129,3 +131,33 @@ def test_backward_agrees_with_differences():
         grown = np.log(after.scale / before.scale) / (2 * step)
         expected = (given * np.column_stack([moved, turned, grown])).sum()
         assert (found * direction).sum() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["scaled", "mirrored", "sheared"])
+def test_splats_are_placed_by_any_matrix(kind: str) -> None:
+    """Catches ellipsoids and colors that do not turn, scale, mirror or shear with their place."""
+    turn = Rotation.from_euler("xyz", (0.4, -1.1, 2.0)).as_matrix()
+    change = {
+        "scaled": 2 * np.eye(3),
+        "mirrored": np.diag([0.5, 0.5, -0.5]),
+        "sheared": np.array([[1, 0.5, 0], [0, 2, 0], [0, 0, -0.5]]),
+    }
+    matrix = np.eye(4)
+    linear = matrix[:3, :3] = turn @ change[kind]
+    matrix[:3, 3] = 1, 2, 3
+    splats = random_splats(1, 40, 1)
+    found = placed(splats, matrix)
+    covariance = []
+    for each in (splats, found):
+        axes = Rotation.from_quat(each.rotation[:, [1, 2, 3, 0]]).as_matrix()
+        axes = axes * np.exp(each.log_scale)[:, None]
+        covariance.append(axes @ axes.transpose(0, 2, 1))
+    expected = linear @ covariance[0] @ linear.T
+    size = np.abs(expected).max((1, 2), keepdims=True)
+    np.testing.assert_allclose(covariance[1] / size, expected / size, atol=1e-5)
+    np.testing.assert_allclose(found.xyz, splats.xyz @ linear.T + [1, 2, 3], atol=1e-6)
+    left, _, right = np.linalg.svd(linear)
+    seen = np.random.default_rng(0).normal(size=(40, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    own = sh_color(splats.sh, seen @ (left @ right))
+    np.testing.assert_allclose(sh_color(found.sh, seen), own, atol=1e-5)
