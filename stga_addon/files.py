@@ -588,7 +588,7 @@ def _read_array(stream: IO[bytes], size: int) -> np.ndarray:
     """The array of a npy stream of `size` bytes, which bounds what its header promises."""
     _read_outline(stream, size)
     stream.seek(0)
-    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))  # type: ignore[no-untyped-call]
+    return np.lib.format.read_array(stream, allow_pickle=False)  # type: ignore[no-untyped-call]
 
 
 def _read_outline(stream: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:

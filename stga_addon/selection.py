@@ -50,7 +50,7 @@ def select_faces(
         in_region |= members
         if members.any() and offset[members].mean() > threshold:
             selected |= members
-    return np.asarray(selected | (~in_region & (offset > threshold)))
+    return selected | (~in_region & (offset > threshold))
 
 
 def select_capture(capture: Capture, options: SelectionOptions) -> dict[int, np.ndarray]:

@@ -51,13 +51,13 @@ class Camera:
         """Camera center (3,) in world meters."""
         rotation = self.world_to_camera[:3, :3]
         translation = self.world_to_camera[:3, 3]
-        return np.asarray(-rotation.T @ translation)
+        return -rotation.T @ translation
 
     @property
     def camera_to_world_gl(self) -> np.ndarray:
         """(4, 4) pose with OpenGL camera axes: what `transform_matrix` and a Blender camera
         hold."""
-        return np.asarray(np.linalg.inv(self.world_to_camera) @ GL_TO_CV)
+        return np.linalg.inv(self.world_to_camera) @ GL_TO_CV
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixel positions (N, 2) and depths (N,) in meters of world points (N, 3) meters. Positions
@@ -74,7 +74,7 @@ class Camera:
         returns them."""
         flat = (pixels - [self.cx, self.cy]) / [self.fl_x, self.fl_y]
         local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depth[:, None]
-        return np.asarray((local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3])
+        return (local - self.world_to_camera[:3, 3]) @ self.world_to_camera[:3, :3]
 
     def scaled(self, factor: float) -> "Camera":
         """The camera with an image `factor` times as large (sizes rounded, at least one pixel)."""

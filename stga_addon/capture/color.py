@@ -76,7 +76,7 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 def with_gamma(pixels: np.ndarray, gamma: float) -> np.ndarray:
     """uint8 pixels that are light to the power of `gamma` (PNG's gAMA), as sRGB."""
     levels = linear_to_srgb((np.arange(256) / 255) ** (1 / gamma))
-    return np.asarray((255 * levels + 0.5).astype(np.uint8)[pixels])
+    return (255 * levels + 0.5).astype(np.uint8)[pixels]
 
 
 @lru_cache(maxsize=8)
@@ -105,4 +105,4 @@ def _to_xyz(primaries: int) -> np.ndarray:
     """(3, 3) from linear light to CIE XYZ (SMPTE RP 177)."""
     x, y = np.array([*CHROMATICITIES[primaries], D65]).T
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
-    return np.asarray(xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]))
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])

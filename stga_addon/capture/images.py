@@ -131,7 +131,7 @@ def area_mean(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
         return pixels
     import cv2
 
-    return np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
+    return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _decode(path: Path, view: View, kind: str) -> np.ndarray:
@@ -244,7 +244,7 @@ def _as_uint8(image: Image.Image) -> np.ndarray:
             raise ValueError("has more than 16 bits a pixel")
 
         def narrow(band: np.ndarray) -> np.ndarray:
-            return np.asarray((band.astype(np.int64)[..., None] * 255 + 32767) // 65535)
+            return (band.astype(np.int64)[..., None] * 255 + 32767) // 65535
 
         return in_bands(wide, 1, narrow)[..., 0]
     if image.mode == "F":
@@ -269,7 +269,7 @@ def _over(pixels: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
     def blend(band: np.ndarray) -> np.ndarray:
         alpha = band[..., -1:].astype(np.uint32)
         behind = np.array(background, np.uint32)
-        return np.asarray((band[..., :-1] * alpha + behind * (255 - alpha) + 127) // 255)
+        return (band[..., :-1] * alpha + behind * (255 - alpha) + 127) // 255
 
     return in_bands(pixels, 3, blend)
 

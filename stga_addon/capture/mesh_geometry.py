@@ -20,7 +20,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     flat = faces.ravel()
     count = len(vertices)
     total = np.stack([np.bincount(flat, np.repeat(n, 3), count) for n in normal.T], axis=-1)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20))
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
 
 
 def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
@@ -33,7 +33,7 @@ def connected_parts(vertices: int, faces: np.ndarray) -> np.ndarray:
             np.minimum.at(part, corner, least)
         part = part[part]
         if np.array_equal(part, before):
-            return np.asarray(part)
+            return part
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Similarity:
     translation: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+        return self.scale * points @ self.rotation.T + self.translation
 
     def camera(self, camera: Camera) -> Camera:
         """The camera in the world that `apply` leads to."""
@@ -77,7 +77,7 @@ def without_head_motion(mesh: np.ndarray, neutral: np.ndarray) -> np.ndarray:
         weights = 1 / (1 + (residual / scale) ** 2) ** 2
         if np.abs(fitted - before).max() < MIN_RESIDUAL * size:
             break
-    return np.asarray(fitted)
+    return fitted
 
 
 def weighted_procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> ArrayPair:
@@ -109,10 +109,10 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     from_b = points[:, None] - b
 
     def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.asarray((first * second).sum(axis=-1))
+        return (first * second).sum(axis=-1)
 
     def along(edge: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        return np.asarray(np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1))
+        return np.clip(dot(offset, edge) / np.maximum(dot(edge, edge), 1e-20), 0, 1)
 
     ab = b - a
     ac = c - a
@@ -136,7 +136,7 @@ def nearest_in_triangles(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     distance = np.linalg.norm(offset, axis=-1)
     distance[0] = np.where(inside, distance[0], np.inf)
     nearest = distance.argmin(axis=0)[None, ..., None]
-    return np.asarray(np.take_along_axis(options, nearest, axis=0)[0])
+    return np.take_along_axis(options, nearest, axis=0)[0]
 
 
 def rasterize(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> ArrayPair:
@@ -238,8 +238,8 @@ def _barycentric_slopes(corners: np.ndarray) -> np.ndarray:
     area = _at(np.stack([along_x[:, 0], along_y[:, 0], constant[:, 0]], -1), x[:, 0], y[:, 0])
     with np.errstate(divide="ignore"):
         inverse = np.where(area != 0, 1 / area, 0.0)
-    return np.asarray(np.stack([along_x, along_y, constant], -1) * inverse[:, None, None])
+    return np.stack([along_x, along_y, constant], -1) * inverse[:, None, None]
 
 
 def _at(slopes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.asarray(slopes[..., 0] * x + slopes[..., 1] * y + slopes[..., 2])
+    return slopes[..., 0] * x + slopes[..., 1] * y + slopes[..., 2]

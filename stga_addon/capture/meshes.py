@@ -288,7 +288,7 @@ def _triangles(text: bytes, earlier: tuple[int, ...]) -> np.ndarray:
     if (index == 0).any():
         raise ValueError("vertex 0, but OBJ counts from 1")
     index = np.where(index > 0, index - 1, np.repeat(np.array(earlier, int), count) + index)
-    return np.asarray(index[_fans(count)])
+    return index[_fans(count)]
 
 
 def is_region_file(name: str) -> bool:

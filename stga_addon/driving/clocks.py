@@ -121,7 +121,7 @@ def seconds_of(where: str, texts: list[str]) -> np.ndarray:
     else:
         elapsed = _seconds_of_frames(second, frames, parts, bool(dropping.any()))
     days = np.concatenate([[0], np.cumsum(np.diff(elapsed) < -DAY_S / 2)])
-    return np.asarray(elapsed + DAY_S * days - elapsed[0])
+    return elapsed + DAY_S * days - elapsed[0]
 
 
 def _are_of_clock(frames: np.ndarray, parts: np.ndarray) -> bool:
@@ -144,10 +144,10 @@ def _seconds_of_frames(
     if len(np.unique(second)) > 1:
         base = min(possible, key=lambda base: _unevenness(second + (frames + parts) / base))
     if not is_dropping:
-        return np.asarray(second + (frames + parts) / base)
+        return second + (frames + parts) / base
     minute = second // 60
     left_out = round(base / 15) * (minute - np.floor(minute / 10))
-    return np.asarray((second * base + frames + parts - left_out) / (base * DROP_RATIO))
+    return (second * base + frames + parts - left_out) / (base * DROP_RATIO)
 
 
 def _unevenness(times: np.ndarray) -> float:

@@ -155,7 +155,7 @@ class _Fit:
         matrix = slopes[..., : self.count].reshape(-1, self.count)
         residual = (wanted - start).reshape(len(wanted), -1)
         normal = matrix.T @ matrix + self.ridge * np.eye(self.count)
-        return np.asarray(np.linalg.solve(normal, matrix.T @ residual.T).T)
+        return np.linalg.solve(normal, matrix.T @ residual.T).T
 
     def expressions(self) -> np.ndarray:
         """(FEATURES, E) that best give single shapes and random combinations."""
@@ -168,8 +168,7 @@ class _Fit:
             wanted = self.neutral + np.tensordot(effective_weights(weights), self.targets, 1)
             rows.append(features(weights))
             solutions.append(self.coefficients(jaw @ self.jaw, wanted))
-        found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
-        return np.asarray(found)
+        return np.linalg.lstsq(np.concatenate(rows), np.concatenate(solutions), rcond=None)[0]
 
     def _jaw(self) -> np.ndarray:
         """(52, 3) axis-angle of the shapes that turn the jaw, fitted together with expressions."""
@@ -201,7 +200,7 @@ def _combinations(pose: tuple[float, float, float], rng: np.random.Generator) ->
     weights = np.concatenate([weights, alone, np.zeros((1, COUNT))])
     weights[:, [COLUMN[name] for name in OPTIONAL]] = 0
     weights[:, [COLUMN[name] for name in JAW_SHAPES]] = pose
-    return np.asarray(weights)
+    return weights
 
 
 def _gaze() -> np.ndarray:

@@ -127,7 +127,7 @@ def _polished(
     """The minimizers near weights (T, K), by projected Newton steps (Bertsekas 1982)."""
 
     def value(w: np.ndarray) -> np.ndarray:
-        return np.asarray((w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1))
+        return (w * (0.5 * np.einsum("tjk,tk->tj", matrices, w) - right)).sum(axis=1)
 
     for _ in range(NEWTON_STEPS):
         slope = right - np.einsum("tjk,tk->tj", matrices, weights)

@@ -106,7 +106,7 @@ def quiet_weights(performance: Performance) -> np.ndarray:
     """(52,) median of the weights over the rows in which their sum is least."""
     order = np.argsort(performance.weights.sum(axis=1), kind="stable")
     quiet = order[: max(1, round(QUIET_SHARE * len(order)))]
-    return np.asarray(np.median(performance.weights[quiet], axis=0))
+    return np.median(performance.weights[quiet], axis=0)
 
 
 def exchanged_neutral(

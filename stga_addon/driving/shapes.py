@@ -217,7 +217,7 @@ def _warped(
         weights = np.linalg.solve(system, np.concatenate([moved, np.zeros((4, 3))]))
         terms = np.hstack([-_distances(points, fixed), _homogeneous(points)])
         warped = points + terms @ weights
-    return np.asarray(warped)
+    return warped
 
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
@@ -225,4 +225,4 @@ def _homogeneous(points: np.ndarray) -> np.ndarray:
 
 
 def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return np.asarray(np.linalg.norm(first[:, None] - second, axis=2))
+    return np.linalg.norm(first[:, None] - second, axis=2)

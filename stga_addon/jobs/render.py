@@ -292,7 +292,7 @@ def _subject(request: Render, composer: Composer, say: Say) -> _Subject:
         if view.timestep not in capture.timesteps:
             problem = f"has no mesh for timestep {view.timestep}, which {view.name} asks for"
             raise StgaError(f"{capture.root}: {problem}")
-        return np.asarray(capture.mesh(view.timestep))
+        return capture.mesh(view.timestep)
 
     return _Subject(
         _pictured(request, avatar, mesh, composer),
@@ -345,7 +345,7 @@ def _lit_colors(
 
 def _middle(vertices: np.ndarray) -> np.ndarray:
     """(3,) center of the vertices' bounding box."""
-    return np.asarray((vertices.min(0) + vertices.max(0)) / 2)
+    return (vertices.min(0) + vertices.max(0)) / 2
 
 
 def unique_names(paths: list[str]) -> list[str]:

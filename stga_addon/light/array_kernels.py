@@ -68,7 +68,7 @@ def _add_group(corners: np.ndarray, area: np.ndarray, depth: np.ndarray) -> None
 
 
 def _crossed(u: np.ndarray, v: np.ndarray, i: int, j: int) -> np.ndarray:
-    return np.asarray(u[i] * v[j] - u[j] * v[i])
+    return u[i] * v[j] - u[j] * v[i]
 
 
 def _line(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,7 +174,7 @@ def add_lights(
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(N,) of vectors (3, N)."""
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def toward_light(

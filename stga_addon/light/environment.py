@@ -75,7 +75,7 @@ def split_environment(
         rest[near] = 0
         level = np.where(near, 0, level)
     values = (rest * angle[..., None]).reshape(-1, 3)
-    return np.asarray(basis(vectors.reshape(-1, 3)).T @ values), tuple(suns)
+    return basis(vectors.reshape(-1, 3)).T @ values, tuple(suns)
 
 
 MAX_LIGHTS = 64

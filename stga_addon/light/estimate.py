@@ -182,7 +182,7 @@ def recorded_irradiance(
         weight = views[:, None] + UNSEEN_WEIGHT
         total += weight * (arriving + bounce.light(arriving))
         count += weight
-    return np.asarray(total / count)
+    return total / count
 
 
 def fit_light(

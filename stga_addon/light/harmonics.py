@@ -34,7 +34,7 @@ _SAMPLES = even_directions(64)
 def rotated(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """(9, C) of the same light in other axes: rotation (3, 3) takes old coordinates to new ones."""
     values = basis(_SAMPLES @ rotation) @ coefficients  # at new direction d the old one is Rᵀ d
-    return np.asarray(np.linalg.lstsq(basis(_SAMPLES), values, rcond=None)[0])
+    return np.linalg.lstsq(basis(_SAMPLES), values, rcond=None)[0]
 
 
 def uniform(radiance: object) -> np.ndarray:
@@ -49,4 +49,4 @@ def least_squares(rows: np.ndarray, values: np.ndarray, ridge: float) -> np.ndar
     of the mean of the normal equations' diagonal: some harmonics may give no light."""
     matrix = rows.T @ rows
     matrix[np.diag_indices(COUNT)] += ridge * np.trace(matrix) / COUNT + DARK**2
-    return np.asarray(np.linalg.solve(matrix, rows.T @ values))
+    return np.linalg.solve(matrix, rows.T @ values)

@@ -46,7 +46,7 @@ class LightView:
             factor = factor / np.where(depth > 1e-4, depth, np.float32(np.nan))
         for k in range(2):
             local[:, k] = local[:, k] * factor + np.float32(self.size / 2)
-        return np.asarray(local)
+        return local
 
 
 class HeadBounds(NamedTuple):

@@ -59,13 +59,13 @@ def kept_shares(kept: Kept, arriving: np.ndarray, irradiance: np.ndarray) -> np.
 def _smooth_step(values: np.ndarray) -> np.ndarray:
     """From 0 to 1 between 0 and 1."""
     values = np.clip(values, 0, 1)
-    return np.asarray(values * values * (3 - 2 * values))
+    return values * values * (3 - 2 * values)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     # np.linalg.norm is slow where the last axis is short
     length = np.sqrt(row_dot(vectors, vectors))
-    return np.asarray(vectors / np.maximum(length, np.float32(1e-12))[:, None])
+    return vectors / np.maximum(length, np.float32(1e-12))[:, None]
 
 
 REFLECTANCE = 0.04  # Of skin, eyes and teeth seen straight on: a refractive index of 1.5
@@ -227,7 +227,7 @@ class Relighter:
         if likeness.share > 0:
             same = np.asarray(likeness.gain, np.float32) * self._recorded(mesh, eye)
             lit += kept_shares(likeness, arriving, self.irradiance)[:, None] * (same - lit)
-        return np.asarray(lit)
+        return lit
 
     def _albedo(self, color: np.ndarray) -> np.ndarray:
         """(N, 3) of recorded sRGB (N, 3) without what depends on the view."""
@@ -241,7 +241,7 @@ class Relighter:
         if damping:
             albedo = np.maximum(albedo, 1e-4)
             albedo = albedo ** (1 - damping) * np.exp(np.log(albedo).mean(0)) ** damping
-        return np.asarray(albedo.astype(np.float32))
+        return albedo.astype(np.float32)
 
     def _recorded(self, mesh: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """(N, 3) linear colors as trained, seen from `eye`."""

@@ -70,14 +70,14 @@ class Bounce:
         """(V, 3) irradiance from skin around a vertex, by what arrives at vertices (V, 3)."""
         columns = np.asarray(irradiance).T
         near = np.stack([self._around(self._weight * column) for column in columns], axis=-1)
-        return np.asarray(self._blocked * near / np.maximum(self._sum_of_weights, 1e-12)[:, None])
+        return self._blocked * near / np.maximum(self._sum_of_weights, 1e-12)[:, None]
 
     def _around(self, values: np.ndarray) -> np.ndarray:
         """(V,): sum of values (V,) in each vertex's cell and those around it."""
         total = np.bincount(self._cell, values, int(np.prod(self._shape))).reshape(self._shape)
         for axis in range(3):  # the outermost cells are empty
             total = total + np.roll(total, 1, axis) + np.roll(total, -1, axis)
-        return np.asarray(total.ravel()[self._cell])
+        return total.ravel()[self._cell]
 
 
 MAX_STEPS = 6
@@ -141,7 +141,7 @@ def _nearest(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(np.einsum("nk,nk->n", a, b))
+    return np.einsum("nk,nk->n", a, b)
 
 
 def at_splats(values: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -106,7 +106,7 @@ class SceneLayer:
 
     def eye_in_avatar(self, eye: np.ndarray) -> np.ndarray:
         """(3,) of a position (3,) in the scene."""
-        return np.asarray((np.linalg.inv(self.to_world) @ [*eye, 1.0])[:3])
+        return (np.linalg.inv(self.to_world) @ [*eye, 1.0])[:3]
 
 
 def random_percentage(count: int) -> np.ndarray:

@@ -86,7 +86,7 @@ def read_triangle_weights(head: Any, name: str) -> np.ndarray:
     index = head.vertex_groups[name].index
     members = ({each.group: each.weight for each in v.groups} for v in head.data.vertices)
     weights = np.array([groups.get(index, 0.0) for groups in members], np.float32)
-    return np.asarray(weights[mesh_triangles(head.data)].min(1))
+    return weights[mesh_triangles(head.data)].min(1)
 
 
 def selected_triangles(head: Any) -> np.ndarray:

@@ -137,7 +137,7 @@ def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """(N,) bool: pixels (N, 2) in the image, a pixel from its border, at a depth (N,) before the
     camera."""
     within = (pixels > 1) & (pixels < [camera.width - 1, camera.height - 1])
-    return np.asarray(within.all(1) & (depth > 0))
+    return within.all(1) & (depth > 0)
 
 
 def projection_derivative(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -183,7 +183,7 @@ def light_basis(normals: np.ndarray) -> np.ndarray:
 
 def shading(basis: np.ndarray, light: np.ndarray) -> np.ndarray:
     """(N, 1) factor of the texture."""
-    return np.asarray(np.clip(basis @ light, MIN_SHADING, MAX_SHADING)[:, None])
+    return np.clip(basis @ light, MIN_SHADING, MAX_SHADING)[:, None]
 
 
 def fitted_light(
@@ -206,7 +206,7 @@ def fitted_light(
     for _ in range(LIGHT_ITERATIONS):
         weighted = design * (weight * robust(target - design @ light, scale))[:, None]
         light = np.linalg.solve(weighted.T @ design + prior, weighted.T @ target + prior @ usual)
-    return np.asarray(light)
+    return light
 
 
 def relit(
@@ -218,18 +218,18 @@ def relit(
 ) -> np.ndarray:
     """The texture (N, 3) in the lighting of a view; arguments as of `fitted_light`."""
     light = fitted_light(values, texture, basis, weight, usual)
-    return np.asarray(texture * shading(basis, light))
+    return texture * shading(basis, light)
 
 
 def robust(residual: np.ndarray, scale: float) -> np.ndarray:
     """Geman-McClure weights."""
-    return np.asarray(1 / (1 + (residual / scale) ** 2) ** 2)
+    return 1 / (1 + (residual / scale) ** 2) ** 2
 
 
 def point_weights(residual: np.ndarray, level: int) -> np.ndarray:
     """(M,) of points whose channels differ from a view's by (M, 3) NOISE_LEVELS."""
     share = residual**2 @ CHANNEL_WEIGHTS / OUTLIER_SQUARED[level]
-    return np.asarray(POINT_SHARE / (1 + share) ** 2)
+    return POINT_SHARE / (1 + share) ** 2
 
 
 def unexplained(
@@ -237,7 +237,7 @@ def unexplained(
 ) -> np.ndarray:
     """(M,) from 0 where images explain points to 1, of differences (M, 3) in NOISE_LEVELS."""
     squared = residual**2 @ weights
-    return np.asarray(squared / (OUTLIER_SQUARED[level] + squared))
+    return squared / (OUTLIER_SQUARED[level] + squared)
 
 
 def flow_weights(miss: np.ndarray) -> np.ndarray:
@@ -306,4 +306,4 @@ def _robust_mean(
         total = (used[..., None] * stacked).sum(0)
         mass = used.sum(0)[:, None]
         mean = np.where(mass > 1e-6, total / np.maximum(mass, 1e-6), mean)
-    return np.asarray(mean)
+    return mean

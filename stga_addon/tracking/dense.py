@@ -357,7 +357,7 @@ class _Solver:
         it."""
         at = self.head.landmarks.positions(*split(values))
         away = np.einsum("nij,nj->ni", landmarks.root, at - landmarks.position)
-        return np.asarray(np.linalg.norm(away, axis=1))
+        return np.linalg.norm(away, axis=1)
 
 
 def _agreeing(

@@ -258,8 +258,7 @@ def _resampled(
 
     border = cv2.BORDER_CONSTANT if black_border else cv2.BORDER_REPLICATE
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
-    return np.asarray(warped)
+    return cv2.warpAffine(image, matrix, (size, size), flags=flags, borderMode=border)
 
 
 def _distinct(boxes: np.ndarray, shares: np.ndarray) -> list[np.ndarray]:

@@ -295,7 +295,7 @@ def pose_from_one_camera(camera: Camera, pixels: np.ndarray, points: np.ndarray)
         place = np.array([*rows[:, 3], 1.0]) / size
         stretch = 1 + (points - center) @ rotation[2] / place[2]
     local = (points - center) @ rotation.T + place
-    return np.asarray((local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3])
+    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
 
 
 def triangulated(

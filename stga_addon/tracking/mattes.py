@@ -195,7 +195,7 @@ def _cut(
     _, label, statistics, _ = cv2.connectedComponentsWithStats(holes, connectivity=4)
     filled = statistics[:, cv2.CC_STAT_AREA] <= MAX_HOLE_SHARE * head.sum()
     filled[0] = False
-    return np.asarray(kept | filled[label])
+    return kept | filled[label]
 
 
 def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) -> np.ndarray:
@@ -219,7 +219,7 @@ def _mean_around(cv2: Any, image: np.ndarray, known: np.ndarray, size: float) ->
 def _shrunk(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:
     """(H, W) bool: pixels farther than so many from the outside, which the border is not."""
     distance = cv2.distanceTransform(where.astype(np.uint8), cv2.DIST_L2, 3)
-    return np.asarray(distance > pixels)
+    return distance > pixels
 
 
 def _grown(cv2: Any, where: np.ndarray, pixels: float) -> np.ndarray:

@@ -35,12 +35,12 @@ class SurfacePoints:
     def on(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Their positions (N, 3), or other values (N, …) interpolated, from those of the vertices
         (V, …)."""
-        return np.asarray(np.einsum("nk,nk...->n...", self.barycentric, vertices[faces[self.face]]))
+        return np.einsum("nk,nk...->n...", self.barycentric, vertices[faces[self.face]])
 
 
 def head_rotation(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) of the root joint in (E + 18,) parameters."""
-    return np.asarray(axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0])
+    return axis_angle_matrices(parameters[None, -RIGID_SIZE : -RIGID_SIZE + 3])[0]
 
 
 def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +51,7 @@ def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def unit(vectors: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """(N, 3) of length 1; shorter ones than `least` stay near 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, least))
+    return vectors / np.maximum(length, least)
 
 
 def face_size(pixels: np.ndarray) -> float:
@@ -169,9 +169,7 @@ class PosedPoints:
         """Values (3 N, …) at the triangles' corners as (N, 3 corners, …), times the barycentric
         coordinates."""
         shaped = values.reshape(len(self.barycentric), 3, *values.shape[1:])
-        return np.asarray(
-            shaped * self.barycentric.reshape(len(shaped), 3, *([1] * (values.ndim - 1)))
-        )
+        return shaped * self.barycentric.reshape(len(shaped), 3, *([1] * (values.ndim - 1)))
 
 
 @dataclass(frozen=True)

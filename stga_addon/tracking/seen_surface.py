@@ -92,7 +92,7 @@ def gray_view(
 def facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Cosine (N,) of the angle between unit normals (N, 3) and the direction to the camera."""
     towards = camera.position - points
-    return np.asarray((towards * normals).sum(1) / np.linalg.norm(towards, axis=1))
+    return (towards * normals).sum(1) / np.linalg.norm(towards, axis=1)
 
 
 def in_sight(
@@ -214,7 +214,7 @@ def large_parts(model: FlameModel) -> np.ndarray:
     numbers, part = np.unique(connected_parts(len(vertices), faces), return_inverse=True)
     extent = [np.ptp(vertices[part == number], axis=0).max() for number in range(len(numbers))]
     large = np.array(extent) > MIN_PART_SHARE * np.ptp(vertices, axis=0).max()
-    return np.asarray(large[part[faces[:, 0]]])
+    return large[part[faces[:, 0]]]
 
 
 def seen_surface(
@@ -294,7 +294,7 @@ def near_landmarks(head: HeadModel, points: SurfacePoints, take: RecordedTake) -
     faces = head.model.faces
     landmarks = take.places.on(template, faces)[take.reliable]
     distance, _ = cKDTree(landmarks).query(points.on(template, faces))
-    return np.asarray(distance < OUTLINE_RADIUS_M)
+    return distance < OUTLINE_RADIUS_M
 
 
 def outline_offsets(
@@ -361,7 +361,7 @@ def _sampled(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
     from scipy.ndimage import map_coordinates
 
     places = [at[..., 1] - 0.5, at[..., 0] - 0.5]
-    return np.asarray(map_coordinates(mask, places, np.float32, order=1, mode="nearest") - 0.5)
+    return map_coordinates(mask, places, np.float32, order=1, mode="nearest") - 0.5
 
 
 def _crossed(

@@ -290,7 +290,7 @@ def _smooth_step(
             for column, other in enumerate((1.0, -2.0, 1.0)[: row + 1]):
                 at = (number + column) * size
                 band[(row - column) * size, at : at + size] += share * first * other
-    return np.asarray(solveh_banded(band, right.ravel(), lower=True).reshape(count, size))
+    return solveh_banded(band, right.ravel(), lower=True).reshape(count, size)
 
 
 def parameter_precision(head: HeadModel) -> np.ndarray:
@@ -341,4 +341,4 @@ def acceleration_precision(model: FlameModel) -> np.ndarray:
     for column, name in enumerate(model.expression_names):
         if name.removesuffix("Left").removesuffix("Right") in LID_SHAPES:
             sigma[column] = LID_ACCELERATION
-    return np.asarray(sigma**-2.0)
+    return sigma**-2.0

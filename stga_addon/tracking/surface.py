@@ -368,7 +368,7 @@ def smooth_offsets(
         robust = trust / (1 + miss**2) ** 2 if values.any() else trust / np.sqrt(1 + miss**2)
         matrix = (at.T @ diags_array(robust) @ at + prior).tocsc()
         values = spsolve(matrix, at.T @ (robust * residual))
-    return np.asarray(values)
+    return values
 
 
 def _laplacian(vertices: np.ndarray, faces: np.ndarray, area: np.ndarray) -> Any:

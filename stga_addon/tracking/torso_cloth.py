@@ -128,7 +128,7 @@ def draped(sheet: TorsoSheet, at: np.ndarray, points: np.ndarray) -> np.ndarray:
     weight = near.sum(1)
     target = np.column_stack([flat, near @ points[:, 2] / np.maximum(weight, 1e-9)])
     share = np.minimum(sheet.height / FULL_HEIGHT, 1) * trust * (weight > MIN_WEIGHT)
-    return np.asarray(at + share[:, None] * (target - at))
+    return at + share[:, None] * (target - at)
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
@@ -293,7 +293,7 @@ class _Cloth:
         torso = self._motion[timestep]
         drawn = self._drape + bend
         rigid = self._take.rigid(torso, self._sheet.vertices)
-        return np.asarray(rigid + drawn @ head_rotation(torso.parameters).T)
+        return rigid + drawn @ head_rotation(torso.parameters).T
 
     @staticmethod
     def _visible(shot: TorsoShot, number: int, at: np.ndarray) -> np.ndarray:
@@ -302,7 +302,7 @@ class _Cloth:
         share = sampled([shot.masks[number].astype(np.float32)], view.camera.project(at)[0])[0]
         finest = view.levels[0].camera
         within = inside(finest, *finest.project(at)) & (share > 127)
-        return np.asarray(shot.shows(number, at) & within)
+        return shot.shows(number, at) & within
 
     def _returned(self, shot: TorsoShot, number: int, bend: np.ndarray) -> _Returned:
         reference = self._references[number]
@@ -339,7 +339,7 @@ class _Cloth:
             weighted = rate.T @ diags_array(precision)
             matrix = matrix + weighted @ rate
             right = right + weighted @ miss[used].ravel()
-        return np.asarray(bend + _solved(matrix.tocsr(), right).reshape(-1, 3))
+        return bend + _solved(matrix.tocsr(), right).reshape(-1, 3)
 
 
 def _solved(matrix: Any, right: np.ndarray) -> np.ndarray:

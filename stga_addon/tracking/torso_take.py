@@ -83,7 +83,7 @@ class TorsoShot:
         head = self.heads[number]
         pixels, depth = camera.project(at)
         x, y = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
-        return np.asarray(inside(camera, pixels, depth) & ~head[y, x])
+        return inside(camera, pixels, depth) & ~head[y, x]
 
 
 class TorsoTake:
@@ -119,7 +119,7 @@ class TorsoTake:
         (root, _) = self.joints(torso.parameters)
         rest = self.model.v_template[vertices] + self.model.shapedirs[vertices] @ expr
         turned = (rest - root) @ head_rotation(torso.parameters).T
-        return np.asarray(turned + root + torso.parameters[-3:] + torso.shift)
+        return turned + root + torso.parameters[-3:] + torso.shift
 
     def with_offset(
         self, torso: PosedTorso, bend: np.ndarray | float = 0.0
@@ -151,11 +151,11 @@ class TorsoTake:
         """(3,) what the torso turns about: the joint of the neck."""
         parameters = self.parameters[timestep]
         root, neck = self.joints(parameters)
-        return np.asarray(root + head_rotation(parameters) @ (neck - root) + parameters[-3:])
+        return root + head_rotation(parameters) @ (neck - root) + parameters[-3:]
 
     def joints(self, parameters: np.ndarray) -> np.ndarray:
         """(2, 3) root, inside the base of the neck, and neck, before posing."""
-        return np.asarray(self._joints + self._joint_dirs @ parameters[:-RIGID_SIZE])
+        return self._joints + self._joint_dirs @ parameters[:-RIGID_SIZE]
 
     def shot(self, timestep: int) -> TorsoShot:
         """Read a timestep; images are of constant size, as optical flow needs them."""
@@ -228,7 +228,7 @@ def with_root(parameters: np.ndarray, rotation: np.ndarray, arm: np.ndarray) -> 
 def head_turn(parameters: np.ndarray) -> np.ndarray:
     """(3, 3) orientation of the head in the world."""
     root, neck = joint_turns(parameters)[[ROOT, NECK]]
-    return np.asarray(root @ neck)
+    return root @ neck
 
 
 def joint_turns(parameters: np.ndarray) -> np.ndarray:
@@ -238,12 +238,12 @@ def joint_turns(parameters: np.ndarray) -> np.ndarray:
 
 def axis_angle(rotation: np.ndarray) -> np.ndarray:
     """(3,) of a rotation (3, 3)."""
-    return np.asarray(to_axis_angle(from_matrices(rotation[None]))[0])
+    return to_axis_angle(from_matrices(rotation[None]))[0]
 
 
 def grown(where: np.ndarray, share: float) -> np.ndarray:
     """The pixels (H, W) bool with those around them, as far as a share of the image's height."""
-    return np.asarray(binary_dilation(where, iterations=max(1, round(share * len(where)))))
+    return binary_dilation(where, iterations=max(1, round(share * len(where))))
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,7 @@ class SeenPoints:
         """Channels (M, 3) of a camera's image at points less the reference's, in NOISE_LEVELS."""
         own = shot.views[number].levels[level]
         values = sampled([own.channels], own.camera.project(at)[0])[0]
-        return np.asarray((values - self.reference[level][rows]) / NOISE_LEVELS)
+        return (values - self.reference[level][rows]) / NOISE_LEVELS
 
 
 def seen_points(take: TorsoTake, timestep: int) -> SeenPoints:

@@ -229,7 +229,7 @@ def on_shell(camera: Camera, pixels: np.ndarray, center: np.ndarray, radius: flo
     nearest = toward @ (center - origin)
     miss = np.linalg.norm(origin + nearest[:, None] * toward - center, axis=1)
     beyond = np.sqrt(np.maximum(radius**2 - miss**2, radius**2 / 4))
-    return np.asarray(origin + (np.maximum(nearest, 0) + beyond)[:, None] * toward)
+    return origin + (np.maximum(nearest, 0) + beyond)[:, None] * toward
 
 
 def first_splats(plates: Sequence[CleanPlate], center: np.ndarray) -> Splats:

@@ -241,7 +241,7 @@ def _posed_vertices(splat_object: Any, head: Any, faces: np.ndarray, depsgraph: 
         raise StgaError(f"{head.name}: {reason}")
     placed = splat_object.evaluated_get(depsgraph).matrix_world
     to_splats = np.array(placed.inverted_safe() @ posed.matrix_world, np.float64)
-    return np.asarray(mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3])
+    return mesh_vertices(posed.data) @ to_splats[:3, :3].T + to_splats[:3, 3]
 
 
 def _may_show_splats(candidate: Any) -> bool:

@@ -146,7 +146,7 @@ def _expression(head: Any, count: int, turns: dict[str, np.ndarray]) -> np.ndarr
     for joint, row in zip(("jaw", "left_eye", "right_eye"), (-9, -6, -3), strict=True):
         slider, bone = from_axis_angle(np.array([added[row : row + 3 or None], turns[joint]]))
         turns[joint] = to_axis_angle(multiply(bone, slider))
-    return np.asarray(expr + added[:count])
+    return expr + added[:count]
 
 
 def _key_value(head: Any, name: str) -> float:

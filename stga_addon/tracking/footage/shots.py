@@ -74,15 +74,15 @@ class Lens:
 
     def _radius(self, tangent: np.ndarray) -> np.ndarray:
         if self.projection == "fisheye":
-            return np.asarray(np.arctan(tangent))
+            return np.arctan(tangent)
         if self.projection == "equisolid fisheye":
-            return np.asarray(2 * np.sin(np.arctan(tangent) / 2))
+            return 2 * np.sin(np.arctan(tangent) / 2)
         if abs(self.parameter) < MIN_RADIUS:
             return tangent
         if self.projection == "field of view":
-            return np.asarray(np.arctan(2 * tangent * np.tan(self.parameter / 2)) / self.parameter)
+            return np.arctan(2 * tangent * np.tan(self.parameter / 2)) / self.parameter
         with np.errstate(invalid="ignore"):  # NaN beyond the widest angle that the lens shows
-            return np.asarray(2 * tangent / (1 + np.sqrt(1 - 4 * self.parameter * tangent**2)))
+            return 2 * tangent / (1 + np.sqrt(1 - 4 * self.parameter * tangent**2))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Undistortion:
 
         maps = _maps(_intrinsics(self.recorded), self.lens, _intrinsics(self.camera))
         method = cv2.INTER_CUBIC if image.ndim == 3 else cv2.INTER_LINEAR
-        return np.asarray(cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE))
+        return cv2.remap(image, *maps, method, borderMode=cv2.BORDER_REPLICATE)
 
 
 def undistortion(recorded: Camera, lens: Lens, where: str) -> Undistortion | None:

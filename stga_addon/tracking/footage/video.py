@@ -445,7 +445,7 @@ def _display_matrix(frame: Any) -> np.ndarray | None:
     if data is None:
         return None
     fixed = np.frombuffer(bytes(data), "<i4")[[0, 1, 3, 4]].reshape(2, 2)
-    return np.asarray(fixed / DISPLAY_MATRIX_ONE)
+    return fixed / DISPLAY_MATRIX_ONE
 
 
 def _turn(frame: Any) -> np.ndarray | None:

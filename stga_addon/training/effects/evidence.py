@@ -77,7 +77,7 @@ class CameraColors:
     def undo(self, color: np.ndarray, camera: np.ndarray) -> np.ndarray:
         """color (S, K, 3) of the cameras (S,), as the mean camera would have seen it."""
         row = np.searchsorted(self.camera, camera)
-        return np.asarray((color - self.offset[row][:, None]) / self.gain[row][:, None])
+        return (color - self.offset[row][:, None]) / self.gain[row][:, None]
 
 
 def fit_cameras(samples: Samples, color: np.ndarray) -> CameraColors:
@@ -260,4 +260,4 @@ def _mean(color: np.ndarray) -> np.ndarray:
     """Mean (K, 3) over the samples (S, K, 3) that are known; NaN where none is."""
     known = ~np.isnan(color)
     count = known.sum(0)
-    return np.asarray(np.where(known, color, 0).sum(0) / np.where(count > 0, count, np.nan))
+    return np.where(known, color, 0).sum(0) / np.where(count > 0, count, np.nan)

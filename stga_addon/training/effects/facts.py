@@ -67,7 +67,7 @@ class CaptureFacts:
         a, b, c = self.capture.neutral[self.capture.faces[self.samples.faces]].swapaxes(0, 1)
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-        return np.asarray(colors / evidence.fit_turning_light(self.samples, colors, normal))
+        return colors / evidence.fit_turning_light(self.samples, colors, normal)
 
     @cached_property
     def matched_colors(self) -> np.ndarray:

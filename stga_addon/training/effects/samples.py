@@ -188,7 +188,7 @@ def _facing(mesh: np.ndarray, triangles: np.ndarray, camera: Camera) -> np.ndarr
     normal = np.cross(p1 - p0, p2 - p0)
     to_camera = camera.position - (p0 + p1 + p2) / 3
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(to_camera, axis=1)
-    return np.asarray(np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30))
+    return np.einsum("fi,fi->f", normal, to_camera) / np.maximum(lengths, 1e-30)
 
 
 def _nearest(corners: np.ndarray, far_first: np.ndarray, camera: Camera) -> np.ndarray:

@@ -269,7 +269,7 @@ def distinct_timesteps(
 
 def _distance(meshes: np.ndarray, mesh: np.ndarray) -> np.ndarray:
     """(T,) root mean square distance of vertices."""
-    return np.asarray(np.sqrt(np.square(meshes - mesh.astype(np.float32)).sum(-1).mean(-1)))
+    return np.sqrt(np.square(meshes - mesh.astype(np.float32)).sum(-1).mean(-1))
 
 
 def views_of_region(capture: Capture, views: Sequence[View], region: np.ndarray) -> list[View]:
